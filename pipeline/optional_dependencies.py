@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 
 def how_to_install(extra: str = "") -> str:
-    """One command, for an error that says what is missing. extra: `train`, `view` or `parquet`."""
+    """One command, for an error that says what is missing. extra: of pyproject.toml, such as `train`."""
     return f"in the checkout: .venv/bin/pip install -e '.{f'[{extra}]' if extra else ''}'"
 
 

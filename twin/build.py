@@ -27,11 +27,13 @@ from twin.errors import TwinError
 from twin.evaluation.accuracy import (
     Evaluation,
     Figures,
+    FigureSums,
     UnseenStd,
     compared_readings,
     evaluate_model,
     evaluation_pieces,
     free_run_residuals,
+    sums_of_model,
 )
 from twin.evaluation.reading_range import reading_sigma_rad_s
 from twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
@@ -213,24 +215,55 @@ def train_twin(
     return TrainedTwin(model, parameters, card, identification, validation)
 
 
+@dataclass(frozen=True, eq=False)
+class RunsOfTwin:
+    """A twin and runs of fans that it knows. rows: of its card, one for each fan. runs: with the tachos of the card.
+    parameters: (fans, 4), behind a drive (fans, 7). unseen_std: what widens the band where the twin was not trained."""
+
+    model: OnnxTwin | Model
+    card: TwinCard
+    rows: list[int]
+    runs: list[Run]
+    parameters: Array
+    sigma_rad_s: Array
+    unseen_std: UnseenStd | None
+
+
+def runs_of_twin(
+    twin: OnnxTwin | TrainedTwin, runs: Sequence[Run], fan_numbers: Sequence[int] | None = None
+) -> RunsOfTwin:
+    """The runs as those of a twin's fans.
+
+    fan_numbers: what the recordings call the runs' fans, as in fan_rows. A twin of one fan serves any. Raises TwinError
+    when the fans do not fit.
+    """
+    card = twin.card
+    rows = fan_rows(card, common_fans(runs), fan_numbers)
+    table = card.model_uncertainty
+    return RunsOfTwin(
+        model=twin if isinstance(twin, OnnxTwin) else twin.model,
+        card=card,
+        rows=rows,
+        runs=measured_as_in_card(card, rows, runs),
+        parameters=twin.parameters[rows],
+        sigma_rad_s=np.array(card.sigma_rad_s)[rows],
+        unseen_std=_unseen_std(table.of_fans(rows) if table else None, drive_of_fans(card, rows)),
+    )
+
+
 def evaluate(
     twin: str | Path | OnnxTwin | TrainedTwin, runs: Sequence[Run], fan_numbers: Sequence[int] | None = None
 ) -> Evaluation:
-    """Figures of a twin, or of its file, on runs.
+    """Figures of a twin, or of its file, on runs. fan_numbers, and what is raised: as for runs_of_twin."""
+    return evaluation_sums(twin, runs, fan_numbers).evaluation()
 
-    fan_numbers: what the recordings call the runs' fans, as in fan_rows. A twin of one fan serves any. The tachos are
-    those of the twin's card. The band is wider where the card says that the twin was not trained.
-    Raises TwinError when the fans do not fit.
-    """
-    loaded = OnnxTwin(twin) if isinstance(twin, str | Path) else twin
-    model = loaded if isinstance(loaded, OnnxTwin) else loaded.model
-    rows = fan_rows(loaded.card, common_fans(runs), fan_numbers)
-    runs = measured_as_in_card(loaded.card, rows, runs)
-    sigma_rad_s = np.array(loaded.card.sigma_rad_s)[rows]
-    unseen_std = _unseen_std(
-        table.of_fans(rows) if (table := loaded.card.model_uncertainty) else None, drive_of_fans(loaded.card, rows)
-    )
-    return evaluate_model(model, loaded.parameters[rows], sigma_rad_s, runs, unseen_std)
+
+def evaluation_sums(
+    twin: str | Path | OnnxTwin | TrainedTwin, runs: Sequence[Run], fan_numbers: Sequence[int] | None = None
+) -> FigureSums:
+    """What the figures are made of, to be added to that of other runs. Arguments and errors as of evaluate."""
+    of = runs_of_twin(OnnxTwin(twin) if isinstance(twin, str | Path) else twin, runs, fan_numbers)
+    return sums_of_model(of.model, of.parameters, of.sigma_rad_s, of.runs, of.unseen_std)
 
 
 def free_run_of(twin: OnnxTwin, runs: Sequence[Run]) -> tuple[Array, Array, Array]:

@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from bench.detection.rack_scoring import Episode, episodes
-from pipeline.replay.offline.healthy_runs import HealthyRuns
+from pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
 from pipeline.replay.offline.limits_of_twin import find_limits
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.runtime.stage import Core
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Alarm, Array, Prediction, Score
 from schemas.units import NS_PER_S
-from scoring.calibration.healthy_statistics import HealthyRun
+from scoring.calibration.healthy_statistics import HealthyRun, one_after_another
 from scoring.samples import samples_of
 from twin.export.card_entries import with_card_entries
 
@@ -75,8 +75,8 @@ def calibrated_twin(
         blocks = [samples_of(block, known.unseen_error) for block in read_predictions(path)]
         fans = blocks[0].speed_rad_s.shape[1]
         runs.append(HealthyRun(path.stem, fans, blocks, range(fans) if known.fans > 1 else None, known.card.tacho))
-    timing = HealthyRuns(recordings, twin, (), lambda _: None).timing()
-    limits = find_limits([known], lambda: runs, timing, alarms_per_day, extrapolate=extrapolate)
+    timing = HealthyRuns(recordings, HealthyPart(twin)).timing()
+    limits = find_limits([known], one_after_another(lambda: runs), timing, alarms_per_day, extrapolate=extrapolate)
     output.write_bytes(with_card_entries(twin.read_bytes(), {"calibration": json.loads(limits.model_dump_json())}))
 
 

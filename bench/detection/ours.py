@@ -19,7 +19,7 @@ from pipeline.replay.offline.limits_of_twin import find_limits
 from pipeline.runtime.stage import Core
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Alarm, Array, Prediction, Score
-from scoring.calibration.healthy_statistics import HealthyRun
+from scoring.calibration.healthy_statistics import HealthyRun, one_after_another
 from scoring.limits import Limits, default_timing
 from scoring.samples import Samples, samples_of
 from twin.export.card_entries import with_card_entries
@@ -121,7 +121,7 @@ def calibrated_twins(
     given = list(twins)
     known = [load_tray_twin(path) for path in given]
     timing = default_timing(min(run.fans for run in healthy()))
-    limits = find_limits(known, healthy, timing, alarms_per_day, extrapolate=extrapolate)
+    limits = find_limits(known, one_after_another(healthy), timing, alarms_per_day, extrapolate=extrapolate)
     made = []
     for number, path in enumerate(given):
         made.append(path.with_name(f"calibrated-{path.name}"))

@@ -20,7 +20,8 @@ import pandas as pd
 from scipy.io import loadmat
 
 from pipeline.cli.recordings.import_table import write_table
-from pipeline.cli.twins.training_data import read_training_data
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from pipeline.cli.twins.training_data import Part, read_training_data
 from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT, read_table
 from twin.runs import Run
 
@@ -138,7 +139,7 @@ def _imported(
 ) -> list[Run]:
     recording = folder / f"{name or table.stem}.mcap"
     write_table(read_table(table, time, command, speed, period=period), recording, "tray1")
-    return read_training_data([recording], None, None, 0.0, math.inf).runs
+    return read_training_data([recording], Part(), RecordingsInParallel(jobs=1)).runs
 
 
 def _by_time(

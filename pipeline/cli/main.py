@@ -58,7 +58,8 @@ VARIADIC: dict[str, tuple[str, ...]] = {
 
 app = typer.Typer(
     name="fantwin",
-    epilog="Exit codes: 0 success; 1 failed, and one line says why; 2 wrong usage; 3 data were lost.",
+    epilog="Exit codes: 0 success; 1 failed, and one line says why; 2 wrong usage; 3 data were lost; 4 bad "
+    "recordings were skipped.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""Options that several commands share, and what they mean."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from pipeline.errors import UsageError
+from pipeline.errors import UsageError, UserError
 
 ConfigOption: TypeAlias = Annotated[Path, typer.Option("-c", "--config", help="Configuration file (TOML).")]
 SetOption: TypeAlias = Annotated[
@@ -34,3 +34,16 @@ def fan_numbers(text: str | None) -> list[int] | None:
         return numbers
     except ValueError as error:
         raise UsageError(f"--fans {text}: give fan numbers counted from 0, with commas: --fans 2,5") from error
+
+
+def make_folder(folder: Path) -> Path:
+    """Create the folder if it is missing.
+
+    Raises:
+        UserError: it cannot be created.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be created: {error.strerror}; name another folder with -o") from error
+    return folder

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
     from pipeline.cli.twins.training_data import TrainingData
@@ -19,16 +21,23 @@ if TYPE_CHECKING:
 LINE_PERIOD_S = 5.0
 EXIT_INTERRUPTED = 130
 """as of a program that SIGINT ends"""
+_SHOW_PART: ContextVar[Callable[[str], None] | None] = ContextVar("show_part", default=None)
 
 
 @contextmanager
 def interruptible(outcome: str) -> Iterator[None]:
-    """Around work whose result is written at its end: Ctrl-C ends the command with one line, which says the outcome."""
+    """Around work whose result is written at its end: Ctrl-C ends the command with one line, which says the outcome.
+
+    So does SIGTERM, so that temporary files are removed: they may be as large as recordings.
+    """
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     except KeyboardInterrupt:
         typer.echo(f"interrupted: {outcome}", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -41,6 +50,51 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
         return
     with console.status(title) as status:
         yield status.update
+
+
+@contextmanager
+def recordings_progress(doing: str, count: int) -> Iterator[Callable[[], None]]:
+    """Around work on so many recordings: one bar. Yields a function that says that one more is done.
+
+    Without a terminal, lines appear every LINE_PERIOD_S. Inside, `show_part` shows what is being done.
+    """
+    console = Console(stderr=True)
+    done = 0
+    shown_s = time.monotonic()
+
+    def line(part: str = "") -> None:
+        nonlocal shown_s
+        if time.monotonic() - shown_s >= LINE_PERIOD_S:
+            shown_s = time.monotonic()
+            typer.echo(f"{doing}: {done}/{count}{f', {part}' if part else ''}", err=True)
+
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
+        bar = bars.add_task(doing, total=count)
+
+        def show(part: str) -> None:
+            bars.update(bar, description=f"{doing}: {part}")
+            if not console.is_terminal:
+                line(part)
+
+        def advance() -> None:
+            nonlocal done
+            done += 1
+            bars.update(bar, completed=done, description=doing)
+            if not console.is_terminal:
+                line()
+
+        token = _SHOW_PART.set(show)
+        try:
+            yield advance
+        finally:
+            _SHOW_PART.reset(token)
+
+
+def show_part(part: str) -> None:
+    """Show which part of a recording is being done; nothing where the work is done in another process."""
+    if show := _SHOW_PART.get():
+        show(part)
 
 
 @contextmanager

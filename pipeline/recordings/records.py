@@ -114,7 +114,8 @@ class RecordReader:
                     raise RecordingError(
                         f"{self.path}: not a recording (MCAP); make one from a table with `fantwin import`"
                     )
-                self.size = os.fstat(file.fileno()).st_size
+                self.size = file.seek(0, os.SEEK_END)
+                file.seek(len(MCAP0_MAGIC))
                 yield from self._records(file)
         except OSError as error:
             active = active_path(self.path)

@@ -6,6 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -43,10 +44,6 @@ class HealthyRun(NamedTuple):
     """its name: runs of one tray are of the same fans"""
 
 
-Runs = Callable[[], Iterable[HealthyRun]]
-"""Returns the healthy runs from the beginning at each call."""
-
-
 class MixedRatesError(Exception):
     """Healthy runs have grids of different rates; limits are valid for one rate."""
 
@@ -59,9 +56,11 @@ class MixedRatesError(Exception):
 
 @dataclass
 class HealthyStatistics:
-    """Statistics of one pass over the healthy runs."""
+    """Statistics of one pass over a healthy run, or over several together."""
 
     top_speed_rad_s: float
+    name: str = ""
+    """of the first run that has samples"""
     period_ns: int = 0
     maxima: list[WindowMaxima] = field(default_factory=list)
     """of each run"""
@@ -80,6 +79,30 @@ class HealthyStatistics:
     """largest standard deviation of a reading of a tacho that counts, from the phases of its pulses, sigma"""
     observed: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
     """of each detector, see Detector.observed"""
+
+    def add(self, other: HealthyStatistics) -> None:
+        """Add what was found in other runs.
+
+        Raises:
+            MixedRatesError: they are not of the same sampling period.
+        """
+        if not self.period_ns:
+            self.name, self.period_ns = other.name, other.period_ns
+        elif other.period_ns not in (0, self.period_ns):
+            raise MixedRatesError((self.name, self.period_ns), (other.name, other.period_ns))
+        self.maxima += other.maxima
+        for source, moments in self.moments.items():
+            moments.add(other.moments[source])
+        for name, ratio_sum in other.ratio_sums.items():
+            self.ratio_sums[name] += ratio_sum
+        self.fan_s += other.fan_s
+        self.speed_sum_rad_s += other.speed_sum_rad_s
+        self.command_sum += other.command_sum
+        self.count_sigmas = max(self.count_sigmas, other.count_sigmas)
+        for name, observed in other.observed.items():
+            largest = self.observed[name]
+            for key, value in observed.items():
+                largest[key] = max(largest.get(key, 0.0), value)
 
     @property
     def period_s(self) -> float:
@@ -119,6 +142,17 @@ class HealthyStatistics:
         return float(self.ratio_sums[row.name] / max(self.moments[row.source].count.sum(), 1.0))
 
 
+RunWork = Callable[[HealthyRun], HealthyStatistics]
+Runs = Callable[[RunWork], Iterable[HealthyStatistics]]
+"""Does the work on each healthy run, from its beginning, in this process or another; results in the order of the runs.
+The work can be pickled."""
+
+
+def one_after_another(runs: Callable[[], Iterable[HealthyRun]]) -> Runs:
+    """Runs that are gone through in this process. runs: returns them from the beginning at each call."""
+    return lambda work: map(work, runs())
+
+
 def healthy_statistics(runs: Runs, limits: Limits, top_speed_rad_s: float) -> HealthyStatistics:
     """Score healthy runs with some limits.
 
@@ -126,21 +160,30 @@ def healthy_statistics(runs: Runs, limits: Limits, top_speed_rad_s: float) -> He
         MixedRatesError: the runs are not all of one sampling period.
     """
     found = HealthyStatistics(top_speed_rad_s)
-    first = ""
-    for run in runs():
-        one = _RunStatistics(found, run, limits.of(run.known_as))
-        for block in run.blocks:
-            if not found.period_ns:
-                found.period_ns, first = block.period_ns, run.name
-            elif block.period_ns != found.period_ns:
-                raise MixedRatesError((first, found.period_ns), (run.name, block.period_ns))
-            one.add(block)
-        one.end()
+    for one in runs(partial(statistics_of_run, limits=limits, top_speed_rad_s=top_speed_rad_s)):
+        found.add(one)
     return found
 
 
-class _RunStatistics:
-    """Adds the statistics of one run to those of all runs."""
+def statistics_of_run(run: HealthyRun, limits: Limits, top_speed_rad_s: float) -> HealthyStatistics:
+    """Score one run. One block of it is in memory at a time.
+
+    Raises:
+        MixedRatesError: its sampling period changes.
+    """
+    found = HealthyStatistics(top_speed_rad_s, run.name)
+    scoring = _RunScoring(found, run, limits.of(run.known_as))
+    for block in run.blocks:
+        if block.period_ns != (found.period_ns or block.period_ns):
+            raise MixedRatesError((run.name, found.period_ns), (run.name, block.period_ns))
+        found.period_ns = block.period_ns
+        scoring.add(block)
+    scoring.end()
+    return found
+
+
+class _RunScoring:
+    """Scores one run, and adds up its statistics."""
 
     def __init__(self, found: HealthyStatistics, run: HealthyRun, limits: Limits) -> None:
         self._found = found
@@ -214,9 +257,7 @@ class _RunStatistics:
         found = self._found
         found.maxima.append(self._windows.end())
         for name, detector in self._scorer.detectors.items():
-            largest = found.observed[name]
-            for key, value in detector.observed().items():
-                largest[key] = max(largest.get(key, 0.0), value)
+            found.observed[name] = {key: max(value, 0.0) for key, value in detector.observed().items()}
         for source, moments in found.moments.items():
             baseline = self._scorer.residuals[source].baseline
             settled = baseline.is_set & ~baseline.is_commissioning
@@ -273,12 +314,11 @@ class _Means:
 
 def truncate_runs(runs: Runs, count: int, fan_s: float) -> Runs:
     """The first part of each of `count` runs, together not longer than fan_s, summed over fans."""
+    return lambda work: runs(partial(_on_first_part, fan_s=fan_s / count, work=work))
 
-    def each() -> Iterator[HealthyRun]:
-        for run in runs():
-            yield run._replace(blocks=_until(run.blocks, fan_s / count / run.fans))
 
-    return each
+def _on_first_part(run: HealthyRun, fan_s: float, work: RunWork) -> HealthyStatistics:
+    return work(run._replace(blocks=_until(run.blocks, fan_s / run.fans)))
 
 
 def _until(blocks: Iterable[Samples], seconds: float) -> Iterator[Samples]:

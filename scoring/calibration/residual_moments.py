@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -45,6 +45,16 @@ class ResidualMoments:
     """histogram of the squares of one-second means, by parts of an octave below the largest square"""
     standardised_octaves: Array = _zeros(OCTAVE_PARTS)
     """the same of the standardised residual; of tachos that count, of means over ten counts"""
+
+    def add(self, other: ResidualMoments) -> None:
+        """Add the sums of other runs."""
+        for one in fields(self):
+            mine, others = getattr(self, one.name), getattr(other, one.name)
+            if isinstance(mine, dict):
+                for fan, sums in others.items():
+                    mine[fan] = mine.get(fan, 0.0) + sums
+            else:  # an array, a number, or a list with an item for each run
+                setattr(self, one.name, mine + others)
 
     def mean_second_square(self) -> float:
         """Mean square of the one-second means: what baselines leave."""

@@ -20,7 +20,6 @@ from schemas.messages import Alarm, Array, InvalidReason, Prediction, Score
 from schemas.standstill import Standstill
 from schemas.tacho import Tacho
 from schemas.twin_card import DriveCard
-from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.detectors.detector import Signal
 from scoring.diagnosis.diagnoser import Diagnoser
@@ -29,6 +28,7 @@ from scoring.limits import Limits, Timing
 from scoring.samples import samples_of
 from scoring.unseen_error import UnseenError
 from stages.scorer import ScorerCore
+from tests.support.calibrated_runs import calibrate
 from tests.support.healthy_residuals import autoregressive
 from tests.support.scored_blocks import balance_of_a_fan
 

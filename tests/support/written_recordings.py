@@ -11,6 +11,7 @@ from pipeline.recordings.reading import read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Alarm, Array, Header, Raw, Severity
 from schemas.topics import tray_key
+from twin.runs import Run
 
 RAW_KEY = tray_key("plant", "tray1", "raw")
 ALARM_KEY = tray_key("plant", "tray1", "alarm")
@@ -51,6 +52,23 @@ def write(path: Path, messages: int, **options: Any) -> Path:
             writer.add_message(RAW_KEY, raw(sequence), 1000 + sequence)
         writer.add_message(ALARM_KEY, alarm(0), 5000)
     return writer.path
+
+
+def write_run(path: Path, run: Run) -> Path:
+    """A recording of a run, as `fantwin import` makes one of a table."""
+    t_ns = np.rint(run.t_s * 1e9).astype(np.int64)
+    with RecordingWriter(path, {"site": "plant", "trays": "tray1", "source": run.name}) as writer:
+        for sequence, first in enumerate(range(0, run.samples, 100)):
+            rows = slice(first, first + 100)
+            message = Raw(
+                header=Header("imported", sequence, "tray1"),
+                fans=run.fans,
+                host_receive_t_ns=t_ns[rows],
+                command=run.command[rows],
+                speed_rad_s=run.speed_rad_s[rows],
+            )
+            writer.add_message(RAW_KEY, message, int(t_ns[rows][-1]))
+    return path
 
 
 def sequences(path: Path) -> list[int]:

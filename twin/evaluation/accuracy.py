@@ -57,6 +57,61 @@ class Evaluation:
     pooled: Figures
 
 
+@dataclass(frozen=True, eq=False)
+class FigureSums:
+    """What figures are made of: sums over samples, (fans,) each. They can be added.
+
+    measured: the number of measured speeds. speed, spread: their sum, and that of their squared deviations from the
+    mean. squares, largest, within: of the free-run error where measured: its squares, its largest magnitude, and how
+    often it is in the band. steps, step_squares: the number of one-step errors, and their squares. noise: the squares
+    of the noise of the tachos.
+    """
+
+    measured: Array
+    speed: Array
+    spread: Array
+    squares: Array
+    largest: Array
+    within: Array
+    steps: Array
+    step_squares: Array
+    noise: Array
+
+    def __add__(self, other: "FigureSums") -> "FigureSums":
+        sums = {name: value + getattr(other, name) for name, value in vars(self).items()}
+        sums["largest"] = np.maximum(self.largest, other.largest)
+        apart = self.speed / np.maximum(self.measured, 1.0) - other.speed / np.maximum(other.measured, 1.0)
+        sums["spread"] += apart**2 * self.measured * other.measured / np.maximum(sums["measured"], 1.0)
+        return FigureSums(**sums)
+
+    def of(self, fans: slice) -> "FigureSums":
+        """The sums of all samples of some fans together, (1,) each."""
+        sums = {name: np.sum(value[fans], keepdims=True) for name, value in vars(self).items()}
+        return FigureSums(**sums | {"largest": np.max(self.largest[fans], keepdims=True)})
+
+    def evaluation(self) -> Evaluation:
+        """The figures of each fan, and of all together."""
+        fans = range(len(self.measured))
+        return Evaluation(tuple(self.of(slice(fan, fan + 1)).figures() for fan in fans), self.of(slice(None)).figures())
+
+    def figures(self) -> Figures:
+        """The figures of sums (1,)."""
+        measured, spread, squares, largest, within, steps, step_squares, noise = (
+            float(value[0]) for name, value in vars(self).items() if name != "speed"
+        )
+        if measured == 0.0:
+            return Figures(np.nan, np.nan, np.nan, np.nan, np.nan, 0)
+        return Figures(
+            rmse_rad_s=math.sqrt(squares / measured),
+            max_error_rad_s=largest,
+            r2=1.0 - squares / spread if spread > 0.0 else np.nan,
+            one_step_rmse_rad_s=math.sqrt(step_squares / steps) if steps else np.nan,
+            coverage_2_sigma=within / measured,
+            samples=int(measured),
+            floor_rad_s=math.sqrt(noise / measured),
+        )
+
+
 def evaluate_model(
     model: TwinModel, parameters: Array, sigma_rad_s: Array, runs: Sequence[Run], unseen_std: UnseenStd | None = None
 ) -> Evaluation:
@@ -64,21 +119,52 @@ def evaluate_model(
 
     The band has this and the unseen error, as that of a running site.
     """
-    pieces = evaluation_pieces(runs)
-    speed = np.concatenate([compared_readings(piece) for piece in pieces])
-    expected = [free_run_readings(model, parameters, piece) for piece in pieces]
-    residual = _residual(speed, np.concatenate(expected))
-    with np.errstate(invalid="ignore"):
-        noise = [measurement_of(piece).noise_rad_s(its) for piece, its in zip(pieces, expected, strict=True)]
-        unseen = [unseen_std(its, piece.command) for piece, its in zip(pieces, expected, strict=True) if unseen_std]
-    std = np.hypot(sigma_rad_s, np.nan_to_num(np.concatenate(unseen))) if unseen else sigma_rad_s
-    one_step = one_step_residuals(model, parameters, pieces)
-    measured = np.isfinite(speed)
-    squared_deviation = np.where(measured, speed - _column_mean(speed), 0.0) ** 2
-    found = _Samples(
-        measured, residual, one_step, np.abs(residual) <= 2.0 * std, squared_deviation, np.concatenate(noise)
+    return sums_of_model(model, parameters, sigma_rad_s, runs, unseen_std).evaluation()
+
+
+def sums_of_model(
+    model: TwinModel, parameters: Array, sigma_rad_s: Array, runs: Sequence[Run], unseen_std: UnseenStd | None = None
+) -> FigureSums:
+    """What the figures are made of. Arguments as of evaluate_model."""
+    first, *others = (
+        figure_sums(model, parameters, sigma_rad_s, piece, free_run_readings(model, parameters, piece), unseen_std)
+        for piece in evaluation_pieces(runs)
     )
-    return Evaluation(tuple(_figures(found.of(fan)) for fan in range(speed.shape[1])), _figures(found))
+    return sum(others, first)
+
+
+def figure_sums(
+    model: TwinModel,
+    parameters: Array,
+    sigma_rad_s: Array,
+    piece: Run,
+    expected: Array,
+    unseen_std: UnseenStd | None = None,
+) -> FigureSums:
+    """The sums over one piece. expected: (n, fans) as free_run_readings gives them. The others as of evaluate_model."""
+    speed = compared_readings(piece)
+    measured = np.isfinite(speed)
+    count = measured.sum(axis=0, dtype=np.float64)
+    errors = np.where(measured, _residual(speed, expected), 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        noise = measurement_of(piece).noise_rad_s(expected)
+        std = np.hypot(sigma_rad_s, np.nan_to_num(unseen_std(expected, piece.command))) if unseen_std else sigma_rad_s
+        squares = np.sum(errors**2, axis=0)
+    steps = _one_step_residual(model, parameters, piece)
+    is_step = np.isfinite(steps)
+    total = np.where(measured, speed, 0.0).sum(axis=0)
+    deviation = np.where(measured, speed - total / np.maximum(count, 1.0), 0.0)
+    return FigureSums(
+        measured=count,
+        speed=total,
+        spread=np.sum(deviation**2, axis=0),
+        squares=squares,
+        largest=np.abs(errors).max(axis=0),
+        within=np.sum(measured & (np.abs(errors) <= 2.0 * std), axis=0, dtype=np.float64),
+        steps=is_step.sum(axis=0, dtype=np.float64),
+        step_squares=np.sum(np.where(is_step, steps, 0.0) ** 2, axis=0),
+        noise=np.sum(np.where(measured, np.broadcast_to(noise, speed.shape), 0.0) ** 2, axis=0),
+    )
 
 
 def evaluation_pieces(runs: Sequence[Run]) -> list[Run]:
@@ -224,43 +310,3 @@ def _advance_side_by_side(model: TwinModel, states: Array, command: Array, step_
 def _residual(measured: Array, predicted: Array) -> Array:
     diverged = np.isfinite(measured) & ~np.isfinite(predicted)
     return np.where(diverged, np.inf, measured - predicted)
-
-
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    """What figures are made of, (n, fans) or (n,)."""
-
-    measured: Flags
-    residual: Array
-    one_step: Array
-    within: Flags
-    squared_deviation: Array
-    noise: Array
-
-    def of(self, fan: int) -> "_Samples":
-        return _Samples(*(values[:, fan] for values in vars(self).values()))
-
-
-def _figures(found: _Samples) -> Figures:
-    measured = found.measured
-    samples = int(np.count_nonzero(measured))
-    if samples == 0:
-        return Figures(np.nan, np.nan, np.nan, np.nan, np.nan, 0)
-    total, errors = float(found.squared_deviation.sum()), np.where(measured, found.residual, 0.0)
-    with np.errstate(over="ignore"):
-        squares = float(np.sum(errors**2))
-    steps = found.one_step[np.isfinite(found.one_step)]
-    return Figures(
-        rmse_rad_s=float(np.sqrt(squares / samples)),
-        max_error_rad_s=float(np.abs(errors).max()),
-        r2=1.0 - squares / total if total > 0.0 else np.nan,
-        one_step_rmse_rad_s=float(np.sqrt(np.mean(steps**2))) if steps.size else np.nan,
-        coverage_2_sigma=float(np.count_nonzero(found.within & measured) / samples),
-        samples=samples,
-        floor_rad_s=float(np.sqrt(np.mean(found.noise[measured] ** 2))),
-    )
-
-
-def _column_mean(speed_rad_s: Array) -> Array:
-    measured = np.isfinite(speed_rad_s)
-    return np.where(measured, speed_rad_s, 0.0).sum(axis=0) / np.maximum(measured.sum(axis=0), 1)

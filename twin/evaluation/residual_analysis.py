@@ -7,8 +7,8 @@ test, and its cross-correlation with the command. Definitions and bounds: Ljung,
 
 The first seconds of each run are left out: a free run starts from a measured speed, and forgets its error only within
 some time constants of the fan. Samples are laid on a grid of the runs' median step: a longer step leaves slots empty,
-jitter within a step is not seen. Runs are separated by more than the longest lag, so that no product combines the end
-of one with the start of another.
+jitter within a step is not seen. All that the analysis needs are sums over pairs of samples of one run, so runs can be
+summed one by one (ResidualSums), wherever they are.
 """
 
 from collections.abc import Sequence
@@ -22,6 +22,8 @@ from scipy.special import chdtrc
 from twin.errors import TwinError
 from twin.evaluation.accuracy import healthy_sigma_rad_s
 from twin.runs import Array, Run
+
+Spectrum = NDArray[np.complex128]
 
 SETTLING_S = 3.0
 SHARE_SETTLING = 0.5
@@ -101,29 +103,124 @@ class HealthyResidual:
     max_sigma: tuple[float, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """Where samples lie: slot of each (samples,), number of slots, step, longest lag shown and window, in slots."""
+@dataclass(frozen=True)
+class ResidualGrid:
+    """The grid that samples are laid on: its step, and in steps the longest lag shown and the window of the sums."""
 
-    slot: NDArray[np.intp]
-    slots: int
     period_s: float
     lags: int
     window: int
 
 
+def residual_grid(period_s: float, longest_s: float, max_lag_s: float = MAX_LAG_S) -> ResidualGrid:
+    """The grid for runs of a median step, of which the longest without a gap lasts so long.
+
+    Lags go to max_lag_s, but not beyond a quarter of that or 1000 steps.
+    """
+    longest = int(LONGEST_LAG_OF_RUN * (max(round(longest_s / period_s), 1) + 1))
+    lags = max(1, min(round(max_lag_s / period_s), longest, MAX_LAGS))
+    return ResidualGrid(period_s, lags, max(lags, min(round(WINDOW_S / period_s), longest)))
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualSums:
+    """Sums over runs, for each fan, from which its residual is analysed. They can be added.
+
+    e is the residual where it is measured, known is one there; u is the command, driven is one at every sample; all are
+    zero elsewhere on the grid. count, error: (fans,) sums of known and e. commands, command: the same of driven and u.
+    auto: (3, fans, window + 1) sums of products at each lag: e e, e known + known e, known known. drive: the same of u
+    and driven. cross: (4, fans, 2 lags + 1) of e u, e driven, known u, known driven, the second factor a lag earlier.
+    lowest, highest: (2, fans) of e and u; infinite e where a free run diverged.
+    """
+
+    count: Array
+    error: Array
+    commands: Array
+    command: Array
+    auto: Array
+    drive: Array
+    cross: Array
+    lowest: Array
+    highest: Array
+
+    def __add__(self, other: "ResidualSums") -> "ResidualSums":
+        sums = {name: value + getattr(other, name) for name, value in vars(self).items()}
+        sums["lowest"], sums["highest"] = np.minimum(self.lowest, other.lowest), np.maximum(self.highest, other.highest)
+        return ResidualSums(**sums)
+
+
+def residual_sums(
+    residual_rad_s: Array, pieces: Sequence[Run], grid: ResidualGrid, settling_s: float = SETTLING_S
+) -> ResidualSums:
+    """The sums over pieces. residual_rad_s: (samples, fans) as free_run_residuals gives it for them.
+
+    settling_s: left out at the start of each piece, but at most half of it. Raises TwinError when residual and pieces
+    are not of one length.
+    """
+    settled = _settled(residual_rad_s, pieces, settling_s)
+    ends = np.cumsum([piece.samples for piece in pieces])
+    parts = np.split(settled, ends[:-1])
+    first, *others = (_sums_of_piece(part, piece, grid) for part, piece in zip(parts, pieces, strict=True))
+    return sum(others, first)
+
+
+def _sums_of_piece(settled: Array, piece: Run, grid: ResidualGrid) -> ResidualSums:
+    steps = np.maximum(np.rint(np.diff(piece.t_s) / grid.period_s), 1.0)
+    slots = np.concatenate(([0], np.cumsum(steps))).astype(int)
+    size = next_fast_len(int(slots[-1]) + 1 + grid.window, real=True)
+    within, around = np.arange(grid.window + 1), np.arange(-grid.lags, grid.lags + 1)
+
+    def transform(values: Array) -> Spectrum:
+        laid = np.zeros(size)
+        laid[slots] = values
+        return np.fft.rfft(laid)
+
+    def lagged(left: Spectrum, right: Spectrum) -> Array:
+        """(size,) sums over t of left(t) right(t - lag), of negative lags at the end."""
+        return np.fft.irfft(left * np.conj(right), size)
+
+    def auto(signal: Spectrum, there: Spectrum) -> Array:
+        with_there = lagged(signal, there)
+        return np.stack(
+            (lagged(signal, signal)[within], with_there[within] + with_there[-within], lagged(there, there)[within])
+        )
+
+    driven = transform(np.ones(piece.samples))
+    measured = np.isfinite(settled)
+    autos, drives, crosses = [], [], []
+    for fan, is_measured in enumerate(measured.T):
+        error, known = transform(np.where(is_measured, settled[:, fan], 0.0)), transform(is_measured)
+        command = transform(piece.command[:, fan])
+        autos.append(auto(error, known))
+        drives.append(auto(command, driven))
+        crosses.append(np.stack([lagged(one, of)[around] for one in (error, known) for of in (command, driven)]))
+    return ResidualSums(
+        count=measured.sum(axis=0, dtype=np.float64),
+        error=np.where(measured, settled, 0.0).sum(axis=0),
+        commands=np.full(piece.fans, float(piece.samples)),
+        command=piece.command.sum(axis=0),
+        auto=np.stack(autos, axis=1),
+        drive=np.stack(drives, axis=1),
+        cross=np.stack(crosses, axis=1),
+        lowest=np.stack((np.where(np.isnan(settled), np.inf, settled).min(axis=0), piece.command.min(axis=0))),
+        highest=np.stack((np.where(np.isnan(settled), -np.inf, settled).max(axis=0), piece.command.max(axis=0))),
+    )
+
+
 def analyse_residual(
     residual_rad_s: Array, pieces: Sequence[Run], *, settling_s: float = SETTLING_S, max_lag_s: float = MAX_LAG_S
 ) -> tuple[ResidualAnalysis, ...]:
-    """The analysis of each fan. residual_rad_s: (samples, fans) as free_run_residuals gives it for these pieces.
-
-    settling_s: left out at the start of each piece, but at most half of it. Lags go to max_lag_s, but not beyond a
-    quarter of the longest piece or 1000 steps. Raises TwinError when residual and pieces are not of one length.
+    """The analysis of each fan. residual_rad_s, settling_s, and what is raised: as for residual_sums. max_lag_s: as for
+    residual_grid.
     """
-    settled = _settled(residual_rad_s, pieces, settling_s)
-    grid = _lay_out(pieces, max_lag_s)
-    command = np.concatenate([piece.command for piece in pieces])
-    return tuple(_of_fan(settled[:, fan], command[:, fan], grid) for fan in range(settled.shape[1]))
+    period_s = float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces])))
+    grid = residual_grid(period_s, max(piece.duration_s for piece in pieces), max_lag_s)
+    return analysis_of(residual_sums(residual_rad_s, pieces, grid, settling_s), grid)
+
+
+def analysis_of(sums: ResidualSums, grid: ResidualGrid) -> tuple[ResidualAnalysis, ...]:
+    """The analysis of each fan from the sums over its runs, all on one grid."""
+    return tuple(_of_fan(sums, fan, grid) for fan in range(len(sums.count)))
 
 
 def healthy_residual(
@@ -160,43 +257,27 @@ def _settled(residual: Array, pieces: Sequence[Run], settling_s: float) -> Array
     return np.where(young[:, np.newaxis] & np.isfinite(residual), np.nan, residual)
 
 
-def _lay_out(pieces: Sequence[Run], max_lag_s: float) -> _Grid:
-    period_s = float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces])))
-    within = [
-        np.concatenate(([0], np.cumsum(np.maximum(np.rint(np.diff(piece.t_s) / period_s), 1.0)))).astype(int)
-        for piece in pieces
-    ]
-    longest = int(LONGEST_LAG_OF_RUN * max(slots[-1] + 1 for slots in within))
-    lags = max(1, min(round(max_lag_s / period_s), longest, MAX_LAGS))
-    window = max(lags, min(round(WINDOW_S / period_s), longest))
-    start = np.cumsum([0, *(slots[-1] + 1 + window for slots in within)])
-    slot = np.concatenate([first + slots for first, slots in zip(start[:-1], within, strict=True)])
-    return _Grid(slot, int(start[-1]), period_s, lags, window)
-
-
-def _of_fan(residual: Array, command: Array, grid: _Grid) -> ResidualAnalysis:
-    measured = np.isfinite(residual)
-    samples = int(np.count_nonzero(measured))
+def _of_fan(sums: ResidualSums, fan: int, grid: ResidualGrid) -> ResidualAnalysis:
+    samples = int(sums.count[fan])
     lags_s = grid.period_s * np.arange(1, grid.lags + 1, dtype=np.float64)
     cross_lags_s = grid.period_s * np.arange(-grid.lags, grid.lags + 1, dtype=np.float64)
-    if samples < MIN_SAMPLES or np.any(np.isinf(residual)) or np.ptp(residual[measured]) == 0.0:
+    lowest, highest = sums.lowest[0, fan], sums.highest[0, fan]
+    if samples < MIN_SAMPLES or not np.isfinite(highest) or highest == lowest:
         nothing = np.full_like(lags_s, np.nan)
         nothing_cross = np.full_like(cross_lags_s, np.nan)
         return ResidualAnalysis(
             samples, grid.period_s, np.nan, np.nan, np.nan, lags_s, nothing, np.nan, 0, np.nan,
             cross_lags_s, nothing_cross, np.nan,
         )  # fmt: skip
-    mean = float(residual[measured].mean())
-    error, known = _on_grid(np.where(measured, residual - mean, 0.0), grid), _on_grid(measured, grid)
-    products, pairs = _lagged_sums(error, error, grid.window), np.rint(_lagged_sums(known, known, grid.window))
-    products, pairs = products[grid.window :], pairs[grid.window :]
+    mean = float(sums.error[fan] / samples)
+    products, pairs = _about_mean(sums.auto[:, fan], mean), np.rint(sums.auto[2, fan])
     autocorrelation = _ratio(products, pairs) / (products[0] / samples)
     inflation, time_in_steps = _integrated(autocorrelation, pairs / samples)
     tested = pairs[1 : min(LJUNG_BOX_LAGS, grid.lags) + 1]
     seen = tested > 0.0
     squares = tested[seen] * autocorrelation[1 : len(tested) + 1][seen] ** 2
     portmanteau = (samples + 2.0) / samples * squares.sum()
-    cross_correlation, cross_bound = _cross(error, known, products, command, grid)
+    cross_correlation, cross_bound = _cross(sums, fan, mean, products, grid)
     return ResidualAnalysis(
         samples=samples,
         period_s=grid.period_s,
@@ -212,6 +293,11 @@ def _of_fan(residual: Array, command: Array, grid: _Grid) -> ResidualAnalysis:
         cross_correlation=cross_correlation,
         cross_bound_95=cross_bound,
     )
+
+
+def _about_mean(sums: Array, mean: float) -> Array:
+    """(lags,) sums of products of a signal less its mean, from (3, lags) those of ResidualSums.auto or drive."""
+    return sums[0] - mean * sums[1] + mean**2 * sums[2]
 
 
 def _integrated(autocorrelation: Array, weight: Array) -> tuple[float, float]:
@@ -231,37 +317,24 @@ def _integrated(autocorrelation: Array, weight: Array) -> tuple[float, float]:
     return max(inflation, 1.0), max(0.5 + float(np.sum(filled[1:end])), 0.5)
 
 
-def _cross(error: Array, known: Array, products: Array, command: Array, grid: _Grid) -> tuple[Array, float]:
-    """Cross-correlation at the lags shown, and its 95 % bound.
+def _cross(sums: ResidualSums, fan: int, mean: float, products: Array, grid: ResidualGrid) -> tuple[Array, float]:
+    """Cross-correlation at the lags shown, and its 95 % bound. products: of the residual less its mean.
 
     The variance of the mean product of two unrelated signals is sum_k R_ee(k) R_uu(k) / N. The sum is tapered by a
     Parzen window: an autocorrelation at long lags is noise, and the taper keeps the sum positive.
     """
-    if np.ptp(command) == 0.0:
+    if sums.lowest[1, fan] == sums.highest[1, fan]:
         return np.full(2 * grid.lags + 1, np.nan), np.nan
-    driven = _on_grid(np.ones(len(command)), grid)
-    drive = _on_grid(command - command.mean(), grid)
-    scale = np.sqrt(products[0] / known.sum()) * command.std()
-    pairs = np.rint(_lagged_sums(known, driven, grid.lags))
-    cross_correlation = _ratio(_lagged_sums(error, drive, grid.lags), pairs) / scale
-    drive_products = _lagged_sums(drive, drive, grid.window)[grid.window :] / len(command)
+    mean_command = float(sums.command[fan] / sums.commands[fan])
+    drive_products = _about_mean(sums.drive[:, fan], mean_command) / sums.commands[fan]
+    scale = np.sqrt(products[0] / sums.count[fan] * drive_products[0])
+    of_both, of_error, of_command, of_neither = sums.cross[:, fan]
+    pairs = np.rint(of_neither)
+    about_means = of_both - mean_command * of_error - mean * of_command + mean * mean_command * of_neither
+    cross_correlation = _ratio(about_means, pairs) / scale
     terms = _parzen(grid.window) * products * drive_products
     deviation = np.sqrt(terms[0] + 2.0 * terms[1:].sum()) / _typical(pairs)
     return cross_correlation, float(NORMAL_95 * deviation / scale)
-
-
-def _on_grid(values: Array, grid: _Grid) -> Array:
-    """(slots,) values (samples,) in their slots, zero elsewhere."""
-    laid = np.zeros(grid.slots)
-    laid[grid.slot] = values
-    return laid
-
-
-def _lagged_sums(left: Array, right: Array, lags: int) -> Array:
-    """(2 lags + 1,) sum over t of left(t) right(t - lag), lag from -lags to lags."""
-    size = next_fast_len(len(left) + lags, real=True)
-    circular = np.fft.irfft(np.fft.rfft(left, size) * np.conj(np.fft.rfft(right, size)), size)
-    return np.concatenate((circular[-lags:], circular[: lags + 1]))
 
 
 def _parzen(window: int) -> Array:

@@ -1,12 +1,12 @@
 """The assessment of a report in sentences: one headline, and a warning for each thing a reader should know."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from twin.report.content import Content, FanContent, Parameter
+from twin.report.content import FanSummary, Parameter, Summary
 
 Level = Literal["as declared", "looser than declared", "not followed"]
 
@@ -17,8 +17,6 @@ WORSE: dict[Level, str] = {
     "not followed": "does not follow {}",
     "looser than declared": "follows {} less closely than its card says",
 }
-RANGE_TOLERANCE = 0.05
-"""of the width of the trained command range; as in production (docs/explanation/deciding.md)"""
 RATE_TOLERANCE = 0.01
 UNCERTAIN = 1.0
 """A parameter is poorly determined when half its 95 % interval is wider than this share of its value."""
@@ -42,7 +40,7 @@ class Assessment:
     warnings: tuple[str, ...]
 
 
-def assess(content: Content) -> Assessment:
+def assess(content: Summary) -> Assessment:
     """The assessment by the worst fan."""
     for level, sentence in WORSE.items():
         if worse := [fan for fan in content.fans if level_of(fan) == level]:
@@ -52,21 +50,21 @@ def assess(content: Content) -> Assessment:
     return Assessment("as declared", f"The twin follows {who} as closely as its card says.", warnings(content))
 
 
-def level_of(fan: FanContent) -> Level:
+def level_of(fan: FanSummary) -> Level:
     """The level of one fan; `not followed` where the free run diverged or is undefined."""
     if fan.rmse_in_sigma <= AS_DECLARED:
         return "as declared"
     return "looser than declared" if fan.rmse_in_sigma <= LOOSER else "not followed"
 
 
-def warnings(content: Content) -> tuple[str, ...]:
+def warnings(content: Summary) -> tuple[str, ...]:
     """One line for each thing a reader should know before trusting the figures."""
     return (*_about_the_data(content), *_about_the_fit(content), *_about_the_parameters(content))
 
 
-def _about_the_data(content: Content) -> Iterable[str]:
+def _about_the_data(content: Summary) -> Iterable[str]:
     card = content.card
-    fastest_rad_s = max(float(np.nanmax(np.abs(fan.measured_rad_s), initial=0.0)) for fan in content.fans)
+    fastest_rad_s = float(np.nanmax([0.0, *(fan.fastest_rad_s for fan in content.fans)]))
     if fastest_rad_s > ANOTHER_UNIT * card.top_speed_rad_s > 0.0:
         fastest, known = (f"{value / content.unit.rad_s:,.0f}" for value in (fastest_rad_s, card.top_speed_rad_s))
         yield f"Speeds up to {fastest} {content.unit.name}, the twin knows {known}: is the recording's unit right?"
@@ -83,8 +81,7 @@ def _about_the_data(content: Content) -> Iterable[str]:
     if card.fans == 1 and len(content.fans) > 1:
         yield f"A twin of one fan is used for {len(content.fans)}: fans differ, and so may their errors."
     low, high = card.command_range
-    reach = RANGE_TOLERANCE * (high - low)
-    outside = np.mean([np.mean((fan.command < low - reach) | (fan.command > high + reach)) for fan in content.fans])
+    outside = np.mean([fan.outside_share for fan in content.fans])
     if outside > 0.0:
         yield (
             f"{outside:.1%} of the commands lie outside the trained range {low:.4g} to {high:.4g} {card.command_unit}"
@@ -96,13 +93,13 @@ def _about_the_data(content: Content) -> Iterable[str]:
             "these figures are meaningless."
         )
 
-    def often_missing(fan: FanContent) -> bool:
-        return bool(np.mean(np.isnan(fan.measured_rad_s)) > OFTEN_MISSING)
+    def often_missing(fan: FanSummary) -> bool:
+        return fan.missing_share > OFTEN_MISSING
 
     yield from _of_fans(content, often_missing, "more than a tenth of the speeds are missing")
 
 
-def _about_the_fit(content: Content) -> Iterable[str]:
+def _about_the_fit(content: Summary) -> Iterable[str]:
     yield from _of_fans(content, _unmeasured, "no speed was measured")
     yield from _of_fans(content, _diverged, "the free run diverges")
     yield from _of_fans(
@@ -126,17 +123,17 @@ def _about_the_fit(content: Content) -> Iterable[str]:
     )
 
 
-def _biased_at_a_speed(fan: FanContent) -> bool:
+def _biased_at_a_speed(fan: FanSummary) -> bool:
     return any(abs(part.mean_rad_s) > BIASED_AT_A_SPEED_IN_SIGMA * fan.sigma_rad_s for part in fan.by_speed)
 
 
-def _about_the_parameters(content: Content) -> Iterable[str]:
+def _about_the_parameters(content: Summary) -> Iterable[str]:
     for name in content.card.used_parameters:
 
-        def negative(fan: FanContent, name: str = name) -> bool:
+        def negative(fan: FanSummary, name: str = name) -> bool:
             return any(parameter.name == name and parameter.value < 0.0 for parameter in fan.parameters)
 
-        def uncertain(fan: FanContent, name: str = name) -> bool:
+        def uncertain(fan: FanSummary, name: str = name) -> bool:
             return any(parameter.name == name and _uncertain(parameter) for parameter in fan.parameters)
 
         yield from _of_fans(content, negative, f"{name} is negative, so physics alone do not describe the fan")
@@ -147,24 +144,23 @@ def _uncertain(parameter: Parameter) -> bool:
     return 0.0 < UNCERTAIN * parameter.value < 0.5 * (parameter.high - parameter.low)
 
 
-def _unmeasured(fan: FanContent) -> bool:
+def _unmeasured(fan: FanSummary) -> bool:
     return fan.figures.samples == 0
 
 
-def _diverged(fan: FanContent) -> bool:
-    return bool(np.any(np.isinf(fan.error_rad_s)))
+def _diverged(fan: FanSummary) -> bool:
+    return bool(np.isinf(fan.figures.max_error_rad_s))
 
 
-def _wide_band(fan: FanContent) -> bool:
-    errors = fan.error_rad_s[np.isfinite(fan.error_rad_s)]
-    return bool(errors.size and fan.sigma_rad_s > WIDE_BAND * errors.std())
+def _wide_band(fan: FanSummary) -> bool:
+    return bool(fan.sigma_rad_s > WIDE_BAND * fan.error_std_rad_s)
 
 
-def _few(fan: FanContent) -> bool:
+def _few(fan: FanSummary) -> bool:
     return not (_unmeasured(fan) or _diverged(fan)) and _independent(fan) < FEW_INDEPENDENT
 
 
-def _independent(fan: FanContent) -> float:
+def _independent(fan: FanSummary) -> float:
     """The effective number of independent errors of a fan; 1 where it cannot be estimated."""
     return float(np.nan_to_num(fan.residual.independent_samples, nan=1.0))
 
@@ -174,26 +170,26 @@ def _uncertainty(independent: float) -> float:
     return float(1.0 / np.sqrt(2.0 * independent))
 
 
-def _biased(fan: FanContent) -> bool:
+def _biased(fan: FanSummary) -> bool:
     """Whether the mean error is large relative to sigma and to its standard error."""
     offset = abs(fan.residual.mean_rad_s)
     standard_error = fan.figures.rmse_rad_s / np.sqrt(fan.residual.independent_samples)
     return bool(offset > BIASED_IN_SIGMA * fan.sigma_rad_s and offset > BIASED_IN_ERRORS * standard_error)
 
 
-def _of_fans(content: Content, concerned: Callable[[FanContent], bool], sentence: str) -> Iterable[str]:
+def _of_fans(content: Summary, concerned: Callable[[FanSummary], bool], sentence: str) -> Iterable[str]:
     """One line that names the fans concerned; none when there are none."""
     if fans := [fan for fan in content.fans if concerned(fan)]:
         yield f"{_these(fans, content).capitalize()}: {sentence}."
 
 
-def _these(fans: list[FanContent], content: Content) -> str:
+def _these(fans: Sequence[FanSummary], content: Summary) -> str:
     if len(content.fans) == 1:
         return "this fan"
     return ("fan " if len(fans) == 1 else "fans ") + ", ".join(str(fan.number) for fan in fans)
 
 
-def _worst(fans: list[FanContent]) -> str:
+def _worst(fans: Sequence[FanSummary]) -> str:
     ratios = [fan.rmse_in_sigma for fan in fans]
     if not np.all(np.isfinite(ratios)):
         return "without limit"

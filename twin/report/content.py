@@ -6,14 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.twin_card import DataCard, DriveCard, TwinCard
-from twin.build import evaluate
-from twin.evaluation.accuracy import Evaluation, Figures, compared_readings, evaluation_pieces, free_run_readings
-from twin.evaluation.residual_analysis import ResidualAnalysis, analyse_residual
-from twin.export.fan_rows import drive_of_fans, fan_rows, measured_as_in_card
+from twin.build import runs_of_twin
+from twin.evaluation.accuracy import Evaluation, Figures, evaluation_pieces
+from twin.evaluation.residual_analysis import ResidualAnalysis, analysis_of
+from twin.export.fan_rows import drive_of_fans, fan_rows
 from twin.export.onnx_twin import OnnxTwin
-from twin.report.speed_bins import SpeedBin, speed_bins
+from twin.report.recording_sums import Extent, RecordingSums, extent_of, free_run_of_piece
+from twin.report.speed_bins import SpeedBin
 from twin.report.timeline import Timeline, timeline
-from twin.runs import Array, Run, common_fans
+from twin.runs import Array, Run
 
 
 @dataclass(frozen=True)
@@ -39,32 +40,22 @@ class Parameter:
 
 
 @dataclass(frozen=True, eq=False)
-class FanContent:
-    """One fan. Arrays (n,) are in rad/s or command units, over all pieces one after the other.
+class FanSummary:
+    """One fan without its samples. row: of the twin. number: as the recordings count fans. fastest_rad_s: the largest
+    measured speed. missing_share, outside_share: of the samples without a speed, and with a command outside the trained
+    range. error_std_rad_s: of the free-run errors that are finite; NaN without any."""
 
-    column: of the runs. row: of the twin. number: as the recording counts fans. predicted_rad_s: the readings expected
-    of the free run, NaN where it diverged. error_rad_s: measured minus that, NaN where nothing is compared, infinite
-    where the free run diverged.
-    """
-
-    column: int
     row: int
     number: int
     figures: Figures
     sigma_rad_s: float
-    command: Array
-    drive: DriveCard | None
-    measured_rad_s: Array
-    predicted_rad_s: Array
-    error_rad_s: Array
+    fastest_rad_s: float
+    missing_share: float
+    outside_share: float
+    error_std_rad_s: float
     parameters: tuple[Parameter, ...]
     residual: ResidualAnalysis
     by_speed: tuple[SpeedBin, ...]
-
-    @property
-    def raised_command(self) -> Array:
-        """(n,) the command, or with a drive the end of its plateau if that is higher."""
-        return self.drive.raised(self.command[:, np.newaxis])[:, 0] if self.drive else self.command
 
     @property
     def rmse_in_sigma(self) -> float:
@@ -73,23 +64,89 @@ class FanContent:
 
 
 @dataclass(frozen=True, eq=False)
-class Content:
-    """All that a page shows. recordings: the files evaluated, the name of one appearing in Timeline without its
-    ending."""
+class Summary:
+    """What is assessed. recordings: the files evaluated."""
 
     twin: OnnxTwin
-    pieces: tuple[Run, ...]
     unit: SpeedUnit
     recordings: tuple[DataCard, ...]
     evaluation: Evaluation
-    timeline: Timeline
     rate_hz: float
-    fans: tuple[FanContent, ...]
+    fans: Sequence[FanSummary]
 
     @property
     def card(self) -> TwinCard:
         """The twin's."""
         return self.twin.card
+
+
+@dataclass(frozen=True, eq=False)
+class FanContent(FanSummary):
+    """One fan with its samples. column: of the runs. Arrays (n,) are in rad/s or command units, over all pieces one
+    after the other; predicted_rad_s, error_rad_s: as of recording_sums.FreeRun."""
+
+    column: int
+    command: Array
+    drive: DriveCard | None
+    measured_rad_s: Array
+    predicted_rad_s: Array
+    error_rad_s: Array
+
+    @property
+    def raised_command(self) -> Array:
+        """(n,) the command, or with a drive the end of its plateau if that is higher."""
+        return self.drive.raised(self.command[:, np.newaxis])[:, 0] if self.drive else self.command
+
+
+@dataclass(frozen=True, eq=False)
+class Content(Summary):
+    """All that a page shows. The name of a recording appears in Timeline without its ending."""
+
+    fans: tuple[FanContent, ...]
+    pieces: tuple[Run, ...]
+    timeline: Timeline
+
+
+def summary_of(
+    twin: OnnxTwin,
+    sums: RecordingSums,
+    extent: Extent,
+    recordings: Sequence[DataCard],
+    unit: SpeedUnit,
+    fan_numbers: Sequence[int] | None = None,
+) -> Summary:
+    """What is assessed, from the sums over recordings of this extent. recordings, fan_numbers: as of report_content.
+
+    Raises TwinError when the fans do not fit.
+    """
+    card, evaluation = twin.card, sums.figures.evaluation()
+    fans = len(evaluation.per_fan)
+    residuals = analysis_of(sums.residual, extent.grid)
+    error_std_rad_s = sums.by_speed.error_std_rad_s()
+    rows = fan_rows(card, fans, fan_numbers)
+    return Summary(
+        twin=twin,
+        unit=unit,
+        recordings=tuple(recordings),
+        evaluation=evaluation,
+        rate_hz=1.0 / extent.median_step_s,
+        fans=tuple(
+            FanSummary(
+                row=row,
+                number=fan_numbers[fan] if fan_numbers is not None else fan,
+                figures=evaluation.per_fan[fan],
+                sigma_rad_s=float(card.sigma_rad_s[row]),
+                fastest_rad_s=float(sums.fastest_rad_s[fan]),
+                missing_share=float(sums.missing[fan]) / sums.samples,
+                outside_share=float(sums.outside[fan]) / sums.samples,
+                error_std_rad_s=float(error_std_rad_s[fan]),
+                parameters=_parameters(twin, row),
+                residual=residuals[fan],
+                by_speed=sums.by_speed.bins(fan, extent.range_rad_s[:, fan]),
+            )
+            for fan, row in enumerate(rows)
+        ),
+    )
 
 
 def report_content(
@@ -99,57 +156,46 @@ def report_content(
     unit: SpeedUnit,
     fan_numbers: Sequence[int] | None = None,
 ) -> Content:
-    """Run the twin over the runs. recordings: the files that the runs came from. fan_numbers: see build.evaluate.
+    """Run the twin over the runs. recordings: the files that the runs came from. fan_numbers: see build.runs_of_twin.
 
     Raises TwinError when the twin does not fit the runs, or there is nothing to evaluate.
     """
-    evaluation = evaluate(twin, runs, fan_numbers)
-    fans = common_fans(runs)
-    rows = fan_rows(twin.card, fans, fan_numbers)
-    pieces = evaluation_pieces(measured_as_in_card(twin.card, rows, runs))
-    parameters, sigma_rad_s = twin.parameters[rows], np.array(twin.card.sigma_rad_s)[rows]
-    identified, intervals_95 = (
-        np.array(of_card)[rows] for of_card in (twin.card.identified_parameters, twin.card.parameter_interval_95)
-    )
+    of, extent = runs_of_twin(twin, runs, fan_numbers), extent_of(runs)
+    free_runs = [free_run_of_piece(of, piece, extent) for piece in evaluation_pieces(of.runs)]
+    pieces = tuple(free_run.piece for free_run in free_runs)
+    first, *others = (free_run.sums for free_run in free_runs)
+    summary = summary_of(twin, sum(others, first), extent, recordings, unit, fan_numbers)
     command, measured = (
         np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("command", "speed_rad_s")
     )
-    predicted = np.concatenate([free_run_readings(twin, parameters, piece) for piece in pieces])
-    predicted[~np.isfinite(predicted)] = np.nan
-    compared = np.concatenate([compared_readings(piece) for piece in pieces])
-    error = np.where(np.isfinite(compared) & ~np.isfinite(predicted), np.inf, compared - predicted)
-    residuals = analyse_residual(error, pieces)
-    return Content(
-        twin=twin,
-        pieces=tuple(pieces),
-        unit=unit,
-        recordings=tuple(recordings),
-        evaluation=evaluation,
-        timeline=timeline(pieces),
-        rate_hz=1.0 / float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces]))),
-        fans=tuple(
-            FanContent(
-                column=fan,
-                row=rows[fan],
-                number=fan_numbers[fan] if fan_numbers is not None else fan,
-                figures=evaluation.per_fan[fan],
-                sigma_rad_s=float(sigma_rad_s[fan]),
-                command=command[:, fan],
-                drive=drive_of_fans(twin.card, rows[fan : fan + 1]),
-                measured_rad_s=measured[:, fan],
-                predicted_rad_s=predicted[:, fan],
-                error_rad_s=error[:, fan],
-                parameters=_parameters(twin.card, identified[fan], intervals_95[fan], parameters[fan]),
-                residual=residuals[fan],
-                by_speed=speed_bins(predicted[:, fan], error[:, fan]),
-            )
-            for fan in range(fans)
-        ),
+    predicted, error = (
+        np.concatenate([getattr(free_run, name) for free_run in free_runs])
+        for name in ("predicted_rad_s", "error_rad_s")
     )
+    fans = tuple(
+        FanContent(
+            **vars(fan),
+            column=column,
+            command=command[:, column],
+            drive=drive_of_fans(twin.card, [fan.row]),
+            measured_rad_s=measured[:, column],
+            predicted_rad_s=predicted[:, column],
+            error_rad_s=error[:, column],
+        )
+        for column, fan in enumerate(summary.fans)
+    )
+    return Content(**vars(summary) | {"fans": fans}, pieces=pieces, timeline=timeline(pieces))
 
 
-def _parameters(card: TwinCard, values: Array, intervals_95: Array, in_force: Array) -> tuple[Parameter, ...]:
+def _parameters(twin: OnnxTwin, row: int) -> tuple[Parameter, ...]:
+    card = twin.card
     return tuple(
         Parameter(name, float(value), float(low), float(high), float(used))
-        for name, value, (low, high), used in zip(card.parameter_names, values, intervals_95, in_force, strict=True)
+        for name, value, (low, high), used in zip(
+            card.parameter_names,
+            card.identified_parameters[row],
+            card.parameter_interval_95[row],
+            twin.parameters[row],
+            strict=True,
+        )
     )

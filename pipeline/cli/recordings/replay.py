@@ -18,8 +18,10 @@ from rich.live import Live
 from rich.text import Text
 
 from pipeline.cli.options import JsonOption, SetOption
+from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
 from pipeline.errors import UsageError
 from pipeline.recordings.dates import format_utc
+from pipeline.recordings.remote import local_copies, matching, recording_path
 from pipeline.replay.live.keyboard import Keys
 from pipeline.replay.live.pace import Pace
 from pipeline.replay.live.player import Progress
@@ -43,7 +45,15 @@ _DECIDING = "Scoring again, without a bus"
 
 
 def replay(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE", help="Parts of one recording, in any order.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            parser=recording_path,
+            callback=matching,
+            metavar="FILE",
+            help="Parts of one recording, in any order; offline, of many.",
+        ),
+    ],
     rate: Annotated[
         str | None,
         typer.Option(
@@ -98,60 +108,61 @@ def replay(
         bool,
         typer.Option("--verify", help="Compare with the recorded result, bit for bit.", rich_help_panel=_DECIDING),
     ] = False,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    skip_bad: SkipBadOption = False,
 ) -> None:
-    """Publish a recording on the bus in recorded time, for the viewer or the stages; or score it again offline.
+    """Publish a recording on the bus in recorded time, for the viewer or the stages; or score recordings again offline.
 
     In a terminal: space pauses, right arrow or s steps to the next sample, up and down double and halve the rate, q
     quits. Topics that a running stage writes are not published. Exit code 3 if a stage lost messages or part of the
     recording could not be read.
 
+    With --offline, files of many recordings can be given: they are scored at once, and one result covers them all.
+
     Example: fantwin replay recording.mcap --rate 4 --from raw -c fantwin.toml
+
+    Example: fantwin replay --offline --verify site-*/*.mcap
     """
     viewing = {"--rate": rate, "--pause": pause, "--loop": loop, "--topics": topics, "--from": from_topic}
     deciding = {"--twin": twin, "--output": output, "--verify": verify}
+    deciding |= {"--jobs": jobs, "--scheduler": scheduler, "--skip-bad": skip_bad}
     for name in (name for name, value in (viewing if offline else deciding).items() if value):
         raise UsageError(f"{name} {'cannot be used' if offline else 'can only be used'} with --offline")
     if not 0.0 <= start < min(end, LONGEST_S) or (end > LONGEST_S and not math.isinf(end)):
         raise UsageError("--start and --end: give 0 <= --start < --end, in seconds")
     if offline:
         from pipeline.cli.recordings.replay_offline import run_offline  # noqa: PLC0415  loads the stages
+        from pipeline.cli.recordings.score_again import Again  # noqa: PLC0415
 
-        run_offline(
-            files,
-            config=config,
-            overrides=overrides or (),
-            twin=twin,
-            output=output,
-            verify=verify,
-            start_s=start,
-            end_s=end,
-            json_output=json_output,
-        )
+        again = Again(config, tuple(overrides or ()), twin, verify, start, end)
+        run_offline(files, again, output, RecordingsInParallel(jobs, scheduler, skip_bad), json_output=json_output)
         return
     pace = Pace(_rate(rate or "1"), paused=pause)
     keys = Keys()
     if pause and not keys.is_available:
         raise UsageError("--pause needs a terminal, to continue with a key")
-    playback = RecordingPlayback(files, _chosen_topics(topics, from_topic), start, end)
-    replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
-    stop = threading.Event()
-    stop_on_signals(stop)
-    console = Console(stderr=True, highlight=False)
-    with keys, _status_line(console, playback.end_s(), playback.seconds_at) as show:
-        outcome = publish(
-            playback,
-            pace,
-            replay_config,
-            stop,
-            loop=loop,
-            keys=keys.pressed,
-            show=show,
-            report=lambda line: console.print(line, markup=False, soft_wrap=True),
-        )
-    for line in outcome.damage:
-        console.print(line, markup=False, soft_wrap=True)
-    for name in outcome.behind:
-        console.print(f"{name} has not received all messages: see `fantwin status`", markup=False, soft_wrap=True)
+    with local_copies():
+        playback = RecordingPlayback(files, _chosen_topics(topics, from_topic), start, end)
+        replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
+        stop = threading.Event()
+        stop_on_signals(stop)
+        console = Console(stderr=True, highlight=False)
+        with keys, _status_line(console, playback.end_s(), playback.seconds_at) as show:
+            outcome = publish(
+                playback,
+                pace,
+                replay_config,
+                stop,
+                loop=loop,
+                keys=keys.pressed,
+                show=show,
+                report=lambda line: console.print(line, markup=False, soft_wrap=True),
+            )
+        for line in outcome.damage:
+            console.print(line, markup=False, soft_wrap=True)
+        for name in outcome.behind:
+            console.print(f"{name} has not received all messages: see `fantwin status`", markup=False, soft_wrap=True)
     if json_output:
         typer.echo(json.dumps({"files": [str(file) for file in playback.files], **asdict(outcome)}))
     else:

@@ -1,27 +1,30 @@
-"""`fantwin replay --offline`: score a recording again, compare, and print the result."""
+"""`fantwin replay --offline`: score recordings again, compare, and print the result."""
 
 from __future__ import annotations
 
 import json
-import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.table import Table
 
-from pipeline.errors import UserError
+from pipeline.cli.options import make_folder
+from pipeline.cli.progress import interruptible
+from pipeline.cli.recordings.score_again import Again, score_again, together
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from pipeline.errors import UsageError, UserError
 from pipeline.recordings.dates import format_utc, has_date
-from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
-from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
-from pipeline.replay.offline.rescoring import RescoredTray, rescore
-from pipeline.replay.offline.verify import CannotCompareError
+from pipeline.recordings.grouping import describe, recordings_of
+from pipeline.recordings.records import active_path
 from schemas.messages import Diagnosis
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import most_probable
@@ -34,137 +37,124 @@ _WIDEST = 100
 
 
 def run_offline(
-    files: Sequence[Path],
-    *,
-    config: Path | None,
-    overrides: Sequence[str],
-    twin: Path | None,
-    output: Path | None,
-    verify: bool,
-    start_s: float,
-    end_s: float,
-    json_output: bool,
+    files: Sequence[Path], again: Again, output: Path | None, pool: RecordingsInParallel, *, json_output: bool
 ) -> None:
     """Score, print, and exit with 0: success, 1: failed, 3: data were lost. With `verify`: 0 equal, 1 different,
-    2 nothing is comparable, 3 equal as far as it is comparable.
+    2 nothing is comparable, 3 equal as far as it is comparable. With 4: recordings were skipped.
+
+    files: of one or many recordings. output: a recording to write; a folder for those of many.
 
     Raises:
         UserError: it failed.
     """
     began_s = time.monotonic()
     try:
-        with open_replay_input(files, config, overrides, twin, start_s, end_s) as replay_input:
-            if verify and not replay_input.is_as_recorded:
-                raise CannotCompareError(
-                    f"{files[0]}: --verify compares with the recording: leave out --twin, -c and --set, and give a "
-                    "recording that holds its configuration"
-                )
-            trays = _rescored(replay_input, output, verify)
-            took_s = time.monotonic() - began_s
-            result = _result(replay_input, trays, took_s)
+        with interruptible("nothing was written"), pool:
+            recordings = recordings_of(pool.map(describe, list(dict.fromkeys(files)), "opening recordings"))
+            with written_at_the_end(output, recordings) as folder:
+                scored = list(pool.map(partial(score_again, again=again, folder=folder), recordings, "scoring"))
     except UserError as error:
-        if not verify:
+        if not again.verify:
             raise
         _print_not_comparable(str(error), json_output)
         raise typer.Exit(EXIT_CANNOT_COMPARE) from error
+    result = together(scored, time.monotonic() - began_s)
     if json_output:
-        typer.echo(json.dumps(result))
+        typer.echo(json.dumps(result | pool.as_json()))
     else:
-        _print_result(trays, result, output)
-    problems = [tray.problem for tray in trays if tray.problem]
-    if problems and not verify and not any(tray.scored for tray in trays):
-        raise UserError(f"{files[0]}: {'; '.join(problems)}")
-    if verify:
+        print_result(result, output)
+    if again.verify:
         found = result["verified"]
-        raise typer.Exit(EXIT_DIFFERS if not found["equal"] else EXIT_LOST if found["not_comparable"] else 0)
-    if result["lost"] or result["damage"]:
-        raise typer.Exit(EXIT_LOST)
+        pool.end(EXIT_DIFFERS if not found["equal"] else EXIT_LOST if found["not_comparable"] else 0)
+    pool.end(EXIT_LOST if result["lost"] or result["damage"] else 0)
 
 
-def _rescored(replay_input: ReplayInput, output: Path | None, verify: bool) -> list[RescoredTray]:
-    columns = (SpinnerColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task("reading what each stage consumed")
-        first: dict[str, int] = {}
+@contextmanager
+def written_at_the_end(output: Path | None, recordings: Sequence[tuple[Path, ...]]) -> Iterator[Path | None]:
+    """Yields a folder for the outputs of recordings, each under the name of the first part. Those that are there at the
+    end get their places: `output` is that of one recording, or the folder of several. If the work fails, none does.
 
-        def progress(tray: str, t_ns: int) -> None:
-            since_s = (t_ns - first.setdefault(tray, t_ns)) / NS_PER_S
-            shown.update(task, description=f"scoring {tray}: {since_s:.0f} s so far")
-
-        return rescore(replay_input, output, verify, progress)
-
-
-def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray], took_s: float) -> dict[str, Any]:
-    now = episodes(alarm for tray in trays for alarm in tray.alarms)
-    scored_s = sum(tray.hours for tray in trays) * 3600
-    result: dict[str, Any] = {
-        "alarms": [episode.as_json() for episode in now],
-        "start_ns": replay_input.first_sample_t_ns,
-        "hours": sum(tray.hours for tray in trays),
-        "samples": sum(tray.samples for tray in trays),
-        "lost": sum(tray.lost for tray in trays),
-        "not_judged": {tray.tray: dict(tray.not_judged.most_common()) for tray in trays},
-        "counts": {tray.tray: dict(sorted(tray.counts.items())) for tray in trays},
-        "restarts": sum(tray.plan.restarts for tray in trays),
-        "damage": list(replay_input.damage.values()),
-        "took_s": took_s,
-        "times_real_time": scored_s / took_s if took_s else math.inf,
-    }
-    compared = [tray.comparison for tray in trays if tray.comparison]
-    if compared:
-        result["verified"] = {
-            "equal": all(one.is_equal for one in compared),
-            "samples_equal": sum(one.equal for one in compared),
-            "samples_different": sum(one.different for one in compared),
-            "samples_not_made": sum(one.not_made for one in compared),
-            "samples_not_recorded": sum(one.not_recorded for one in compared),
-            "alarms_equal": sum(one.alarms_equal for one in compared),
-            "alarms_different": sum(one.alarms_different for one in compared),
-            "alarms_not_recorded": sum(one.alarms_not_recorded for one in compared),
-            "samples_not_comparable": sum(one.not_comparable for one in compared),
-            "alarms_not_comparable": sum(one.alarms_not_comparable for one in compared),
-            "not_comparable": [reason for one in compared for reason in one.reasons],
-            "differences": [line for one in compared for line in one.named],
-        }
-    elif not replay_input.is_as_recorded and any(tray.recorded_alarms for tray in trays):
-        within = [
-            alarm for tray in trays for alarm in tray.recorded_alarms if tray.start_ns <= alarm.t_ns <= tray.end_ns
-        ]
-        what_if = compare_episodes(now, episodes(within))
-        result["what_if"] = _what_if(what_if)
-    return result
+    Raises:
+        UserError: a place is taken, or nothing can be written there.
+    """
+    if output is None:
+        yield None
+        return
+    if len(recordings) > 1 and output.suffix == ".mcap":
+        raise UsageError(f"-o {output}: these are {len(recordings)} recordings: name a folder")
+    is_folder = len(recordings) > 1 or output.is_dir()
+    places: dict[str, Path] = {}
+    for path, *_ in recordings:
+        place = output / path.name if is_folder else output
+        if path.name in places:
+            raise UserError(f"{path}: another recording has its name, and both would be written to {place}")
+        _refuse_taken(place)
+        places[path.name] = place
+    folder = make_folder(output if is_folder else output.parent)
+    try:
+        unfinished = TemporaryDirectory(dir=folder, prefix=".replay-")
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written: {error.strerror}; name another folder with -o") from error
+    with unfinished as name:
+        yield Path(name)
+        for path in Path(name).iterdir():
+            _refuse_taken(places[path.name])
+            path.rename(places[path.name])
 
 
-def _what_if(found: AlarmDiff) -> dict[str, Any]:
-    return {name: [episode.as_json() for episode in getattr(found, name)] for name in ("gained", "lost", "kept")}
+def _refuse_taken(place: Path) -> None:
+    for path in (place, active_path(place)):
+        if path.exists():
+            raise UserError(f"{path}: exists already; give another name with -o, or remove it")
 
 
-def _print_result(trays: Sequence[RescoredTray], result: dict[str, Any], output: Path | None) -> None:
+def print_result(result: dict[str, Any], output: Path | None) -> None:
+    """For people, what `together` gives."""
     console = Console(highlight=False, soft_wrap=True)
     console.width = min(_WIDEST, console.width) if console.is_terminal else _WIDEST
-    now, start_ns = result["alarms"], result["start_ns"]
-    _print_alarms(console, "alarms", now, start_ns)
+    if "recordings" in result:
+        _print_recordings(console, result)
+    else:
+        _print_alarms(console, "alarms", result["alarms"], result["start_ns"])
+    alarms = sum(len(one["alarms"]) for one in result.get("recordings", [result]))
     console.print(
-        f"{len(now)} alarm{'s' * (len(now) != 1)} in {_duration(result['hours'])}, {result['samples']} samples, "
-        f"{result['lost']} lost; "
-        f"{result['times_real_time']:.0f} times real time"
+        f"{alarms} alarm{'s' * (alarms != 1)} in {_duration(result['hours'])}, {result['samples']} samples, "
+        f"{result['lost']} lost; {result['times_real_time']:.0f} times real time"
     )
-    for tray in trays:
-        if tray.problem:
-            console.print(f"[bold yellow]not scored:[/bold yellow] {escape(tray.problem)}")
+    for problem in result["not_scored"]:
+        console.print(f"[bold yellow]not scored:[/bold yellow] {escape(problem)}")
     if result["restarts"]:
         console.print(f"{result['restarts']} restarts of stages, replayed as recorded")
     for damage in result["damage"]:
         console.print(f"[bold yellow]damaged:[/bold yellow] {escape(damage)}")
-    if "what_if" in result:
-        for name in ("gained", "lost"):
-            found = result["what_if"][name]
-            console.print(f"against the recording: {len(found)} alarms {name}")
-            _print_alarms(console, name, found, start_ns)
+    for one in result.get("recordings", [result]):
+        for name in ("gained", "lost") if "what_if" in one else ():
+            found = one["what_if"][name]
+            where = f"{one['files'][0]}: " if "recordings" in result else ""
+            console.print(f"{where}against the recording: {len(found)} alarms {name}", markup=False)
+            _print_alarms(console, name, found, one["start_ns"])
     if "verified" in result:
         _print_verified(result["verified"], console)
     if output:
         console.print(f"written to {output}", markup=False)
+
+
+def _print_recordings(console: Console, result: dict[str, Any]) -> None:
+    """A row for each recording, and the alarms of those that have any."""
+    table = Table("recording", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in ("time", "alarms", "lost"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for one in result["recordings"]:
+        alarms = str(len(one["alarms"]))
+        table.add_row(escape(one["files"][0]), _duration(one["hours"]), alarms, str(one["lost"]))
+    console.print(table)
+    room = _SHOWN
+    for one in result["recordings"]:
+        if one["alarms"] and room > 0:
+            _print_alarms(console, f"{one['files'][0]}: alarms", one["alarms"][:room], one["start_ns"])
+        room -= len(one["alarms"])
+    if room < 0:
+        console.print(f"and {-room} more; all with --json")
 
 
 def _duration(hours: float) -> str:

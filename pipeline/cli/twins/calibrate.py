@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import typer
@@ -14,13 +15,16 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.cli.options import JsonOption, SetOption
-from pipeline.cli.progress import interruptible, working
-from pipeline.cli.twins.calibration_check import check_declared_rate
+from pipeline.cli.progress import interruptible, show_part
+from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from pipeline.cli.twins.calibration_check import Check, check_declared_rate
 from pipeline.cli.twins.drops_found import drop_lines, drops_found
 from pipeline.cli.twins.outlier_run_check import outlier_warning
-from pipeline.cli.twins.training_data import FromOption, ToOption, sha256_of, twin_errors
+from pipeline.cli.twins.training_data import FromOption, ToOption, twin_errors
 from pipeline.errors import UsageError, UserError
-from pipeline.replay.offline.healthy_runs import HealthyRuns
+from pipeline.recordings.remote import matching, recording_path
+from pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
+from pipeline.replay.offline.kept_samples import KeptSamples
 from pipeline.replay.offline.limits_of_twin import find_limits
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
@@ -30,6 +34,8 @@ from scoring.detectors.table import calibrated_rows
 from scoring.limits import Limits, Timing
 
 EXIT_BROKEN = 3
+MAX_KEPT_SAMPLES = 10_000_000
+"""of fans, about 85 bytes each: so many are kept on the disk between passes, as many of each recording"""
 
 
 def calibrate(
@@ -37,7 +43,10 @@ def calibrate(
     healthy: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="HEALTHY.mcap...", help="Healthy recordings, preferably not those that the twin was trained on."
+            parser=recording_path,
+            callback=matching,
+            metavar="HEALTHY.mcap...",
+            help="Healthy recordings, preferably not those that the twin was trained on.",
         ),
     ] = None,
     false_alarms_per_day: Annotated[
@@ -52,6 +61,8 @@ def calibrate(
     verify: Annotated[
         list[Path] | None,
         typer.Option(
+            parser=recording_path,
+            callback=matching,
             metavar="OTHER.mcap...",
             help="Other healthy recordings, to test the declared rate: all arguments up to the next option, so name "
             "TWIN.onnx and HEALTHY.mcap... before it.",
@@ -77,6 +88,9 @@ def calibrate(
     ] = None,
     overrides: SetOption = None,
     seed: Annotated[int, typer.Option(help="Seed of the bootstrap.")] = 0,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
 ) -> None:
     """Set the alarm limits of a twin from healthy recordings, and write them into its card.
@@ -85,7 +99,8 @@ def calibrate(
     as frequent as declared. If the data cannot support the rate, the command refuses and says how much is needed.
     Without calibration only large errors of the speed, missing readings and standstill raise alarms.
 
-    Exit codes: 0 success; 1 error; 3 --verify found more false alarms than declared; 130 Ctrl-C.
+    Exit codes: 0 success; 1 error; 3 --verify found more false alarms than declared; 4 recordings were skipped;
+    130 Ctrl-C.
 
     Example: fantwin calibrate TWIN.onnx healthy-1.mcap healthy-2.mcap --false-alarms-per-day 1
 
@@ -99,60 +114,57 @@ def calibrate(
     if output and (output.is_dir() or not output.parent.is_dir()):  # before an hour of scoring
         raise UserError(f"{output}: cannot write the twin: name a file in an existing folder")
     result: dict[str, Any] = {}
-    if healthy:
-        if false_alarms_per_day is None:
-            raise UsageError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
-        with interruptible("nothing was written"):
+    check: Check | None = None
+    pool = RecordingsInParallel(jobs, scheduler, skip_bad)
+    with interruptible("nothing was written"), pool:
+        if healthy:
+            if false_alarms_per_day is None:
+                raise UsageError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
+            part = HealthyPart(twin, tuple(overrides or ()), from_s, to_s, tray)
             limits, warning, speed_unit = _calibrated(
-                twin,
-                healthy,
-                (from_s, to_s),
-                tray,
-                false_alarms_per_day,
-                extrapolate,
-                alarms_left_out,
-                overrides or [],
-                seed,
+                healthy, part, false_alarms_per_day, pool, extrapolate, alarms_left_out, seed
             )
-        output = output or twin
-        _write(twin, output, limits)
-        result = {"twin": str(output), "calibration": json.loads(limits.model_dump_json())}
-        result["warnings"] = [warning] if warning else []
-        drops = drops_found(output, RAD_S_PER_UNIT[speed_unit])
-        result |= {"speed_unit": speed_unit, "drops_found": [drop.as_json() for drop in drops]}
-        if warning:
-            typer.echo(warning, err=True)
-        if not json_output:
-            _print(output, limits, drop_lines(drops, speed_unit))
-    check = check_declared_rate(output or twin, verify, overrides or [], tray) if verify else None
-    if check:
-        result["verify"] = check.as_json()
+            output = output or twin
+            _write(twin, output, limits)
+            drops = drops_found(output, RAD_S_PER_UNIT[speed_unit])
+            result = {
+                "twin": str(output),
+                "calibration": json.loads(limits.model_dump_json()),
+                "warnings": [warning] if warning else [],
+                "speed_unit": speed_unit,
+                "drops_found": [drop.as_json() for drop in drops],
+            }
+            if warning:
+                typer.echo(warning, err=True)
+            if not json_output:
+                _print(output, limits, drop_lines(drops, speed_unit))
+        if verify:
+            check = check_declared_rate(output or twin, verify, overrides or [], pool, tray)
+            result["verify"] = check.as_json()
     if json_output:
-        typer.echo(json.dumps(result))
+        typer.echo(json.dumps(result | pool.as_json()))
     elif check:
         typer.echo(check.text)
-    if check and check.is_broken:
-        raise typer.Exit(EXIT_BROKEN)
+    pool.end(EXIT_BROKEN if check and check.is_broken else 0)
 
 
 def _calibrated(
-    twin: Path,
     healthy: list[Path],
-    part_s: tuple[float, float],
-    tray: str | None,
+    part: HealthyPart,
     per_day: float,
+    pool: RecordingsInParallel,
     extrapolate: bool,
     alarms_left_out: int,
-    overrides: list[str],
     seed: int,
 ) -> tuple[Limits, str, SpeedUnit]:
     """The limits, a warning about the recordings, empty if there is none, and the unit of speeds in the first."""
-    known = load_tray_twin(twin)
+    known = load_tray_twin(part.twin)
     top_speed_rad_s = known.card.top_speed_rad_s
     if top_speed_rad_s <= 0.0:
-        raise UserError(f"{twin}: its training data have no speed above zero (speed_range_rad_s): train it again")
-    with working("scoring healthy recordings") as show:
-        runs = HealthyRuns(healthy, twin, overrides, show, *part_s, tray)
+        raise UserError(f"{part.twin}: its training data have no speed above zero (speed_range_rad_s): train it again")
+    with TemporaryDirectory(prefix="fantwin-calibrate-") as folder:
+        kept = KeptSamples(Path(folder), MAX_KEPT_SAMPLES // len(healthy))
+        runs = HealthyRuns(healthy, part, pool.map, kept, show_part)
         timing = runs.timing()
         try:
             longest_fan_s = runs.longest_fan_s()  # however much of it can be scored
@@ -167,23 +179,24 @@ def _calibrated(
             raise UserError(_mixed_rates(error)) from error
         except FragmentedError as error:
             raise UserError(_fragmented(error)) from error
-        show("comparing the recordings")
         warning = outlier_warning(runs, limits, top_speed_rad_s)
     assert limits.declared_rate
     declared_rate = limits.declared_rate.model_copy(
         update={
-            "data": tuple({"name": path.name, "sha256": sha256_of(path), **_part(*part_s, tray)} for path in healthy),
+            "data": tuple(
+                {"name": path.name, "sha256": sha256, **_part(part)} for path, sha256 in runs.sha256().items()
+            ),
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
     )
     return limits.model_copy(update={"declared_rate": declared_rate}), warning, runs.speed_unit
 
 
-def _part(from_s: float, to_s: float, tray: str | None) -> dict[str, float | str]:
+def _part(part: HealthyPart) -> dict[str, float | str]:
     """The part of each recording, for the card; empty for the whole."""
-    wanted: dict[str, float | str] = {"from_s": from_s} if from_s > 0.0 else {}
-    wanted |= {"to_s": to_s} if to_s < math.inf else {}
-    return wanted | ({"tray": tray} if tray else {})
+    wanted: dict[str, float | str] = {"from_s": part.from_s} if part.from_s > 0.0 else {}
+    wanted |= {"to_s": part.to_s} if part.to_s < math.inf else {}
+    return wanted | ({"tray": part.tray} if part.tray else {})
 
 
 def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path], overrides: list[str]) -> None:
@@ -239,7 +252,7 @@ def _mixed_rates(error: MixedRatesError) -> str:
     (first, first_ns), (other, other_ns) = error.first, error.other
     rates = f"{NS_PER_S / first_ns:g} Hz and {NS_PER_S / other_ns:g} Hz"
     if first == other:
-        return f"{first}: its grid changes between {rates}, and limits hold for one rate: calibrate without it"
+        return f"{first}: its trays have grids of different rates, {rates}, and limits hold for one: choose with --tray"
     return (
         f"{first} and {other} have grids of different rates, {rates}, and limits hold for one: calibrate on recordings "
         "of one rate, or choose one with --set resampler.rate_hz=..."

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipeline.cli.progress import working
-from pipeline.cli.twins.training_data import sha256_of
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.errors import UserError
+from pipeline.recordings.checksum import sha256_of
 from pipeline.replay.offline.alarm_episodes import episodes
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import rescore
@@ -74,7 +75,11 @@ class Check:
 
 
 def check_declared_rate(
-    twin: Path, recordings: Sequence[Path], overrides: Sequence[str], tray: str | None = None
+    twin: Path,
+    recordings: Sequence[Path],
+    overrides: Sequence[str],
+    pool: RecordingsInParallel,
+    tray: str | None = None,
 ) -> Check:
     """Count alarms on other healthy recordings, processed as by `fantwin replay --offline`.
 
@@ -89,27 +94,33 @@ def check_declared_rate(
     declared = Limits.model_validate(calibration).declared_rate if calibration else None
     if declared is None:
         raise UserError(f"{twin}: its alarms were never calibrated: give healthy recordings and --false-alarms-per-day")
-    _refuse_its_own_recordings(twin, loaded, declared, recordings)
+    made_from = _made_from(twin, loaded, declared)
+    list(pool.map(partial(_refuse_its_own, made_from=made_from), recordings, "looking for its own recordings"))
+    count = partial(_count_alarms, twin=twin, overrides=tuple(overrides), tray=tray)
+    counts = list(pool.map(count, recordings, "scoring other healthy recordings"))
+    return Check(sum(alarms for alarms, _ in counts), sum(hours for _, hours in counts), declared.false_alarms_per_day)
+
+
+def _count_alarms(path: Path, twin: Path, overrides: tuple[str, ...], tray: str | None) -> tuple[int, float]:
+    """Alarms of one recording, and the fan-hours that could be scored."""
     alarms, fan_hours = 0, 0.0
-    with working("scoring other healthy recordings") as show:
-        for path in recordings:
-            show(f"verifying: {path}")
-            with open_replay_input([path], None, overrides, twin, tray=tray) as replay_input:
-                for each, rescored in zip(replay_input.trays, rescore(replay_input, None, False), strict=True):
-                    if rescored.problem:
-                        raise UserError(f"{path}: {rescored.problem}")
-                    alarms += len(episodes(rescored.alarms))
-                    fan_samples = rescored.samples * each.fans - rescored.not_judged.total()
-                    fan_hours += fan_samples * rescored.period_ns / NS_PER_HOUR
-    return Check(alarms, fan_hours, declared.false_alarms_per_day)
+    with open_replay_input([path], None, overrides, twin, tray=tray) as replay_input:
+        for each, rescored in zip(replay_input.trays, rescore(replay_input, None, False), strict=True):
+            if rescored.problem:
+                raise UserError(f"{path}: {rescored.problem}")
+            alarms += len(episodes(rescored.alarms))
+            fan_samples = rescored.samples * each.fans - rescored.not_judged.total()
+            fan_hours += fan_samples * rescored.period_ns / NS_PER_HOUR
+    return alarms, fan_hours
 
 
-def _refuse_its_own_recordings(path: Path, twin: TrayTwin, declared: DeclaredRate, recordings: Sequence[Path]) -> None:
+def _made_from(path: Path, twin: TrayTwin, declared: DeclaredRate) -> dict[str, str]:
+    """By the hash of each recording that a twin was made from: how, in words."""
     training = json.loads(twin.card_json).get("training", {})
-    for verb, data in (("calibrated", declared.data), ("trained", training.get("data", ()))):
-        known = {entry["sha256"] for entry in data}
-        for recording in recordings:
-            if recording.is_file() and sha256_of(recording) in known:
-                raise UserError(
-                    f"{recording}: {path} was {verb} on it, so it proves nothing: --verify takes other recordings"
-                )
+    used = (("trained", training.get("data", ())), ("calibrated", declared.data))
+    return {entry["sha256"]: f"{path} was {verb} on it" for verb, data in used for entry in data}
+
+
+def _refuse_its_own(path: Path, made_from: dict[str, str]) -> None:
+    if how := made_from.get(sha256_of(path)):
+        raise UserError(f"{path}: {how}, so it proves nothing: --verify takes other recordings")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,27 +14,29 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.cli.options import JsonOption
+from pipeline.cli.options import JsonOption, make_folder
 from pipeline.cli.progress import interruptible, training_progress
+from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
 from pipeline.cli.twins.figures import figures_in, shown
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
+    Part,
     RecordingsArgument,
     ToOption,
     TrainingData,
     TrayOption,
     WindowOption,
     data_cards,
-    make_folder,
     read_held_out,
     read_training_data,
     twin_errors,
 )
 from pipeline.errors import UsageError, UserError
+from pipeline.recordings.remote import matching, recording_path
 
 if TYPE_CHECKING:
-    from twin.comparison import Candidate, Contender
+    from twin.comparison import Candidate, Contender, Source
 
 SOURCE_HEADER = {"held-out": "held\nout", "test": "test\nrmse"}
 SOURCE_MEANING = {
@@ -47,11 +50,21 @@ def compare(
     recordings: RecordingsArgument,
     validate: Annotated[
         list[Path] | None,
-        typer.Option(metavar="REC.mcap", help="Held-out healthy recording: stops training, not fitted. Repeatable."),
+        typer.Option(
+            parser=recording_path,
+            callback=matching,
+            metavar="REC.mcap",
+            help="Held-out healthy recording: stops training, not fitted. Repeatable.",
+        ),
     ] = None,
     test: Annotated[
         list[Path] | None,
-        typer.Option(metavar="REC.mcap", help="Healthy recording for the comparison, unused in training. Repeatable."),
+        typer.Option(
+            parser=recording_path,
+            callback=matching,
+            metavar="REC.mcap",
+            help="Healthy recording for the comparison, unused in training. Repeatable.",
+        ),
     ] = None,
     output: Annotated[
         Path | None,
@@ -75,6 +88,9 @@ def compare(
         int | None, typer.Option(min=1, help="Maximum iterations. Default: depends on the model.")
     ] = None,
     command_unit: Annotated[str, typer.Option(help="Unit of the command, for the cards, e.g. %.")] = "",
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
 ) -> None:
     """Train physical, NARX, neural ODE and both hybrids on the same recordings and print them side by side.
@@ -84,17 +100,18 @@ def compare(
     Example: fantwin compare healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap --test healthy-4.mcap -o twins
     """
     not_compared = f"no comparison; the twins that were finished are in {output}" if output else "no comparison"
+    pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible(not_compared), twin_errors():
         from twin.comparison import best, contend, source_of  # noqa: PLC0415  loads twin only when it is needed
 
         chosen = _chosen(model)
-        training_data = read_training_data(recordings, tray, fans, from_s, to_s, window_s)
-        held_out = (
-            read_held_out(training_data, validate, tray, fans, validate_from_s, validate_to_s, window_s)
-            if validate
-            else None
-        )
-        untouched = read_held_out(training_data, test, tray, fans, test_from_s, test_to_s, window_s) if test else None
+        part = Part(tray, fans, from_s, to_s, tuple(window_s or ()))
+        validation_part = replace(part, from_s=validate_from_s, to_s=validate_to_s)
+        test_part = replace(part, from_s=test_from_s, to_s=test_to_s)
+        with pool:
+            training_data = read_training_data(recordings, part, pool)
+            held_out = read_held_out(training_data, validate, validation_part, pool) if validate else None
+            untouched = read_held_out(training_data, test, test_part, pool) if test else None
         folder = make_folder(output) if output else None
         validation_runs, test_runs = (part.runs if part else [] for part in (held_out, untouched))
         data, validation_data = data_cards(training_data), data_cards(held_out) if held_out else ()
@@ -129,8 +146,14 @@ def compare(
     if folder:
         _write(folder / "comparison.json", json.dumps(result, indent=2) + "\n")
     if json_output:
-        typer.echo(json.dumps(result))
-        return
+        typer.echo(json.dumps(result | pool.as_json()))
+    else:
+        _print(result, folder)
+    pool.end()
+
+
+def _print(result: dict[str, Any], folder: Path | None) -> None:
+    source: Source = result["evaluated_on"]
     Console().print(table(result))
     typer.echo(f"* best: smallest free-run rmse over {SOURCE_MEANING[source]}.")
     if floor := next(

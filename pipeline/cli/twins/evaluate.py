@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,16 +16,21 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.cli.options import JsonOption, fan_numbers
+from pipeline.cli.progress import interruptible
+from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
 from pipeline.cli.twins.figures import figures_in, sentence, shown
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
+    Part,
     RecordingsArgument,
     ToOption,
     TrainingData,
     TrayOption,
     data_cards,
-    read_training_data,
+    joined,
+    read_recording_data,
+    report_damage,
     twin_errors,
 )
 from pipeline.errors import UsageError
@@ -36,7 +43,8 @@ if TYPE_CHECKING:
     from twin.evaluation.resampling import Grid
     from twin.evaluation.residual_analysis import ResidualAnalysis
     from twin.report.assessment import Assessment
-    from twin.report.content import Content
+    from twin.report.content import Summary
+    from twin.report.recording_sums import Extent
 
 EXPECTED_COVERAGE = math.erf(math.sqrt(2.0))
 """share of a normal distribution within two standard deviations"""
@@ -53,6 +61,9 @@ def evaluate(
         list[str] | None,
         typer.Option(metavar="HZ|irregular", help="Evaluate on this sample grid, too, e.g. 50. Repeatable."),
     ] = None,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
 ) -> None:
     """Run a twin freely over recordings and compare it with the measured speeds, in the recording's own units.
@@ -64,59 +75,92 @@ def evaluate(
     Example: fantwin evaluate TWIN.onnx held-out.mcap --rate 20 --rate irregular --json
     """
     grids: list[Grid] = [_grid(text) for text in rate or []]
-    with twin_errors():
+    part = Part(tray, fans, from_s, to_s)
+    pool = RecordingsInParallel(jobs, scheduler, skip_bad)
+    with interruptible("nothing was evaluated"), twin_errors(), pool:
         # The command line loads twin only when it is needed.
-        from twin.build import evaluate as evaluate_twin  # noqa: PLC0415
-        from twin.evaluation.resampling import on_grid  # noqa: PLC0415
         from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
         from twin.report.assessment import assess  # noqa: PLC0415
-        from twin.report.content import SpeedUnit, report_content  # noqa: PLC0415
+        from twin.report.content import SpeedUnit, summary_of  # noqa: PLC0415
+        from twin.report.recording_sums import common_extent  # noqa: PLC0415
 
         loaded = OnnxTwin(twin)
-        training_data = read_training_data(recordings, tray, fans, from_s, to_s)
-        unit = SpeedUnit(training_data.speed_unit, training_data.rad_s_per_unit)
-        content = report_content(loaded, training_data.runs, data_cards(training_data), unit, fan_numbers(fans))
-        assessment = assess(content)
-        on_grids: list[tuple[Grid, Evaluation]] = [
-            (grid, evaluate_twin(loaded, on_grid(training_data.runs, grid), fan_numbers(fans))) for grid in grids
-        ]
-    result = as_json(content, assessment, on_grids, training_data)
+        known = list(pool.map(partial(_known_of, part=part), recordings, "reading"))
+        about, extent = joined([data for data, _ in known]), common_extent([extent for _, extent in known])
+        report_damage(about)
+        work = partial(_sums_of, part=part, twin=twin, extent=extent, grids=grids)
+        sums, *on_grids = reduce(_added, pool.map(work, recordings, "evaluating"))
+        unit = SpeedUnit(about.speed_unit, about.rad_s_per_unit)
+        summary = summary_of(loaded, sums, extent, data_cards(about), unit, fan_numbers(fans))
+        assessment = assess(summary)
+    result = as_json(
+        summary, assessment, [(grid, of.evaluation()) for grid, of in zip(grids, on_grids, strict=True)], about
+    )
     if json_output:
-        typer.echo(json.dumps(result))
-        return
-    typer.echo(f"{result['headline']}\n{sentence(result, training_data.speed_unit)}")
+        typer.echo(json.dumps(result | pool.as_json()))
+    else:
+        _print(result)
+    pool.end()
+
+
+def _known_of(path: Path, part: Part) -> tuple[TrainingData, Extent]:
+    """What must be known of all recordings before one is evaluated; without the samples."""
+    from twin.report.recording_sums import extent_of  # noqa: PLC0415
+
+    data = read_recording_data(path, part)
+    with twin_errors():
+        return replace(data, runs=[]), extent_of(data.runs)
+
+
+def _sums_of(path: Path, part: Part, twin: Path, extent: Extent, grids: Sequence[Grid]) -> list[Any]:
+    """The RecordingSums of one recording, and its FigureSums on each of the other grids."""
+    from twin.build import evaluation_sums, runs_of_twin  # noqa: PLC0415
+    from twin.evaluation.resampling import on_grid  # noqa: PLC0415
+    from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
+    from twin.report.recording_sums import recording_sums  # noqa: PLC0415
+
+    numbers = fan_numbers(part.fans)
+    with twin_errors():
+        loaded, runs = OnnxTwin(twin), read_recording_data(path, part).runs
+        on_grids = [evaluation_sums(loaded, on_grid(runs, grid), numbers) for grid in grids]
+        return [recording_sums(runs_of_twin(loaded, runs, numbers), extent), *on_grids]
+
+
+def _added(sums: list[Any], others: list[Any]) -> list[Any]:
+    return [one + other for one, other in zip(sums, others, strict=True)]
+
+
+def _print(result: dict[str, Any]) -> None:
+    typer.echo(f"{result['headline']}\n{sentence(result, result['speed_unit'])}")
     console = Console()
     console.print(_fan_table(result))
-    if grids:
+    if result["grids"]:
         console.print(_grid_table(result))
     for warning in result["warnings"]:
         typer.echo(warning, err=True)
 
 
 def as_json(
-    content: Content,
-    assessment: Assessment,
-    on_grids: Sequence[tuple[Grid, Evaluation]],
-    training_data: TrainingData,
+    summary: Summary, assessment: Assessment, on_grids: Sequence[tuple[Grid, Evaluation]], about: TrainingData
 ) -> dict[str, Any]:
     """The result as JSON fields; speeds in the recordings' own unit, None where a figure is undefined."""
-    scale = training_data.rad_s_per_unit
+    scale = about.rad_s_per_unit
 
     def figures_of(evaluation: Evaluation) -> dict[str, Any]:
-        by_fan = zip(training_data.fans, evaluation.per_fan, strict=True)
+        by_fan = zip(about.fans, evaluation.per_fan, strict=True)
         return figures_in(evaluation.pooled, scale) | {
             "fans": [{"fan": number} | figures_in(fan, scale) for number, fan in by_fan]
         }
 
-    result = figures_of(content.evaluation)
-    for its, fan in zip(result["fans"], content.fans, strict=True):
+    result = figures_of(summary.evaluation)
+    for its, fan in zip(result["fans"], summary.fans, strict=True):
         its["residual"] = residual_json(fan.residual, scale)
     return result | {
-        "speed_unit": training_data.speed_unit,
+        "speed_unit": about.speed_unit,
         "expected_coverage_2_sigma": EXPECTED_COVERAGE,
         "assessment": assessment.level,
         "headline": assessment.headline,
-        "warnings": [*training_data.outliers, *assessment.warnings],
+        "warnings": [*about.outliers, *assessment.warnings],
         "grids": [{"rate": grid} | figures_of(evaluation) for grid, evaluation in on_grids],
     }
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import typer
 
-from pipeline.cli.twins.training_data import TrainingData, common_unit, training_data_of, twin_errors
+from pipeline.cli.twins.training_data import TrainingData, joined, training_data_of, twin_errors
 from pipeline.recordings.excerpts import ExcerptReader
 
 MOST_HZ = 100.0
@@ -33,15 +33,7 @@ def read_excerpts(excerpts: Iterable[Excerpt]) -> TrainingData:
     Raises:
         UserError: they cannot be read, or are not in one unit.
     """
-    parts = list(each_excerpt(excerpts))
-    unit = common_unit([(part.speed_unit, part.recorded[0].path) for part in parts])
-    return TrainingData(
-        [run for part in parts for run in part.runs],
-        [run for part in parts for run in part.recorded],
-        unit,
-        parts[0].fans,
-        tuple(dict.fromkeys(line for part in parts for line in part.outliers)),
-    )
+    return joined(list(each_excerpt(excerpts)))
 
 
 def each_excerpt(excerpts: Iterable[Excerpt]) -> Iterator[TrainingData]:
@@ -53,7 +45,7 @@ def each_excerpt(excerpts: Iterable[Excerpt]) -> Iterator[TrainingData]:
         found = reader.read(excerpt.from_s, excerpt.to_s)
         if found.damage:
             typer.echo(found.damage, err=True)
-        yield _thinned(training_data_of([found]))
+        yield _thinned(training_data_of(found))
 
 
 def _thinned(data: TrainingData) -> TrainingData:
@@ -61,11 +53,8 @@ def _thinned(data: TrainingData) -> TrainingData:
         from twin.evaluation.resampling import thinned  # noqa: PLC0415  the command line loads twin only when it is needed
 
         runs = [thinned(run, every_of(1.0 / run.median_period_s)) for run in data.runs]
-    recorded = [
-        replace(of, t_s=run.t_s, command=run.command, speed_rad_s=run.speed_rad_s)
-        for of, run in zip(data.recorded, runs, strict=True)
-    ]
-    return replace(data, runs=runs, recorded=recorded)
+    sources = [replace(source, samples=run.samples) for source, run in zip(data.sources, runs, strict=True)]
+    return replace(data, runs=runs, sources=sources)
 
 
 def every_of(rate_hz: float) -> int:

@@ -13,9 +13,11 @@ from rich.table import Table
 
 from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import interruptible, training_progress
+from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
+    Part,
     RecordingsArgument,
     ToOption,
     TrainingData,
@@ -45,6 +47,9 @@ def identify(
     tray: TrayOption = None,
     fans: FansOption = None,
     window_s: WindowOption = None,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
 ) -> None:
     """Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.
@@ -54,25 +59,28 @@ def identify(
 
     Example: fantwin identify REC.mcap --json
     """
+    pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible("nothing was identified"), twin_errors():
         from twin.fitting.identification import identify as identify_fans  # noqa: PLC0415  loads twin only when it is needed
 
-        training_data = read_training_data(recordings, tray, fans, from_s, to_s, window_s)
-        hints = training_data.tacho_hints()
+        part = Part(tray, fans, from_s, to_s, tuple(window_s or ()))
+        with pool:
+            training_data = read_training_data(recordings, part, pool)
         if not json_output:
-            show_hints(hints)
+            show_hints(training_data.hints)
         with training_progress(training_data) as start:
             found = identify_fans(training_data.runs, progress=start(""))
-    result = as_json(found, training_data, hints)
+    result = as_json(found, training_data)
     if json_output:
-        typer.echo(json.dumps(result))
-        return
-    Console().print(_table(result))
-    for warning in result["warnings"]:
-        typer.secho(f"warning: {warning}", fg=typer.colors.YELLOW, err=True)
+        typer.echo(json.dumps(result | pool.as_json()))
+    else:
+        Console().print(_table(result))
+        for warning in result["warnings"]:
+            typer.secho(f"warning: {warning}", fg=typer.colors.YELLOW, err=True)
+    pool.end()
 
 
-def as_json(found: Identification, training_data: TrainingData, hints: list[str]) -> dict[str, Any]:
+def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any]:
     """The result as JSON fields; None where a figure is undefined.
 
     Rows and columns of covariance and correlation are in the order of `parameters`; those of a lag that was not found
@@ -100,7 +108,7 @@ def as_json(found: Identification, training_data: TrainingData, hints: list[str]
         "speed_unit": training_data.speed_unit,
         "iterations": found.iterations,
         "warnings": training_data.with_fan_numbers([*found.warnings, *found.misfits]),
-        "hints": hints,
+        "hints": list(training_data.hints),
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import threading
 from typing import Annotated
@@ -101,4 +102,4 @@ def _end_with_parent() -> None:
     """The stage that started this process holds its standard input open."""
     while os.read(sys.stdin.fileno(), 1):
         pass
-    os._exit(1)
+    os.kill(os.getpid(), signal.SIGTERM)

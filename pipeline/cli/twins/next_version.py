@@ -354,6 +354,7 @@ class _Work:
                 extrapolate=True,
                 alarms_left_out=self._alarms_since(of[0].span[0]),
                 output=done,
+                jobs=1,
             )
         calibration = load_tray_twin(done).card.calibration
         drops = tuple(

@@ -11,11 +11,13 @@ import typer
 
 from pipeline.cli.options import JsonOption, fan_numbers
 from pipeline.cli.progress import working
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.cli.twins.drops_found import drop_lines, drops_found
 from pipeline.cli.twins.figures import figures_in, sentence
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
+    Part,
     RecordingsArgument,
     ToOption,
     TrayOption,
@@ -55,7 +57,7 @@ def report(
 
         loaded = OnnxTwin(twin)
         check_writable(output, ".html")
-        training_data = read_training_data(recordings, tray, fans, from_s, to_s)
+        training_data = read_training_data(recordings, Part(tray, fans, from_s, to_s), RecordingsInParallel(jobs=1))
         unit = SpeedUnit(training_data.speed_unit, training_data.rad_s_per_unit)
         with working(f"drawing {output}"):
             content = report_content(loaded, training_data.runs, data_cards(training_data), unit, fan_numbers(fans))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
@@ -12,10 +12,12 @@ import typer
 
 from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import interruptible, training_progress
+from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
 from pipeline.cli.twins.figures import figures_in, sentence, shown
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
+    Part,
     RecordingsArgument,
     ToOption,
     TrainingData,
@@ -28,6 +30,7 @@ from pipeline.cli.twins.training_data import (
     show_hints,
     twin_errors,
 )
+from pipeline.recordings.remote import matching, recording_path
 
 if TYPE_CHECKING:
     from twin.build import TrainedTwin
@@ -66,7 +69,12 @@ def train(
     model: Annotated[str, typer.Option(help="Kind of model: physical, narx, neural-ode or hybrid.")] = "hybrid",
     validate: Annotated[
         list[Path] | None,
-        typer.Option(metavar="REC.mcap", help="Held-out healthy recording: evaluated, not fitted. Repeatable."),
+        typer.Option(
+            parser=recording_path,
+            callback=matching,
+            metavar="REC.mcap",
+            help="Held-out healthy recording: evaluated, not fitted. Repeatable.",
+        ),
     ] = None,
     from_s: FromOption = 0.0,
     to_s: ToOption = math.inf,
@@ -95,6 +103,9 @@ def train(
         ),
     ] = None,
     command_unit: Annotated[str, typer.Option(help="Unit of the command, for the card, e.g. %.")] = "",
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
 ) -> None:
     """Train a twin of healthy fans and write it, with its card, as an ONNX file.
@@ -107,17 +118,16 @@ def train(
     Example: fantwin train healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap --model hybrid -o TWIN.onnx
     """
     not_written = "no twin was written; --iterations N ends after N iterations of each network and writes one"
+    pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible(not_written), twin_errors():
         check_writable(output, ".onnx")
-        training_data = read_training_data(recordings, tray, fans, from_s, to_s, window_s)
-        held_out = (
-            read_held_out(training_data, validate, tray, fans, validate_from_s, validate_to_s, window_s)
-            if validate
-            else None
-        )
-        hints = training_data.tacho_hints()
+        part = Part(tray, fans, from_s, to_s, tuple(window_s or ()))
+        validation_part = replace(part, from_s=validate_from_s, to_s=validate_to_s)
+        with pool:
+            training_data = read_training_data(recordings, part, pool)
+            held_out = read_held_out(training_data, validate, validation_part, pool) if validate else None
         if not json_output:
-            show_hints(hints)
+            show_hints(training_data.hints)
         with training_progress(training_data) as start:
             trained = fit_twin(
                 training_data,
@@ -127,11 +137,17 @@ def train(
                 start(""),
             )
         trained.save(output)
-    result = as_json(trained, training_data, output, hints)
+    result = as_json(trained, training_data, output)
     if json_output:
-        typer.echo(json.dumps(result))
-        return
-    typer.echo(f"{output}: {model} of {result['fans']} fan(s), {result['network_parameters']} network parameters")
+        typer.echo(json.dumps(result | pool.as_json()))
+    else:
+        _print(result, training_data)
+    pool.end()
+
+
+def _print(result: dict[str, Any], training_data: TrainingData) -> None:
+    networks = f"{result['network_parameters']} network parameters"
+    typer.echo(f"{result['twin']}: {result['model']} of {result['fans']} fan(s), {networks}")
     typer.echo(f"  {result['evaluated_on']} data, {sentence(result, training_data.speed_unit)}")
     typer.echo(f"  {balance_sentence(result)}")
     for warning in result["warnings"]:
@@ -184,7 +200,7 @@ def balance_sentence(result: dict[str, Any]) -> str:
     return f"torque balance: healthy sigma {sigmas} {unit}; coefficients of {sources}"
 
 
-def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path, hints: list[str]) -> dict[str, Any]:
+def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path) -> dict[str, Any]:
     """The result as JSON fields; figures in the recordings' own units."""
     card = trained.card
     return {
@@ -202,5 +218,5 @@ def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path, hin
         "iterations": card.training.iterations,
         "duration_s": card.training.duration_s,
         "warnings": training_data.with_fan_numbers(trained.identification.warnings),
-        "hints": hints,
+        "hints": list(training_data.hints),
     }

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
+import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 from pydantic import ValidationError
 
-from pipeline.cli.options import fan_numbers
+from pipeline.cli.options import fan_numbers, make_folder
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT
 from pipeline.devices.tacho_evidence import tacho_hints
 from pipeline.errors import UsageError, UserError
 from pipeline.optional_dependencies import how_to_install
-from pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
+from pipeline.recordings.checksum import sha256_of
+from pipeline.recordings.remote import matching, recording_path
+from pipeline.recordings.runs import RecordedTray, read_runs
 from schemas.tacho import Tacho
 
 if TYPE_CHECKING:
@@ -26,7 +30,13 @@ if TYPE_CHECKING:
     from twin.runs import Run
 
 RecordingsArgument: TypeAlias = Annotated[
-    list[Path], typer.Argument(metavar="REC.mcap...", help="Recordings; each counts its seconds from its own start.")
+    list[Path],
+    typer.Argument(
+        parser=recording_path,
+        callback=matching,
+        metavar="REC.mcap...",
+        help="Recordings, also at URLs; each counts its seconds from its own start.",
+    ),
 ]
 FromOption: TypeAlias = Annotated[
     float, typer.Option("--from", min=0.0, help="Use each recording from this second on.")
@@ -54,17 +64,32 @@ _EXTRA_MODULES = ("jinja2", "matplotlib", "onnx", "scipy", "torch")
 
 
 @dataclass(frozen=True, eq=False)
+class Source:
+    """Where a run is from. first_s, last_s: its times, in seconds since the first sample of the recording."""
+
+    path: Path
+    samples: int
+    first_s: float
+    last_s: float
+
+
+@dataclass(frozen=True, eq=False)
 class TrainingData:
     """Runs without their outliers, with the fan numbers and the speed unit of their recordings.
 
-    fans: the fan number of each column. outliers: a warning for each fan and file with many outliers.
+    sources: of each run. fans: the fan number of each column. outliers: a warning for each fan and file with many
+    outliers. hints: what speaks against the declared tachos in the longest run; see pipeline.devices.tacho_evidence.
+    damage: what could not be read, a line for each file. sha256: of files that were read whole.
     """
 
     runs: list[Run]
-    recorded: list[RecordedRun]
+    sources: list[Source]
     speed_unit: str
     fans: list[int]
     outliers: tuple[str, ...]
+    hints: tuple[str, ...] = ()
+    damage: tuple[str, ...] = ()
+    sha256: Mapping[Path, str] = field(default_factory=dict)
 
     @property
     def rad_s_per_unit(self) -> float:
@@ -87,66 +112,99 @@ class TrainingData:
 
         return re.sub(rf"({_NUMBER}(?: and {_NUMBER})?) rad/s", in_both, line)
 
-    def tacho_hints(self) -> list[str]:
-        """What speaks against the declared tachos in the longest run; see pipeline.devices.tacho_evidence."""
-        longest = max(self.recorded, key=lambda run: len(run.t_s))
-        return tacho_hints(longest.t_s, longest.speed_rad_s, self.runs[0].tacho, self.fans)
-
 
 def _rounded(value: float) -> str:
     return f"{float(f'{value:.3g}'):g}"
 
 
-def read_training_data(
-    recordings: Sequence[Path],
-    tray: str | None,
-    fans: str | None,
-    from_s: float,
-    to_s: float,
-    windows_s: Sequence[float] | None = None,
-) -> TrainingData:
+@dataclass(frozen=True)
+class Part:
+    """Which part of each recording is read; see the options. windows_s: of tachos, in place of the recordings' own."""
+
+    tray: str | None = None
+    fans: str | None = None
+    from_s: float = 0.0
+    to_s: float = math.inf
+    windows_s: tuple[float, ...] = ()
+
+
+def read_training_data(recordings: Sequence[Path], part: Part, pool: RecordingsInParallel) -> TrainingData:
     """The runs of several recordings, their outliers left out. Damage in a recording is reported on stderr.
 
-    windows_s: of tachos that count, in place of the recordings' own; see WindowOption.
+    All samples of the part are in memory, 16 bytes for each of a fan: a fit needs them all.
 
     Raises:
         UserError: a recording cannot be used, or they are not in one unit.
     """
-    found = [read_runs(path, tray, fan_numbers(fans), from_s, to_s) for path in recordings]
-    for each in found:
-        if each.damage:
-            typer.echo(each.damage, err=True)
-    return training_data_of(found, fans, windows_s)
+    data = joined(list(pool.map(partial(read_recording_data, part=part), recordings, "reading")))
+    report_damage(data)
+    return data
 
 
-def training_data_of(
-    found: Sequence[RecordedTray], fans: str | None = None, windows_s: Sequence[float] | None = None
-) -> TrainingData:
-    """The runs of what was read of recordings, their outliers left out. fans, windows_s: as for `read_training_data`.
+def report_damage(data: TrainingData) -> None:
+    """Say on stderr what could not be read."""
+    for line in data.damage:
+        typer.echo(line, err=True)
+
+
+def read_recording_data(path: Path, part: Part) -> TrainingData:
+    """The runs of one recording. Raises as `read_training_data`."""
+    found = read_runs(path, part.tray, fan_numbers(part.fans), part.from_s, part.to_s)
+    data = training_data_of(found, part.fans, part.windows_s)
+    longest, tacho = max(
+        ((run, run_data.tacho) for run, run_data in zip(found.runs, data.runs, strict=True)),
+        key=lambda each: len(each[0].t_s),
+    )
+    hints = tacho_hints(longest.t_s, longest.speed_rad_s, tacho, data.fans)
+    return replace(data, hints=tuple(hints), sha256={path: sha256_of(path)})
+
+
+def training_data_of(found: RecordedTray, fans: str | None = None, windows_s: Sequence[float] = ()) -> TrainingData:
+    """The runs of what was read of a recording, their outliers left out. fans, windows_s: as of `Part`.
 
     Raises:
-        UserError: they are not in one unit.
+        UserError: their speed unit is not known.
     """
     from twin.fitting.outliers import without_outliers  # noqa: PLC0415  the command line loads twin only when it is needed
     from twin.runs import Run  # noqa: PLC0415
 
-    counted = counting_tachos(windows_s) if windows_s else None
-    recorded = [run for each in found for run in each.runs]
-    tachos = [counted or each.tacho for each in found for _ in each.runs]
-    unit = common_unit([(each.speed_unit, each.runs[0].path) for each in found])
+    path = found.runs[0].path
+    tacho = counting_tachos(windows_s) if windows_s else found.tacho
+    numbers = fan_numbers(fans) or list(range(found.runs[0].command.shape[1]))
     with twin_errors():
-        cleaned = [
-            without_outliers(Run(run.path.stem, run.t_s, run.command, run.speed_rad_s, tacho))
-            for run, tacho in zip(recorded, tachos, strict=True)
-        ]
-    numbers = fan_numbers(fans) or list(range(recorded[0].command.shape[1]))
-    outliers = tuple(
-        f"{run.path}: fan {fan}: {share:.1%} of the speeds are outliers and left out; check the tacho and its wiring"
-        for run, (_, shares) in zip(recorded, cleaned, strict=True)
-        for fan, share in zip(numbers, shares, strict=False)
-        if share > MANY_OUTLIERS
+        cleaned = [without_outliers(Run(path.stem, run.t_s, run.command, run.speed_rad_s, tacho)) for run in found.runs]
+    return TrainingData(
+        runs=[run for run, _ in cleaned],
+        sources=[Source(path, len(run.t_s), float(run.t_s[0]), float(run.t_s[-1])) for run in found.runs],
+        speed_unit=common_unit([(found.speed_unit, path)]),
+        fans=numbers,
+        outliers=tuple(
+            f"{path}: fan {fan}: {share:.1%} of the speeds are outliers and left out; check the tacho and its wiring"
+            for _, shares in cleaned
+            for fan, share in zip(numbers, shares, strict=False)
+            if share > MANY_OUTLIERS
+        ),
+        damage=(found.damage,) if found.damage else (),
     )
-    return TrainingData([run for run, _ in cleaned], recorded, unit, numbers, outliers)
+
+
+def joined(parts: Sequence[TrainingData]) -> TrainingData:
+    """Training data of several recordings, or parts of them, together.
+
+    Raises:
+        UserError: they are not in one unit.
+    """
+    longest = max(parts, key=lambda part: max(source.samples for source in part.sources))
+    return TrainingData(
+        runs=[run for part in parts for run in part.runs],
+        sources=[source for part in parts for source in part.sources],
+        speed_unit=common_unit([(part.speed_unit, part.sources[0].path) for part in parts]),
+        fans=parts[0].fans,
+        outliers=tuple(dict.fromkeys(line for part in parts for line in part.outliers)),
+        hints=longest.hints,
+        damage=tuple(line for part in parts for line in part.damage),
+        sha256={path: digest for part in parts for path, digest in part.sha256.items()},
+    )
 
 
 def common_unit(found: Sequence[tuple[str, Path]]) -> str:
@@ -203,48 +261,36 @@ def twin_errors() -> Iterator[None]:
         raise UserError(f"this needs the extra `train` ({error.name}); {how_to_install('train')}") from error
 
 
-def data_cards(training_data: TrainingData) -> list[DataCard]:
+def data_cards(data: TrainingData) -> list[DataCard]:
     """One card entry for each file of the training data."""
     from schemas.twin_card import DataCard  # noqa: PLC0415
 
     samples: dict[Path, int] = {}
-    for run in training_data.recorded:
-        samples[run.path] = samples.get(run.path, 0) + len(run.t_s)
-    fans = training_data.runs[0].fans
+    for source in data.sources:
+        samples[source.path] = samples.get(source.path, 0) + source.samples
     return [
-        DataCard(name=path.name, sha256=sha256_of(path), fans=fans, samples=count) for path, count in samples.items()
+        DataCard(name=path.name, sha256=data.sha256.get(path) or sha256_of(path), fans=len(data.fans), samples=count)
+        for path, count in samples.items()
     ]
 
 
-def sha256_of(path: Path) -> str:
-    """The hash of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def read_held_out(
-    training_data: TrainingData,
-    recordings: Sequence[Path],
-    tray: str | None,
-    fans: str | None,
-    from_s: float,
-    to_s: float,
-    windows_s: Sequence[float] | None = None,
+    training_data: TrainingData, recordings: Sequence[Path], part: Part, pool: RecordingsInParallel
 ) -> TrainingData:
     """Recordings for evaluation, which take no part in the fit.
 
     Raises:
         UserError: they cannot be used, are in another unit, or overlap the training data.
     """
-    held_out = read_training_data(recordings, tray, fans, from_s, to_s, windows_s)
+    held_out = read_training_data(recordings, part, pool)
     if held_out.speed_unit != training_data.speed_unit:
         raise UserError(
             f"{recordings[0]}: speeds in {held_out.speed_unit}, the training data are in {training_data.speed_unit}: "
             "give recordings of one unit"
         )
-    for own in held_out.recorded:
-        for other in training_data.recorded:
-            if own.path == other.path and own.t_s[0] <= other.t_s[-1] and other.t_s[0] <= own.t_s[-1]:
+    for own in held_out.sources:
+        for other in training_data.sources:
+            if own.path == other.path and own.first_s <= other.last_s and other.first_s <= own.last_s:
                 raise UserError(
                     f"{own.path}: overlaps the training data; give another recording, or other seconds of it"
                 )
@@ -267,16 +313,3 @@ def check_writable(output: Path, suffix: str) -> None:
             output.unlink()
     except OSError as error:
         raise UserError(f"{output}: cannot be written: {error.strerror}; name another file with -o") from error
-
-
-def make_folder(folder: Path) -> Path:
-    """Create the folder if it is missing.
-
-    Raises:
-        UserError: it cannot be created.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be created: {error.strerror}; name another folder with -o") from error
-    return folder

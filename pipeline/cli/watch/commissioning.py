@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipeline.cli.twins.training_data import read_training_data
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from pipeline.cli.twins.training_data import Part, read_training_data
 from pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, RecordingSite, Stopped
 from pipeline.config.models import Config, TrayConfig
 from pipeline.config.twin_entry import write_twin
@@ -226,5 +227,5 @@ class Commissioning:
 
 def _check_tachos(work: TrayWork) -> None:
     """Raises UserError if the readings for training are not those of the declared tachos."""
-    if hints := read_training_data(work.training, work.name, None, 0.0, float("inf")).tacho_hints():
+    if hints := read_training_data(work.training, Part(work.name), RecordingsInParallel(jobs=1)).hints:
         raise UserError(f"{hints[0]}: declare the tacho that was found as `tacho` in [[tray]], then start again")

@@ -7,36 +7,71 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Protocol, TypeVar
 
 from pipeline.errors import UserError
+from pipeline.recordings.checksum import sha256_of
 from pipeline.recordings.length import longest_s
+from pipeline.replay.offline.kept_samples import KeptSamples, RecordedTray, TrayRuns
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.baseline.shared_offset import LEAST_FANS
-from scoring.calibration.healthy_statistics import HealthyRun
+from scoring.calibration.healthy_statistics import HealthyRun, HealthyStatistics, MixedRatesError, RunWork
 from scoring.limits import Timing, default_timing
 from scoring.samples import Samples, samples_of
-
-MAX_KEPT_SAMPLES = 10_000_000
-"""of fans, about 80 bytes each: so many are kept between passes; with more, recordings are read again"""
 
 REPORTED_EVERY_S = 5.0
 """of the time that the work takes"""
 CLOCK_MARGIN = 1.01
 """by which the clock of a device may be faster than that of the host"""
 
+Result = TypeVar("Result")
+
+
+class MapRecordings(Protocol):
+    """Work on many recordings."""
+
+    def __call__(self, work: Callable[[Path], Result], recordings: Sequence[Path], doing: str, /) -> Iterator[Result]:
+        """Does the work on each recording, in any process; results in their order. doing: for people."""
+        ...
+
+
+def in_this_process(work: Callable[[Path], Result], recordings: Sequence[Path], _doing: str) -> Iterator[Result]:
+    """One recording after another."""
+    return map(work, recordings)
+
 
 @dataclass(frozen=True)
-class RecordedTray:
-    """One tray of one recording."""
+class HealthyPart:
+    """Which samples of each recording count, and the twin that they are compared with.
+
+    from_s, to_s: in seconds since the first sample of the tray. tray: the only one that is used; without it all are.
+    """
+
+    twin: Path
+    overrides: tuple[str, ...] = ()
+    from_s: float = 0.0
+    to_s: float = math.inf
+    tray: str | None = None
+
+    def opened(self, path: Path) -> AbstractContextManager[ReplayInput]:
+        """A recording. Raises as `open_replay_input`."""
+        return open_replay_input([path], None, self.overrides, self.twin, self.from_s, self.to_s, self.tray)
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What is known of a recording without scoring it."""
 
     path: Path
-    tray: str
-    fans: int
+    trays: tuple[RecordedTray, ...]
+    timing: Timing
+    longest_fan_s: float
+    speed_unit: SpeedUnit
 
 
 class HealthyRuns:
@@ -45,63 +80,37 @@ class HealthyRuns:
     def __init__(
         self,
         paths: Sequence[Path],
-        twin: Path,
-        overrides: Sequence[str],
-        progress: Callable[[str], None],
-        from_s: float = 0.0,
-        to_s: float = math.inf,
-        tray: str | None = None,
+        part: HealthyPart,
+        each: MapRecordings = in_this_process,
+        kept: KeptSamples | None = None,
+        progress: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """from_s, to_s: the part of each recording, in seconds since the first sample of the tray. tray: the only one
-        of each recording that is used; without it all are."""
-        self._from_s, self._to_s = from_s, to_s
-        self._tray = tray
+        """each: does the work. kept: where samples are kept between passes. progress: takes how far a recording is."""
         self._paths = paths
-        self._twin = twin
-        self._overrides = overrides
+        self._part = part
+        self._each = each
+        self._kept = kept
         self._progress = progress
-        loaded = load_tray_twin(twin)
-        self._knows_fans = loaded.fans > 1
-        self._tachos = loaded.card.tacho
-        self._unseen_error = loaded.unseen_error
         self._pass = 0
-        self._kept: list[HealthyRun] | None = None
         self.trays: list[RecordedTray] = []
         """of each run of the last pass"""
 
-    def __call__(self) -> Iterator[HealthyRun]:
-        """All runs from the beginning.
+    def __call__(self, work: RunWork) -> Iterator[HealthyStatistics]:
+        """What the work returns for each run. Of one recording in each process, a block is in memory at a time.
 
         Raises:
             UserError: a recording cannot be used.
         """
         self._pass += 1
-        if self._kept is not None:
-            for run in self._kept:
-                yield run._replace(blocks=self._reported(run.name, run.blocks))
-            return
-        self.trays = []
-        kept = _KeptRuns()
-        for path in self._paths:
-            try:
-                for tray, blocks in self._of(path):
-                    self.trays.append(tray)
-                    known_as = range(tray.fans) if self._knows_fans else None
-                    run = kept.recording(HealthyRun(str(path), tray.fans, blocks, known_as, self._tachos, tray.tray))
-                    yield run._replace(blocks=self._reported(str(path), run.blocks))
-            except CodecError as error:
-                raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
-        self._kept = kept.complete
+        of_recording = partial(_work_on, work=work, part=self._part, kept=self._kept, progress=self._progress)
+        found = list(self._each(of_recording, self._paths, f"pass {self._pass} over healthy recordings"))
+        self.trays = [tray for of_one in found for tray, _ in of_one]
+        return (statistics for of_one in found for _, statistics in of_one)
 
-    def _reported(self, name: str, blocks: Iterable[Samples]) -> Iterator[Samples]:
-        where, scored_s, shown_s = f"pass {self._pass}: {name}", 0.0, time.monotonic()
-        self._progress(where)
-        for block in blocks:
-            yield block
-            scored_s += len(block.t_ns) * block.period_ns / NS_PER_S
-            if time.monotonic() - shown_s > REPORTED_EVERY_S:
-                shown_s = time.monotonic()
-                self._progress(f"{where}, {scored_s / 3600.0:.1f} h")
+    def sha256(self) -> dict[Path, str]:
+        """Of the recordings that were used in the last pass."""
+        used = list(dict.fromkeys(tray.path for tray in self.trays))
+        return dict(self._each(_path_and_sha256, used, "naming the recordings in the card"))
 
     def timing(self) -> Timing:
         """The times of the scorer in the configuration of the recordings, with the overrides applied.
@@ -110,16 +119,10 @@ class HealthyRuns:
             UserError: a recording cannot be used; the times are not the same in all; or some trays have one fan and
                 others several.
         """
-        scorers: dict[Path, Any] = {}
-        trays: list[RecordedTray] = []
-        for path in self._paths:
-            with self._opened(path) as replay_input:
-                scorers[path] = replay_input.config.sections["scorer"]
-                trays += [RecordedTray(path, tray.name, tray.fans) for tray in replay_input.trays]
-        _refuse_one_fan_among_several(trays)
+        _refuse_one_fan_among_several([tray for facts in self._facts.values() for tray in facts.trays])
         found: dict[Timing, Path] = {}
-        for path, scorer in scorers.items():
-            found.setdefault(scorer.timing(default_timing(trays[0].fans)), path)
+        for facts in self._facts.values():
+            found.setdefault(facts.timing, facts.path)
         first, *others = found
         for other in others:
             names = [name for name in Timing.model_fields if getattr(first, name) != getattr(other, name)]
@@ -135,16 +138,7 @@ class HealthyRuns:
         Raises:
             UserError: a recording cannot be used, or ends before the part of it that is wanted.
         """
-        total_s = 0.0
-        for path in self._paths:
-            with self._opened(path) as replay_input:
-                fans = sum(tray.fans for tray in replay_input.trays)
-                recorded_s = CLOCK_MARGIN * longest_s(path, replay_input.first_sample_t_ns) + 1.0
-            part_s = min(recorded_s, self._to_s) - self._from_s
-            if part_s <= 0.0:
-                raise UserError(f"{path}: no samples from {self._from_s:g} s to {self._to_s:g} s; see --from and --to")
-            total_s += fans * part_s
-        return total_s
+        return sum(facts.longest_fan_s for facts in self._facts.values())
 
     @property
     def speed_unit(self) -> SpeedUnit:
@@ -153,19 +147,74 @@ class HealthyRuns:
         Raises:
             UserError: it cannot be used.
         """
-        with self._opened(self._paths[0]) as replay_input:
-            return replay_input.trays[0].speed_unit
+        return next(iter(self._facts.values())).speed_unit
 
-    def _of(self, path: Path) -> Iterator[tuple[RecordedTray, Iterator[Samples]]]:
-        with self._opened(path, self._from_s, self._to_s) as replay_input:
-            for tray in replay_input.trays:
-                name = tray.name
-                predictions = replay_input.pipeline(name).predictions()
-                samples = (samples_of(block, self._unseen_error) for block in predictions)
-                yield RecordedTray(path, name, tray.fans), samples
+    @cached_property
+    def _facts(self) -> dict[Path, _Facts]:
+        found = self._each(partial(_facts_of, part=self._part), self._paths, "opening healthy recordings")
+        return {facts.path: facts for facts in found}
 
-    def _opened(self, path: Path, from_s: float = 0.0, to_s: float = math.inf) -> AbstractContextManager[ReplayInput]:
-        return open_replay_input([path], None, self._overrides, self._twin, from_s, to_s, self._tray)
+
+def _facts_of(path: Path, part: HealthyPart) -> _Facts:
+    with part.opened(path) as replay_input:
+        trays = tuple(RecordedTray(path, tray.name, tray.fans) for tray in replay_input.trays)
+        recorded_s = CLOCK_MARGIN * longest_s(path, replay_input.first_sample_t_ns) + 1.0
+        scorer = replay_input.config.sections["scorer"]
+        timing = scorer.timing(default_timing(trays[0].fans))  # type: ignore[attr-defined]  the scorer's own settings
+        speed_unit = replay_input.trays[0].speed_unit
+    part_s = min(recorded_s, part.to_s) - part.from_s
+    if part_s <= 0.0:
+        raise UserError(f"{path}: no samples from {part.from_s:g} s to {part.to_s:g} s; see --from and --to")
+    return _Facts(path, trays, timing, part_s * sum(tray.fans for tray in trays), speed_unit)
+
+
+def _path_and_sha256(path: Path) -> tuple[Path, str]:
+    return path, sha256_of(path)
+
+
+def _work_on(
+    path: Path, work: RunWork, part: HealthyPart, kept: KeptSamples | None, progress: Callable[[str], None]
+) -> list[tuple[RecordedTray, HealthyStatistics]]:
+    twin = load_tray_twin(part.twin)
+    found: list[tuple[RecordedTray, HealthyStatistics]] = []
+    try:
+        for tray, blocks in (kept and kept.of(path)) or _computed(path, part, kept):
+            known_as = range(tray.fans) if twin.fans > 1 else None
+            reported = _reported(blocks, f"{path.name} {tray.tray}", progress)
+            run = HealthyRun(str(path), tray.fans, reported, known_as, twin.card.tacho, tray.tray)
+            found.append((tray, work(run)))
+    except CodecError as error:
+        raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
+    except MixedRatesError as error:
+        rates = f"{NS_PER_S / error.first[1]:g} Hz and {NS_PER_S / error.other[1]:g} Hz"
+        raise UserError(
+            f"{path}: its grid changes between {rates}, and limits hold for one rate: calibrate without it"
+        ) from error
+    return found
+
+
+def _computed(path: Path, part: HealthyPart, kept: KeptSamples | None) -> TrayRuns:
+    """The samples of each tray of a recording, computed as the stages do."""
+    unseen_error = load_tray_twin(part.twin).unseen_error
+    with part.opened(path) as replay_input:
+        runs = (
+            (
+                RecordedTray(path, tray.name, tray.fans),
+                (samples_of(block, unseen_error) for block in replay_input.pipeline(tray.name).predictions()),
+            )
+            for tray in replay_input.trays
+        )
+        yield from kept.keep(path, runs) if kept else runs
+
+
+def _reported(blocks: Iterable[Samples], what: str, progress: Callable[[str], None]) -> Iterator[Samples]:
+    scored_s, shown_s = 0.0, time.monotonic()
+    for block in blocks:
+        yield block
+        scored_s += len(block.t_ns) * block.period_ns / NS_PER_S
+        if time.monotonic() - shown_s > REPORTED_EVERY_S:
+            shown_s = time.monotonic()
+            progress(f"{what}, {scored_s / 3600.0:.1f} h")
 
 
 def _refuse_one_fan_among_several(trays: Sequence[RecordedTray]) -> None:
@@ -182,36 +231,3 @@ def _refuse_one_fan_among_several(trays: Sequence[RecordedTray]) -> None:
             "for one kind of tray, since fans beside others are compared with them: calibrate twice, and write one of "
             "the twins to another file with -o; --tray chooses a tray of recordings with several"
         )
-
-
-class _KeptRuns:
-    """The blocks of all runs, kept while they are gone through for the first time, if they are not too many."""
-
-    def __init__(self) -> None:
-        self._runs: list[HealthyRun] | None = []
-        self._room = MAX_KEPT_SAMPLES
-        self._unfinished = 0
-
-    @property
-    def complete(self) -> list[HealthyRun] | None:
-        """The runs; None if they were too many, or one was not read to its end."""
-        return None if self._unfinished else self._runs
-
-    def recording(self, run: HealthyRun) -> HealthyRun:
-        """The same run, whose blocks are kept as they are read."""
-        kept: list[Samples] = []
-        if self._runs is not None:
-            self._runs.append(run._replace(blocks=kept))
-        return run._replace(blocks=self._recorded(run.blocks, kept))
-
-    def _recorded(self, blocks: Iterable[Samples], kept: list[Samples]) -> Iterator[Samples]:
-        self._unfinished += 1
-        for block in blocks:
-            self._room -= block.speed_rad_s.size
-            if self._room < 0:
-                self._runs = None
-                kept.clear()
-            else:
-                kept.append(block)
-            yield block
-        self._unfinished -= 1

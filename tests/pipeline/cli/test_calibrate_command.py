@@ -15,6 +15,7 @@ from pipeline.cli.main import expand_variadic
 from pipeline.cli.twins.calibration_check import Check
 from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.runtime.tray_twin import load_tray_twin
+from scoring.calibration.healthy_statistics import RunWork
 from scoring.limits import Limits, default_timing
 from tests.support.fantwin_command import error_of, fantwin
 
@@ -167,7 +168,7 @@ def test_too_little_data_for_any_limit_is_refused_also_with_extrapolate(folder: 
 def test_recordings_too_short_for_the_rate_are_refused_before_any_of_them_is_scored(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def scored(self: HealthyRuns) -> NoReturn:
+    def scored(self: HealthyRuns, work: RunWork) -> NoReturn:
         raise AssertionError("scored")
 
     monkeypatch.setattr(HealthyRuns, "__call__", scored)

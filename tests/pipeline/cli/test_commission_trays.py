@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
+from pipeline.cli.twins.training_data import Part
 from pipeline.cli.watch import commission, commissioning
 from pipeline.cli.watch.child_commands import Commands, Stopped
 from pipeline.config.models import TrayConfig
@@ -248,8 +249,8 @@ def test_only_the_chosen_tray_gets_a_twin_under_the_chosen_name(played: Played) 
 def test_a_wrong_tacho_of_a_tray_is_found_before_it_is_swept_again(
     played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def read(_recordings: object, tray: str, *_part: object) -> SimpleNamespace:
-        return SimpleNamespace(tacho_hints=lambda: ["fan 0: counts over 0.5 s"] if tray == "a" else [])
+    def read(_recordings: object, part: Part, _each: object) -> SimpleNamespace:
+        return SimpleNamespace(hints=("fan 0: counts over 0.5 s",) if part.tray == "a" else ())
 
     monkeypatch.setattr(commissioning, "read_training_data", read)
     result = played.commission("--sweep")

@@ -1,6 +1,7 @@
 """Progress on stderr while a command works without a terminal."""
 
 import math
+import signal
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
@@ -44,8 +45,11 @@ def test_without_a_terminal_work_is_reported_once(capsys: pytest.CaptureFixture[
     assert capsys.readouterr().err == "drawing page.html\n"
 
 
-def test_ctrl_c_ends_with_one_line_and_its_own_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_sigterm_end_with_one_line_and_their_own_exit_code(
+    capsys: pytest.CaptureFixture[str], number: signal.Signals
+) -> None:
     with pytest.raises(typer.Exit) as ended, progress.interruptible("no twin was written"):
-        raise KeyboardInterrupt
+        signal.raise_signal(number)
     assert ended.value.exit_code == 130
     assert capsys.readouterr().err == "interrupted: no twin was written\n"

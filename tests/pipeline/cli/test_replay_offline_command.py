@@ -230,10 +230,19 @@ def test_a_time_range_is_judged_and_compared_with_the_recorded_alarms_of_that_ra
     assert "--start" in error("--json", GOLDEN, "--start", "1000")
 
 
-def test_parts_of_two_runs_are_refused(tmp_path):
+def test_files_of_two_runs_are_two_recordings(tmp_path):
     site = Site(tmp_path, seed=1)
     site.run(100)
-    assert "two runs" in error(GOLDEN, site.finished())
+    other = site.finished()
+    both = json.loads(replay("--json", "--verify", GOLDEN, other).stdout)
+    each = [json.loads(replay("--json", "--verify", path).stdout) for path in (GOLDEN, other)]
+    assert [one["files"] for one in both["recordings"]] == [[str(GOLDEN)], [str(other)]]
+    for name in ("samples", "lost", "restarts"):
+        assert both[name] == sum(one[name] for one in each)
+    assert both["verified"]["samples_equal"] == sum(one["verified"]["samples_equal"] for one in each)
+    assert both["verified"]["equal"]
+    shown = replay(GOLDEN, other).stdout
+    assert "1 alarm in" in shown and f"{GOLDEN}: alarms, s since the first sample" in shown
 
 
 def test_an_attachment_is_written_nowhere_else(tmp_path):

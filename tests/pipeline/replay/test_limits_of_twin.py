@@ -38,7 +38,7 @@ def test_calibration_knows_top_speed_bend_drive_and_tachos_of_all_twins(
     faster = replace(plain, card=replace(plain.card, speed_range_rad_s=(0.0, 700.0)))
     counting = replace(plain, card=replace(plain.card, tacho=(Tacho(kind="count", window_s=0.5),)))
     for twins in ([plain], [with_a_drive(plain)], [with_a_drive(plain), faster], [plain, counting]):
-        limits_of_twin.find_limits(twins, lambda: iter(()), Timing(), 1.0, alarms_left_out=2)
+        limits_of_twin.find_limits(twins, lambda _work: iter(()), Timing(), 1.0, alarms_left_out=2)
     bend_rad_s = plain.bend_rad_s
     assert bend_rad_s
     common = {"crossover_speed_rad_s": bend_rad_s, "sigma_rad_s": pytest.approx(plain.sigma_rad_s.mean())}
@@ -73,7 +73,7 @@ def test_calibration_knows_the_sigma_of_each_fan_relative_to_its_full_speed(
     without_drag = replace(balance, viscous=np.array([0.002, 0.0]), drag=np.zeros(2))
     assert replace(twin, balance=without_drag).full_speed_rad_s == pytest.approx([500.0, twin.card.top_speed_rad_s])
     for twins in ([twin], [twin, twin]):
-        limits_of_twin.find_limits(twins, lambda: iter(()), Timing(), 1.0)
+        limits_of_twin.find_limits(twins, lambda _work: iter(()), Timing(), 1.0)
     assert given[0]["speed"] == pytest.approx([0.01, 0.01])
     assert given[0]["balance"].tolist() == [0.01, 0.02]
     assert given[1] == {}

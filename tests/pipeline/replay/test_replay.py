@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 from pipeline.cli.recordings.replay import status_line
+from pipeline.cli.recordings.score_again import Again
 from pipeline.replay.live.player import Progress
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from stages.resampler import ResamplerConfig, ResamplerCore
@@ -62,13 +64,14 @@ def test_a_tray_that_the_configuration_lacks_is_one_line(recording, tmp_path):
 def test_deciding_again_is_handed_over_as_it_was_asked_for(recording, tmp_path, monkeypatch):
     asked: dict[str, object] = {}
     stand_in = ModuleType("pipeline.cli.recordings.replay_offline")
-    vars(stand_in)["run_offline"] = lambda files, **words: asked.update(words, files=files)
+    vars(stand_in)["run_offline"] = lambda files, again, output, _pool, *, json_output: asked.update(
+        files=files, again=again, output=output, json_output=json_output
+    )
     monkeypatch.setitem(sys.modules, "pipeline.cli.recordings.replay_offline", stand_in)
     words = ["--offline", "--verify", "--twin", "t.onnx", "-o", "out.mcap", "--start", 1, "--set", "site=x", "--json"]
     assert fantwin("replay", recording, *words).exit_code == 0
-    assert asked["files"] == [recording]
-    assert (asked["verify"], asked["json_output"], asked["start_s"], asked["end_s"]) == (True, True, 1.0, math.inf)
-    assert (str(asked["twin"]), str(asked["output"]), asked["overrides"]) == ("t.onnx", "out.mcap", ["site=x"])
+    assert (asked["files"], asked["output"], asked["json_output"]) == ([recording], Path("out.mcap"), True)
+    assert asked["again"] == Again(None, ("site=x",), Path("t.onnx"), verify=True, start_s=1.0, end_s=math.inf)
 
 
 def test_the_status_line_shows_time_position_rate_and_messages():

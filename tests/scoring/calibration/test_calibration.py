@@ -11,13 +11,11 @@ import pytest
 from schemas.messages import Array
 from schemas.units import NS_PER_S
 from scoring.calibration.alarm_rate import dispersion, poisson_interval, rate_interval
-from scoring.calibration.calibration import TooLittleError, _with_alarms_at_most, calibrate
+from scoring.calibration.calibration import TooLittleError, _with_alarms_at_most
 from scoring.calibration.healthy_statistics import (
     HealthyRun,
     HealthyStatistics,
     MixedRatesError,
-    Runs,
-    healthy_statistics,
 )
 from scoring.calibration.tail import Tail
 from scoring.calibration.windows import WindowMaxima, Windows, peaks
@@ -28,6 +26,7 @@ from scoring.detectors.tacho import TachoSettings
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, Timing
 from scoring.samples import Samples
+from tests.support.calibrated_runs import MadeRuns, calibrate, statistics_of
 from tests.support.healthy_residuals import STEP_NS, Raised, alarms_of, autoregressive, in_blocks, samples_of
 
 TOP_RAD_S = 200.0
@@ -45,7 +44,7 @@ def healthy(
     runs: int = RUNS,
     samples: int = RUN_SAMPLES,
     period_ns: int = STEP_NS,
-) -> Runs:
+) -> MadeRuns:
     def each() -> Iterator[HealthyRun]:
         for run in range(runs):
             speed, balance = (
@@ -65,7 +64,7 @@ def of_fans(block: Samples, fans: Array) -> Samples:
     )
 
 
-def coarse_and_short(memory_s: float, seed: int, runs: int = RUNS) -> Runs:
+def coarse_and_short(memory_s: float, seed: int, runs: int = RUNS) -> MadeRuns:
     """Five fan-hours at the least cost: the more fans and the fewer samples, the less there is to compute."""
     return healthy(memory_s, seed, MANY_FANS, runs, SHORT_SAMPLES, COARSE_NS)
 
@@ -233,7 +232,7 @@ def days(
     period_ns: int = STEP_NS,
     wrong_sigmas: float = 0.0,
     known_as: range | None = None,
-) -> Runs:
+) -> MadeRuns:
     """Runs in which speeds hold for ten seconds each; on every day the speed is off by a share, or by a constant.
 
     wrong_sigmas: the twin is wrong by about so much, of each fan otherwise at each speed.
@@ -459,7 +458,7 @@ def test_an_excursion_over_several_windows_counts_once() -> None:
 
 
 def test_only_samples_with_a_score_are_counted(white_limits: Limits) -> None:
-    found = healthy_statistics(healthy(0.0, 11, fans=2, runs=2, samples=2500), white_limits, TOP_RAD_S)
+    found = statistics_of(healthy(0.0, 11, fans=2, runs=2, samples=2500), white_limits, TOP_RAD_S)
     assert found.fan_s == pytest.approx(2 * 2 * 24.0)
     assert found.windows == 2 * 2 * 3
 

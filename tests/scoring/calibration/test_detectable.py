@@ -10,12 +10,13 @@ import pytest
 from schemas.messages import Array
 from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.settings import BaselineSettings
-from scoring.calibration.calibration import FragmentedError, calibrate
+from scoring.calibration.calibration import FragmentedError
 from scoring.calibration.detectable import detectable_drops
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.detectors.drift import DriftSettings
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.limits import Limits, Timing
+from tests.support.calibrated_runs import calibrate
 from tests.support.healthy_residuals import alarms_of, autoregressive, samples_of
 from tests.support.scored_blocks import balance_of_a_fan
 

@@ -11,8 +11,8 @@ import pytest
 
 from schemas.messages import Array
 from schemas.tacho import INSTANTANEOUS, Tacho
-from scoring.calibration.calibration import SHARED_SHARE, calibrate
-from scoring.calibration.healthy_statistics import HealthyRun, Runs
+from scoring.calibration.calibration import SHARED_SHARE
+from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.detectors.detector import Signal
 from scoring.detectors.deviation import summed_deviation
 from scoring.detectors.drift import DriftSettings
@@ -20,6 +20,7 @@ from scoring.detectors.smoothed import SmoothedSettings
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, Timing, default_timing
 from scoring.samples import Samples
+from tests.support.calibrated_runs import MadeRuns, calibrate
 from tests.support.healthy_residuals import Raised, alarms_of, autoregressive, in_blocks, samples_of
 
 PERIOD_NS = 100_000_000
@@ -38,7 +39,7 @@ def tray(seed: int, seconds: float, shift_sigmas: Array | float = 0.0) -> Sample
     return replace(made, speed_sigma_rad_s=sigma, balance_sigma=sigma)
 
 
-def healthy(runs: int, seconds: float, tachos: tuple[Tacho, ...] = INSTANTANEOUS) -> Runs:
+def healthy(runs: int, seconds: float, tachos: tuple[Tacho, ...] = INSTANTANEOUS) -> MadeRuns:
     def each() -> Iterator[HealthyRun]:
         for run in range(runs):
             yield HealthyRun(f"run {run}", FANS, in_blocks(tray(10 * run, seconds)), tachos=tachos)
@@ -200,7 +201,7 @@ def test_with_the_margins_of_few_data_the_recordings_have_no_more_alarms_than_de
 
 
 def test_what_one_fan_alone_does_at_a_speed_is_not_expected_of_the_others() -> None:
-    def each(slow_fans: range) -> Runs:
+    def each(slow_fans: range) -> MadeRuns:
         def runs() -> Iterator[HealthyRun]:
             made = tray(8, 1200.0)
             row = np.arange(len(made.t_ns))[:, np.newaxis]
@@ -219,7 +220,7 @@ def test_what_one_fan_alone_does_at_a_speed_is_not_expected_of_the_others() -> N
 
 
 def test_the_fewer_speeds_were_seen_the_wider_are_the_limits() -> None:
-    def at(speeds_rad_s: list[float]) -> Runs:
+    def at(speeds_rad_s: list[float]) -> MadeRuns:
         def each() -> Iterator[HealthyRun]:
             for number, block in enumerate([tray(5, 240.0)]):
                 rows = np.arange(len(block.t_ns)) * len(speeds_rad_s) // len(block.t_ns)

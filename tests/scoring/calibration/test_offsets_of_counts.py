@@ -10,11 +10,11 @@ import numpy as np
 from schemas.messages import Array
 from schemas.tacho import Tacho
 from scoring.baseline.healthy_residual import FanOffsets, HealthyResidual
-from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, default_timing
 from scoring.samples import Samples
+from tests.support.calibrated_runs import calibrate
 from tests.support.healthy_residuals import autoregressive, in_blocks, rows_of, samples_of
 
 FANS, RUNS, PERIOD_NS = 3, 12, 100_000_000

@@ -10,10 +10,10 @@ import pytest
 
 from schemas.tacho import INSTANTANEOUS, Tacho
 from scoring.baseline.healthy_residual import HealthyResidual
-from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.calibration.unvisited_speeds import wider_at_unvisited_speeds
 from scoring.limits import Limits, default_timing
+from tests.support.calibrated_runs import calibrate
 from tests.support.healthy_residuals import in_blocks, samples_of
 
 FANS, TOP_RAD_S, HELD_RAD_S = 4, 200.0, 100.0

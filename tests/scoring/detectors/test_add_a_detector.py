@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from schemas.messages import Alarm, Array, Statistic, Transition
-from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.detectors import table
 from scoring.detectors.alarm_units import AlarmUnits
@@ -25,6 +24,7 @@ from scoring.detectors.detector import (
 )
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, Timing
+from tests.support.calibrated_runs import calibrate
 from tests.support.healthy_residuals import autoregressive, in_blocks, samples_of
 from tests.support.scored_blocks import CALIBRATION, commissioned, core_of, feed, prediction_of, snapshot_of
 

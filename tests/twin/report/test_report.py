@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import astuple, replace
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,16 +24,18 @@ from tests.pipeline.cli.test_train_commands import record
 from tests.support.browser import seen_in_browser
 from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run, rough_run
 from tests.support.fantwin_command import error_of, fantwin
+from twin.build import runs_of_twin
 from twin.export.onnx_twin import OnnxTwin
 from twin.fitting.identification import identify
 from twin.models.physical import PhysicalModel
 from twin.models.physics import PARAMETER_NAMES
 from twin.report import figures
 from twin.report.assessment import assess
-from twin.report.content import Content, SpeedUnit, report_content
+from twin.report.content import Content, SpeedUnit, report_content, summary_of
 from twin.report.figures import error_over_speed, histogram
 from twin.report.page import MOST_FANS_DRAWN, drawn_fans, report_page, shown
-from twin.report.speed_bins import speed_bins
+from twin.report.recording_sums import common_extent, extent_of, recording_sums
+from twin.report.speed_bins import speed_sums
 from twin.report.steady_states import static_curve
 from twin.report.timeline import broken_at, kept_samples, timeline
 from twin.runs import Run
@@ -409,18 +411,39 @@ def test_ticks_of_small_figures_leave_room_for_large_speeds(twin):
         assert 2 <= len(re.findall(r'id="[^"]*-xtick_\d+"', drawn)) <= 6
 
 
+def test_recordings_summed_one_by_one_give_the_figures_of_all_their_samples(twin):
+    runs = [published_run(2, 10.0), published_run(3, 14.0)]
+    extent = common_extent([extent_of([run]) for run in runs])
+    first, second = (recording_sums(runs_of_twin(twin, [run]), extent) for run in runs)
+    summary = summary_of(twin, first + second, extent, [], RAD_S)
+    content = report_content(twin, runs, [], RAD_S)
+    (fan,), (of_samples,) = summary.fans, content.fans
+    error = of_samples.error_rad_s[np.isfinite(of_samples.error_rad_s)]
+    speed = of_samples.measured_rad_s[np.isfinite(of_samples.error_rad_s)]
+    assert fan.figures.rmse_rad_s == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert fan.figures.r2 == pytest.approx(1.0 - np.sum(error**2) / np.sum((speed - speed.mean()) ** 2))
+    assert fan.error_std_rad_s == pytest.approx(error.std())
+    assert astuple(fan.figures) == pytest.approx(astuple(of_samples.figures))
+    assert fan.residual.ljung_box_p == pytest.approx(of_samples.residual.ljung_box_p)
+    np.testing.assert_allclose(fan.residual.cross_correlation, of_samples.residual.cross_correlation, atol=1e-9)
+    assert [part.middle_rad_s for part in fan.by_speed] == [part.middle_rad_s for part in of_samples.by_speed]
+    assert assess(summary) == assess(content)
+
+
 def test_errors_are_gathered_by_speed_and_few_samples_make_no_point():
     rng = np.random.default_rng(1)
     speed = rng.uniform(0.0, 100.0, 20_000)
     error = rng.normal(np.where(speed < 50.0, 4.0, 0.0), 1.0)
     speed[0], speed[1] = 300.0, np.nan
-    bins = speed_bins(speed, error)
+    range_rad_s = np.array([[0.0], [300.0]])
+    bins = speed_sums(speed[:, np.newaxis], error[:, np.newaxis], range_rad_s).bins(0, range_rad_s[:, 0])
     assert len(bins) == 7  # of 20 up to 300 rad/s: those that reach below 100
     for part in bins:
         if not 45.0 < part.middle_rad_s < 55.0:
             assert part.mean_rad_s == pytest.approx(4.0 if part.middle_rad_s < 50.0 else 0.0, abs=0.15)
             assert part.std_rad_s == pytest.approx(1.0, abs=0.1)
-    assert speed_bins(np.full(5, np.nan), np.zeros(5)) == ()
+    nothing = speed_sums(np.full((5, 1), np.nan), np.zeros((5, 1)), range_rad_s)
+    assert nothing.bins(0, range_rad_s[:, 0]) == nothing.bins(0, np.full(2, np.nan)) == ()
 
 
 def test_invalid_input_is_a_one_line_error(folder, tmp_path):

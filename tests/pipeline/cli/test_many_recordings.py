@@ -1,0 +1,256 @@
+"""Commands over many recordings: the same result from one process and from several, bad recordings, and the end."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+from typer.testing import Result
+
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from pipeline.cli.twins.training_data import Part, read_recording_data
+from pipeline.errors import UserError
+from tests.support.but_for_times import but_for_times, content_of
+from tests.support.fan_data import published_run
+from tests.support.fantwin_command import error_of, fantwin
+from tests.support.written_recordings import write_run
+
+RECORDINGS = ("a.mcap", "b.mcap", "c.mcap")
+BAD = "bad.mcap"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three recordings of a healthy tray, a file that is none, and a twin."""
+    path = tmp_path_factory.mktemp("many")
+    for seed, name in enumerate(RECORDINGS, start=1):
+        write_run(path / name, published_run(seed, 40.0 + 5.0 * seed, fans=2))
+    (path / BAD).write_bytes(b"nothing that was recorded")
+    trained = fantwin("train", path / "a.mcap", "--model", "physical", "-o", path / "twin.onnx")
+    assert trained.exit_code == 0, trained.output
+    return path
+
+
+def words_of(command: str, folder: Path, recordings: Sequence[Path | str], output: Path) -> list[object]:
+    """The words of each command, which writes into the folder `output` if it writes anything."""
+    twin = folder / "twin.onnx"
+    words: dict[str, list[object]] = {
+        "identify": [*recordings],
+        "train": [*recordings, "--model", "physical", "-o", output / "trained.onnx"],
+        "compare": [*recordings, "--model", "physical", "-o", output],
+        "evaluate": [twin, *recordings, "--rate", 50, "--rate", "irregular"],
+        "calibrate": [
+            twin,
+            *recordings,
+            "--false-alarms-per-day",
+            1500,
+            "--extrapolate",
+            "-o",
+            output / "calibrated.onnx",
+        ],
+        "replay": ["--offline", *recordings, "--twin", twin, "-o", output],
+    }
+    return [command, *words[command], "--json"]
+
+
+COMMANDS = ("identify", "train", "compare", "evaluate", "calibrate", "replay")
+
+
+def outcome_of(result: Result, output: Path) -> tuple[str, dict[str, bytes]]:
+    """What a command printed and what it wrote, but for times and the name of the folder."""
+    printed = json.dumps(but_for_times(json.loads(result.stdout))).replace(str(output), "OUTPUT")
+    written = {path.name: content_of(path).replace(str(output).encode(), b"OUTPUT") for path in output.iterdir()}
+    return printed, written
+
+
+def run_all(command: str, folder: Path, names: tuple[str, ...], output: Path, *options: object) -> Result:
+    output.mkdir()
+    return fantwin(*words_of(command, folder, [folder / name for name in names], output), *options)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_one_process_and_two_print_and_write_the_same(folder: Path, tmp_path: Path, command: str) -> None:
+    outcomes = []
+    for jobs in (1, 2):
+        output = tmp_path / f"with-{jobs}"
+        result = run_all(command, folder, RECORDINGS, output, "--jobs", jobs)
+        assert result.exit_code == 0, result.output
+        outcomes.append(outcome_of(result, output))
+    assert outcomes[0] == outcomes[1]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_recordings_at_urls_give_what_files_give(folder: Path, tmp_path: Path, command: str) -> None:
+    memory = pytest.importorskip("fsspec", reason="the extra `remote` is not installed").filesystem("memory")
+    for name in RECORDINGS:
+        memory.pipe_file(f"/many/{name}", (folder / name).read_bytes())
+    outputs = [tmp_path / "files", tmp_path / "urls"]
+    outcomes = []
+    for output, place in zip(outputs, (str(folder), "memory://many"), strict=True):
+        output.mkdir()
+        words = words_of(command, folder, [f"{place}/{name}" for name in RECORDINGS], output)
+        result = fantwin(*words, "--jobs", 1)
+        assert result.exit_code == 0, result.output
+        printed, written = outcome_of(result, output)
+        outcomes.append((printed.replace(place, "PLACE"), written))
+    memory.store.clear()
+    assert outcomes[0] == outcomes[1]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_bad_recording_stops_all_before_anything_is_written_or_is_skipped_and_named(
+    folder: Path, tmp_path: Path, command: str
+) -> None:
+    names = (*RECORDINGS[:1], BAD, *RECORDINGS[1:2])
+    output = tmp_path / "stopped"
+    output.mkdir()
+    error = error_of(*words_of(command, folder, [folder / name for name in names], output), "--jobs", 1)
+    assert error == f"{folder / BAD}: not a recording (MCAP); make one from a table with `fantwin import`"
+    assert list(output.iterdir()) == []
+
+    skipping, without = tmp_path / "skipping", tmp_path / "without"
+    result = run_all(command, folder, names, skipping, "--jobs", 1, "--skip-bad")
+    assert result.exit_code == 4, result.output
+    assert result.stderr.splitlines()[-1] == f"skipped: {error}"
+    document = json.loads(result.stdout)
+    assert document.pop("skipped") == [{"recording": str(folder / BAD), "reason": error}]
+    good = run_all(command, folder, RECORDINGS[:2], without, "--jobs", 1)
+    assert outcome_of(result, skipping)[1] == outcome_of(good, without)[1]
+    same = json.dumps(but_for_times(document)).replace(str(skipping), str(without))
+    assert same == json.dumps(but_for_times(json.loads(good.stdout)))
+
+
+def test_the_error_of_another_process_is_that_of_one_and_of_several_the_first_argument_s(folder: Path) -> None:
+    bad = [folder / "none.mcap", folder / BAD]
+    alone = error_of("identify", folder / "a.mcap", *bad, "--jobs", 1)
+    assert alone == f"{folder / 'none.mcap'}: cannot read the recording: No such file or directory"
+    assert error_of("identify", folder / "a.mcap", *bad, "--jobs", 3) == alone
+    assert error_of("identify", *bad, "--jobs", 2, "--skip-bad") == alone, "where none is left, that is an error"
+
+
+def test_a_recording_of_which_nothing_can_be_scored_is_bad_and_leaves_no_output(folder: Path, tmp_path: Path) -> None:
+    short = write_run(tmp_path / "short.mcap", published_run(9, 0.05, fans=2))
+    words = ("replay", "--offline", folder / "a.mcap", short, "--twin", folder / "twin.onnx", "-o", tmp_path / "out")
+    result = fantwin(*words, "--jobs", 1, "--skip-bad", "--json")
+    assert result.exit_code == 4, result.output
+    (skipped,) = json.loads(result.stdout)["skipped"]
+    assert skipped["recording"] == str(short) and "no sample could be scored" in skipped["reason"]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.mcap"]
+
+
+def test_a_recording_that_was_skipped_stays_so_in_all_that_follows(folder: Path) -> None:
+    paths = [folder / name for name in (BAD, "a.mcap")]
+    pool = RecordingsInParallel(jobs=1, skip_bad=True)
+    assert len(list(pool.map(lambda path: read_recording_data(path, Part()), paths, "reading"))) == 1
+    seen: list[Path] = []
+    list(pool.map(seen.append, paths, "again"))
+    assert seen == [folder / "a.mcap"]
+
+
+def loaded_by(work: Callable[[Path], object]) -> Callable[[Path], bool]:
+    def is_loaded(path: Path) -> bool:
+        work(path)
+        return "torch" in sys.modules
+
+    return is_loaded
+
+
+def test_processes_that_read_recordings_do_not_load_torch(folder: Path) -> None:
+    paths = [folder / name for name in RECORDINGS[:2]]
+    read = loaded_by(lambda path: read_recording_data(path, Part()))
+    assert list(RecordingsInParallel(jobs=2).map(read, paths, "reading")) == [False, False]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_linear_algebra_has_one_thread_in_every_process(folder: Path, jobs: int) -> None:
+    """With more it rounds in another order, so results would depend on the number of cores."""
+    paths = [folder / name for name in RECORDINGS[:2]]
+    with threadpool_limits(2), RecordingsInParallel(jobs) as pool:
+        found = pool.map(lambda _path: {each["num_threads"] for each in threadpool_info()}, paths, "counting")
+        assert list(found) == [{1}, {1}]
+
+
+def test_a_process_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
+    def end_itself(_path: Path) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    paths = [folder / name for name in RECORDINGS[:2]]
+    with pytest.raises(UserError, match="ended from outside, .* fewer --jobs than 2"):
+        list(RecordingsInParallel(jobs=2).map(end_itself, paths, "reading"))
+
+
+def test_ctrl_c_ends_all_processes_with_one_line(tmp_path: Path) -> None:
+    """Both workers wait in the middle of their recording, which is a pipe, when the terminal sends Ctrl-C to all."""
+    pipes = [tmp_path / name for name in ("one.mcap", "two.mcap")]
+    for pipe in pipes:
+        os.mkfifo(pipe)
+    command = subprocess.Popen(
+        [sys.executable, "-m", "pipeline", "identify", *map(str, pipes), "--jobs", "2"],
+        stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    ends = [os.open(pipe, os.O_WRONLY) for pipe in pipes]  # returns when a worker has opened it
+    os.killpg(command.pid, signal.SIGINT)
+    _, errors = command.communicate(timeout=60)
+    assert (command.returncode, errors) == (130, "interrupted: nothing was identified\n")
+    closed = select.poll()
+    for end in ends:
+        closed.register(end, 0)
+        assert closed.poll(60_000), "the worker that read it has not ended"
+        closed.unregister(end)
+        os.close(end)
+
+
+def test_a_command_that_is_ended_while_it_fetches_a_recording_leaves_no_copy(tmp_path: Path) -> None:
+    pytest.importorskip("s3fs", reason="the extra `remote` is not installed")
+    begun, ended = threading.Semaphore(0), threading.Event()
+
+    class Endless(BaseHTTPRequestHandler):
+        """Sends the beginning of a file, and no more."""
+
+        def do_HEAD(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Length", "1000000")
+            self.send_header("Accept-Ranges", "none")
+            self.end_headers()
+
+        def do_GET(self) -> None:
+            self.do_HEAD()
+            self.wfile.write(bytes(1000))
+            self.wfile.flush()
+            begun.release()
+            ended.wait()
+
+        def log_message(self, *_args: object) -> None:
+            """Nothing."""
+
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    with ThreadingHTTPServer(("127.0.0.1", 0), Endless) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        urls = [f"http://127.0.0.1:{server.server_port}/{name}" for name in RECORDINGS[:2]]
+        command = subprocess.Popen(
+            [sys.executable, "-m", "pipeline", "identify", *urls, "--jobs", "2"],
+            stderr=subprocess.PIPE, text=True, env=os.environ | {"TMPDIR": str(temporary)},
+        )  # fmt: skip
+        assert begun.acquire(timeout=120) and begun.acquire(timeout=120)
+        assert len([*temporary.glob("fantwin-copies-*/fantwin-copies-*")]) == 2
+        command.terminate()
+        _, errors = command.communicate(timeout=60)
+        ended.set()
+        server.shutdown()
+    assert (command.returncode, errors) == (130, "interrupted: nothing was identified\n")
+    assert [*temporary.iterdir()] == []
+
+
+def test_jobs_and_a_cluster_are_not_both_wanted_and_no_cluster_is_one_line(folder: Path) -> None:
+    assert "give one" in error_of("identify", folder / "a.mcap", "--jobs", 2, "--scheduler", "tcp://127.0.0.1:1")

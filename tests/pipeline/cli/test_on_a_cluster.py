@@ -1,0 +1,61 @@
+"""Commands on real Dask workers on this host."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from pipeline.errors import UserError
+from tests.pipeline.cli.test_many_recordings import RECORDINGS, folder, outcome_of, run_all
+from tests.support.fantwin_command import error_of
+
+dask = pytest.importorskip("dask", reason="the extra `cluster` is not installed")
+distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+
+__all__ = ["folder"]
+
+
+def cluster_of(workers: int) -> Any:
+    return distributed.LocalCluster(n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
+
+
+def test_two_workers_give_what_one_process_gives(folder: Path, tmp_path: Path) -> None:
+    with cluster_of(2) as cluster:
+        scheduler = "--scheduler", cluster.scheduler_address
+        for command in ("identify", "calibrate", "replay"):
+            alone, there = tmp_path / f"{command}-alone", tmp_path / command
+            expected = outcome_of(run_all(command, folder, RECORDINGS, alone, "--jobs", 1), alone)
+            result = run_all(command, folder, RECORDINGS, there, *scheduler)
+            assert result.exit_code == 0, result.output
+            assert outcome_of(result, there) == expected
+        bad = folder / "bad.mcap"
+        assert error_of("identify", bad, folder / "a.mcap", *scheduler) == error_of("identify", bad, "--jobs", 1)
+        result = run_all("identify", folder, ("a.mcap", "bad.mcap"), tmp_path / "skipped", *scheduler, "--skip-bad")
+        assert (result.exit_code, len(json.loads(result.stdout)["skipped"])) == (4, 1)
+
+
+def end_itself(_path: Path) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
+    paths = [folder / name for name in RECORDINGS]
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        cluster_of(1) as cluster,
+        RecordingsInParallel(scheduler=cluster.scheduler_address) as pool,
+        pytest.raises(UserError, match=f"ended from outside, .*: see {cluster.scheduler_address}"),
+    ):
+        list(pool.map(end_itself, paths, "reading"))
+
+
+def test_no_scheduler_there_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.cli.recordings_in_parallel.CONNECT_S", 0.2)
+    error = error_of("identify", folder / "a.mcap", "--scheduler", "tcp://127.0.0.1:1")
+    assert error == "--scheduler tcp://127.0.0.1:1: no Dask scheduler answers there"

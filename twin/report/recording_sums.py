@@ -1,0 +1,128 @@
+"""What is known of a twin on some recordings, as sums: recordings are summed one by one, wherever they are.
+
+All sums have the extent of the runs in common, which must be known before.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.twin_card import TwinCard
+from twin.build import RunsOfTwin
+from twin.errors import TwinError
+from twin.evaluation.accuracy import FigureSums, compared_readings, evaluation_pieces, figure_sums, free_run_readings
+from twin.evaluation.residual_analysis import ResidualGrid, ResidualSums, residual_grid, residual_sums
+from twin.report.speed_bins import SpeedSums, speed_sums
+from twin.runs import Array, Run
+
+RANGE_TOLERANCE = 0.05
+"""of the width of the trained command range; as in production (docs/explanation/deciding.md)"""
+
+
+@dataclass(frozen=True, eq=False)
+class Extent:
+    """How fast and how long runs are. range_rad_s: (2, fans) lowest and highest measured speed; longest_s: of runs
+    without a gap. steps: how many steps the median is of."""
+
+    median_step_s: float
+    steps: int
+    longest_s: float
+    range_rad_s: Array
+
+    @property
+    def grid(self) -> ResidualGrid:
+        """For the sums over the residual."""
+        return residual_grid(self.median_step_s, self.longest_s)
+
+
+def extent_of(runs: Sequence[Run]) -> Extent:
+    """The extent of some runs. Raises TwinError when there is nothing to evaluate."""
+    pieces = evaluation_pieces(runs)
+    steps_s = np.concatenate([np.diff(piece.t_s) for piece in pieces])
+    speed_rad_s = np.concatenate([piece.speed_rad_s for piece in pieces])
+    low, high = np.fmin.reduce(speed_rad_s), np.fmax.reduce(speed_rad_s)
+    longest_s = max(piece.duration_s for piece in pieces)
+    return Extent(float(np.median(steps_s)), len(steps_s), longest_s, np.stack((low, high)))
+
+
+def common_extent(extents: Sequence[Extent]) -> Extent:
+    """That of all of some recordings; the median step is the median over recordings, each weighted by its steps.
+
+    Raises TwinError when they are of different numbers of fans.
+    """
+    fans = {extent.range_rad_s.shape[1] for extent in extents}
+    if len(fans) > 1:
+        raise TwinError(f"runs of {sorted(fans)} fans are mixed; give runs of one fan count")
+    ordered = sorted(extents, key=lambda extent: extent.median_step_s)
+    up_to = np.cumsum([extent.steps for extent in ordered])
+    return Extent(
+        median_step_s=ordered[int(np.searchsorted(up_to, up_to[-1] / 2))].median_step_s,
+        steps=int(up_to[-1]),
+        longest_s=max(extent.longest_s for extent in extents),
+        range_rad_s=np.stack(
+            (
+                np.fmin.reduce([extent.range_rad_s[0] for extent in extents]),
+                np.fmax.reduce([extent.range_rad_s[1] for extent in extents]),
+            )
+        ),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingSums:
+    """Sums over runs. They can be added. fastest_rad_s, missing, outside: (fans,) the largest measured speed, and how
+    many of the samples have no speed and a command far outside the trained range."""
+
+    figures: FigureSums
+    residual: ResidualSums
+    by_speed: SpeedSums
+    samples: int
+    fastest_rad_s: Array
+    missing: Array
+    outside: Array
+
+    def __add__(self, other: "RecordingSums") -> "RecordingSums":
+        sums = {name: value + getattr(other, name) for name, value in vars(self).items()}
+        return RecordingSums(**sums | {"fastest_rad_s": np.fmax(self.fastest_rad_s, other.fastest_rad_s)})
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRun:
+    """A piece of a run beside the free run of a twin, (n, fans) in rad/s. predicted: the readings expected of it, NaN
+    where it diverged. error: measured minus that, NaN where nothing is compared, infinite where it diverged."""
+
+    piece: Run
+    predicted_rad_s: Array
+    error_rad_s: Array
+    sums: RecordingSums
+
+
+def free_run_of_piece(of: RunsOfTwin, piece: Run, extent: Extent) -> FreeRun:
+    """Run a twin freely over a piece."""
+    expected = free_run_readings(of.model, of.parameters, piece)
+    predicted = np.where(np.isfinite(expected), expected, np.nan)
+    compared = compared_readings(piece)
+    error = np.where(np.isfinite(compared) & np.isnan(predicted), np.inf, compared - predicted)
+    sums = RecordingSums(
+        figures=figure_sums(of.model, of.parameters, of.sigma_rad_s, piece, expected, of.unseen_std),
+        residual=residual_sums(error, [piece], extent.grid),
+        by_speed=speed_sums(predicted, error, extent.range_rad_s),
+        samples=piece.samples,
+        fastest_rad_s=np.fmax.reduce(np.abs(piece.speed_rad_s)),
+        missing=np.isnan(piece.speed_rad_s).sum(axis=0, dtype=np.float64),
+        outside=_is_outside(of.card, piece.command).sum(axis=0, dtype=np.float64),
+    )
+    return FreeRun(piece, predicted, error, sums)
+
+
+def recording_sums(of: RunsOfTwin, extent: Extent) -> RecordingSums:
+    """The sums over all runs, one piece in memory at a time. Raises TwinError when there is nothing to evaluate."""
+    first, *others = (free_run_of_piece(of, piece, extent).sums for piece in evaluation_pieces(of.runs))
+    return sum(others, first)
+
+
+def _is_outside(card: TwinCard, command: Array) -> Array:
+    low, high = card.command_range
+    reach = RANGE_TOLERANCE * (high - low)
+    return (command < low - reach) | (command > high + reach)
