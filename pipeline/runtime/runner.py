@@ -174,6 +174,7 @@ class Runner:
         failed = self._active_core
         for name, parts in self._parts.items():
             self._close_core(name, parts, failed)
+        ending.run("reporting what was consumed", self._outputs.report_last, CORES_CLOSED)
         last = self._report_end()
         ending.run("leaving the bus", self._bus.close, BUS_LEFT)
         if ending.error is not None:

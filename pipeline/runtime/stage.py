@@ -172,8 +172,15 @@ class Stage:
         unknown = [name for name in (*self.reads, *self.writes) if name not in BY_NAME]
         if unknown:
             raise ValueError(f"stage {self.name!r}: no such topic: {', '.join(unknown)}; known: {', '.join(BY_NAME)}")
-        if "health" in self.writes:
-            raise ValueError(f"stage {self.name!r}: health is published by the runner; take it out of `writes`")
+        for name in self.writes:
+            if BY_NAME[name].is_of_session:
+                raise ValueError(f"stage {self.name!r}: {name} is published by the runner; take it out of `writes`")
+
+    @property
+    def makes_samples_of_samples(self) -> bool:
+        """Whether it makes blocks of samples from its main input: it then reports what it has consumed."""
+        has_samples = [BY_NAME[name].has_samples for name in (*self.reads[:1], *self.writes)]
+        return bool(self.reads) and has_samples[0] and any(has_samples[1:])
 
 
 def load_stage(name: str) -> Stage:

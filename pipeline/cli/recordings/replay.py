@@ -30,8 +30,8 @@ from pipeline.replay.stage_chain import replay_starts
 from pipeline.runtime.signals import stop_on_signals
 from schemas.topics import TOPICS
 
-REPLAYED = tuple(topic.name for topic in TOPICS if topic.recorded and topic.name != "health")
-"""the topics replayed by default; the health of stages that are not running is not one of them"""
+REPLAYED = tuple(topic.name for topic in TOPICS if topic.recorded and not topic.is_of_session)
+"""the topics replayed by default"""
 _KEYS_HELP = "space pause, → step, ↑↓ rate, q quit"
 _SHOWN_EVERY_S = 0.1
 LARGEST_RATE = 1e6
