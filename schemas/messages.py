@@ -149,10 +149,6 @@ class InputPosition:
             contiguous_from=before.contiguous_from if before and follows else header.sequence,
         )
 
-    def continues(self, before: InputPosition) -> bool:
-        """Whether no input message is missing between the two."""
-        return self.producer == before.producer and self.contiguous_from <= before.sequence + 1
-
 
 @dataclass(frozen=True, slots=True)
 class Header:

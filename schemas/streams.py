@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 from schemas.messages import Health, Input
 
@@ -89,6 +89,26 @@ class StreamState:
             refused=self.refused,
             unsaved=unsaved,
         )
+
+
+class Position(Protocol):
+    """An input position, decoded (`schemas.messages.InputPosition`) or as protobuf has it."""
+
+    @property
+    def producer(self) -> str: ...  # noqa: D102
+    @property
+    def sequence(self) -> int: ...  # noqa: D102
+    @property
+    def consumed_count(self) -> int: ...  # noqa: D102
+    @property
+    def contiguous_from(self) -> int: ...  # noqa: D102
+    @property
+    def from_timer(self) -> bool: ...  # noqa: D102
+
+
+def continues(before: Position, position: Position) -> bool:
+    """Whether no input message is missing between two input positions of a stage."""
+    return position.producer == before.producer and position.contiguous_from <= before.sequence + 1
 
 
 def input_streams(health: Health) -> dict[StreamId, StreamState]:

@@ -18,9 +18,11 @@ from dataclasses import dataclass
 
 from schemas.fields import Array, time_column
 from schemas.messages import Consumed, InputPosition, Message
+from schemas.streams import continues
 from schemas.topics import BY_NAME
 from schemas.units import NS_PER_S
 
+CONSUMED = "consumed"
 PERIOD_NS = 10 * NS_PER_S
 
 
@@ -59,7 +61,7 @@ class ConsumedReports:
         if before is None:
             self._outputs[key] = _Reported(newest, True, newest.t_ns)
             return [newest]
-        has_break = not position.continues(_position(before.newest))
+        has_break = not continues(_position(before.newest), position)
         due = [before.newest] if has_break and not before.is_reported else []
         before.newest, before.is_reported = newest, False
         if has_break or position.from_timer or abs(newest.t_ns - before.reported_t_ns) >= PERIOD_NS:

@@ -6,13 +6,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from pipeline.bus.session import Bus
-from pipeline.runtime.consumed import ConsumedReports
+from pipeline.runtime.consumed import CONSUMED, ConsumedReports
 from pipeline.runtime.stage import Stage, StageError
 from schemas.codec import encode, type_name
 from schemas.messages import Consumed, Header, InputPosition, Message, Output
 from schemas.topics import BY_NAME, TOPICS, tray_key
 
-CONSUMED = "consumed"
 _TOPIC_NAMES = {topic.message: topic.name for topic in TOPICS}
 
 

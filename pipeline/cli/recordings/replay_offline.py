@@ -19,9 +19,9 @@ from rich.table import Table
 from pipeline.errors import UserError
 from pipeline.recordings.dates import format_utc, has_date
 from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
+from pipeline.replay.offline.comparison import CannotCompareError
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from pipeline.replay.offline.rescoring import RescoredTray, rescore
-from pipeline.replay.offline.verify import CannotCompareError
 from schemas.messages import Diagnosis
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import most_probable
@@ -123,6 +123,10 @@ def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray], took_s: fl
             "alarms_not_recorded": sum(one.alarms_not_recorded for one in compared),
             "samples_not_comparable": sum(one.not_comparable for one in compared),
             "alarms_not_comparable": sum(one.alarms_not_comparable for one in compared),
+            "snapshots_equal": sum(one.snapshots_equal for one in compared),
+            "snapshots_different": sum(one.snapshots_different for one in compared),
+            "snapshots_not_comparable": sum(one.snapshots_not_comparable for one in compared),
+            "left_out": list(replay_input.metadata.left_out),
             "not_comparable": [reason for one in compared for reason in one.reasons],
             "differences": [line for one in compared for line in one.named],
         }
@@ -174,22 +178,27 @@ def _duration(hours: float) -> str:
 
 
 def _print_verified(found: dict[str, Any], console: Console) -> None:
+    has_scores = "score" not in found["left_out"]
+    what = "samples" if has_scores else "snapshots"
     if found["equal"]:
         console.print(
-            f"[bold green]equal:[/bold green] {found['samples_equal']} samples and {found['alarms_equal']} alarms, "
+            f"[bold green]equal:[/bold green] {found[f'{what}_equal']} {what} and {found['alarms_equal']} alarms, "
             "to the bit"
         )
     else:
+        different, equal = found[f"{what}_different"], found[f"{what}_equal"]
+        not_made = f"{found['samples_not_made']} were not replayed, " if has_scores else ""
         console.print(
-            f"[bold red]DIFFERS:[/bold red] {found['samples_different']} of "
-            f"{found['samples_different'] + found['samples_equal']} samples differ, {found['samples_not_made']} "
-            f"were not replayed, {found['alarms_different']} alarms differ; the first differences:"
+            f"[bold red]DIFFERS:[/bold red] {different} of {different + equal} {what} differ, {not_made}"
+            f"{found['alarms_different']} alarms differ; the first differences:"
         )
         for line in found["differences"]:
             console.print(f"  {line}", markup=False)
+    if not has_scores:
+        console.print("scores were not recorded (recorder.topics): alarms and the scorers' snapshots were compared")
     if found["not_comparable"]:
         console.print(
-            f"[bold yellow]not comparable:[/bold yellow] {found['samples_not_comparable']} samples and "
+            f"[bold yellow]not comparable:[/bold yellow] {found[f'{what}_not_comparable']} {what} and "
             f"{found['alarms_not_comparable']} alarms:"
         )
         for reason in found["not_comparable"]:

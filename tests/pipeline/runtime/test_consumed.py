@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.runtime.consumed import PERIOD_NS, ConsumedReports
 from schemas.messages import Alarm, Consumed, Grid, Header, InputPosition, Severity
+from schemas.streams import continues
 
 STEP_NS = 1_000_000_000
 
@@ -68,7 +69,7 @@ def test_between_two_reports_nothing_is_missing_and_no_timer_has_acted(events):
         assert not any(position.from_timer for position in positions if position)
         chain = [one.header.input_position, *positions, other.header.input_position]
         pairs = list(pairwise(chain))
-        assert not between or all(after.continues(before) for before, after in pairs if before and after)
+        assert not between or all(continues(before, after) for before, after in pairs if before and after)
         assert other.t_ns - one.t_ns <= PERIOD_NS
 
 
