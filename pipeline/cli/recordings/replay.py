@@ -6,7 +6,7 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -18,8 +18,9 @@ from rich.live import Live
 from rich.text import Text
 
 from pipeline.cli.options import JsonOption, SetOption
-from pipeline.errors import UsageError
+from pipeline.errors import UsageError, UserError
 from pipeline.recordings.dates import format_utc
+from pipeline.recordings.left_out import without
 from pipeline.replay.live.keyboard import Keys
 from pipeline.replay.live.pace import Pace
 from pipeline.replay.live.player import Progress
@@ -132,11 +133,15 @@ def replay(
     keys = Keys()
     if pause and not keys.is_available:
         raise UsageError("--pause needs a terminal, to continue with a key")
-    playback = RecordingPlayback(files, _chosen_topics(topics, from_topic), start, end)
+    chosen = _chosen_topics(topics, from_topic)
+    playback = RecordingPlayback(files, chosen, start, end)
+    missing = _left_out(playback.files, chosen, is_asked_for=bool(topics or from_topic))
     replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
     stop = threading.Event()
     stop_on_signals(stop)
     console = Console(stderr=True, highlight=False)
+    if missing:
+        console.print(missing, markup=False, soft_wrap=True)
     with keys, _status_line(console, playback.end_s(), playback.seconds_at) as show:
         outcome = publish(
             playback,
@@ -175,6 +180,18 @@ def _chosen_topics(topics: str | None, from_topic: str | None) -> tuple[str, ...
         if name not in REPLAYED:
             raise UsageError(f"--topics {name}: is not one of {', '.join(REPLAYED)}")
     return chosen
+
+
+def _left_out(files: Sequence[Path], topics: Sequence[str], *, is_asked_for: bool) -> str:
+    """A line about what the recorder left out of these topics; empty if nothing.
+
+    Raises:
+        UserError: the topics were asked for.
+    """
+    line = without(files, topics)
+    if line and is_asked_for:
+        raise UserError(f"{files[0]}: {line}")
+    return f"{files[0]}: {line}" if line else ""
 
 
 def _rate(text: str) -> float:
