@@ -81,7 +81,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("alarm", Alarm, ON_CHANGE, True, 1024, MIB, "transitions of alarms"),
     Topic("request", Request, ON_CHANGE, True, 64, 64 * KIB, "requests of operators about alarms"),
     Topic(
-        "snapshot", ScorerSnapshot, "on change, and each minute", True, 4, 16 * MIB, "a scorer's state for a restart"
+        "snapshot", ScorerSnapshot, "on change, and each minute", True, 4, 96 * MIB, "a scorer's state for a restart"
     ),
     Topic("command", Command, ON_CHANGE, True, 64, 64 * KIB, "commands and set-points for the fans"),
     Topic("twin", ModelCard, ON_CHANGE, True, 8, 4 * MIB, "the twin in force", True),

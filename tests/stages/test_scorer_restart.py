@@ -22,6 +22,7 @@ from stages.scorer import ScorerCore
 from tests.stages.test_scorer import eventful_prediction
 from tests.support.scored_blocks import (
     CALIBRATION,
+    EPOCH_NS,
     LIVELY,
     commissioned,
     core_of,
@@ -149,6 +150,23 @@ def test_every_alarm_and_answer_is_in_the_snapshot_before_it_is_emitted(tmp_path
     assert alarms and noted()["active"]
     feed(scorer, [request_of(Action.SHELVE, duration_s=60.0)])
     assert noted()["shelved_until_t_ns"] > 0
+
+
+@pytest.mark.parametrize(("fans", "rest_s"), [(64, 0.0), (80, 0.4)])
+def test_in_a_storm_of_alarms_a_large_tray_takes_its_snapshots_one_after_a_rest(fans: int, rest_s: float) -> None:
+    scorer = commissioned(core_of(fans, calibration=LIVELY, baseline_s=0.1, on_delay_s=0.03), fans)
+    taken_s: list[float] = []
+    with_alarms = 0
+    for block in range(40):
+        residual = np.zeros((5, fans))
+        residual[:, : 1 + min(block, 20)] = 20.0  # one more fan in each block, up to one second
+        made = scorer.step(prediction_of(residual, first=5 * block))
+        with_alarms += any(isinstance(message, Alarm) for message in made)
+        taken_s += [(each.t_ns - EPOCH_NS) / 1e9 for each in made if isinstance(each, ScorerSnapshot)]
+    last = json.loads(snapshot_of(scorer).state_json)["alarms"]["last_emitted"]
+    assert len(last) == 21 and with_alarms > 20
+    assert len(taken_s) == with_alarms if not rest_s else np.diff(taken_s).min() >= rest_s - 1e-9
+    assert taken_s[-1] > 1.0, "what is owed is taken after the rest, without another alarm"
 
 
 def test_without_events_there_is_a_snapshot_every_minute() -> None:
