@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,6 @@ from pipeline.recordings.reading import read_recording
 from pipeline.recordings.recorder_config import SAMPLES
 from pipeline.recordings.writing import RecordingWriter
 from schemas.envelope import Envelope
-from schemas.messages import Raw
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 from simulation.published_fan import RATE_HZ, rough_run
@@ -43,48 +42,65 @@ TRAYS = {1: 120.0, 8: 120.0, 64: 120.0, 1024: 20.0}
 
 
 def main(json_output: JsonOption = False) -> None:
-    """Print bytes of the file for each fan-sample."""
-    rows: list[dict[str, Any]] = []
+    """Print bytes of the file for each fan-sample, and for each fan of a snapshot."""
+    fast: list[dict[str, Any]] = []
+    slow: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         progress("training and calibrating the twin")
         twin = calibrated_twin(folder)
         for fans, seconds in TRAYS.items():
-            progress(f"{fans} fans")
+            progress(f"a tray of {fans} fans")
             run = rough_run(3, seconds, fans, fan_variation=0.0).run
             for block_s in BLOCKS_S:
                 whole = list(read_recording(site_recording(run, block_s, twin, folder)))
-                raw = size([each for each in whole if each.topic == "raw"], folder)
-                rare = size([each for each in whole if each.topic not in SAMPLES], folder)
-                rows.append(
+                by_topic = {name: [each for each in whole if each.topic == name] for name in ("raw", "snapshot")}
+                of_samples = [each for each in whole if each.topic in SAMPLES]
+                fast.append(
                     {
                         "fans": fans,
-                        "rate, Hz": RATE_HZ,
                         "message, s": block_s,
-                        "raw": raw / (run.samples * fans),
-                        "all topics": size(whole, folder) / (run.samples * fans),
-                        "rare, a fan and minute": rare / fans / seconds * 60.0,
+                        "raw": size(by_topic["raw"], folder) / (run.samples * fans),
+                        "all four": size(of_samples, folder) / (run.samples * fans),
+                        "a snapshot": size(by_topic["snapshot"], folder) / (len(by_topic["snapshot"]) * fans),
                     }
                 )
-            slow = size(raw_envelopes(slow_raws(run)), folder) / (seconds * fans)
-            rows.append({**dict.fromkeys(rows[-1]), "fans": fans, "rate, Hz": 1.0, "message, s": 1.0, "raw": slow})
-    show({"bytes of a recording for each fan-sample": rows}, [], as_json=json_output)
+        whole_site = once_a_second(run)
+        for fans in TRAYS:
+            messages = [each for tray in trays_of(whole_site, fans) for each in tray]
+            messages.sort(key=lambda envelope: envelope.received_t_ns)
+            each = size(messages, folder) / (whole_site.samples * whole_site.fans)
+            slow.append({"fans of a tray": fans, "trays": whole_site.fans // fans, "raw": each})
+    show(
+        {
+            f"one tray at {RATE_HZ:g} Hz: bytes for each fan-sample by topics; of a snapshot for each fan": fast,
+            f"{whole_site.fans:,} fans at 1 Hz, each sample a message: bytes for each fan-sample": slow,
+        },
+        [],
+        as_json=json_output,
+    )
 
 
-def raw_envelopes(messages: Iterable[Raw]) -> list[Envelope]:
-    """As they are recorded right after they were measured."""
-    key = tray_key(SITE, TRAY, "raw")
-    return [Envelope.of(key, raw, int(raw.host_receive_t_ns[-1])) for raw in messages]
+def once_a_second(run: Run) -> Run:
+    """The samples of a run that are a second apart."""
+    rows = np.arange(0, run.samples, round(RATE_HZ))
+    return replace(run, t_s=run.t_s[rows], command=run.command[rows], speed_rad_s=run.speed_rad_s[rows])
 
 
-def slow_raws(run: Run) -> Iterable[Raw]:
-    """The samples of a run once a second, each in a message."""
-    step = round(RATE_HZ)
-    rows = np.arange(0, run.samples, step)
-    slow = replace(run, t_s=run.t_s[rows], command=run.command[rows], speed_rad_s=run.speed_rad_s[rows])
-    for raw in raws(slow, 1.0 / RATE_HZ):
-        since_ns = (raw.host_receive_t_ns - START_NS) * step
-        yield replace(raw, host_receive_t_ns=START_NS + since_ns, device_clock_us=(since_ns // 1000).astype(np.uint32))
+def trays_of(run: Run, fans: int) -> Iterator[list[Envelope]]:
+    """The raw messages of one sample of each tray, if the fans are on trays of so many."""
+    for first in range(0, run.fans, fans):
+        of_tray = slice(first, first + fans)
+        tray = replace(
+            run, command=run.command[:, of_tray], speed_rad_s=run.speed_rad_s[:, of_tray], tacho=run.tacho[:1]
+        )
+        messages: list[Envelope] = []
+        for number, raw in enumerate(raws(tray, 1.0 / RATE_HZ)):
+            t_ns = START_NS + np.array([number * NS_PER_S + first])
+            clock_us = np.array([number * 1_000_000 + first], np.uint32)
+            timed = replace(raw, host_receive_t_ns=t_ns, device_clock_us=clock_us)
+            messages.append(Envelope.of(tray_key(SITE, f"tray{first}", "raw"), timed, int(t_ns[0])))
+        yield messages
 
 
 def size(envelopes: Collection[Envelope], folder: Path) -> int:
