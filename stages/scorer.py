@@ -47,6 +47,7 @@ from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
 from scoring.snapshot_times import with_times_moved
 
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
+SNAPSHOT_PERIOD_SAMPLES = 3000  # at least: at slow rates snapshots would be most of a recording
 MOST_FANS_AT_ONCE = 64  # of a tray whose snapshot is taken with each alarm
 REST_NS_PER_FAN = 5_000_000  # between snapshots with alarms of a larger tray: each takes a millisecond a fan after days
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
@@ -207,8 +208,8 @@ class ScorerCore(Core):
         self._unscored.update(item.period_ns, score.valid, score.invalid_reason)
         self._judged_share.add(score.valid, score.invalid_reason)
         self._owes_snapshot |= bool(alarms)
-        is_due = self._owes_snapshot and self._last_t_ns - self._snapshot_t_ns >= self._rest_ns
-        return [*before_score, score, *alarms, *self._take_snapshot(at_once=is_due)]
+        snapshots = self._take_snapshot() if self._is_snapshot_due(item.period_ns) else []
+        return [*before_score, score, *alarms, *snapshots]
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md says what each counts."""
@@ -254,7 +255,7 @@ class ScorerCore(Core):
 
     def last_snapshot(self) -> list[ScorerSnapshot]:
         """The state now; nothing before the first sample."""
-        return self._take_snapshot(at_once=True) if self._last_t_ns > np.iinfo(np.int64).min else []
+        return self._take_snapshot() if self._last_t_ns > np.iinfo(np.int64).min else []
 
     def abort(self) -> None:
         """Save nothing; another process may use the snapshot."""
@@ -312,12 +313,15 @@ class ScorerCore(Core):
         commissioned[[alarm.fan for alarm in alarms if alarm.transition == Transition.COMMISSIONING]] = True
         self._tray.recommission(commissioned, self._last_t_ns)
         self._counts["requests"] += 1
-        return [*alarms, *self._take_snapshot(at_once=True)]
+        return [*alarms, *self._take_snapshot()]
 
-    def _take_snapshot(self, *, at_once: bool) -> list[ScorerSnapshot]:
-        """The state for a restart, at once or when the last snapshot is old enough."""
-        if not at_once and self._last_t_ns - self._snapshot_t_ns < SNAPSHOT_PERIOD_NS:
-            return []
+    def _is_snapshot_due(self, period_ns: int) -> bool:
+        """Whether alarms have changed since the last snapshot, or it is old; period_ns: between samples."""
+        rest_ns = self._rest_ns if self._owes_snapshot else max(SNAPSHOT_PERIOD_NS, SNAPSHOT_PERIOD_SAMPLES * period_ns)
+        return self._last_t_ns - self._snapshot_t_ns >= rest_ns
+
+    def _take_snapshot(self) -> list[ScorerSnapshot]:
+        """The state for a restart."""
         self._snapshot_t_ns, self._owes_snapshot = self._last_t_ns, False
         snapshot = ScorerSnapshot(
             t_ns=max(self._last_t_ns, 0), twin_sha256=self._twin.sha256, state_json=_json(self._state())
