@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
-from schemas.messages import Health, Input
+from schemas.messages import Health, Input, InputPosition
 
 LOSS_PREFIX = "lost_"
 """start of the names of counters that count losses"""
@@ -91,22 +91,7 @@ class StreamState:
         )
 
 
-class Position(Protocol):
-    """An input position, decoded (`schemas.messages.InputPosition`) or as protobuf has it."""
-
-    @property
-    def producer(self) -> str: ...  # noqa: D102
-    @property
-    def sequence(self) -> int: ...  # noqa: D102
-    @property
-    def consumed_count(self) -> int: ...  # noqa: D102
-    @property
-    def contiguous_from(self) -> int: ...  # noqa: D102
-    @property
-    def from_timer(self) -> bool: ...  # noqa: D102
-
-
-def continues(before: Position, position: Position) -> bool:
+def continues(before: InputPosition, position: InputPosition) -> bool:
     """Whether no input message is missing between two input positions of a stage."""
     return position.producer == before.producer and position.contiguous_from <= before.sequence + 1
 

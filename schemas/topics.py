@@ -78,14 +78,12 @@ TOPICS: tuple[Topic, ...] = (
     Topic("grid", Grid, "the grid's rate over the block size", True, 8192, 16 * MIB, "samples on a uniform grid"),
     Topic("prediction", Prediction, "as grid", True, 8192, 32 * MIB, "the healthy twin beside the measurement"),
     Topic("score", Score, "as prediction", True, 8192, 64 * MIB, "scored samples, ready to draw"),
-    Topic("alarm", Alarm, ON_CHANGE, True, 1024, MIB, "transitions of alarms"),
+    Topic("alarm", Alarm, ON_CHANGE, True, CATCH_UP_MESSAGES, MIB, "transitions of alarms"),
     Topic("request", Request, ON_CHANGE, True, 64, 64 * KIB, "requests of operators about alarms"),
-    Topic(
-        "snapshot", ScorerSnapshot, "on change, and each minute", True, 4, 96 * MIB, "a scorer's state for a restart"
-    ),
+    Topic("snapshot", ScorerSnapshot, "on change, and regularly", True, 4, 96 * MIB, "a scorer's state for a restart"),
     Topic("command", Command, ON_CHANGE, True, 64, 64 * KIB, "commands and set-points for the fans"),
-    Topic("twin", ModelCard, ON_CHANGE, True, 8, 4 * MIB, "the twin in force", True),
-    Topic("new_twin", NewTwin, ON_CHANGE, False, 2, 4 * MIB, "a learned twin that is to take over", True),
+    Topic("twin", ModelCard, ON_CHANGE, True, 8, 16 * MIB, "the twin in force", True),
+    Topic("new_twin", NewTwin, ON_CHANGE, False, 2, 16 * MIB, "a learned twin that is to take over", True),
     Topic(
         "consumed",
         Consumed,

@@ -134,7 +134,8 @@ class _Site:
             return False
         tray, topic = key.split("/")[-2:]
         is_its_tray = STAGES[stage].scope == "site" or tray == health.instance
-        return is_its_tray and current_name(topic) in self.reads.get(stage, load_stage(stage).reads)
+        reads = self.reads[stage] if stage in self.reads else load_stage(stage).reads
+        return is_its_tray and current_name(topic) in reads
 
     def has_ended(self, stream: StreamId, run: Sequence[_Session]) -> bool:
         """Whether the producer of a stream had ended when these sessions of a stage had stopped."""

@@ -16,7 +16,7 @@ def left_out(paths: Iterable[Path], topics: Collection[str]) -> list[str]:
     return [topic for topic in topics if topic in found]
 
 
-def without(paths: Collection[Path], topics: Collection[str]) -> str:
+def left_out_hint(paths: Collection[Path], topics: Collection[str]) -> str:
     """A line about those of these topics that the recorder left out, and how to make them; empty if there are none."""
     missing = left_out(paths, topics)
     if not missing:

@@ -21,7 +21,7 @@ from pipeline.cli.twins.training_data import make_folder
 from pipeline.errors import UsageError, UserError
 from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.arrays import Block, read_topics
-from pipeline.recordings.left_out import without
+from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.order import in_order
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.records import ACTIVE_SUFFIX
@@ -80,7 +80,7 @@ def export(
         for table in written:
             typer.echo(f"{table['file']}: {table['rows']} rows")
     for name in absent:
-        typer.echo(": ".join(filter(None, (f"no {name} in this recording", without(parts, (name,))))), err=True)
+        typer.echo(": ".join(filter(None, (f"no {name} in this recording", left_out_hint(parts, (name,))))), err=True)
     for line in arrays.damage:
         typer.echo(line, err=True)
     if arrays.damage:
@@ -199,5 +199,5 @@ def _default_topics(parts: Sequence[Path]) -> tuple[str]:
 def _no_messages(parts: Sequence[Path], topics: Sequence[str], tray: str | None, damage: Sequence[str]) -> str:
     of_tray = f" of a tray {tray!r}" if tray else ""
     lost = f" ({'; '.join(damage)})" if damage else ""
-    todo = without(parts, topics) or "see --topic and --tray"
+    todo = left_out_hint(parts, topics) or "see --topic and --tray"
     return f"{parts[0]}: no {' or '.join(topics)}{of_tray} in this recording{lost}; {todo}"

@@ -20,7 +20,7 @@ from rich.text import Text
 from pipeline.cli.options import JsonOption, SetOption
 from pipeline.errors import UsageError, UserError
 from pipeline.recordings.dates import format_utc
-from pipeline.recordings.left_out import without
+from pipeline.recordings.left_out import left_out_hint
 from pipeline.replay.live.keyboard import Keys
 from pipeline.replay.live.pace import Pace
 from pipeline.replay.live.player import Progress
@@ -188,7 +188,7 @@ def _left_out(files: Sequence[Path], topics: Sequence[str], *, is_asked_for: boo
     Raises:
         UserError: the topics were asked for.
     """
-    line = without(files, topics)
+    line = left_out_hint(files, topics)
     if line and is_asked_for:
         raise UserError(f"{files[0]}: {line}")
     return f"{files[0]}: {line}" if line else ""

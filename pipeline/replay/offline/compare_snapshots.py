@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from enum import Enum
 from typing import Any, NamedTuple
 
 from pipeline.recordings.dates import format_utc
@@ -28,17 +27,10 @@ REGRESSED = ("wear", "causes")
 class Difference(NamedTuple):
     """Where two states differ first."""
 
-    kind: Kind
     where: str
     """keys and places in lists, with dots between"""
-
-
-class Kind(Enum):
-    """How two states differ."""
-
-    VALUE = "value"
-    FORM = "form"
-    """one has a key that the other has not: another version took it"""
+    is_of_form: bool = False
+    """one has an entry that the other has not, because another version took it"""
 
 
 class SnapshotVerifier:
@@ -72,17 +64,14 @@ class SnapshotVerifier:
         for session in sessions:
             if session.producer not in self._visited:
                 self._begin_session(session.producer)
-        self._end_session()
+        self._settle(None)
 
     def _begin_session(self, producer: str) -> None:
-        self._end_session()
+        self._settle(None)
         self._producer = producer
         self._visited.add(producer)
         self._recorded = _saved(self._read(), producer)
         self._next = next(self._recorded, None)
-
-    def _end_session(self) -> None:
-        self._settle(None)
 
     def _settle(self, until_t_ns: int | None) -> None:
         """Compare the recorded snapshots before a time; None: all."""
@@ -94,8 +83,8 @@ class SnapshotVerifier:
 
     def _compare(self, recorded: ScorerSnapshot, made: Sequence[ScorerSnapshot]) -> None:
         found = self._found
-        differences = [first_difference(each, recorded) for each in made]
-        if None in differences:
+        differences = list(filter(None, (first_difference(each, recorded) for each in made)))
+        if len(differences) < len(made):
             found.snapshots_equal += 1
             return
         limit = self._limit_of(self._producer or "")
@@ -105,41 +94,40 @@ class SnapshotVerifier:
         elif not differences:
             found.snapshots_different += 1
             found.name(f"{at}: recorded and not replayed")
-        elif (difference := differences[-1]) and difference.kind == Kind.FORM:
+        elif differences[-1].is_of_form:
             found.snapshots_not_comparable += 1
-            found.add_reason(f"{found.tray}: snapshots have another form, see {difference.where}")
-        elif difference:
+            found.add_reason(f"{found.tray}: snapshots have another form, see {differences[-1].where}")
+        else:
             found.snapshots_different += 1
-            found.name(f"{at}: {difference.where} differs")
+            found.name(f"{at}: {differences[-1].where} differs")
 
 
 def first_difference(made: ScorerSnapshot, recorded: ScorerSnapshot) -> Difference | None:
     """Where two snapshots differ; a difference of values before one of form. None: nowhere."""
     if made.twin_sha256 != recorded.twin_sha256:
-        return Difference(Kind.VALUE, "twin_sha256")
+        return Difference("twin_sha256")
     if made.state_json == recorded.state_json:
         return None
     try:
         one, other = (current_keys(json.loads(each.state_json), FORMER_SCORER_KEYS) for each in (made, recorded))
     except (ValueError, TypeError, AttributeError):
-        return Difference(Kind.FORM, "state_json")
-    found = sorted(_differences(one, other, ()), key=lambda difference: difference.kind == Kind.FORM)
-    return found[0] if found else None
+        return Difference("state_json", is_of_form=True)
+    return min(_differences(one, other, ()), key=lambda difference: difference.is_of_form, default=None)
 
 
 def _differences(one: Any, other: Any, path: tuple[str, ...]) -> Iterator[Difference]:
     if isinstance(one, dict) and isinstance(other, dict):
-        for key in one.keys() | other.keys():
+        for key in {**one, **other}:
             if key in one and key in other:
                 yield from _differences(one[key], other[key], (*path, key))
-            else:
-                yield Difference(Kind.FORM, ".".join((*path, key)))
+            else:  # entries of fans are named by their number
+                yield Difference(".".join((*path, key)), is_of_form=not key.isdigit())
     elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
         for number, (mine, others) in enumerate(zip(one, other, strict=True)):
             if mine != others:
                 yield from _differences(mine, others, (*path, str(number)))
     elif not _is_same(one, other, path):
-        yield Difference(Kind.VALUE, ".".join(path))
+        yield Difference(".".join(path))
 
 
 def _is_same(one: Any, other: Any, path: tuple[str, ...]) -> bool:

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from pipeline.replay.stage_chain import StageChain
-from schemas.messages import ModelCard, Request, ScorerSnapshot
-from schemas.streams import Position
+from schemas.messages import InputPosition, ModelCard, Request, ScorerSnapshot
 
 BEGINNING = -(2**63)
 RAW_MISSING = "{raw_missing}"
@@ -70,7 +69,7 @@ class Session:
     """time of the newest sample in its recorded output, or in what else it is known to have made"""
     next_number: int = 0
     """of its outputs or reports"""
-    position: Position | None = None
+    position: InputPosition | None = None
     """of its newest recorded output"""
     snapshots_t_ns: list[int] = field(default_factory=list)
     """when it took the recorded snapshots, in order: a replay takes its own there. Only where these are compared"""

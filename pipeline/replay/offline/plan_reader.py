@@ -18,6 +18,7 @@ from schemas.messages import (
     Alarm,
     Consumed,
     Grid,
+    InputPosition,
     Message,
     ModelCard,
     Prediction,
@@ -25,7 +26,7 @@ from schemas.messages import (
     Score,
     ScorerSnapshot,
 )
-from schemas.streams import Position, continues
+from schemas.streams import continues
 
 _NEVER_REACHED = "raw messages never reached {}, and the recording does not say which"
 
@@ -36,7 +37,7 @@ class Output(NamedTuple):
     producer: str
     number: int
     """counts what is known of its producer: sequence number of the output, or of the report"""
-    position: Position
+    position: InputPosition
     first_t_ns: Callable[[], int]
     newest_t_ns: int
 
@@ -122,13 +123,22 @@ class PlanReader:
         header = decode_header(envelope)
         if not header.HasField("input_position"):
             raise NoInputPositionError
+        known = header.input_position
+        position = InputPosition(
+            known.topic,
+            known.producer,
+            known.sequence,
+            known.consumed_count,
+            known.contiguous_from,
+            known.from_timer,
+        )
 
         def first_t_ns() -> int:
             message = envelope.message
             assert isinstance(message, Grid | Prediction | Score)
             return int(message.t_ns[0])
 
-        output = Output(header.producer, header.sequence, header.input_position, first_t_ns, envelope.newest_t_ns)
+        output = Output(header.producer, header.sequence, position, first_t_ns, envelope.newest_t_ns)
         self._extend(self._stages[envelope.topic], output)
 
     def _add_report(self, report: Consumed) -> None:
