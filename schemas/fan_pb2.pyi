@@ -474,6 +474,20 @@ class NewTwin(_message.Message):
     first_sample_t_ns: int
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin: _Optional[str] = ..., sha256: _Optional[str] = ..., content: _Optional[bytes] = ..., first_sample_t_ns: _Optional[int] = ...) -> None: ...
 
+class Consumed(_message.Message):
+    __slots__ = ("header", "topic", "output_sequence", "first_t_ns", "t_ns")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    TOPIC_FIELD_NUMBER: _ClassVar[int]
+    OUTPUT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    FIRST_T_NS_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    topic: str
+    output_sequence: int
+    first_t_ns: int
+    t_ns: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., topic: _Optional[str] = ..., output_sequence: _Optional[int] = ..., first_t_ns: _Optional[int] = ..., t_ns: _Optional[int] = ...) -> None: ...
+
 class Clock(_message.Message):
     __slots__ = ("header", "t_ns", "rate")
     HEADER_FIELD_NUMBER: _ClassVar[int]

@@ -374,6 +374,22 @@ class NewTwin:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Consumed:
+    """What a session of a stage had consumed when it made an output: the input position of the header is the output's.
+
+    Attributes:
+        topic, output_sequence: of the output.
+        first_t_ns, t_ns: its first and its newest sample.
+    """
+
+    header: Header = Header()
+    topic: str
+    output_sequence: int
+    first_t_ns: int
+    t_ns: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Clock:
     """Position of a replay in the recording's own time; `rate` is 0 while it is paused."""
 
@@ -461,7 +477,19 @@ class Health:
 
 
 Message: TypeAlias = (
-    Raw | Grid | Prediction | Score | Alarm | Request | ScorerSnapshot | Command | ModelCard | NewTwin | Clock | Health
+    Raw
+    | Grid
+    | Prediction
+    | Score
+    | Alarm
+    | Request
+    | ScorerSnapshot
+    | Command
+    | ModelCard
+    | NewTwin
+    | Consumed
+    | Clock
+    | Health
 )
 MESSAGE_TYPES: tuple[type[Message], ...] = get_args(Message)
 

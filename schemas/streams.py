@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from schemas.messages import Health, Input
+from schemas.messages import Health, Input, InputPosition
 
 LOSS_PREFIX = "lost_"
 """start of the names of counters that count losses"""
@@ -89,6 +89,11 @@ class StreamState:
             refused=self.refused,
             unsaved=unsaved,
         )
+
+
+def continues(before: InputPosition, position: InputPosition) -> bool:
+    """Whether no input message is missing between two input positions of a stage."""
+    return position.producer == before.producer and position.contiguous_from <= before.sequence + 1
 
 
 def input_streams(health: Health) -> dict[StreamId, StreamState]:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from schemas.fields import columns, time_column
 from schemas.messages import (
     Alarm,
     Clock,
     Command,
+    Consumed,
     Grid,
     Health,
     Message,
@@ -23,8 +25,10 @@ from schemas.messages import (
     ScorerSnapshot,
 )
 
-ON_CHANGE = "on change"
+ON_CHANGE, AT_BREAKS = "on change", "at each break, and each 10 s"
 KIB, MIB = 1 << 10, 1 << 20
+MOST_SAMPLES, MOST_FAN_SAMPLES = 4096, 4096 * 64
+"""of a message, whatever its block: samples, and samples times fans"""
 ROOT = "fantwin"
 HEALTH_CHUNK = "health"
 ALIVE_CHUNK = "alive"
@@ -40,7 +44,7 @@ class Topic:
         history: a producer keeps this many of its last messages for consumers that missed them, 80 s at 100 Hz, as far
             as its memory allows (`pipeline.bus.publisher`).
         largest_bytes: a longer message is refused before it is decoded. The largest that any configuration makes is
-            half of it or less (blocks of 4096 samples of 64 fans).
+            half of it or less (`most_samples`).
     """
 
     name: str
@@ -52,11 +56,18 @@ class Topic:
     about: str
     is_needed_first: bool = False
     """a consumer that begins needs its last message before those of other topics"""
+    is_of_session: bool = False
+    """about a session of a stage: a live replay does not publish it, since that session does not run"""
+
+    @property
+    def has_samples(self) -> bool:
+        """Its messages are blocks of samples, nearly all bytes of a recording: a recorder may leave them out."""
+        return time_column(self.message) in columns(self.message)
 
     @property
     def is_rare(self) -> bool:
-        """Published only on change: every consumer needs each message, and asking for it again is cheap."""
-        return self.rate == ON_CHANGE
+        """Published seldom: every consumer needs each message, and asking for it again is cheap."""
+        return self.rate in (ON_CHANGE, AT_BREAKS)
 
 
 CATCH_UP_MESSAGES = 4096
@@ -67,16 +78,33 @@ TOPICS: tuple[Topic, ...] = (
     Topic("grid", Grid, "the grid's rate over the block size", True, 8192, 16 * MIB, "samples on a uniform grid"),
     Topic("prediction", Prediction, "as grid", True, 8192, 32 * MIB, "the healthy twin beside the measurement"),
     Topic("score", Score, "as prediction", True, 8192, 64 * MIB, "scored samples, ready to draw"),
-    Topic("alarm", Alarm, ON_CHANGE, True, 1024, MIB, "transitions of alarms"),
+    Topic("alarm", Alarm, ON_CHANGE, True, CATCH_UP_MESSAGES, MIB, "transitions of alarms"),
     Topic("request", Request, ON_CHANGE, True, 64, 64 * KIB, "requests of operators about alarms"),
-    Topic(
-        "snapshot", ScorerSnapshot, "on change, and each minute", True, 4, 16 * MIB, "a scorer's state for a restart"
-    ),
+    Topic("snapshot", ScorerSnapshot, "on change, and regularly", True, 4, 96 * MIB, "a scorer's state for a restart"),
     Topic("command", Command, ON_CHANGE, True, 64, 64 * KIB, "commands and set-points for the fans"),
-    Topic("twin", ModelCard, ON_CHANGE, True, 8, 4 * MIB, "the twin in force", True),
-    Topic("new_twin", NewTwin, ON_CHANGE, False, 2, 4 * MIB, "a learned twin that is to take over", True),
+    Topic("twin", ModelCard, ON_CHANGE, True, 8, 16 * MIB, "the twin in force", True),
+    Topic("new_twin", NewTwin, ON_CHANGE, False, 2, 16 * MIB, "a learned twin that is to take over", True),
+    Topic(
+        "consumed",
+        Consumed,
+        AT_BREAKS,
+        True,
+        1024,
+        4 * KIB,
+        "what a session of a stage has consumed",
+        is_of_session=True,
+    ),
     Topic("clock", Clock, "20 Hz", False, 1, 4 * KIB, "position of a replay"),
-    Topic("health", Health, "1 Hz for each stage", True, 8, 2 * MIB, "status and losses of a stage"),
+    Topic(
+        "health",
+        Health,
+        "1 Hz for each stage",
+        True,
+        8,
+        2 * MIB,
+        "status and losses of a stage",
+        is_of_session=True,
+    ),
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}
 FORMER_NAMES = {"memory": "snapshot"}
@@ -86,6 +114,11 @@ FORMER_NAMES = {"memory": "snapshot"}
 def current_name(topic: str) -> str:
     """The name of a topic today, given a name that it has or had."""
     return FORMER_NAMES.get(topic, topic)
+
+
+def most_samples(fans: int) -> int:
+    """The most samples of a message of so many fans: what is more goes into the next one."""
+    return max(1, min(MOST_SAMPLES, MOST_FAN_SAMPLES // fans))
 
 
 def largest_bytes(key: str) -> int:

@@ -40,12 +40,11 @@ from pipeline.devices.source_kinds import build_source
 from pipeline.errors import UserError
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from schemas.messages import Array, Command, Raw
+from schemas.topics import most_samples
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
 STEP_SHOWN_NS = 60 * NS_PER_S  # how long health says that the host clock was set
 FLOAT32_TOLERANCE = 1e-6
-MOST_SAMPLES = 4096
-"""in a message, however fast a line is"""
 
 
 class AcquisitionConfig(StageConfig):
@@ -119,6 +118,8 @@ class AcquisitionCore(Core):
         self._sequence = DeviceSequence()
         self._block: list[_Received] = []
         self._block_ns = round(config.block_s * NS_PER_S)
+        self._most_samples = most_samples(tray.fans)
+        """in a message, however fast a line is"""
         self._arrived_t_ns = started_t_ns
         """the newest samples"""
         self._counts: Counter[str] = Counter()
@@ -209,7 +210,7 @@ class AcquisitionCore(Core):
             if self._block and received.columns != self._block[0].columns:
                 messages += self._flush()
             self._block.append(received)
-            if len(self._block) >= MOST_SAMPLES:
+            if len(self._block) >= self._most_samples:
                 messages += self._flush()
         return messages + self._flush_if_next_is_late(batch.received_t_ns)
 

@@ -1,6 +1,7 @@
-"""Recorder: writes all messages on the bus to MCAP files.
+"""Recorder: writes the messages on the bus to MCAP files.
 
-Reads   every topic marked as recorded in schemas/topics.py, of all trays, and the health of all stages
+Reads   every topic marked as recorded in schemas/topics.py, of all trays, and the health of all stages; of the topics
+        of samples those of `topics`, in a large site only raw samples
 Writes  nothing on the bus; a recording of one or more parts, docs/reference/recordings.md
 Units   as in the messages: their bytes are not changed
 Timing  a message survives a crash, also of the machine, at most `flush_interval_s` after its receipt
@@ -13,11 +14,8 @@ import os
 import secrets
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
-
-from pydantic import Field, field_validator
 
 from pipeline.recordings.disk import DiskError
 from pipeline.recordings.held_messages import HeldMessages
@@ -25,9 +23,10 @@ from pipeline.recordings.interference import Interference
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.recordings.open_part import OpenPart, PartsFolder
 from pipeline.recordings.parts import RecordingParts
-from pipeline.recordings.reading import RecordingError
+from pipeline.recordings.reading import LEFT_OUT_KEY, RecordingError
+from pipeline.recordings.recorder_config import RecorderConfig, recorded_topics
 from pipeline.recordings.sequence_ledger import SequenceLedger
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from schemas.envelope import Envelope
 from schemas.messages import Health, Message
 from schemas.streams import StreamId
@@ -45,36 +44,6 @@ ROOM_TO_RESUME = 1 << 20
 _LOG = logging.getLogger(__name__)
 
 
-class RecorderConfig(StageConfig):
-    """Section `[recorder]`."""
-
-    file: Path = Field(
-        default=Path("recording.mcap"),
-        description="relative to run_folder; its parts are NAME.mcap, NAME-2.mcap and so on",
-    )
-    flush_interval_s: float = Field(default=1.0, gt=0, description="a crash loses at most this much")
-    part_bytes: int = Field(default=100_000_000, ge=0, description="a new part begins at this size; 0: never")
-    part_s: float = Field(default=0.0, ge=0, description="a new part begins after this time; 0: never")
-    min_free_bytes: int = Field(default=100_000_000, ge=0, description="free space to leave on the disk")
-    delete_oldest: bool = Field(
-        default=False, description="make room by deleting the oldest parts of this recording, instead of pausing"
-    )
-
-    @field_validator("part_bytes")
-    @classmethod
-    def _not_too_small(cls, value: int) -> int:
-        if 0 < value < 1_000_000:
-            raise ValueError("must be 0 (no limit) or at least 1,000,000 bytes")
-        return value
-
-    @field_validator("part_s")
-    @classmethod
-    def _not_too_short(cls, value: float) -> float:
-        if 0 < value < 1.0:
-            raise ValueError("must be 0 (no limit) or at least 1 s")
-        return value
-
-
 class Recorder(Core):
     """Adds every message to the open part, and begins new parts.
 
@@ -82,8 +51,9 @@ class Recorder(Core):
     second the recorder tries to resume.
     """
 
-    def __init__(self, parts: PartsFolder, config: RecorderConfig, now_ns: int) -> None:
-        """Begin the first part, at `now_ns`. If the disk is full or gone, wait for it.
+    def __init__(self, parts: PartsFolder, config: RecorderConfig, now_ns: int, left_out: Collection[str] = ()) -> None:
+        """Begin the first part, at `now_ns`. If the disk is full or gone, wait for it. left_out: topics that are not
+        recorded on purpose.
 
         Raises:
             RecordingError: nothing can be recorded there.
@@ -91,7 +61,7 @@ class Recorder(Core):
         self._parts = parts
         self._config = config
         self._part: OpenPart | None = None
-        self._ledger = SequenceLedger(parts.before)
+        self._ledger = SequenceLedger(parts.before, left_out)
         self._before = parts.before
         self._cards: dict[str, Envelope] = {}
         self._own_producer = ""
@@ -177,6 +147,11 @@ class Recorder(Core):
         recorded = self._recorded + (self._part.written if self._part else Counter())
         written = {f"recorded_{topic}": count for topic, count in recorded.items()}
         return written | self._counts | self._interference.counts
+
+    def notes(self) -> Sequence[str]:
+        """Which topics are left out on purpose."""
+        left_out = ", ".join(self._ledger.left_out)
+        return [f"not recorded: {left_out} (recorder.topics)"] if left_out else []
 
     def unsaved(self) -> Sequence[Envelope]:
         """Messages that are not flushed to the disk yet."""
@@ -337,6 +312,10 @@ def build(context: Context) -> BuiltStage:
     config: RecorderConfig = context.config
     metadata, attachments = recording_metadata(context)
     metadata["flush_interval_s"] = f"{config.flush_interval_s:g}"
+    reads = STAGE.reads if context.reads is None else context.reads
+    left_out = tuple(name for name in STAGE.reads if name not in reads)
+    if left_out:
+        metadata[LEFT_OUT_KEY] = ",".join(left_out)
     try:
         parts = RecordingParts(context.run_folder / config.file, metadata, attachments, session=secrets.token_hex(4))
         for recovery in parts.repaired:
@@ -356,7 +335,7 @@ def build(context: Context) -> BuiltStage:
                 "start again, or use `fantwin recover`",
                 path,
             )
-        return BuiltStage(Recorder(parts, config, context.started_t_ns))
+        return BuiltStage(Recorder(parts, config, context.started_t_ns, left_out))
     except RecordingError as error:
         raise StageError(f"{error} (recorder.file)") from error
 
@@ -378,7 +357,7 @@ def check(context: Context) -> list[str]:
 
 STAGE = Stage(
     name="recorder",
-    about="records every message, with configuration and twin, in MCAP files",
+    about="records what a site sends, with configuration and twin, in MCAP files",
     reads=tuple(topic.name for topic in TOPICS if topic.recorded),
     writes=(),
     config=RecorderConfig,
@@ -386,4 +365,5 @@ STAGE = Stage(
     core_per_tray=False,
     wants_envelopes=True,
     check=check,
+    chooses=recorded_topics,
 )

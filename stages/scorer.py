@@ -30,6 +30,7 @@ from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from pipeline.runtime.tray_scorer import DATA_LOST_AFTER_NS, TrayScorer
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.blocks import select
+from schemas.fan_numbers import fans_in_words
 from schemas.messages import (
     Alarm,
     ModelCard,
@@ -46,6 +47,9 @@ from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
 from scoring.snapshot_times import with_times_moved
 
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
+SNAPSHOT_PERIOD_SAMPLES = 3000  # at least: at slow rates snapshots would be most of a recording
+MOST_FANS_AT_ONCE = 64  # of a tray whose snapshot is taken with each alarm
+REST_NS_PER_FAN = 5_000_000  # between snapshots with alarms of a larger tray: each takes a millisecond a fan after days
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "baselines, alarms and wear start from the beginning"
 OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
@@ -99,6 +103,9 @@ class ScorerCore(Core):
         """why the snapshot was not used as a whole, for people"""
         self._set_back, self._set_back_until_t_ns = "", 0
         """that the snapshot was set back, for people"""
+        self._rest_ns = fans * REST_NS_PER_FAN if fans > MOST_FANS_AT_ONCE else 0
+        self._owes_snapshot = False
+        """alarms have changed since the last one"""
         self._start_new()
         stored = snapshot_store.load() if snapshot_store and not continues else None
         self._at_start = self.restore(stored) if stored else self._continued(continues) if continues else []
@@ -200,7 +207,9 @@ class ScorerCore(Core):
         score, alarms = self._tray.score(item if new.all() else select(item, new))
         self._unscored.update(item.period_ns, score.valid, score.invalid_reason)
         self._judged_share.add(score.valid, score.invalid_reason)
-        return [*before_score, score, *alarms, *self._take_snapshot(at_once=bool(alarms))]
+        self._owes_snapshot |= bool(alarms)
+        snapshots = self._take_snapshot() if self._is_snapshot_due(item.period_ns) else []
+        return [*before_score, score, *alarms, *snapshots]
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md says what each counts."""
@@ -231,7 +240,7 @@ class ScorerCore(Core):
         problems += [self._snapshot_store.problem] if self._snapshot_store else []
         held = np.flatnonzero(self._tray.fan_scorer.held_baselines)
         if len(held):
-            names = ", ".join(map(str, held.tolist()))
+            names = fans_in_words(held.tolist())
             problems.append(
                 f"the baseline of fan {names} is at its adaptation limit: inspect the fan, or commission it again"
             )
@@ -246,7 +255,7 @@ class ScorerCore(Core):
 
     def last_snapshot(self) -> list[ScorerSnapshot]:
         """The state now; nothing before the first sample."""
-        return self._take_snapshot(at_once=True) if self._last_t_ns > np.iinfo(np.int64).min else []
+        return self._take_snapshot() if self._last_t_ns > np.iinfo(np.int64).min else []
 
     def abort(self) -> None:
         """Save nothing; another process may use the snapshot."""
@@ -304,13 +313,16 @@ class ScorerCore(Core):
         commissioned[[alarm.fan for alarm in alarms if alarm.transition == Transition.COMMISSIONING]] = True
         self._tray.recommission(commissioned, self._last_t_ns)
         self._counts["requests"] += 1
-        return [*alarms, *self._take_snapshot(at_once=True)]
+        return [*alarms, *self._take_snapshot()]
 
-    def _take_snapshot(self, *, at_once: bool) -> list[ScorerSnapshot]:
-        """The state for a restart, at once or when the last snapshot is old enough."""
-        if not at_once and self._last_t_ns - self._snapshot_t_ns < SNAPSHOT_PERIOD_NS:
-            return []
-        self._snapshot_t_ns = self._last_t_ns
+    def _is_snapshot_due(self, period_ns: int) -> bool:
+        """Whether alarms have changed since the last snapshot, or it is old; period_ns: between samples."""
+        rest_ns = self._rest_ns if self._owes_snapshot else max(SNAPSHOT_PERIOD_NS, SNAPSHOT_PERIOD_SAMPLES * period_ns)
+        return self._last_t_ns - self._snapshot_t_ns >= rest_ns
+
+    def _take_snapshot(self) -> list[ScorerSnapshot]:
+        """The state for a restart."""
+        self._snapshot_t_ns, self._owes_snapshot = self._last_t_ns, False
         snapshot = ScorerSnapshot(
             t_ns=max(self._last_t_ns, 0), twin_sha256=self._twin.sha256, state_json=_json(self._state())
         )

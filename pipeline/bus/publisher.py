@@ -61,9 +61,11 @@ class Publisher:
             self._of_all.total += size
 
     def _keeps_too_much(self) -> bool:
-        if len(self._kept) > self._topic.history or self._kept_bytes > KEPT_BYTES:
+        if len(self._kept) > self._topic.history:
             return True
-        return self._of_all.total > KEPT_BYTES_OF_ALL and not self._topic.is_rare and len(self._kept) > 1
+        is_full = self._kept_bytes > KEPT_BYTES
+        is_full |= self._of_all.total > KEPT_BYTES_OF_ALL and not self._topic.is_rare
+        return is_full and len(self._kept) > 1  # the newest is kept, however large it is
 
     def _answer(self, query: zenoh.Query) -> None:
         """Answer with what is kept of a range, and at the end with the number of published messages."""

@@ -14,7 +14,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from pipeline.config.registry import STAGES
-from pipeline.devices.sample_source import SourceConfig
+from pipeline.devices.sample_source import MOST_FANS, SourceConfig, too_many_fans
+from pipeline.devices.serial_config import MOST_FANS_ON_LINE
 from pipeline.devices.source_kinds import parse_source
 from pipeline.errors import UsageError, UserError
 from schemas.tacho import Tachos, tacho_of_each_fan
@@ -112,7 +113,9 @@ class TrayConfig(Section):
     short_form_keys: ClassVar[tuple[str, ...]] = ("port", "baud", "protocol")
 
     name: Name = Field(description="letters, digits, `_` and `-`; names of trays differ")
-    fans: int = Field(ge=1, le=64, description="number of fans in every sample")
+    fans: int = Field(
+        ge=1, le=MOST_FANS, description=f"number of fans in every sample; on a serial line at most {MOST_FANS_ON_LINE}"
+    )
     source: Annotated[SourceConfig, BeforeValidator(parse_source)] = Field(
         default={"kind": "serial"}, validate_default=True, description="where samples come from; used by acquisition"
     )
@@ -152,6 +155,12 @@ class TrayConfig(Section):
     @model_validator(mode="after")
     def _tacho_for_each_fan(self) -> Self:
         tacho_of_each_fan(self.tacho, self.fans)
+        return self
+
+    @model_validator(mode="after")
+    def _fans_that_the_source_carries(self) -> Self:
+        if self.fans > self.source.most_fans:
+            raise ValueError(too_many_fans(self.source.kind, self.fans, self.source.most_fans))
         return self
 
     @model_validator(mode="after")

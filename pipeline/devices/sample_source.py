@@ -16,11 +16,24 @@ from typing import Protocol, TypeAlias
 
 from pydantic import BaseModel
 
+MOST_FANS = 1024
+"""of a tray: those whose samples come in one reading"""
+
 
 class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """Base of every kind's settings, `source = { kind = "...", ... }` of a [[tray]]: frozen, unknown keys refused."""
 
     kind: str
+
+    @property
+    def most_fans(self) -> int:
+        """The most fans of a tray with this source."""
+        return MOST_FANS
+
+
+def too_many_fans(kind: str, fans: int, most: int) -> str:
+    """The error of a tray with more fans than its source carries."""
+    return f"fans = {fans}: a {kind} source carries at most {most} fans; make several trays of them"
 
 
 @dataclass(frozen=True, slots=True)

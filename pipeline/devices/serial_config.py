@@ -6,7 +6,10 @@ from typing import Literal
 
 from pydantic import Field
 
-from pipeline.devices.sample_source import SourceConfig
+from pipeline.devices.sample_source import MOST_FANS, SourceConfig
+
+MOST_FANS_ON_LINE = 64
+"""that a frame carries: `schemas.wire.MAX_FANS`, which is not imported for reading a configuration"""
 
 
 class SerialConfig(SourceConfig, frozen=True):
@@ -16,3 +19,8 @@ class SerialConfig(SourceConfig, frozen=True):
     port: str = Field(default="", description="serial port, for example /dev/ttyUSB0; only acquisition needs it")
     baud: int = Field(default=115200, gt=0, description="bits a second")
     protocol: Literal["binary", "text"] = Field(default="binary", description="form of the frames on the line")
+
+    @property
+    def most_fans(self) -> int:
+        """Those of a frame. Without a port there is no line: the samples come from elsewhere, such as a replay."""
+        return MOST_FANS_ON_LINE if self.port else MOST_FANS

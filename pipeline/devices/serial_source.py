@@ -15,6 +15,7 @@ from pipeline.devices.sample_source import (
     Rejected,
     SourceContext,
     SourceEvent,
+    too_many_fans,
 )
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.serial_port import ReceivedBytes, SerialPort
@@ -39,8 +40,10 @@ class SerialSource:
         """The port is not opened yet; a test may give another `link`.
 
         Raises:
-            UserError: no port is given.
+            UserError: no port is given, or a frame cannot carry so many fans.
         """
+        if context.fans > wire.MAX_FANS:
+            raise UserError(too_many_fans(config.kind, context.fans, wire.MAX_FANS))
         if not config.port:
             raise UserError('port is missing; add for example port = "/dev/ttyUSB0"')
         self._path = context.folder / config.port

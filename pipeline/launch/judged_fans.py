@@ -16,6 +16,7 @@ from pipeline.launch.event_log import without_figures
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode
+from schemas.fan_numbers import fans_in_words
 from schemas.messages import FanState, InvalidReason, Score
 from schemas.topics import tray_key
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST, REASONS
@@ -39,7 +40,7 @@ class Unjudged:
         """For people."""
         if not self.fans:
             return f"{self.tray}: no fan is judged: {self.why}"
-        names = ", ".join(map(str, self.fans))
+        names = fans_in_words(self.fans)
         return f"{self.tray}: {'fan' if len(self.fans) == 1 else 'fans'} {names} not judged: {self.why}"
 
     def as_json(self) -> dict[str, object]:
@@ -57,7 +58,7 @@ class AtRest:
 
     def line(self) -> str:
         """For people."""
-        names = ", ".join(map(str, self.fans))
+        names = fans_in_words(self.fans)
         return f"{self.tray}: {'fan' if len(self.fans) == 1 else 'fans'} {names}: {self.words}"
 
     @property

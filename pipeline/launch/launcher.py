@@ -24,6 +24,7 @@ from pipeline.launch.stage_notes import note_lines
 from pipeline.launch.watchdog import Watchdog
 from pipeline.recordings.parts import part_files, part_path
 from pipeline.runtime.clock import REPLAY
+from pipeline.runtime.stage import load_stage
 from pipeline.runtime.tray_twin import load_tray_twin, twin_path
 from schemas.messages import StageStatus
 from schemas.topics import alive_key
@@ -109,6 +110,7 @@ class Launcher:
             UserError: a stage cannot run as configured; the others have been stopped.
         """
         self._refuse_unusable_twins()
+        reads = {name: load_stage(name).reads_as_configured(self._config) for name in self._config.stages}
         with Bus(self._config.bus, stop) as bus:
             self._refuse_second_launcher(bus, stop)
             before = self._parts()
@@ -126,7 +128,7 @@ class Launcher:
                 self.outcome.recordings = [str(path) for number, path in self._parts().items() if number > last]
                 ready = [slot for slot in self._slots if slot.was_ready]  # one that was never ready has lost nothing
                 sessions = {each for slot in ready for each in slot.sessions}
-                self.outcome.lost = self._watcher.losses(sessions)
+                self.outcome.lost = self._watcher.losses(sessions, reads)
                 self.outcome.refused = self._watcher.refused()
                 self.outcome.notes = note_lines(view.health for view in self._watcher.stages())
                 self.outcome.unusable = self._watcher.unusable(sessions)

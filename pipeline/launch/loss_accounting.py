@@ -19,7 +19,7 @@ counts.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -35,18 +35,23 @@ NOT_PROCESSED = "lost_at_stop"
 """the counter of a stage of what had arrived when it had to end; it is not among what its session had"""
 
 
-def losses(healths: Iterable[Health], launched: Collection[Launched] | None = None) -> dict[str, int]:
+def losses(
+    healths: Iterable[Health],
+    launched: Collection[Launched] | None = None,
+    reads: Mapping[str, Collection[str]] | None = None,
+) -> dict[str, int]:
     """What each stage has lost, by its label.
 
     Args:
         healths: the last of every session, in the order in which they were heard.
         launched: the sessions that one launcher has started, and whose losses are wanted. None: those of all sessions,
             of which none is known to have been due a stream from its first message.
+        reads: by stage the topics that it reads as configured; None: all of its declaration.
     """
     sessions: dict[str, list[_Session]] = {}
     for health in healths:
         sessions.setdefault(label(health), []).append(_Session(health, input_streams(health)))
-    site = _Site()
+    site = _Site(reads or {})
     for own in sessions.values():
         site.add(own, launched or ())
     if launched is not None:
@@ -97,8 +102,10 @@ class _Site:
         published: how many messages of each stream are known to be published.
         followers: by producer, the later sessions of its stage.
         launched: by producer, the stage of those that the launcher has started.
+        reads: by stage the topics that it reads, where these are fewer than declared.
     """
 
+    reads: Mapping[str, Collection[str]]
     published: dict[StreamId, int] = field(default_factory=dict)
     followers: dict[str, set[str]] = field(default_factory=dict)
     launched: dict[str, str] = field(default_factory=dict)
@@ -118,7 +125,17 @@ class _Site:
         """Whether the launcher started producer and consumer: all that is published is due."""
         key, producer = stream
         both = producer in self.launched and consumer.name in self.launched
-        return both and not _is_of_health(key) and _reads(consumer.health, key)
+        return both and not _is_of_health(key) and self._is_read(consumer.health, key)
+
+    def _is_read(self, health: Health, key: str) -> bool:
+        """Whether the stage that reports this is configured to read a key of a tray."""
+        stage = health.stage
+        if stage not in STAGES:
+            return False
+        tray, topic = key.split("/")[-2:]
+        is_its_tray = STAGES[stage].scope == "site" or tray == health.instance
+        reads = self.reads[stage] if stage in self.reads else load_stage(stage).reads
+        return is_its_tray and current_name(topic) in reads
 
     def has_ended(self, stream: StreamId, run: Sequence[_Session]) -> bool:
         """Whether the producer of a stream had ended when these sessions of a stage had stopped."""
@@ -187,15 +204,6 @@ def _stops_before(producer: str, consumer: str) -> bool:
     """Whether a launcher stops the stage `producer` before `consumer`: in the order of the data flow."""
     order = list(STAGES)
     return producer in STAGES and consumer in STAGES and order.index(producer) < order.index(consumer)
-
-
-def _reads(health: Health, key: str) -> bool:
-    """Whether the stage that reports this is configured to read a key of a tray."""
-    if health.stage not in STAGES:
-        return False
-    tray, topic = key.split("/")[-2:]
-    is_its_tray = STAGES[health.stage].scope == "site" or tray == health.instance
-    return is_its_tray and current_name(topic) in load_stage(health.stage).reads
 
 
 def _is_of_health(key: str) -> bool:

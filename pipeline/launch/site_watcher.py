@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from itertools import chain
 
@@ -143,10 +143,12 @@ class SiteWatcher:
             healths = [each.health for each in self._believed()]
         return next((health for health in healths if (label(health), health.process_id) == session), None)
 
-    def losses(self, launched: Collection[Launched] | None = None) -> dict[str, int]:
+    def losses(
+        self, launched: Collection[Launched] | None = None, reads: Mapping[str, Collection[str]] | None = None
+    ) -> dict[str, int]:
         """What every stage has lost, over all its sessions; see `pipeline.launch.loss_accounting`."""
         with self._lock:
-            return losses((each.health for each in self._believed()), launched)
+            return losses((each.health for each in self._believed()), launched, reads)
 
     def refused(self) -> dict[str, dict[str, int]]:
         """What every stage has refused, over all its sessions; see `pipeline.launch.refused_input`."""

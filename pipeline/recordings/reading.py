@@ -34,6 +34,8 @@ METADATA_NAME = "fantwin"
 """the metadata record that describes a recording"""
 TACHO_KEY = "tacho"
 """with the name of a tray: its tachos, as schemas.tacho writes them"""
+LEFT_OUT_KEY = "left_out"
+"""topics that were left out on purpose, separated by commas"""
 
 
 @dataclass
@@ -152,6 +154,11 @@ class RecordingMetadata:
         """The unit in which people see a tray's speeds: the tray's, the recording's, or rad/s."""
         return self.metadata.get(f"speed_unit.{tray}") or self.metadata.get("speed_unit", "rad/s")
 
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The topics that the recorder left out on purpose (`recorder.topics`), in the order of their table."""
+        return left_out_of(self.metadata)
+
     def tacho(self, tray: str) -> tuple[Tacho, ...]:
         """How the speeds of a tray were measured; instantaneous where the recording does not say.
 
@@ -163,6 +170,11 @@ class RecordingMetadata:
             return tachos_from_json(text) if text else INSTANTANEOUS
         except ValueError as error:
             raise RecordingError(f"the metadata are damaged: {TACHO_KEY}.{tray} is not a list of tachos") from error
+
+
+def left_out_of(metadata: Mapping[str, str]) -> tuple[str, ...]:
+    """The topics that a recording's metadata name as left out."""
+    return tuple(filter(None, metadata.get(LEFT_OUT_KEY, "").split(",")))
 
 
 def read_metadata(path: Path) -> RecordingMetadata:

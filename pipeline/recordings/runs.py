@@ -16,6 +16,7 @@ import numpy as np
 
 from pipeline.devices.device_clock import DeviceClock
 from pipeline.devices.measured_table import hold_last
+from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from schemas.messages import Array, Raw
 from schemas.tacho import Tacho, tacho_of_each_fan
@@ -90,7 +91,8 @@ def read_runs(
     for name, messages in pending.items():
         by_tray.setdefault(name, []).extend(messages)
     if not by_tray:
-        raise RecordingError(f"{path}: no raw samples{f' of tray {tray!r}' if tray else ''} in this recording")
+        why = left_out_hint([path], ("raw",)) or "correct --tray, or name another recording"
+        raise RecordingError(f"{path}: no raw samples{f' of tray {tray!r}' if tray else ''} in this recording: {why}")
     if len(by_tray) > 1:
         raise RecordingError(f"{path}: several trays, {', '.join(sorted(by_tray))}: choose one with --tray")
     ((name, messages),) = by_tray.items()

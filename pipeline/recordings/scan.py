@@ -14,7 +14,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from pipeline.recordings.index import Index, message_indexes
 from pipeline.recordings.message_counts import MessageCounts
-from pipeline.recordings.reading import METADATA_NAME
+from pipeline.recordings.reading import METADATA_NAME, left_out_of
 from pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,
     MESSAGE,
@@ -192,9 +192,10 @@ class _Scanner:
         found = self._found
         if metadata.name == METADATA_NAME:
             found.metadata.update(metadata.metadata)
+            found.counts.ledger.left_out = left_out_of(metadata.metadata)
         elif metadata.name == BEFORE_NAME:
             found.before = before_from_metadata(metadata.metadata)
-            found.counts.ledger = SequenceLedger(found.before)
+            found.counts.ledger = SequenceLedger(found.before, found.counts.ledger.left_out)
 
     def _add_unchunked(self, record: Record) -> None:
         """A message outside of chunks, as other writers may write them."""

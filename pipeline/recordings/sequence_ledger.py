@@ -6,7 +6,7 @@ See schemas/streams.py for what a stream is and how its gaps are counted.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 
 from schemas.messages import Health
@@ -47,10 +47,14 @@ _FIELDS = {field.name for field in fields(StreamCounts)}
 class SequenceLedger:
     """Counts messages in the order in which they are recorded."""
 
-    def __init__(self, before: Mapping[StreamId, int] | None = None) -> None:
-        """before: the next expected sequence number of each stream, after the parts before this one."""
+    def __init__(self, before: Mapping[StreamId, int] | None = None, left_out: Collection[str] = ()) -> None:
+        """before: the next expected sequence number of each stream, after the parts before this one. left_out: topics
+        that are not recorded on purpose, so that nothing of them is missing."""
         self.counts: dict[StreamId, StreamCounts] = {}
-        self._streams = {stream: StreamState(sequence) for stream, sequence in (before or {}).items()}
+        self.left_out = left_out
+        self._streams = {
+            stream: StreamState(sequence) for stream, sequence in (before or {}).items() if self._is_recorded(stream[0])
+        }
         self._published: dict[StreamId, int] = {}
 
     @property
@@ -82,9 +86,10 @@ class SequenceLedger:
     def add_health(self, health: Health) -> None:
         """Use a recorded health: it says how many messages its stage had published."""
         for stream, published in output_streams(health).items():
-            self._published[stream] = published
-            if published == 0 and _is_recorded(stream[0]):
-                self._state(stream).skip_to(0)  # all its messages are known from here on: recorded or missing
+            if self._is_recorded(stream[0]):
+                self._published[stream] = published
+                if published == 0:
+                    self._state(stream).skip_to(0)  # all its messages are known from here on: recorded or missing
 
     def add_lost(self, key: str, producer: str, sequence: int) -> None:
         """A received message will not be recorded: it is missing as soon as a later one is recorded, or at the end."""
@@ -115,13 +120,13 @@ class SequenceLedger:
 
     def for_next_part(self) -> SequenceLedger:
         """An empty ledger that continues this one."""
-        ledger = SequenceLedger(self.next)
+        ledger = SequenceLedger(self.next, self.left_out)
         ledger._published = self._published
         return ledger
 
     def as_lost(self) -> SequenceLedger:
         """An empty ledger in place of this one, whose file is lost: what it counted is missing from now on."""
-        ledger = SequenceLedger()
+        ledger = SequenceLedger(left_out=self.left_out)
         ledger._published = self._published
         for stream, state in self._streams.items():
             if state.next_sequence is not None:
@@ -132,6 +137,13 @@ class SequenceLedger:
     def before_as_metadata(self) -> dict[str, str]:
         """`next` as a metadata record; meant for the start of a part."""
         return {" ".join(stream): str(sequence) for stream, sequence in self.next.items()}
+
+    def _is_recorded(self, key: str) -> bool:
+        try:
+            topic = topic_of(key)
+        except KeyError:
+            return False
+        return topic.recorded and topic.name not in self.left_out
 
     def _state(self, stream: StreamId) -> StreamState:
         state = self._streams.get(stream)
@@ -218,13 +230,6 @@ def sum_by_key(streams: Iterable[tuple[StreamId, StreamCounts]]) -> dict[str, St
             total.first_ns = min(counts.first_ns, total.first_ns if total.first_ns is not None else counts.first_ns)
             total.last_ns = max(counts.last_ns, total.last_ns or 0)
     return dict(sorted(found.items()))
-
-
-def _is_recorded(key: str) -> bool:
-    try:
-        return topic_of(key).recorded
-    except KeyError:
-        return False
 
 
 def _stream(name: str) -> StreamId:

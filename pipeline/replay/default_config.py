@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config
 from pipeline.devices.line_rate import GAP_PERIODS
+from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_recording
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
@@ -47,7 +48,8 @@ def first_raw(paths: Sequence[Path], metadata: RecordingMetadata) -> dict[str, l
         if trays and all(samples.get(name, 0) >= _SAMPLED for name in trays):
             break
     if not found:
-        raise RecordingError(f"{paths[0]}: no raw samples in this recording: there is nothing to score")
+        why = left_out_hint(paths, ("raw",)) or "there is nothing to score"
+        raise RecordingError(f"{paths[0]}: no raw samples in this recording: {why}")
     return {tray: found[tray] for tray in sorted(found)}
 
 

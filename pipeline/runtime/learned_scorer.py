@@ -115,6 +115,10 @@ class LearnedTwinScorer(Core):
         self.abort()
         return []
 
+    def last_snapshot(self) -> Sequence[Message]:
+        """That of the core; nothing before the first twin."""
+        return self._core.last_snapshot() if self._core else []
+
     def abort(self) -> None:
         """Save nothing; another process may use the snapshot."""
         if self._store:

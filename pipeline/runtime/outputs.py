@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from pipeline.bus.session import Bus
+from pipeline.runtime.consumed import CONSUMED, ConsumedReports
 from pipeline.runtime.stage import Stage, StageError
 from schemas.codec import encode, type_name
-from schemas.messages import Header, InputPosition, Message, Output
+from schemas.messages import Consumed, Header, InputPosition, Message, Output
 from schemas.topics import BY_NAME, TOPICS, tray_key
 
 _TOPIC_NAMES = {topic.message: topic.name for topic in TOPICS}
@@ -20,13 +21,15 @@ class Outputs:
     def __init__(self, bus: Bus, site: str, stage: Stage, trays: Iterable[str], producer: str) -> None:
         self._stage = stage
         self._producer = producer
+        reports = (CONSUMED,) if stage.makes_samples_of_samples else ()
         self._publishers = {
             (tray, name): bus.publisher(
                 tray_key(site, tray, name), BY_NAME[name], type_name(BY_NAME[name].message), producer
             )
             for tray in trays
-            for name in stage.writes
+            for name in (*stage.writes, *reports)
         }
+        self._consumed = ConsumedReports()
         self._positions: dict[str, InputPosition] = {}
         """by tray: up to where the main input has been processed"""
 
@@ -42,15 +45,28 @@ class Outputs:
         Raises:
             StageError: it is of a topic that the stage does not declare to write, or of no tray that it serves.
         """
-        publisher = self._publishers.get((tray, _TOPIC_NAMES[type(message)]))
-        if publisher is None:
+        topic = _TOPIC_NAMES[type(message)]
+        publisher = self._publishers.get((tray, topic))
+        if publisher is None or topic == CONSUMED:
             raise StageError(self._refusal(tray, message))
         position = self._positions.get(tray)
         if position and from_timer:
             position = replace(position, from_timer=True)
         stamped = replace(message, header=Header(self._producer, publisher.published, tray, position))
         publisher.put(encode(stamped))
+        if (tray, CONSUMED) in self._publishers:
+            self._report(self._consumed.after(topic, stamped))
         return stamped
+
+    def report_last(self) -> None:
+        """Publish what the stage had consumed when it made its last outputs: no more follow."""
+        self._report(self._consumed.last())
+
+    def _report(self, due: Iterable[Consumed]) -> None:
+        for report in due:
+            publisher = self._publishers[report.header.tray, CONSUMED]
+            header = replace(report.header, sequence=publisher.published)
+            publisher.put(encode(replace(report, header=header)))
 
     def counts(self) -> list[Output]:
         """How many messages have been published on each key."""

@@ -83,6 +83,7 @@ class Runner:
         self._inbox = Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
         started_t_ns = HOST_CLOCK.now_ns()
+        reads = stage.reads_as_configured(config)
         context = Context(
             site=config.site,
             trays=trays,
@@ -94,6 +95,7 @@ class Runner:
             configuration_path=config.path,
             configuration_text=config.text,
             overrides=config.overrides,
+            reads=reads,
         )
         self._parts: dict[str, BuiltStage] = (
             {t.name: stage.build(replace(context, trays=(t,))) for t in trays}
@@ -122,9 +124,7 @@ class Runner:
         self._health_publisher = self._bus.publisher(
             health_key(config.site, stage.name, self._instance), BY_NAME["health"], type_name(Health), self.producer
         )
-        self._read_keys = {
-            tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
-        }
+        self._read_keys = {tray_key(config.site, t.name, name) for t in trays for name in reads if name != "health"}
         self._peers = Peers(self._read_keys)
         main = (
             stage.reads[0] if stage.reads and not self._has_source else ""
@@ -174,6 +174,7 @@ class Runner:
         failed = self._active_core
         for name, parts in self._parts.items():
             self._close_core(name, parts, failed)
+        ending.run("reporting what was consumed", self._outputs.report_last, CORES_CLOSED)
         last = self._report_end()
         ending.run("leaving the bus", self._bus.close, BUS_LEFT)
         if ending.error is not None:

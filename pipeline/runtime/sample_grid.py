@@ -21,12 +21,12 @@ from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import cut, join
 from schemas.messages import Array, Grid, InvalidReason, Raw
 from schemas.tacho import Tacho
+from schemas.topics import most_samples
 from schemas.units import NS_PER_S
 
 LONGEST_TICK_NS = NS_PER_S // 10  # a longer pause between ticks is a host that stalled, not a silent source
 SET_BACK_NS = NS_PER_S  # a new sample this much older than the newest: a replay was restarted
 MAX_ENDED_PRODUCERS = 64
-MOST_SAMPLES = 4096  # in a message: those of a long gap are published at once
 GAP, STALE, NO_SPEED, CLOCK_RESTARTED = (
     np.uint8(reason)
     for reason in (InvalidReason.GAP, InvalidReason.STALE, InvalidReason.NO_SPEED, InvalidReason.CLOCK_RESTARTED)
@@ -304,6 +304,7 @@ class SampleGrid:
             return []
         grid, self._pending = join(self._pending), []
         rows = len(grid.t_ns)
-        if rows <= MOST_SAMPLES:
+        most = most_samples(self._fans)
+        if rows <= most:  # those of a long gap are published at once
             return [grid]
-        return [cut(grid, first, min(first + MOST_SAMPLES, rows)) for first in range(0, rows, MOST_SAMPLES)]
+        return [cut(grid, first, min(first + most, rows)) for first in range(0, rows, most)]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from pipeline.config.models import Section, TrayConfig
+from pipeline.config.models import Config, Section, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
@@ -111,6 +111,8 @@ class Context:
     """for a check: this stage already runs on this host, and has taken itself what it needs"""
     decision_rules: DecisionRules = CURRENT_RULES
     """an older version only while an older recording is replayed"""
+    reads: tuple[str, ...] | None = None
+    """the topics that it reads as configured; None: all that its declaration names"""
 
     @property
     def tray(self) -> TrayConfig:
@@ -152,6 +154,7 @@ class Stage:
         may_drop: a consumer that may drop messages: its missing messages do not count as losses.
         check: lists, without side effects, what would keep the stage from working (a missing port, a twin that
             does not fit); one line each. `fantwin doctor` prints them.
+        chooses: of the topics in `reads`, those that it reads with this section and these trays of the site.
 
     Raises:
         ValueError: `reads` or `writes` names an unknown topic.
@@ -167,13 +170,25 @@ class Stage:
     wants_envelopes: bool = False
     may_drop: bool = False
     check: Callable[[Context], Sequence[str]] = no_problems
+    chooses: Callable[[Any, Sequence[TrayConfig]], Sequence[str]] | None = None
 
     def __post_init__(self) -> None:
         unknown = [name for name in (*self.reads, *self.writes) if name not in BY_NAME]
         if unknown:
             raise ValueError(f"stage {self.name!r}: no such topic: {', '.join(unknown)}; known: {', '.join(BY_NAME)}")
-        if "health" in self.writes:
-            raise ValueError(f"stage {self.name!r}: health is published by the runner; take it out of `writes`")
+        for name in self.writes:
+            if BY_NAME[name].is_of_session:
+                raise ValueError(f"stage {self.name!r}: {name} is published by the runner; take it out of `writes`")
+
+    def reads_as_configured(self, config: Config) -> tuple[str, ...]:
+        """The topics that it reads with this configuration, which has its section."""
+        return tuple(self.chooses(config.sections[self.name], config.trays)) if self.chooses else self.reads
+
+    @property
+    def makes_samples_of_samples(self) -> bool:
+        """Whether it makes blocks of samples from its main input: it then reports what it has consumed."""
+        has_samples = [BY_NAME[name].has_samples for name in (*self.reads[:1], *self.writes)]
+        return bool(self.reads) and has_samples[0] and any(has_samples[1:])
 
 
 def load_stage(name: str) -> Stage:

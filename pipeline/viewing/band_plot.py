@@ -23,6 +23,7 @@ from matplotlib.patches import Patch
 
 from pipeline.errors import UserError
 from pipeline.recordings.dates import format_utc, has_date
+from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.viewing.trace import Trace, state_changes, trace_of
 from schemas.messages import Array, Score
@@ -96,7 +97,8 @@ def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUn
                 scores.setdefault(envelope.message.header.tray, []).append(envelope.message)
     where = ", ".join(str(path) for path in recordings)
     if not scores:
-        raise UserError(f"{where}: holds no scores to plot; did twin_integrator and scorer run?")
+        why = left_out_hint(recordings, ("score",)) or "did twin_integrator and scorer run?"
+        raise UserError(f"{where}: holds no scores to plot; {why}")
     if tray is None:
         if len(scores) > 1:
             raise UserError(f"{where}: there are several trays; choose one with --tray: {', '.join(sorted(scores))}")

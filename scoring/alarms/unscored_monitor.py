@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from schemas.fan_numbers import fans_in_words
 from schemas.messages import Array, InvalidReason
 from schemas.units import NS_PER_S
 from scoring.samples import among
@@ -53,7 +54,7 @@ class UnscoredMonitor:
         for reason in np.unique(self._invalid_reason[late]).tolist():
             fans = np.flatnonzero(late & (self._invalid_reason == reason))
             doublings = int(self._unscored_ns[fans].min() // self._limit_ns).bit_length() - 1
-            names = ", ".join(map(str, fans.tolist()))
+            names = fans_in_words(fans.tolist())
             subject = f"fan {names} is" if len(fans) == 1 else f"fans {names} are"
             explanation = REASONS.get(InvalidReason(reason), InvalidReason(reason).words)
             at_least_s = self._limit_ns * 2**doublings / NS_PER_S

@@ -19,7 +19,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 import stages.recorder
-from pipeline.config.models import TrayConfig
+from pipeline.config.loading import parse_config
+from pipeline.config.models import ConfigError, TrayConfig
+from pipeline.recordings.contents import contents_of
 from pipeline.recordings.disk import DiskError
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
@@ -27,7 +29,7 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.stage import Context, StageError
 from schemas.codec import encode
 from schemas.envelope import Envelope
-from schemas.messages import Header, Health, Input, Message, ModelCard, Raw, StageStatus
+from schemas.messages import Header, Health, Input, Message, ModelCard, Output, Raw, StageStatus
 from schemas.topics import TOPICS, health_key, topic_of, tray_key
 from stages.recorder import STAGE, Recorder, RecorderConfig
 from tests.support.message_strategies import any_message, same
@@ -552,3 +554,67 @@ def test_limits_that_make_no_sense_are_refused(wrong):
 def test_doctor_says_when_the_disk_is_too_full(tmp_path):
     (problem,) = STAGE.check(context(tmp_path, min_free_bytes=1 << 60))
     assert "nothing is recorded below" in problem
+
+
+SAMPLES = ("raw", "grid", "prediction", "score")
+
+
+def chosen(fans: int, *lines: str) -> set[str]:
+    """The topics of samples that are recorded of a site with two trays of so many fans."""
+    trays = "".join(f'[[tray]]\nname = "{name}"\nfans = {fans}\n' for name in ("a", "b"))
+    config = parse_config(trays + "[recorder]\n" + "\n".join(lines), Path("c.toml"), (), ("recorder",))
+    topics = STAGE.reads_as_configured(config)
+    rare = {topic.name for topic in TOPICS if topic.recorded} - set(SAMPLES)
+    assert rare <= set(topics), "what is rare is always recorded"
+    assert {"alarm", "request", "command", "twin", "snapshot", "consumed", "health"} == rare
+    return set(topics) & set(SAMPLES)
+
+
+def test_a_large_site_records_raw_samples_and_leaves_out_what_follows_from_them():
+    assert chosen(32) == set(SAMPLES)
+    assert chosen(33) == {"raw"}
+
+
+def test_the_topics_of_samples_can_be_chosen():
+    assert chosen(33, "topics = ['raw', 'grid', 'prediction', 'score']") == set(SAMPLES)
+    assert chosen(2, "topics = ['score', 'raw']") == {"raw", "score"}
+    assert chosen(2, "topics = []") == set()
+
+
+@pytest.mark.parametrize(
+    ("topic", "words"),
+    [
+        ("scor", "recorder.topics = ['scor']: unknown topic 'scor'; did you mean 'score'?"),
+        ("clock", "unknown topic 'clock'; known: raw, grid, prediction, score"),
+        ("alarm", "alarm is always recorded: name only topics of samples, raw, grid, prediction, score"),
+    ],
+)
+def test_a_topic_that_cannot_be_chosen_is_refused_in_one_line(topic, words):
+    with pytest.raises(ConfigError) as refused:
+        chosen(2, f"topics = ['{topic}']")
+    assert words in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_recording_says_which_topics_were_left_out_on_purpose(tmp_path):
+    run = replace(context(tmp_path), reads=("raw", "alarm", *set(STAGE.reads) - {*SAMPLES, "alarm"}))
+    core = STAGE.build(run).core
+    for number in range(2):
+        outputs = tuple(Output(key=tray_key("plant", "tray1", name), published=3 * number) for name in SAMPLES)
+        health = Health(
+            header=Header("scorer-1", number, ""),
+            stage="scorer",
+            instance="all",
+            status=StageStatus.OK,
+            t_ns=1,
+            uptime_s=0.0,
+            outputs=outputs,
+        )
+        core.step(envelope(health, "health"))
+    assert core.notes() == ["not recorded: grid, prediction, score (recorder.topics)"]
+    core.close()
+    path = run.run_folder / "recording.mcap"
+    assert read_metadata(path).left_out == ("grid", "prediction", "score")
+    missing = {key: counts.missing for (key, _), counts in contents_of(path).streams.items() if counts.missing}
+    assert missing == {RAW_KEY: 3}, "only what should have been recorded is missing"
+    STAGE.build(context(tmp_path)).core.close()
+    assert read_metadata(run.run_folder / "recording-2.mcap").left_out == ()

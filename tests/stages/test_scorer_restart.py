@@ -15,6 +15,7 @@ from pipeline.runtime.snapshot_store import SnapshotStore
 from schemas.blocks import cut
 from schemas.fields import columns
 from schemas.messages import Action, Alarm, FanState, Header, Prediction, Score, ScorerSnapshot, Transition
+from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms
 from scoring.fan_scorer import FanScorer
@@ -22,6 +23,7 @@ from stages.scorer import ScorerCore
 from tests.stages.test_scorer import eventful_prediction
 from tests.support.scored_blocks import (
     CALIBRATION,
+    EPOCH_NS,
     LIVELY,
     commissioned,
     core_of,
@@ -151,15 +153,37 @@ def test_every_alarm_and_answer_is_in_the_snapshot_before_it_is_emitted(tmp_path
     assert noted()["shelved_until_t_ns"] > 0
 
 
-def test_without_events_there_is_a_snapshot_every_minute() -> None:
+@pytest.mark.parametrize(("fans", "rest_s"), [(64, 0.0), (80, 0.4)])
+def test_in_a_storm_of_alarms_a_large_tray_takes_its_snapshots_one_after_a_rest(fans: int, rest_s: float) -> None:
+    scorer = commissioned(core_of(fans, calibration=LIVELY, baseline_s=0.1, on_delay_s=0.03), fans)
+    taken_s: list[float] = []
+    with_alarms = 0
+    for block in range(40):
+        residual = np.zeros((5, fans))
+        residual[:, : 1 + min(block, 20)] = 20.0  # one more fan in each block, up to one second
+        made = scorer.step(prediction_of(residual, first=5 * block))
+        with_alarms += any(isinstance(message, Alarm) for message in made)
+        taken_s += [(each.t_ns - EPOCH_NS) / 1e9 for each in made if isinstance(each, ScorerSnapshot)]
+    last = json.loads(snapshot_of(scorer).state_json)["alarms"]["last_emitted"]
+    assert len(last) == 21 and with_alarms > 20
+    assert len(taken_s) == with_alarms if not rest_s else np.diff(taken_s).min() >= rest_s - 1e-9
+    assert taken_s[-1] > 1.0, "what is owed is taken after the rest, without another alarm"
+
+
+@pytest.mark.parametrize(("period_ns", "apart_s"), [(10_000_000, 60), (100_000_000, 300)])
+def test_without_events_there_is_a_snapshot_every_minute_and_at_slow_rates_every_3000_samples(
+    period_ns: int, apart_s: int
+) -> None:
     scorer = core_of()
-    notes = [
-        message
-        for second in range(180)
-        for message in scorer.step(prediction_of(np.full(100, 0.1), first=100 * second))
-        if isinstance(message, ScorerSnapshot)
-    ]
-    assert [round((note.t_ns - notes[0].t_ns) / 1e9) for note in notes] == [0, 60, 120]
+    block_ns = 5 * NS_PER_S
+    offsets_ns = np.arange(0, block_ns, period_ns)
+    taken_ns: list[int] = []
+    for block in range(3 * apart_s // 5):
+        prediction = prediction_of(np.full(len(offsets_ns), 0.1))
+        t_ns = EPOCH_NS + block * block_ns + offsets_ns
+        made = scorer.step(replace(prediction, t_ns=t_ns, period_ns=period_ns))
+        taken_ns += [each.t_ns for each in made if isinstance(each, ScorerSnapshot)]
+    assert np.diff(taken_ns).tolist() == [apart_s * NS_PER_S] * 2
 
 
 def raised() -> ScorerCore:

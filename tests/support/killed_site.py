@@ -17,11 +17,12 @@ import numpy as np
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.recordings.writing import RecordingWriter
+from pipeline.runtime.consumed import ConsumedReports
 from pipeline.runtime.decision_rules import CURRENT_RULES
 from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import join
-from schemas.messages import Action, Header, InputPosition, Message, NewTwin, Raw, Request
+from schemas.messages import Action, Consumed, Header, InputPosition, Message, NewTwin, Raw, Request
 from schemas.topics import BY_NAME, TOPICS, tray_key
 from schemas.units import NS_PER_S
 from tests.support.twin_files import small_hybrid, write_twin
@@ -65,6 +66,7 @@ class Session:
     published: dict[str, int] = field(default_factory=dict)
     kept: deque[tuple[str, Message]] = field(default_factory=lambda: deque(maxlen=200))
     position: InputPosition | None = None
+    consumed: ConsumedReports = field(default_factory=ConsumedReports)
 
 
 class Stages:
@@ -153,6 +155,7 @@ class Stages:
         """Stop cleanly."""
         for stage in CHAIN:
             self._put_out(stage, self._core(stage).close(), from_timer=True)
+            self._report(self.stages[stage], self.stages[stage].consumed.last())
         self.writer.finish()
 
     def _begin(self, stage: str) -> Session:
@@ -191,14 +194,24 @@ class Stages:
         session.published[topic] = sequence + 1
         stamped: Any = replace(message, header=Header(session.producer, sequence, self.tray, position))
         session.kept.append((topic, stamped))
-        if self.records and BY_NAME[topic].recorded:
-            self.writer.add_message(tray_key(self.config.site, self.tray, topic), stamped, self.now_ns)
+        self._record(topic, stamped)
+        self._report(session, session.consumed.after(topic, stamped))
         if topic == "raw" and self.lost_on_the_bus:
             self.lost_on_the_bus -= 1
             return
         reader = next((name for name in CHAIN if topic in load_stage(name).reads), None)
         if reader:
             self._step(reader, topic, stamped)
+
+    def _report(self, session: Session, due: Iterable[Consumed]) -> None:
+        for report in due:
+            sequence = session.published.get("consumed", 0)
+            session.published["consumed"] = sequence + 1
+            self._record("consumed", replace(report, header=replace(report.header, sequence=sequence)))
+
+    def _record(self, topic: str, message: Message) -> None:
+        if self.records and BY_NAME[topic].recorded:
+            self.writer.add_message(tray_key(self.config.site, self.tray, topic), message, self.now_ns)
 
 
 class Site(Stages):

@@ -38,6 +38,7 @@ _TIMES = (
     "newest_input_t_ns",
     "newest_output_t_ns",
     "first_sample_t_ns",
+    "first_t_ns",
 )
 SCALARS: dict[str, st.SearchStrategy[Any]] = {
     **dict.fromkeys(_TIMES, INT64),

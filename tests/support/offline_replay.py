@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.writing import RecordingWriter
+from pipeline.replay.offline.comparison import Comparison
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import RescoredTray, rescore
-from pipeline.replay.offline.verify import Comparison
-from schemas.messages import Alarm
+from pipeline.replay.offline.verify import TrayVerifier
+from schemas.messages import Alarm, Header, Score
 from tests.support.killed_site import Site
 
 
@@ -48,6 +50,33 @@ def changed(path: Path, out: Path, change) -> Path:
             if message is not None:
                 writer.add_message(entry.key, message, entry.received_t_ns)
     return out
+
+
+def without_topics(path: Path, out: Path, *topics: str) -> Path:
+    """A copy as a recorder makes it that leaves these topics out."""
+    head = read_metadata(path)
+    with RecordingWriter(out, {**head.metadata, "left_out": ",".join(topics)}, head.attachments) as writer:
+        for entry in read_recording(path):
+            if entry.topic not in topics:
+                writer.add(entry)
+    return out
+
+
+def remade(lean: Path, whole: Path) -> Comparison:
+    """What a replay of the recording `lean` makes, compared with the scores and alarms of the recording `whole`."""
+    with open_replay_input([lean], None, (), None) as given, open_replay_input([whole], None, (), None) as wanted:
+        (tray,) = given.trays
+        plan, recorded_alarms, why_none = given.read_plan(tray.name)
+        assert plan, why_none
+        pipeline = given.pipeline(tray.name, plan)
+        verifier = TrayVerifier(tray.name, lambda topic: wanted.envelopes(tray.name, (topic,)), pipeline.limit_of)
+        alarms: list[Alarm] = []
+        for producer, message in ((each.producer, each.message) for each in pipeline.run()):
+            if isinstance(message, Alarm):
+                alarms.append(replace(message, header=Header(producer, 0, tray.name)))
+            elif isinstance(message, Score):
+                verifier.add(producer, message)
+        return verifier.finish(plan.last, alarms, recorded_alarms)
 
 
 def recording_of(folder: Path, seed: int, *samples: int, killed: str = "", calibrated: bool = False) -> Path:

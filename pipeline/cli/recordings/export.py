@@ -21,6 +21,7 @@ from pipeline.cli.twins.training_data import make_folder
 from pipeline.errors import UsageError, UserError
 from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.arrays import Block, read_topics
+from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.order import in_order
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.records import ACTIVE_SUFFIX
@@ -67,7 +68,7 @@ def export(
             tables.add(block)
             status.update(f"exporting {parts[0]}: {tables.rows} rows")
         if not tables.begun:
-            raise UserError(_no_messages(parts[0], topics, tray, arrays.damage))
+            raise UserError(_no_messages(parts, topics, tray, arrays.damage))
         tables.finish("; ".join(arrays.damage))
     written = [table.summary() for table in tables.begun.values()]
     absent = [name for name in topics if name not in {table["topic"] for table in written}]
@@ -79,7 +80,7 @@ def export(
         for table in written:
             typer.echo(f"{table['file']}: {table['rows']} rows")
     for name in absent:
-        typer.echo(f"no {name} in this recording", err=True)
+        typer.echo(": ".join(filter(None, (f"no {name} in this recording", left_out_hint(parts, (name,))))), err=True)
     for line in arrays.damage:
         typer.echo(line, err=True)
     if arrays.damage:
@@ -195,7 +196,8 @@ def _default_topics(parts: Sequence[Path]) -> tuple[str]:
     return ("score",) if has_scores else ("raw",)
 
 
-def _no_messages(path: Path, topics: Sequence[str], tray: str | None, damage: Sequence[str]) -> str:
+def _no_messages(parts: Sequence[Path], topics: Sequence[str], tray: str | None, damage: Sequence[str]) -> str:
     of_tray = f" of a tray {tray!r}" if tray else ""
     lost = f" ({'; '.join(damage)})" if damage else ""
-    return f"{path}: no {' or '.join(topics)}{of_tray} in this recording{lost}; see --topic and --tray"
+    todo = left_out_hint(parts, topics) or "see --topic and --tray"
+    return f"{parts[0]}: no {' or '.join(topics)}{of_tray} in this recording{lost}; {todo}"

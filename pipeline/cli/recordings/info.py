@@ -23,6 +23,7 @@ from pipeline.launch.stage_notes import note_lines, notes_as_json
 from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
 from pipeline.recordings.dates import format_clock, format_local
 from pipeline.recordings.metadata import CONFIGURATION
+from pipeline.recordings.reading import left_out_of
 from pipeline.recordings.records import active_path
 from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 from schemas.messages import Health
@@ -92,6 +93,7 @@ def _part_as_json(part: Contents) -> dict[str, Any]:
         "last_ns": part.last_ns,
         "duration_s": _duration_s(part),
         "metadata": dict(part.metadata),
+        "left_out": list(left_out_of(part.metadata)),
         "attachments": list(part.attachments),
         "has_configuration": _has_configuration(part),
         "twins": {_tray(key): {"twin": c.twin, "kind": c.kind, "sha256": c.sha256} for key, c in part.cards.items()},
@@ -176,6 +178,8 @@ def _about(part: Contents) -> list[str]:
         )
     for key, card in part.cards.items():
         lines.append(f"twin of {_tray(key)}: {card.twin}, {card.kind}, sha256 {card.sha256[:12]}")
+    if left_out := left_out_of(metadata):
+        lines.append(f"left out on purpose (recorder.topics): {', '.join(left_out)}")
     if "source" in metadata:
         lines.append(f"made from: {metadata['source']}")
     if part.attachments:

@@ -6,7 +6,7 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -19,8 +19,9 @@ from rich.text import Text
 
 from pipeline.cli.options import JsonOption, SetOption
 from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
-from pipeline.errors import UsageError
+from pipeline.errors import UsageError, UserError
 from pipeline.recordings.dates import format_utc
+from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.remote import local_copies, matching, recording_path
 from pipeline.replay.live.keyboard import Keys
 from pipeline.replay.live.pace import Pace
@@ -32,8 +33,8 @@ from pipeline.replay.stage_chain import replay_starts
 from pipeline.runtime.signals import stop_on_signals
 from schemas.topics import TOPICS
 
-REPLAYED = tuple(topic.name for topic in TOPICS if topic.recorded and topic.name != "health")
-"""the topics replayed by default; the health of stages that are not running is not one of them"""
+REPLAYED = tuple(topic.name for topic in TOPICS if topic.recorded and not topic.is_of_session)
+"""the topics replayed by default"""
 _KEYS_HELP = "space pause, → step, ↑↓ rate, q quit"
 _SHOWN_EVERY_S = 0.1
 LARGEST_RATE = 1e6
@@ -143,11 +144,15 @@ def replay(
     if pause and not keys.is_available:
         raise UsageError("--pause needs a terminal, to continue with a key")
     with local_copies():
-        playback = RecordingPlayback(files, _chosen_topics(topics, from_topic), start, end)
+        chosen = _chosen_topics(topics, from_topic)
+        playback = RecordingPlayback(files, chosen, start, end)
+        missing = _left_out(playback.files, chosen, is_asked_for=bool(topics or from_topic))
         replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
         stop = threading.Event()
         stop_on_signals(stop)
         console = Console(stderr=True, highlight=False)
+        if missing:
+            console.print(missing, markup=False, soft_wrap=True)
         with keys, _status_line(console, playback.end_s(), playback.seconds_at) as show:
             outcome = publish(
                 playback,
@@ -186,6 +191,18 @@ def _chosen_topics(topics: str | None, from_topic: str | None) -> tuple[str, ...
         if name not in REPLAYED:
             raise UsageError(f"--topics {name}: is not one of {', '.join(REPLAYED)}")
     return chosen
+
+
+def _left_out(files: Sequence[Path], topics: Sequence[str], *, is_asked_for: bool) -> str:
+    """A line about what the recorder left out of these topics; empty if nothing.
+
+    Raises:
+        UserError: the topics were asked for.
+    """
+    line = left_out_hint(files, topics)
+    if line and is_asked_for:
+        raise UserError(f"{files[0]}: {line}")
+    return f"{files[0]}: {line}" if line else ""
 
 
 def _rate(text: str) -> float:

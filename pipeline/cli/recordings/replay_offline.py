@@ -164,22 +164,27 @@ def _duration(hours: float) -> str:
 
 
 def _print_verified(found: dict[str, Any], console: Console) -> None:
+    has_scores = "score" not in found["left_out"]
+    what = "samples" if has_scores else "snapshots"
     if found["equal"]:
         console.print(
-            f"[bold green]equal:[/bold green] {found['samples_equal']} samples and {found['alarms_equal']} alarms, "
+            f"[bold green]equal:[/bold green] {found[f'{what}_equal']} {what} and {found['alarms_equal']} alarms, "
             "to the bit"
         )
     else:
+        different, equal = found[f"{what}_different"], found[f"{what}_equal"]
+        not_made = f"{found['samples_not_made']} were not replayed, " if has_scores else ""
         console.print(
-            f"[bold red]DIFFERS:[/bold red] {found['samples_different']} of "
-            f"{found['samples_different'] + found['samples_equal']} samples differ, {found['samples_not_made']} "
-            f"were not replayed, {found['alarms_different']} alarms differ; the first differences:"
+            f"[bold red]DIFFERS:[/bold red] {different} of {different + equal} {what} differ, {not_made}"
+            f"{found['alarms_different']} alarms differ; the first differences:"
         )
         for line in found["differences"]:
             console.print(f"  {line}", markup=False)
+    if not has_scores:
+        console.print("scores were not recorded (recorder.topics): alarms and the scorers' snapshots were compared")
     if found["not_comparable"]:
         console.print(
-            f"[bold yellow]not comparable:[/bold yellow] {found['samples_not_comparable']} samples and "
+            f"[bold yellow]not comparable:[/bold yellow] {found[f'{what}_not_comparable']} {what} and "
             f"{found['alarms_not_comparable']} alarms:"
         )
         for reason in found["not_comparable"]:

@@ -12,9 +12,9 @@ from typing import Any
 from pipeline.cli.progress import show_part
 from pipeline.errors import UserError
 from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
+from pipeline.replay.offline.comparison import CannotCompareError
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from pipeline.replay.offline.rescoring import RescoredTray, rescore
-from pipeline.replay.offline.verify import CannotCompareError
 from schemas.units import NS_PER_S
 
 SUMS = ("hours", "samples", "lost", "restarts")
@@ -109,6 +109,10 @@ def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray]) -> dict[st
             "alarms_not_recorded": sum(one.alarms_not_recorded for one in compared),
             "samples_not_comparable": sum(one.not_comparable for one in compared),
             "alarms_not_comparable": sum(one.alarms_not_comparable for one in compared),
+            "snapshots_equal": sum(one.snapshots_equal for one in compared),
+            "snapshots_different": sum(one.snapshots_different for one in compared),
+            "snapshots_not_comparable": sum(one.snapshots_not_comparable for one in compared),
+            "left_out": list(replay_input.metadata.left_out),
             "not_comparable": [reason for one in compared for reason in one.reasons],
             "differences": [line for one in compared for line in one.named],
         }
@@ -129,10 +133,11 @@ def _verified(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Comparisons of several recordings together: lists one after another, numbers summed."""
     counts = Counter[str]()
     for one in found:
-        counts.update({name: value for name, value in one.items() if name.startswith(("samples_", "alarms_"))})
+        counts.update({name: value for name, value in one.items() if isinstance(value, int) and name != "equal"})
     return {
         "equal": all(one["equal"] for one in found),
         **counts,
+        "left_out": list(dict.fromkeys(topic for one in found for topic in one["left_out"])),
         "not_comparable": [line for one in found for line in one["not_comparable"]],
         "differences": [line for one in found for line in one["differences"]],
     }

@@ -47,8 +47,8 @@ def wear(
     """Show how each fan has changed since commissioning, how fast, and when its limit will be reached
     (docs/explanation/wear.md).
 
-    The values are those of the scorer's last snapshot, which is at most a minute old. Exit code 0: shown; 1: nothing is
-    known; 3: a recording could not be read in full.
+    The values are those of the scorer's last snapshot, which is at most a minute or 3,000 samples old. Exit code 0:
+    shown; 1: nothing is known; 3: a recording could not be read in full.
 
     Example: fantwin wear
 
@@ -56,7 +56,7 @@ def wear(
     """
     if recordings:
         snapshots, damage = _recorded(recordings)
-        nothing = f"no wear in {', '.join(map(str, recordings))}: a scorer records it every minute and when it stops"
+        nothing = f"no wear in {', '.join(map(str, recordings))}: a scorer records it regularly and when it stops"
     else:
         settings, damage = load_config(config, overrides or (), stages=()), []
         stop = threading.Event()
@@ -71,7 +71,7 @@ def wear(
                 for snapshot in _decoded(payload)
                 if watcher.counts(key, snapshot.header.producer)
             ]
-        nothing = "no scorer has recorded wear so far: it does so every minute; try again later"
+        nothing = "no scorer has recorded wear so far: it does so regularly; try again later"
     found = [
         (tray, snapshot.t_ns, wear) for tray, snapshot in _latest(snapshots).items() for wear in _wear_in(snapshot)
     ]

@@ -6,10 +6,12 @@ and write. They run as fast as possible, on larger blocks; their output does not
 
 from __future__ import annotations
 
+import heapq
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,7 @@ from pipeline.replay.offline.sample_stream import SampleStream
 from pipeline.replay.stage_chain import StageChain
 from pipeline.runtime.stage import Context, Core, Stage
 from schemas.blocks import cut
-from schemas.messages import Header, Message, NewTwin, Prediction, ScorerSnapshot
+from schemas.messages import Header, Message, NewTwin, Prediction, Request, ScorerSnapshot
 from schemas.messages import newest_t_ns as message_t_ns
 from schemas.topics import BY_NAME
 
@@ -153,24 +155,32 @@ class OfflinePipeline:
         self._limited.add(session.producer)
         session.set_limit(newest_t_ns, f"the recording lacks {RAW_MISSING} raw messages that were scored")
 
-    def _run_last(self, core: Core, session: Session) -> Iterator[Message]:
-        """What the last stage makes of its samples, and of the requests between them."""
+    def _run_last(self, core: Any, session: Session) -> Iterator[Message]:
+        """What the last stage makes of its samples, and of the requests between them; and its snapshots at the samples
+        of the recorded ones."""
         for card in session.twins:
             core.step(card)
-        requests = deque(session.requests)
+        snapshots = ((t_ns, None) for t_ns in dict.fromkeys(session.snapshots_t_ns))
+        events = deque(heapq.merge(snapshots, session.requests, key=itemgetter(0)))  # at one time snapshots first
         for block in self._samples(session, self._last_inputs):
             done = 0
-            while requests and requests[0][0] <= block.t_ns[-1]:
-                after_t_ns, request = requests.popleft()
+            while events and events[0][0] <= block.t_ns[-1]:
+                after_t_ns, request = events.popleft()
                 row = max(done, int(np.searchsorted(block.t_ns, after_t_ns, side="right")))
                 if row > done:
                     yield from core.step(cut(block, done, row))
                     done = row
-                self._observe(request)
-                yield from core.step(request)
+                yield from self._between_samples(core, request)
             if done < len(block.t_ns):
                 yield from core.step(cut(block, done, len(block.t_ns)) if done else block)
-        for _, request in requests:
+        for _, request in events:
+            yield from self._between_samples(core, request)
+
+    def _between_samples(self, core: Any, request: Request | None) -> Iterator[Message]:
+        """What the last stage makes of a request, or without one its snapshot."""
+        if request is None:
+            yield from core.last_snapshot()
+        else:
             self._observe(request)
             yield from core.step(request)
 

@@ -15,10 +15,12 @@ from pipeline.recordings.order import in_order
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
 from pipeline.replay.default_config import default_config, first_raw
 from pipeline.replay.offline.offline_pipeline import OfflinePipeline
-from pipeline.replay.offline.plan import PlanReader, TrayPlan, undisturbed_plan
+from pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
+from pipeline.replay.offline.plan_reader import PlanReader
 from pipeline.replay.offline.raw_blocks import RawBlocks
 from pipeline.replay.resolve_config import attached_config, recorded_rules
 from pipeline.replay.stage_chain import StageChain, decision_chain
+from pipeline.runtime.consumed import CONSUMED
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
@@ -74,8 +76,10 @@ class ReplayInput:
 
         The plan is None if the recording does not contain it, or if another grid or only a part is replayed.
         """
-        reader = PlanReader(self.stages)
-        for envelope in self.envelopes(tray, (*self.stages.outputs, *self.stages.side_topics)):
+        left_out = self.metadata.left_out
+        recorded = [topic for topic in self.stages.outputs if topic not in left_out]
+        reader = PlanReader(self.stages, left_out)
+        for envelope in self.envelopes(tray, (*recorded, *self.stages.side_topics, CONSUMED)):
             reader.add(envelope)
         if reader.undecodable:
             line = f"{self.paths[0]}: messages left out that cannot be decoded: {reader.undecodable}"

@@ -12,12 +12,13 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.recordings.writing import RecordingWriter
+from pipeline.replay.offline.comparison import CannotCompareError, Comparison
 from pipeline.replay.offline.output_recording import TrayOutput, output_writer
 from pipeline.replay.offline.plan import RAW_MISSING, TrayPlan, undisturbed_plan
 from pipeline.replay.offline.replay_input import ReplayInput
-from pipeline.replay.offline.verify import CannotCompareError, Comparison, TrayVerifier
+from pipeline.replay.offline.verify import TrayVerifier
 from schemas.codec import CodecError
-from schemas.messages import Alarm, Header, InvalidReason, Message, Score
+from schemas.messages import Alarm, Header, InvalidReason, Message, Score, ScorerSnapshot
 from schemas.streams import LOSS_PREFIX
 from schemas.units import NS_PER_S
 
@@ -126,7 +127,12 @@ def _rescore_tray(
     output = TrayOutput(writer, replay_input.config.site, tray) if writer else None
     pipeline = replay_input.pipeline(tray, rescored.plan, output.add if output else _ignore)
     verifier = (
-        TrayVerifier(tray, lambda: replay_input.envelopes(tray, ("score",)), pipeline.limit_of)
+        TrayVerifier(
+            tray,
+            lambda topic: replay_input.envelopes(tray, (topic,)),
+            pipeline.limit_of,
+            replay_input.metadata.left_out,
+        )
         if verify and plan
         else None
     )
@@ -138,8 +144,8 @@ def _rescore_tray(
             elif isinstance(message, Score):
                 rescored.add(message, pipeline.longest_repeat)
                 progress(tray, rescored.end_ns)
-                if verifier:
-                    verifier.add(replayed.producer, message)
+            if verifier and isinstance(message, Score | ScorerSnapshot):
+                verifier.add(replayed.producer, message)
     except CodecError as error:
         raise UserError(f"{replay_input.paths[0]}: a message cannot be decoded: {error}; see `fantwin info`") from error
     rescored.counts, rescored.raw_missing = pipeline.counts, pipeline.raw_missing
@@ -147,7 +153,8 @@ def _rescore_tray(
         rescored.comparison = found = verifier.finish(rescored.plan.last, rescored.alarms, recorded_alarms)
         found.reasons = [reason.replace(RAW_MISSING, str(rescored.raw_missing)) for reason in found.reasons]
         if not (found.has_content or found.reasons):
-            found.reasons.append(f"{tray}: no scores in the recording: nothing to compare with")
+            what = "scores" if found.has_scores else "alarms or snapshots"
+            found.reasons.append(f"{tray}: no {what} in the recording: nothing to compare with")
     elif verify:
         rescored.comparison = Comparison(tray, reasons=[f"{tray}: {no_plan_reason}"])
     return rescored

@@ -1,4 +1,4 @@
-"""Comparing replayed scores and alarms with the recorded ones, to the bit.
+"""Comparing replayed scores and alarms with the recorded ones, to the bit; where scores are not recorded, snapshots.
 
 Only the numbers of causes (probability, size and its interval) may differ by CAUSE_TOLERANCE: they come from a linear
 regression, whose last digits depend on the processor.
@@ -7,79 +7,25 @@ regression, whose last digits depend on the processor.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
-from pipeline.errors import UserError
 from pipeline.recordings.dates import format_utc
-from pipeline.replay.offline.plan import BEGINNING, Limit, Session
+from pipeline.replay.offline.compare_snapshots import SnapshotVerifier
+from pipeline.replay.offline.comparison import CAUSE_TOLERANCE, Comparison
+from pipeline.replay.offline.plan import Limit, Session
 from schemas.blocks import cut
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header, decode_together
 from schemas.fields import columns
-from schemas.messages import Alarm, Array, Score, Transition
+from schemas.messages import Alarm, Array, Score, ScorerSnapshot, Transition
 
-CAUSE_TOLERANCE = 1e-6
-"""relative"""
-MAX_NAMED = 5
-"""differences that are described"""
+SCORE, SNAPSHOT = "score", "snapshot"
 _BLOCK_MESSAGES = 512
 _SAMPLE_COLUMNS = {name: column.dtype for name, column in columns(Score).items() if column.by_sample and name != "t_ns"}
-
-
-class CannotCompareError(UserError):
-    """The replay cannot be compared with the recording."""
-
-
-@dataclass
-class Comparison:
-    """The result for one tray. Samples are those of the tray, with all fans."""
-
-    tray: str
-    equal: int = 0
-    different: int = 0
-    """replayed, and not equal"""
-    not_made: int = 0
-    """recorded, and not replayed"""
-    not_recorded: int = 0
-    """replayed, and not in the recording: in flight when it ended, or lost"""
-    alarms_equal: int = 0
-    alarms_different: int = 0
-    alarms_not_recorded: int = 0
-    """replayed, and later than the last recorded score of their session"""
-    not_comparable: int = 0
-    """not equal or not replayed, where the recording lacks what they were computed from"""
-    alarms_not_comparable: int = 0
-    reasons: list[str] = field(default_factory=list)
-    """why something is not comparable, a line each"""
-    named: list[str] = field(default_factory=list)
-    """the first differences, a line each"""
-
-    @property
-    def is_equal(self) -> bool:
-        """Whether nothing differs."""
-        return not (self.different or self.not_made or self.alarms_different)
-
-    @property
-    def has_content(self) -> bool:
-        """Whether anything could be compared."""
-        return bool(self.equal or self.different or self.not_made)
-
-    def add_not_comparable(self, samples: int, limit: Limit) -> None:
-        """Count samples beyond the limit of their session."""
-        self.not_comparable += samples
-        since = "" if limit.t_ns == BEGINNING else f"after {format_utc(limit.t_ns)}: "
-        reason = f"{self.tray}: {since}{limit.reason}"
-        if samples and reason not in self.reasons:
-            self.reasons.append(reason)
-
-    def name(self, difference: str) -> None:
-        """Describe a difference, if it is one of the first."""
-        if len(self.named) < MAX_NAMED:
-            self.named.append(difference)
 
 
 class TrayVerifier:
@@ -92,20 +38,28 @@ class TrayVerifier:
     def __init__(
         self,
         tray: str,
-        read_scores: Callable[[], Iterable[Envelope]],
+        read: Callable[[str], Iterable[Envelope]],
         limit_of: Callable[[str], Limit | None],
+        left_out: Collection[str] = (),
     ) -> None:
-        """read_scores: the recorded scores of the tray, from the beginning at each call. limit_of: the limit of a
-        session of the scorer, as known when its last scores were made."""
-        self._read_scores = read_scores
+        """read: the recorded messages of a topic of the tray, from the beginning at each call. limit_of: the limit of a
+        session of the scorer, as known when its last scores were made. left_out: topics that are not recorded."""
+        self._read = read
         self._limit_of = limit_of
         self._producer: str | None = None
         self._recorded: RecordedSession | None = None
         self._visited: set[str] = set()
-        self._found = Comparison(tray)
+        self._found = Comparison(tray, has_scores=SCORE not in left_out)
+        self._snapshots = SnapshotVerifier(lambda: read(SNAPSHOT), limit_of, self._found)
 
-    def add(self, producer: str, score: Score) -> None:
-        """Compare the next replayed scores, of the recorded session `producer`."""
+    def add(self, producer: str, message: Score | ScorerSnapshot) -> None:
+        """Compare the next scores or snapshot that were replayed, of the recorded session `producer`."""
+        if isinstance(message, Score) and self._found.has_scores:
+            self._add_score(producer, message)
+        elif isinstance(message, ScorerSnapshot) and not (message.restored or self._found.has_scores):
+            self._snapshots.add(producer, message)
+
+    def _add_score(self, producer: str, score: Score) -> None:
         if self._recorded is None or producer != self._producer:
             self._end_session()
             self._recorded = self._begin_session(producer)
@@ -113,22 +67,32 @@ class TrayVerifier:
 
     def finish(self, sessions: Sequence[Session], alarms: Sequence[Alarm], recorded: Sequence[Alarm]) -> Comparison:
         """Compare what is left, and the alarms; the result."""
+        if self._found.has_scores:
+            self._finish_scores(sessions)
+        else:
+            self._snapshots.finish(sessions)
+        for session in sessions:
+            replayed, known = (
+                [alarm for alarm in listed if alarm.header.producer == session.producer]
+                for listed in (alarms, recorded)
+            )
+            limit = self._limit_of(session.producer)
+            compare_alarms(replayed, known, session.last_t_ns, self._found, limit)
+            if limit is not None and limit.t_ns < session.last_t_ns and not self._found.has_scores:
+                self._found.add_limit(limit)
+        return self._found
+
+    def _finish_scores(self, sessions: Sequence[Session]) -> None:
         self._end_session()
         for session in sessions:
             if session.producer not in self._visited:
                 self._recorded = self._begin_session(session.producer)
                 self._end_session()
-            replayed, known = (
-                [alarm for alarm in listed if alarm.header.producer == session.producer]
-                for listed in (alarms, recorded)
-            )
-            compare_alarms(replayed, known, session.last_t_ns, self._found, self._limit_of(session.producer))
-        return self._found
 
     def _begin_session(self, producer: str) -> RecordedSession:
         self._producer = producer
         self._visited.add(producer)
-        return RecordedSession(self._read_scores(), producer)
+        return RecordedSession(self._read(SCORE), producer)
 
     def _end_session(self) -> None:
         if self._recorded and self._producer is not None:

@@ -35,3 +35,11 @@ def test_row_16_publishers_of_a_process_keep_a_bounded_number_of_bytes_together(
                 publisher.put(bytes(100))
         assert sum(len(each._kept) for each in (first, second)) == 100
         assert len(rare._kept) == 100, "what is published only on change is kept all the same"
+
+
+def test_the_newest_message_is_kept_however_large_it_is(endpoint):
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        publisher = bus.publisher(tray_key("s", "a", "snapshot"), BY_NAME["snapshot"], "", "p")
+        for number in range(3):
+            publisher.put(bytes([number]) * (publisher_module.KEPT_BYTES + 1))
+        assert [(sequence, payload[0]) for sequence, payload in publisher._kept] == [(2, 2)]

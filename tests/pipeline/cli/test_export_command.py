@@ -287,7 +287,7 @@ def test_every_topic_has_a_table_of_plain_columns():
     for kind in MESSAGE_TYPES:
         found = table_columns(kind)
         assert next(iter(found)) == ("host_receive_t_ns" if kind is Raw else "t_ns")
-        assert ("fan" in found) == (kind.__name__ not in ("Health", "Clock", "NewTwin", "ScorerSnapshot"))
+        assert ("fan" in found) == (kind.__name__ not in ("Health", "Clock", "Consumed", "NewTwin", "ScorerSnapshot"))
         assert all(column.dtype.kind in "iufbO" for column in found.values())
     assert not {"inputs", "outputs", "counters"} & set(table_columns(Health))
 

@@ -146,7 +146,7 @@ def test_recordings_of_earlier_versions_are_shown_in_the_same_way(tmp_path, note
 @pytest.mark.parametrize("state", ["{}", "no json", '{"wear": 3}', '{"wear": {"fans": [{}]}}'])
 def test_a_recording_without_wear_is_one_line(tmp_path, notes, state):
     path = recording(tmp_path / "r.mcap", [replace(notes[0], state_json=state)])
-    assert error_of("wear", path) == f"no wear in {path}: a scorer records it every minute and when it stops"
+    assert error_of("wear", path) == f"no wear in {path}: a scorer records it regularly and when it stops"
 
 
 def test_a_recording_that_cannot_be_read_in_full_is_shown_as_far_as_it_is_readable(tmp_path, notes):
@@ -210,7 +210,7 @@ def test_a_running_site_reports_the_same(site, tmp_path, notes):
 
 @pytest.mark.parametrize("site", [False], indirect=True)
 def test_a_scorer_that_has_noted_nothing_yet_is_one_line(site):
-    assert error_of("wear", *site) == "no scorer has recorded wear so far: it does so every minute; try again later"
+    assert error_of("wear", *site) == "no scorer has recorded wear so far: it does so regularly; try again later"
 
 
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, monkeypatch):

@@ -345,7 +345,7 @@ class NoSessions:
     def stages(self) -> list[Any]:
         return []
 
-    def losses(self, _launched: object) -> dict[str, int]:
+    def losses(self, _launched: object, _reads: object) -> dict[str, int]:
         return {}
 
     def refused(self) -> dict[str, dict[str, int]]:

@@ -149,6 +149,12 @@ def test_a_stage_is_due_only_what_it_reads():
     assert not any(found.values())
 
 
+def test_a_stage_is_due_nothing_of_a_topic_that_it_leaves_out_on_purpose():
+    recorder = health("w1", "recorder", 9)
+    assert losses([SENT, recorder], LAUNCHED, {"recorder": ("grid", "alarm")})["recorder"] == 0
+    assert losses([SENT, recorder], LAUNCHED, {"recorder": ("raw", "alarm")})["recorder"] == 90
+
+
 def test_counting_losses_imports_no_stage():
     """Its imports take seconds, in which no health is heard: `fantwin status` would call all stages silent."""
     look = (

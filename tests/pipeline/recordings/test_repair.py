@@ -27,6 +27,8 @@ from pipeline.recordings.repair import recover, repair_in_place
 from pipeline.recordings.scan import scan
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
 from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import Header, Health, Output, StageStatus
+from schemas.topics import health_key
 from tests.support.failing_writers import disk_of
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
 
@@ -433,3 +435,27 @@ def test_a_recording_that_is_renamed_while_it_is_read_is_one_line(
     monkeypatch.setattr(RecordReader, "__iter__", then_renamed)
     with pytest.raises(RecordingError, match="one.mcap: cannot read the recording: No such file"):
         scan(path)
+
+
+def test_what_a_killed_recorder_left_out_on_purpose_is_not_missing_in_the_repaired_file(tmp_path):
+    metadata = {"site": "plant", "left_out": "grid,score"}
+    writer = RecordingWriter(tmp_path / "r.mcap", metadata, ledger=SequenceLedger(left_out=("grid", "score")))
+    keys = (RAW_KEY, RAW_KEY.replace("/raw", "/grid"))
+    for number in range(2):
+        outputs = tuple(Output(key=key, published=5 * number) for key in keys)
+        health = Health(
+            header=Header("acquisition-1", number, ""),
+            stage="acquisition",
+            instance="tray1",
+            status=StageStatus.OK,
+            t_ns=1,
+            uptime_s=1.0,
+            outputs=outputs,
+        )
+        writer.add_message(health_key("plant", "acquisition", "tray1"), health, number)
+    writer.flush()
+    killed = tmp_path / "killed.mcap"
+    killed.write_bytes((tmp_path / "r.mcap.active").read_bytes())
+    found = recover(killed).found
+    assert found.counts.ledger.unrecorded() == {STREAM: 5}
+    assert read_metadata(killed).left_out == ("grid", "score")

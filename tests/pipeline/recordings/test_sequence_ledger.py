@@ -135,6 +135,21 @@ def test_topics_that_are_not_recorded_are_never_missing():
     assert ledger.counts == {}
 
 
+def test_topics_that_were_left_out_on_purpose_are_never_missing():
+    grid = "fantwin/plant/tray1/grid"
+    ledger = SequenceLedger({(grid, "a"): 3, (KEY, "a"): 3}, left_out=("grid",))
+    for published in (0, 5):
+        ledger.add_health(health("b", published, grid))
+    ledger.add_health(health("a", 9, grid))
+    assert ledger.unrecorded() == {}
+    assert ledger.next == {(KEY, "a"): 3}, "a recorder that takes it up again misses nothing of it"
+    for successor in (ledger.for_next_part(), ledger.as_lost()):
+        successor.add_health(health("c", 0, grid))
+        successor.add_health(health("c", 5, grid))
+        successor.finish()
+        assert not [key for key, _ in successor.counts if key == grid]
+
+
 def test_first_and_last_times_allow_for_a_clock_that_was_set_back():
     ledger = SequenceLedger()
     for sequence, t_ns in enumerate((50, 90, 10, 20)):

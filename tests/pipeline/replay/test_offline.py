@@ -15,9 +15,9 @@ from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.records import RecordReader
 from pipeline.replay.offline.alarm_episodes import episodes
+from pipeline.replay.offline.comparison import CannotCompareError
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import rescore
-from pipeline.replay.offline.verify import CannotCompareError
 from schemas.messages import Action, Alarm, FanState, Score, Transition
 from schemas.units import NS_PER_S
 from tests.support.killed_site import CHAIN, Site

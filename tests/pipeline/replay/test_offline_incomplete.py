@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from pipeline.recordings.reading import RecordingError
+from pipeline.replay.offline.comparison import CannotCompareError
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import rescore
-from pipeline.replay.offline.verify import CannotCompareError
 from schemas import fan_pb2
 from tests.support.killed_site import Site
 from tests.support.offline_replay import changed, made_equal, recorded, verified, verified_in_part

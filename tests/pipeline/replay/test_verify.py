@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.replay.offline.verify import Comparison, compare_alarms
+from pipeline.replay.offline.comparison import Comparison
+from pipeline.replay.offline.verify import compare_alarms
 from schemas.messages import Alarm, Diagnosis, Severity, Transition
 
 

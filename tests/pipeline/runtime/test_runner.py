@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.bus.session import Bus
+from pipeline.config.models import TrayConfig
 from pipeline.launch.loss_accounting import losses
-from pipeline.runtime.stage import BuiltStage, Core
+from pipeline.runtime.stage import BuiltStage, Context, Core
 from schemas.codec import encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Command, Grid, Header, Health, InputPosition, Message, Output, Raw, StageStatus
@@ -309,3 +311,24 @@ def test_a_stage_whose_launcher_has_gone_runs_until_its_producers_have_ended(con
     bench.end()
     assert last and last.status == StageStatus.OK, "it ended while there was still somebody to read from"
     assert ended_by_itself
+
+
+def test_a_stage_hears_only_the_topics_that_it_reads_as_configured(config):
+    contexts: list[Context] = []
+
+    def build(context: Context) -> BuiltStage:
+        contexts.append(context)
+        return BuiltStage(Passer())
+
+    def choose(section: object, trays: Sequence[TrayConfig]) -> Sequence[str]:
+        assert section == config.sections["resampler"] and trays == config.trays
+        return ("raw",)
+
+    bench = Bench(toy(build, reads=("raw", "command"), chooses=choose), config)
+    command = bench.bus.publisher(tray_key("s", TRAY_A, "command"), BY_NAME["command"], type_name(Command), "operator")
+    command.put(encode(Command(header=Header("operator", 0, TRAY_A), fans=1, t_ns=1, command=np.ones(1))))
+    bench.feed(TRAY_A, 1)
+    bench.next(Grid)
+    last = bench.end()
+    assert [line.key for line in last.inputs] == [tray_key("s", TRAY_A, "raw")]
+    assert contexts[0].reads == ("raw",)

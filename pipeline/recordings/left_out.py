@@ -1,0 +1,35 @@
+"""What a recorder left out of a recording on purpose, in words: what is missing, and which command makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from pathlib import Path
+
+from pipeline.recordings.reading import RecordingError, read_metadata
+
+RAW = "raw"
+
+
+def left_out(paths: Iterable[Path], topics: Collection[str]) -> list[str]:
+    """Which of these topics the recorder left out of a recording, given its parts."""
+    found = {topic for path in paths for topic in _left_out_of(path)}
+    return [topic for topic in topics if topic in found]
+
+
+def left_out_hint(paths: Collection[Path], topics: Collection[str]) -> str:
+    """A line about those of these topics that the recorder left out, and how to make them; empty if there are none."""
+    missing = left_out(paths, topics)
+    if not missing:
+        return ""
+    line = f"its recorder left out {', '.join(missing)} (recorder.topics)"
+    if left_out(paths, (RAW,)):
+        return f"{line}, and without {RAW} nothing can be made again"
+    files = " ".join(map(str, paths))
+    return f"{line}: `fantwin replay {files} --offline -o WHOLE.mcap` makes a recording with all topics"
+
+
+def _left_out_of(path: Path) -> tuple[str, ...]:
+    try:
+        return read_metadata(path).left_out
+    except RecordingError:  # reported by whoever reads its messages
+        return ()

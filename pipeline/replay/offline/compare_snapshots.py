@@ -1,0 +1,151 @@
+"""Comparing replayed snapshots of a scorer with the recorded ones: where scores are not recorded, they show that every
+statistic, baseline and alarm was the same.
+
+A scorer takes snapshots at the end of a block of samples. A replay has other blocks, so it takes its own at the samples
+of the recorded ones.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+from pipeline.recordings.dates import format_utc
+from pipeline.replay.offline.comparison import CAUSE_TOLERANCE, Comparison
+from pipeline.replay.offline.plan import Limit, Session
+from schemas.codec import CodecError
+from schemas.envelope import Envelope
+from schemas.messages import ScorerSnapshot
+from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
+
+REGRESSED = ("wear", "causes")
+"""entries whose numbers come from linear regressions: they may differ by CAUSE_TOLERANCE"""
+
+
+class Difference(NamedTuple):
+    """Where two states differ first."""
+
+    where: str
+    """keys and places in lists, with dots between"""
+    is_of_form: bool = False
+    """one has an entry that the other has not, because another version took it"""
+
+
+class SnapshotVerifier:
+    """Compares what a replay of one tray makes, session by session, in order."""
+
+    def __init__(
+        self, read: Callable[[], Iterable[Envelope]], limit_of: Callable[[str], Limit | None], found: Comparison
+    ) -> None:
+        """read: the recorded snapshots of the tray, from the beginning at each call. limit_of: the limit of a session
+        of the scorer. found: takes the results."""
+        self._read = read
+        self._limit_of = limit_of
+        self._found = found
+        self._producer: str | None = None
+        self._recorded: Iterator[ScorerSnapshot] = iter(())
+        self._next: ScorerSnapshot | None = None
+        self._made: list[ScorerSnapshot] = []
+        """those of one time: a request is answered between two samples"""
+        self._visited: set[str] = set()
+
+    def add(self, producer: str, made: ScorerSnapshot) -> None:
+        """Compare the next replayed snapshot, of the recorded session `producer`."""
+        if producer != self._producer:
+            self._begin_session(producer)
+        if self._made and made.t_ns != self._made[0].t_ns:
+            self._settle(made.t_ns)
+        self._made.append(made)
+
+    def finish(self, sessions: Sequence[Session]) -> None:
+        """Compare what is left."""
+        for session in sessions:
+            if session.producer not in self._visited:
+                self._begin_session(session.producer)
+        self._settle(None)
+
+    def _begin_session(self, producer: str) -> None:
+        self._settle(None)
+        self._producer = producer
+        self._visited.add(producer)
+        self._recorded = _saved(self._read(), producer)
+        self._next = next(self._recorded, None)
+
+    def _settle(self, until_t_ns: int | None) -> None:
+        """Compare the recorded snapshots before a time; None: all."""
+        while self._next is not None and (until_t_ns is None or self._next.t_ns < until_t_ns):
+            made = [each for each in self._made if each.t_ns == self._next.t_ns]
+            self._compare(self._next, made)
+            self._next = next(self._recorded, None)
+        self._made = []
+
+    def _compare(self, recorded: ScorerSnapshot, made: Sequence[ScorerSnapshot]) -> None:
+        found = self._found
+        differences = list(filter(None, (first_difference(each, recorded) for each in made)))
+        if len(differences) < len(made):
+            found.snapshots_equal += 1
+            return
+        limit = self._limit_of(self._producer or "")
+        at = f"{found.tray}: snapshot of {format_utc(recorded.t_ns)}"
+        if limit is not None and recorded.t_ns > limit.t_ns:
+            found.snapshots_not_comparable += 1
+        elif not differences:
+            found.snapshots_different += 1
+            found.name(f"{at}: recorded and not replayed")
+        elif differences[-1].is_of_form:
+            found.snapshots_not_comparable += 1
+            found.add_reason(f"{found.tray}: snapshots have another form, see {differences[-1].where}")
+        else:
+            found.snapshots_different += 1
+            found.name(f"{at}: {differences[-1].where} differs")
+
+
+def first_difference(made: ScorerSnapshot, recorded: ScorerSnapshot) -> Difference | None:
+    """Where two snapshots differ; a difference of values before one of form. None: nowhere."""
+    if made.twin_sha256 != recorded.twin_sha256:
+        return Difference("twin_sha256")
+    if made.state_json == recorded.state_json:
+        return None
+    try:
+        one, other = (current_keys(json.loads(each.state_json), FORMER_SCORER_KEYS) for each in (made, recorded))
+    except (ValueError, TypeError, AttributeError):
+        return Difference("state_json", is_of_form=True)
+    return min(_differences(one, other, ()), key=lambda difference: difference.is_of_form, default=None)
+
+
+def _differences(one: Any, other: Any, path: tuple[str, ...]) -> Iterator[Difference]:
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in {**one, **other}:
+            if key in one and key in other:
+                yield from _differences(one[key], other[key], (*path, key))
+            else:  # entries of fans are named by their number
+                yield Difference(".".join((*path, key)), is_of_form=not key.isdigit())
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        for number, (mine, others) in enumerate(zip(one, other, strict=True)):
+            if mine != others:
+                yield from _differences(mine, others, (*path, str(number)))
+    elif not _is_same(one, other, path):
+        yield Difference(".".join(path))
+
+
+def _is_same(one: Any, other: Any, path: tuple[str, ...]) -> bool:
+    if isinstance(one, float) and isinstance(other, float) and not set(REGRESSED).isdisjoint(path):
+        return math.isclose(one, other, rel_tol=CAUSE_TOLERANCE, abs_tol=CAUSE_TOLERANCE**2)
+    return one == other
+
+
+def _saved(envelopes: Iterable[Envelope], producer: str) -> Iterator[ScorerSnapshot]:
+    """The snapshots that a session saved, in order, each once. What cannot be decoded is reported with the plan."""
+    next_sequence = 0
+    for envelope in envelopes:
+        try:
+            message = envelope.message
+        except CodecError:
+            continue
+        header = message.header
+        if isinstance(message, ScorerSnapshot) and header.producer == producer and header.sequence >= next_sequence:
+            next_sequence = header.sequence + 1
+            if not message.restored:
+                yield message

@@ -1,0 +1,292 @@
+"""Reads the plan of a replay from a recording: what each session consumed, by the input positions of its outputs.
+
+Where a recorder left outputs out, the stages' own reports of what they had consumed (`pipeline.runtime.consumed`) take
+their place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from typing import NamedTuple
+
+from pipeline.replay.offline.plan import BEGINNING, Session, Span, TrayPlan
+from pipeline.replay.stage_chain import StageChain
+from schemas.codec import CodecError
+from schemas.envelope import Envelope
+from schemas.fast_decode import decode_header
+from schemas.messages import (
+    Alarm,
+    Consumed,
+    Grid,
+    InputPosition,
+    Message,
+    ModelCard,
+    Prediction,
+    Request,
+    Score,
+    ScorerSnapshot,
+)
+from schemas.streams import continues
+
+_NEVER_REACHED = "raw messages never reached {}, and the recording does not say which"
+
+
+class Output(NamedTuple):
+    """What is known of a recorded output, or of one that a stage has reported."""
+
+    producer: str
+    number: int
+    """counts what is known of its producer: sequence number of the output, or of the report"""
+    position: InputPosition
+    first_t_ns: Callable[[], int]
+    newest_t_ns: int
+
+
+class NoInputPositionError(Exception):
+    """An output does not say which input it was made from."""
+
+
+class PlanReader:
+    """Reads a tray's outputs and side topics, in the order they were recorded."""
+
+    def __init__(self, chain: StageChain, left_out: Collection[str] = ()) -> None:
+        """left_out: topics that the recorder did not record."""
+        self._left_out = left_out
+        self._result = chain.outputs[-1]
+        self._stages = {topic: stage.name for stage, topic in zip(chain.stages, chain.outputs, strict=True)}
+        self._first = chain.stages[0].name
+        self._sessions: dict[str, dict[str, Session]] = {stage.name: {} for stage in chain.stages}
+        self._snapshots: dict[str, ScorerSnapshot] = {}
+        self._saved_t_ns: dict[tuple[str, int], int] = {}
+        """of each saved snapshot by producer and sequence"""
+        self._known: dict[tuple[str, str], int] = {}
+        """by producer of the last stage and of its input: up to when it is known to have scored"""
+        self._requests: dict[str, Request] = {}
+        self._twins: dict[tuple[str, int], ModelCard] = {}
+        self._answers: dict[tuple[str, str], tuple[int, int]] = {}
+        self._has_positions = True
+        self.alarms: dict[tuple[str, int], Alarm] = {}
+        """the recorded alarms by producer and sequence, each once"""
+        self.undecodable = 0
+
+    def add(self, envelope: Envelope) -> None:
+        """Read the next message."""
+        try:
+            if envelope.topic in self._stages:
+                if self._has_positions:
+                    self._add_output(envelope)
+            elif isinstance(message := envelope.message, Consumed):
+                self._add_report(message)
+            else:
+                self._add_side(message)
+        except NoInputPositionError:
+            self._has_positions = False
+        except CodecError:
+            self.undecodable += 1
+
+    def plan(self) -> TrayPlan | None:
+        """The sessions; None where the recording says of none what it consumed (`no_plan_reason`)."""
+        plan = TrayPlan({stage: list(sessions.values()) for stage, sessions in self._sessions.items()})
+        if not self._has_positions:
+            return None
+        if self._result in self._left_out:
+            self._extend_last(plan.last)
+        producing, *consuming = plan.sessions.values()
+        for stage, sessions in zip(list(plan.sessions)[1:], consuming, strict=True):
+            _drop_unknown_producers(sessions, {session.producer for session in producing})
+            plan.sessions[stage] = producing = [session for session in sessions if session.spans]
+        if not all(plan.sessions.values()):
+            return None
+        _open_ends(plan)
+        _find_repeats(plan)
+        self._add_sides(plan)
+        _limit_unknown_beginnings(plan)
+        return plan
+
+    @property
+    def twins(self) -> list[ModelCard]:
+        """The learned twins, each with its first sample, in order."""
+        return sorted(self._twins.values(), key=lambda card: card.t_ns)
+
+    @property
+    def no_plan_reason(self) -> str:
+        """Why there is no plan."""
+        if not self._has_positions:
+            return "the scores have no input positions: nothing to compare with"
+        empty = [topic for topic, stage in self._stages.items() if not self._sessions[stage]]
+        lacking = "it does not say what the scorer consumed"
+        if empty:
+            lacking = f"it has no {'reports' if empty[0] in self._left_out else 'messages'} of topic {empty[0]}"
+        return f"{lacking}: nothing to compare with"
+
+    def _add_output(self, envelope: Envelope) -> None:
+        header = decode_header(envelope)
+        if not header.HasField("input_position"):
+            raise NoInputPositionError
+        known = header.input_position
+        position = InputPosition(
+            known.topic,
+            known.producer,
+            known.sequence,
+            known.consumed_count,
+            known.contiguous_from,
+            known.from_timer,
+        )
+
+        def first_t_ns() -> int:
+            message = envelope.message
+            assert isinstance(message, Grid | Prediction | Score)
+            return int(message.t_ns[0])
+
+        output = Output(header.producer, header.sequence, position, first_t_ns, envelope.newest_t_ns)
+        self._extend(self._stages[envelope.topic], output)
+
+    def _add_report(self, report: Consumed) -> None:
+        header, position = report.header, report.header.input_position
+        if report.topic in self._left_out and position is not None:
+            output = Output(header.producer, header.sequence, position, lambda: report.first_t_ns, report.t_ns)
+            self._extend(self._stages[report.topic], output)
+
+    def _extend(self, stage: str, output: Output) -> None:
+        """Add to the session of a stage what it consumed up to this output."""
+        sessions = self._sessions[stage]
+        session = sessions.get(output.producer)
+        if session is None:
+            # the first stage consumes messages without making output; the others answer the first message at once
+            began_before = stage != self._first and output.position.consumed_count > 1
+            lacks_outputs = stage != self._first and output.number > 0
+            session = sessions[output.producer] = Session(output.producer, began_before, lacks_outputs)
+        elif output.number < session.next_number:
+            return  # this part of the recording overlaps the one before
+        if stage == self._first:
+            _extend_by_messages(session, output)
+        else:
+            _extend_by_samples(session, output)
+        session.position = output.position
+        session.next_number, session.last_t_ns = output.number + 1, output.newest_t_ns
+
+    def _extend_last(self, sessions: Iterable[Session]) -> None:
+        """A killed session has not reported its last outputs: its alarms and snapshots show that it went on."""
+        for session in sessions:
+            span = session.spans[-1]
+            known_t_ns = self._known.get((session.producer, span.producer), session.last_t_ns)
+            session.last_t_ns = max(session.last_t_ns, known_t_ns)
+            if span.last is not None:
+                span.last = max(span.last, session.last_t_ns)
+            saved = [t_ns for (producer, _), t_ns in self._saved_t_ns.items() if producer == session.producer]
+            session.snapshots_t_ns = saved
+
+    def _add_side(self, message: Message) -> None:
+        header = message.header
+        if isinstance(message, Alarm | ScorerSnapshot) and (position := header.input_position):
+            key = header.producer, position.producer
+            self._known[key] = max(message.t_ns, self._known.get(key, message.t_ns))
+        if isinstance(message, ScorerSnapshot):
+            if message.restored:
+                self._snapshots.setdefault(header.producer, message)
+            else:
+                self._saved_t_ns.setdefault((header.producer, header.sequence), message.t_ns)
+        elif isinstance(message, Request):
+            self._requests[f"{header.producer}/{header.sequence}"] = message
+        elif isinstance(message, ModelCard):
+            if message.content:
+                self._twins.setdefault((header.producer, header.sequence), message)
+        elif isinstance(message, Alarm):
+            self.alarms.setdefault((header.producer, header.sequence), message)
+            if message.request:
+                self._answers.setdefault((header.producer, message.request), (header.sequence, message.t_ns))
+
+    def _add_sides(self, plan: TrayPlan) -> None:
+        for of_stage in list(plan.sessions.values())[1:-1]:
+            for session in of_stage:
+                session.twins = [card for card in self.twins if card.header.producer == session.producer]
+        sessions = {session.producer: session for session in plan.last}
+        for producer, session in sessions.items():
+            session.twins = self.twins
+            session.snapshot = self._snapshots.get(producer)
+        for (producer, name), (_, t_ns) in sorted(self._answers.items(), key=lambda answer: answer[1]):
+            if name in self._requests and producer in sessions:
+                sessions[producer].requests.append((t_ns, self._requests[name]))
+
+
+def _extend_by_messages(session: Session, output: Output) -> None:
+    before, position = session.position, output.position
+    if before is None:
+        first = max(0, position.sequence - position.consumed_count + 1)
+        session.spans.append(Span(position.producer, first, position.sequence))
+        if position.contiguous_from > first:
+            session.set_limit(BEGINNING, _NEVER_REACHED.format(session.producer))
+    elif continues(before, position):
+        session.spans[-1].last = position.sequence
+    else:
+        # Some messages never arrived, or another producer follows. The consumed messages that the counts show before
+        # `contiguous_from` were those right after the last known one, unless there was more than one gap.
+        newly_contiguous = position.sequence - position.contiguous_from + 1
+        earlier = position.consumed_count - before.consumed_count - newly_contiguous
+        if earlier != 0:
+            session.set_limit(session.last_t_ns, _NEVER_REACHED.format(session.producer))
+        session.spans[-1].last = before.sequence + max(earlier, 0)
+        session.spans.append(Span(position.producer, position.contiguous_from, position.sequence))
+    session.spans[-1].last_known = position.sequence
+    if position.from_timer:
+        session.timer_outputs[position.producer, position.sequence] = output.newest_t_ns
+
+
+def _extend_by_samples(session: Session, output: Output) -> None:
+    before = session.position
+    if before and continues(before, output.position):
+        session.spans[-1].last = output.newest_t_ns
+    else:
+        if before and output.number > session.next_number:  # it may have consumed samples of any producer in between
+            session.set_limit(session.last_t_ns, f"what {session.producer} consumed next was not recorded")
+        session.spans.append(Span(output.position.producer, output.first_t_ns(), output.newest_t_ns))
+
+
+def _drop_unknown_producers(sessions: list[Session], known: set[str]) -> None:
+    for session in sessions:
+        unknown = next((span for span in session.spans if span.producer not in known), None)
+        if unknown:
+            before = session.spans[: session.spans.index(unknown)]
+            last = before[-1].last if before else None
+            session.set_limit(
+                BEGINNING if last is None else last,
+                f"{session.producer} consumed what {unknown.producer} made, and nothing of that was recorded",
+            )
+            session.spans = [span for span in session.spans if span.producer in known]
+
+
+def _limit_unknown_beginnings(plan: TrayPlan) -> None:
+    for sessions in plan.sessions.values():
+        for number, session in enumerate(sessions):
+            if session.lacks_outputs or (session.began_before and session.snapshot is None):
+                reason = (
+                    f"the first messages of {session.producer} were not recorded"
+                    if number
+                    else f"the recording begins in the middle of {session.producer}: name the parts before it as well"
+                )
+                session.set_limit(BEGINNING, reason)
+
+
+def _open_ends(plan: TrayPlan) -> None:
+    """Let sessions produce more than was recorded of them, as far as the next stage needs it.
+
+    The last messages of a killed session may have reached the next stage and not the recorder. What the last sessions
+    had not yet consumed when the recording ended is processed as well.
+    """
+    *producing, deciding = plan.sessions.values()
+    for session in (*(session for sessions in producing for session in sessions), deciding[-1]):
+        session.spans[-1].last = None
+    for sessions, consuming in zip(producing, [*producing[1:], deciding], strict=True):
+        spans = consuming[-1].spans
+        names = [session.producer for session in sessions]
+        if spans[-1].producer in names:
+            spans += [Span(name, BEGINNING, None) for name in names[names.index(spans[-1].producer) + 1 :]]
+
+
+def _find_repeats(plan: TrayPlan) -> None:
+    """Set `wanted_again_from` of every span of samples."""
+    for sessions in list(plan.sessions.values())[1:]:
+        wanted: dict[str, int] = {}
+        for span in reversed([span for session in sessions for span in session.spans]):
+            span.wanted_again_from = wanted.get(span.producer)
+            wanted[span.producer] = min(span.first, wanted.get(span.producer, span.first))

@@ -1,0 +1,105 @@
+"""Commands on a recording whose recorder left topics out: each works, or says in one line what is missing and which
+command makes it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.support.fantwin_command import error_of, fantwin
+from tests.support.offline_replay import changed, recorded, recording_of, without_topics
+
+MADE = ("grid", "prediction", "score")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recording_of(tmp_path_factory.mktemp("whole"), 1, 300, calibrated=True)
+
+
+@pytest.fixture(scope="module")
+def lean(whole: Path) -> Path:
+    return without_topics(whole, whole.with_name("lean.mcap"), *MADE)
+
+
+@pytest.fixture(scope="module")
+def without_raw(whole: Path) -> Path:
+    return without_topics(whole, whole.with_name("without-raw.mcap"), "raw")
+
+
+def advice(path: Path, *topics: str) -> str:
+    return (
+        f"its recorder left out {', '.join(topics)} (recorder.topics): `fantwin replay {path} --offline -o WHOLE.mcap` "
+        "makes a recording with all topics"
+    )
+
+
+def test_info_names_the_topics_and_reports_no_loss(lean):
+    done = fantwin("info", lean)
+    assert done.exit_code == 0
+    assert "left out on purpose (recorder.topics): grid, prediction, score" in done.stdout
+    assert json.loads(fantwin("info", lean, "--json").stdout)["files"][0]["left_out"] == list(MADE)
+
+
+def test_it_is_verified_by_its_alarms_and_snapshots(lean):
+    done = fantwin("replay", "--offline", "--verify", lean)
+    alarms, snapshots = len(recorded(lean, "alarm")), len(recorded(lean, "snapshot"))
+    assert done.exit_code == 0, done.output
+    assert f"equal: {snapshots} snapshots and {alarms} alarms, to the bit" in done.stdout
+    assert "scores were not recorded (recorder.topics)" in done.stdout
+    found = json.loads(fantwin("replay", "--offline", "--verify", "--json", lean).stdout)["verified"]
+    assert (found["samples_equal"], found["snapshots_equal"], found["alarms_equal"]) == (0, snapshots, alarms)
+    assert found["left_out"] == list(MADE)
+
+
+def test_a_difference_is_exit_code_1(lean, tmp_path):
+    def doubled(entry):
+        if entry.topic == "raw":
+            entry.message.speed_rad_s.setflags(write=True)
+            entry.message.speed_rad_s[:] *= 1.01
+        return entry.message
+
+    done = fantwin("replay", "--offline", "--verify", changed(lean, tmp_path / "r.mcap", doubled))
+    assert done.exit_code == 1
+    assert "DIFFERS" in done.stdout and "snapshots differ" in done.stdout and "tray1: snapshot of " in done.stdout
+
+
+def test_commands_that_need_scores_name_the_command_that_makes_them_and_work_after_it(lean, tmp_path):
+    picture, made = tmp_path / "b.png", tmp_path / "whole-again.mcap"
+    assert error_of("plot", lean, "-o", picture) == f"{lean}: holds no scores to plot; {advice(lean, 'score')}"
+    assert fantwin("replay", "--offline", lean, "-o", made).exit_code == 0
+    assert fantwin("plot", made, "-o", picture).exit_code == 0 and picture.exists()
+
+
+def test_an_export_has_raw_samples_and_names_what_is_missing(lean, tmp_path):
+    done = fantwin("export", lean, "--to", "csv", "-o", tmp_path)
+    assert done.exit_code == 0 and "lean.tray1.raw.csv: 300 rows" not in done.stdout, "a row for each fan"
+    assert "lean.tray1.raw.csv: 900 rows" in done.stdout
+    line = error_of("export", lean, "--to", "csv", "--topic", "grid", "-o", tmp_path)
+    assert line == f"{lean}: no grid in this recording; {advice(lean, 'grid')}"
+    done = fantwin("export", lean, "--to", "csv", "--topic", "alarm", "--topic", "score", "-o", tmp_path)
+    assert f"no score in this recording: {advice(lean, 'score')}" in done.stderr
+
+
+@pytest.mark.parametrize("words", [("--from", "grid"), ("--topics", "grid,alarm")])
+def test_topics_that_are_not_there_cannot_be_replayed(lean, words):
+    assert error_of("replay", lean, *words) == f"{lean}: {advice(lean, 'grid')}"
+
+
+@pytest.mark.parametrize("words", [("replay", "--offline"), ("identify",), ("evaluate", "t.onnx")])
+def test_without_raw_samples_there_is_nothing_to_make_the_rest_of(without_raw, whole, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t.onnx").write_bytes((whole.parent / "twin.onnx").read_bytes())
+    line = error_of(*words, without_raw)
+    assert line == (
+        f"{without_raw}: no raw samples in this recording: its recorder left out raw (recorder.topics), and without "
+        "raw nothing can be made again"
+    )
+
+
+def test_what_is_learned_of_a_recording_needs_raw_samples_only(whole, lean):
+    twin = whole.parent / "twin.onnx"
+    found = [json.loads(fantwin("evaluate", twin, path, "--json").stdout) for path in (whole, lean)]
+    assert json.dumps(found[0]).replace(str(whole), "") == json.dumps(found[1]).replace(str(lean), "")

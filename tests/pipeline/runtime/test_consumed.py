@@ -1,0 +1,97 @@
+"""Reports of what a session has consumed: few, and the outputs between two of them follow from both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.runtime.consumed import PERIOD_NS, ConsumedReports
+from schemas.messages import Alarm, Consumed, Grid, Header, InputPosition, Severity
+from schemas.streams import continues
+
+STEP_NS = 1_000_000_000
+
+
+class Resampler:
+    """Makes a grid of two samples of each raw message, as the runner would publish it."""
+
+    def __init__(self) -> None:
+        self.reports = ConsumedReports()
+        self.grids: list[Grid] = []
+        self.reported: list[Consumed] = []
+        self._position: InputPosition | None = None
+
+    def takes(self, producer: str, sequence: int) -> None:
+        self._position = InputPosition.after(self._position, "raw", Header(producer, sequence, "a"))
+        self._puts_out(self._position)
+
+    def waits(self) -> None:
+        """A timer makes it go on without input."""
+        if self._position:
+            self._puts_out(replace(self._position, from_timer=True))
+
+    def _puts_out(self, position: InputPosition) -> None:
+        header = Header("resampler-1", len(self.grids), "a", position)
+        t_ns = np.array([0, 1]) + len(self.grids) * STEP_NS
+        one = np.ones((2, 1))
+        valid = {"valid": one > 0, "invalid_reason": one.astype(np.uint8)}
+        grid = Grid(header=header, fans=1, period_ns=1, t_ns=t_ns, command=one, speed_rad_s=one, **valid)
+        self.grids.append(grid)
+        self.reported += self.reports.after("grid", grid)
+
+
+@settings(deadline=None)
+@given(events=st.lists(st.sampled_from(["next", "next", "next", "next", "gap", "restart", "timer"]), max_size=60))
+def test_between_two_reports_nothing_is_missing_and_no_timer_has_acted(events):
+    stage, life, sequence = Resampler(), 0, 0
+    for event in events:
+        life += event == "restart"
+        sequence = 0 if event == "restart" else sequence + 1 + (event == "gap")
+        if event == "timer":
+            stage.waits()
+        else:
+            stage.takes(f"acquisition-{life}", sequence)
+    stage.reported += stage.reports.last()
+    numbers = [report.output_sequence for report in stage.reported]
+    assert numbers == sorted(set(numbers))
+    assert not stage.grids or {0, len(stage.grids) - 1} <= set(numbers)
+    for report in stage.reported:
+        grid = stage.grids[report.output_sequence]
+        assert (report.header, report.topic) == (grid.header, "grid")
+        assert (report.first_t_ns, report.t_ns) == (grid.t_ns[0], grid.t_ns[-1])
+    for one, other in pairwise(stage.reported):
+        between = stage.grids[one.output_sequence + 1 : other.output_sequence]
+        positions = [each.header.input_position for each in between]
+        assert not any(position.from_timer for position in positions if position)
+        chain = [one.header.input_position, *positions, other.header.input_position]
+        pairs = list(pairwise(chain))
+        assert not between or all(continues(before, after) for before, after in pairs if before and after)
+        assert other.t_ns - one.t_ns <= PERIOD_NS
+
+
+def test_a_run_without_a_break_is_reported_each_ten_seconds():
+    stage = Resampler()
+    for sequence in range(35):
+        stage.takes("acquisition-0", sequence)
+    assert [report.output_sequence for report in stage.reported] == [0, 10, 20, 30]
+    assert [report.output_sequence for report in stage.reports.last()] == [34]
+    assert stage.reports.last() == [], "the end is reported once"
+
+
+def test_outputs_that_are_no_samples_are_not_reported():
+    alarm = Alarm(
+        header=Header("scorer-1", 0, "a", InputPosition("prediction", "p", 0, 1, 0)),
+        fan=0,
+        active=True,
+        severity=Severity.ALARM,
+        t_ns=1,
+        onset_t_ns=1,
+        residual_rad_s=0.0,
+        limit_rad_s=0.0,
+        message="",
+    )
+    assert ConsumedReports().after("alarm", alarm) == []
