@@ -33,7 +33,7 @@ from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.sessions import Session, Sessions, refuse_second
 from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage
-from schemas.codec import CodecError, decode, encode, type_name
+from schemas.codec import CodecError, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, Note, StageStatus, newest_t_ns
 from schemas.streams import stage_losses
@@ -320,10 +320,11 @@ class Runner:
             envelope = self._decode(item.key, item.payload, item.received_t_ns)
             if envelope is None:
                 return
-            if isinstance(envelope.message, Health):
-                self._handle_health(envelope, envelope.message)
-            elif isinstance(envelope.message, Clock):
-                if not self._clock.update(envelope.message):
+            message = None if self._is_undecoded(envelope) else envelope.message
+            if isinstance(message, Health):
+                self._handle_health(envelope, message)
+            elif isinstance(message, Clock):
+                if not self._clock.update(message):
                     self._counts["refused_clocks"] += 1
             else:
                 self._health.add_input(envelope.key, envelope.received_t_ns, HOST_CLOCK.now_ns())
@@ -332,7 +333,7 @@ class Runner:
     def _handle_recovered(self, item: Recovered) -> None:
         now_ns = HOST_CLOCK.now_ns()
         decoded = (self._decode(key, payload, now_ns) for key, payload in item.answer.messages)
-        envelopes = [e for e in decoded if e is not None and e.message.header.producer != self.producer]
+        envelopes = [e for e in decoded if e is not None and e.header.producer != self.producer]
         if self._recovery.is_catch_up(item.request):
             due = self._tracker.accept_kept(envelopes)
         else:
@@ -355,14 +356,18 @@ class Runner:
 
     def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
         try:
-            topic = topic_of(key)
-            return Envelope(key, topic.name, payload, received_t_ns, decode(topic.message, payload))
+            envelope = Envelope(key, topic_of(key).name, payload, received_t_ns)
+            _ = envelope.header if self._is_undecoded(envelope) else envelope.message
         except (KeyError, CodecError):
             self._counts["undecodable"] += 1
             return None
+        return envelope
+
+    def _is_undecoded(self, envelope: Envelope) -> bool:
+        return envelope.topic in self.stage.undecoded
 
     def _step(self, envelope: Envelope) -> None:
-        header = envelope.message.header
+        header = envelope.header
         name = header.tray if header.tray in self._parts else ""
         if name not in self._parts:
             self._counts["unknown_tray"] += 1
@@ -379,7 +384,8 @@ class Runner:
         ):  # samples of a device do not depend on any input
             self._outputs.advance(header.tray, envelope.topic, header)
         self._owes_answer |= self._has_source
-        core, item = self._parts[name].core, envelope if self.stage.wants_envelopes else envelope.message
+        core = self._parts[name].core
+        item = envelope if self.stage.wants_envelopes or self._is_undecoded(envelope) else envelope.message
         self._call(name, lambda: core.step(item), input_tray=header.tray)
 
     def _call(

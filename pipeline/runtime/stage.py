@@ -149,6 +149,8 @@ class Stage:
         build: builds the core, and its source if it has one.
         core_per_tray: a core for each tray, or one core that serves all trays of the process.
         wants_envelopes: whether `step` is given envelopes instead of messages.
+        undecoded: topics whose messages `step` is given as envelopes, of which only the header has been decoded: for a
+            core that looks into few of them.
         may_drop: a consumer that may drop messages: its missing messages do not count as losses.
         check: lists, without side effects, what would keep the stage from working (a missing port, a twin that
             does not fit); one line each. `fantwin doctor` prints them.
@@ -165,6 +167,7 @@ class Stage:
     build: Callable[[Context], BuiltStage]
     core_per_tray: bool = True
     wants_envelopes: bool = False
+    undecoded: tuple[str, ...] = ()
     may_drop: bool = False
     check: Callable[[Context], Sequence[str]] = no_problems
 

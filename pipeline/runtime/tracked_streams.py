@@ -118,7 +118,7 @@ class TrackedStreams:
 
         unsaved: the messages that are lost if the stage is killed now.
         """
-        at_risk = Counter((envelope.key, envelope.message.header.producer) for envelope in unsaved)
+        at_risk = Counter((envelope.key, envelope.header.producer) for envelope in unsaved)
         found: list[Input] = []
         for name, group in self._groups.items():
             found += [
