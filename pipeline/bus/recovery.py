@@ -65,7 +65,10 @@ class RecoveryRequest:
         last: int,
         timeout_s: float,
         on_answer: OnAnswer,
+        newest: int | None = None,
     ) -> None:
+        """newest: no more than the last messages of each producer; None: as many as a consumer that begins may ask for,
+        if all producers are asked, and otherwise all."""
         self._is_of_one = producer != ALL_PRODUCERS
         self._on_answer = on_answer
         self._messages: list[tuple[str, bytes]] = []
@@ -76,9 +79,11 @@ class RecoveryRequest:
         self._lock = threading.Lock()
         self._has_ended = False
         self._cancellation = zenoh.CancellationToken()
-        newest = "" if self._is_of_one else f";newest={CATCH_UP_MESSAGES}"
+        if newest is None and not self._is_of_one:
+            newest = CATCH_UP_MESSAGES
+        only_newest = "" if newest is None else f";newest={newest}"
         session.get(
-            f"{recovery_key(key, producer)}?first={first};last={last};count=1{newest}",
+            f"{recovery_key(key, producer)}?first={first};last={last};count=1{only_newest}",
             zenoh.handlers.Callback(self._receive, lambda: self._end(None), indirect=False),
             target=zenoh.QueryTarget.ALL,
             timeout=timeout_s,

@@ -24,7 +24,8 @@ from pipeline.errors import UsageError, UserError
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
-from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness, Recovered
+from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness, Newest, Recovered
+from pipeline.runtime.newest_messages import NewestMessages
 from pipeline.runtime.notifier import Notifier
 from pipeline.runtime.outputs import Outputs
 from pipeline.runtime.peers import Peers
@@ -33,6 +34,7 @@ from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.sessions import Session, Sessions, refuse_second
 from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage
+from pipeline.runtime.subscriptions import Subscriptions
 from schemas.codec import CodecError, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, Note, StageStatus, newest_t_ns
@@ -122,9 +124,11 @@ class Runner:
         self._health_publisher = self._bus.publisher(
             health_key(config.site, stage.name, self._instance), BY_NAME["health"], type_name(Health), self.producer
         )
-        self._read_keys = {
-            tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
-        }
+        self._subscriptions = Subscriptions(
+            self._bus, config.site, stage, [t.name for t in trays], self._on_bus, self._tracker.forget
+        )
+        self._newest = NewestMessages(self._bus, self._inbox)
+        self._read_keys = self._subscriptions.keys
         self._peers = Peers(self._read_keys)
         main = (
             stage.reads[0] if stage.reads and not self._has_source else ""
@@ -194,8 +198,7 @@ class Runner:
         self._drain()
 
     def _start(self) -> None:
-        for key in sorted(self._read_keys):
-            self._bus.subscribe(key, self._on_bus)
+        self._follow()
         if self.stage.core_per_tray and not self._has_source:  # others use the host's time, also during a replay
             for tray in self._parts:
                 self._bus.subscribe(tray_key(self._site, tray, "clock"), self._on_bus)
@@ -212,6 +215,12 @@ class Runner:
         self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
         for name, parts in self._parts.items():
             self._sources.start(name, parts)
+
+    def _follow(self) -> None:
+        """Read what the core follows message by message, and ask for the newest of the rest."""
+        serves_all = self._parts.get("")
+        followed = serves_all.core.followed() if serves_all and self.stage.undecoded else None
+        self._newest.watch(self._subscriptions.follow(followed))
 
     def _on_bus(self, key: str, payload: bytes) -> None:
         self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()))
@@ -233,6 +242,9 @@ class Runner:
                 for name, parts in self._parts.items():
                     now_ns = self._clock.tick_ns(name)
                     self._call(name, lambda core=parts.core, now_ns=now_ns: core.tick(now_ns), from_timer=True)
+                if self.stage.undecoded:
+                    self._follow()
+                    self._newest.ask()
                 news = self._owes_answer or self._lost() > reported_lost
                 if now >= next_health or (now >= next_loss and news):
                     self._owes_answer = False
@@ -311,6 +323,8 @@ class Runner:
             self._call(item.core, lambda: core.step(item.item))
         elif isinstance(item, Recovered):
             self._handle_recovered(item)
+        elif isinstance(item, Newest):
+            self._handle_newest(item)
         elif isinstance(item, Liveness):
             self._peers.update(item)
             self._sessions.update(item.key, item.alive)
@@ -343,6 +357,19 @@ class Runner:
         self._due += due
         self._recovery.finish(item)
 
+    def _handle_newest(self, item: Newest) -> None:
+        now_ns = HOST_CLOCK.now_ns()
+        decoded = (self._decode(key, payload, now_ns) for key, payload in item.answer.messages)
+        newest = self._newest.finish(item, [e for e in decoded if e and self._counts_on_its_key(e)])
+        if newest is not None:
+            self._health.add_input(newest.key, now_ns, now_ns)
+            self._step(newest)
+        self._newest.ask()
+
+    def _counts_on_its_key(self, envelope: Envelope) -> bool:
+        producer = envelope.header.producer
+        return not (self._sessions.is_ignored(producer) or self._sessions.is_stranger(envelope.key, producer))
+
     def _handle_health(self, envelope: Envelope, health: Health) -> None:
         if not self._tracker.believes(health):
             return
@@ -350,7 +377,7 @@ class Runner:
         if health.stage == REPLAY:
             self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
         self._sessions.add_health(health, self._read_keys)
-        self._due += self._tracker.reconcile(health, self._read_keys)
+        self._due += self._tracker.reconcile(health, self._subscriptions.current)
         if "health" in self.stage.reads:
             self._due += self._tracker.accept(envelope)
 

@@ -128,6 +128,10 @@ class SequenceTracker:
                 return False
         return True
 
+    def forget(self, key: str) -> None:
+        """This consumer begins to read a key, perhaps again: what it has not read meanwhile is history, not a loss."""
+        self._streams.forget(key)
+
     @property
     def is_waiting(self) -> bool:
         """Whether an answer is due."""

@@ -6,7 +6,7 @@ publishes what it returns. The runner is the only loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -71,6 +71,12 @@ class Core(Protocol):
     def notes(self) -> Sequence[str]:
         """What the core works with and has done, a line each, for people; nothing that is wrong."""
         return ()
+
+    def followed(self) -> Set[str] | None:
+        """The trays whose messages of the `undecoded` topics are all passed to `step`; None: all trays. Of the others
+        `step` gets the newest message, about once a second. Only a core that serves all trays is asked, at every tick.
+        """
+        return None
 
     def problem(self) -> str:
         """One line on what is wrong now and what to do; empty when all is well."""
