@@ -5,8 +5,8 @@ the tray. Samples are collected and drawn twice a second, because a call into Re
 cheap.
 
 With few fans, every sample is drawn. With more than `fleet_above`, an overview has a cell for every fan, and only some
-fans are drawn sample by sample: those in alarm, as far as there is room, and those in `show`. Of the other trays only
-the newest score is looked into, twice a second; the rest is never decoded.
+fans are drawn sample by sample: those in alarm, as far as there is room, and those in `show`. Of the other trays the
+newest score is asked for once a second, and the rest never arrives.
 
 Only samples and alarms are on the time line, at the time of the sample. Reports in host time go to a page
 without time; otherwise, in a replay of an old recording, these reports would be the newest data, which viewers follow.
@@ -16,9 +16,8 @@ It may drop messages: the runner keeps a bounded queue in front of it and counts
 from __future__ import annotations
 
 import importlib.util
-import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -158,6 +157,10 @@ class ViewerCore(Core):
         """Samples drawn, scores with another number of fans, and messages of trays that are not configured."""
         return {"samples_drawn": self._samples_drawn, "wrong_fan_count": 0, **self._counts}
 
+    def followed(self) -> Set[str] | None:
+        """The trays with a fan that is drawn; None if all are."""
+        return {fan.tray for fan in self._places} if self._fleet else None
+
     def problem(self) -> str:
         """Scores with another number of fans than configured, or what the sink reports; empty if there is nothing."""
         for name, view in self._views.items():
@@ -270,7 +273,7 @@ class ViewerCore(Core):
                 self._sink.change_states(*fan, np.array([view.drawn_t_ns[fan.number] + 1]), [SILENT])
 
     def _draw_before(self, view: _TrayView, fan: Fan) -> None:
-        """Draw what was before a plot began, two samples a second."""
+        """Draw what was before a plot began, a sample or two a second."""
         assert self._fleet is not None
         drawn_t_ns = view.drawn_t_ns.get(fan.number)
         before = [s for s in self._fleet.history(fan.tray) if drawn_t_ns is None or int(s.t_ns[0]) > drawn_t_ns]
@@ -327,8 +330,7 @@ def build(context: Context) -> BuiltStage:
     fleet = None
     if is_fleet:
         places = PlotPlaces(plots, round(config.alarm_plot_hold_s * NS_PER_S))
-        flushes_in_window = math.ceil(config.window_s * NS_PER_S / FLUSH_PERIOD_NS)
-        fleet = FleetView(context.site, context.trays, places, flushes_in_window)
+        fleet = FleetView(context.site, context.trays, places, round(config.window_s * NS_PER_S))
     return BuiltStage(ViewerCore(context.trays, sink, fleet))
 
 

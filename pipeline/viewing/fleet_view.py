@@ -1,11 +1,12 @@
 """What is shown of a fleet: an overview of all fans, and which of them are drawn with their bands.
 
-It is fed with the newest sample of each tray, twice a second. The samples of the last window are kept, so that a plot
+It is fed with the newest sample of each tray, once or twice a second. Those of the last window are kept, so that a plot
 that begins with an alarm shows what was before it.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,10 @@ from schemas.units import NS_PER_S
 
 SILENT_AFTER_NS = 5 * NS_PER_S
 """a tray without a score for so long is silent"""
+ADDED_EVERY_NS = NS_PER_S // 2
+"""the newest samples come no faster"""
+BEHIND_NS = 10 * NS_PER_S
+"""trays may be so far behind the others; if all that comes is older still, it is a replay, at times of its own"""
 PAGE_PERIOD_NS = NS_PER_S
 """between two pages about the worst fans: faster than this nobody reads"""
 REPEAT_NS = 5 * NS_PER_S
@@ -51,11 +56,13 @@ class Overview:
 class FleetView:
     """Collects what the overview shows, and chooses the fans that have a plot."""
 
-    def __init__(self, site: str, trays: Sequence[TrayConfig], places: PlotPlaces, flushes_in_window: int) -> None:
+    def __init__(self, site: str, trays: Sequence[TrayConfig], places: PlotPlaces, window_ns: int) -> None:
+        """window_ns: how far back a plot begins."""
         self._site = site
         self._fleet = Fleet(trays)
         self._places = places
-        self._history = {tray.name: deque[Score](maxlen=flushes_in_window) for tray in trays}
+        self._window_ns = window_ns
+        self._history = {tray.name: deque[Score](maxlen=math.ceil(window_ns / ADDED_EVERY_NS)) for tray in trays}
         self._heard_ns: dict[str, int] = {}
         """by tray, host time"""
         self.silent: set[str] = set()
@@ -73,7 +80,8 @@ class FleetView:
 
     def history(self, tray: str) -> Sequence[Score]:
         """The samples of a tray that were added within the last window, one a score, with `TRACE_COLUMNS`."""
-        return self._history[tray]
+        kept = self._history[tray]
+        return [score for score in kept if 0 <= int(kept[-1].t_ns[0] - score.t_ns[0]) < self._window_ns]
 
     def add_newest(self, scores: Sequence[Score], now_ns: int) -> None:
         """Take the last sample of the newest score, with `COLUMNS`, of each tray that has sent one since the last call.
@@ -86,8 +94,9 @@ class FleetView:
             newest = _last_sample(score)
             self._history[tray].append(newest)
             self._fleet.update(newest)
-        if scores:
-            self._t_ns = max(int(score.t_ns[-1]) for score in scores)
+        newest_t_ns = max((int(score.t_ns[-1]) for score in scores), default=self._t_ns)
+        if newest_t_ns > self._t_ns or newest_t_ns < self._t_ns - BEHIND_NS:
+            self._t_ns = newest_t_ns
         self.silent = {tray for tray, heard_ns in self._heard_ns.items() if now_ns - heard_ns > SILENT_AFTER_NS}
         for tray in self.silent:
             self._fleet.silence(tray, int(self._history[tray][-1].t_ns[-1]))

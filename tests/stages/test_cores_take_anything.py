@@ -152,5 +152,5 @@ def test_the_scorer_survives_any_snapshot(memory: ScorerSnapshot) -> None:
 @given(sessions(Score, Alarm, ModelCard, Health), st.sampled_from(["tray1", "tray1", "elsewhere"]), st.booleans())
 def test_the_viewer_survives_any_message(session: list[Message], tray: str, is_fleet: bool) -> None:
     trays, plots = [TrayConfig(name="tray1", fans=FANS)], FleetPlots([Fan("tray1", 0)], 1)
-    fleet = FleetView("site", trays, PlotPlaces(plots, 0), 4) if is_fleet else None
+    fleet = FleetView("site", trays, PlotPlaces(plots, 0), 2_000_000_000) if is_fleet else None
     survives(ViewerCore(trays, FakeSink(), fleet), session, tray, STAGE.undecoded)

@@ -22,14 +22,13 @@ from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
 from tests.support.score_data import START_NS, STEP_NS, made_up_tray
 
 HOLD_S, WINDOW_S = 3, 4
-FLUSHES_IN_WINDOW = WINDOW_S * 1_000_000_000 // FLUSH_PERIOD_NS
 TRAYS = ("tray1", "tray2", "tray3")
 
 
 def fleet_core(sink: FakeSink, *, show: tuple[Fan, ...] = (), for_alarms: int = 2, hold_s: int = HOLD_S) -> ViewerCore:
     trays = [TrayConfig(name=name, fans=3) for name in TRAYS]
     places = PlotPlaces(FleetPlots(show, for_alarms), hold_s * 1_000_000_000)
-    return ViewerCore(trays, sink, FleetView("site", trays, places, FLUSHES_IN_WINDOW))
+    return ViewerCore(trays, sink, FleetView("site", trays, places, WINDOW_S * 1_000_000_000))
 
 
 def messages_of(seconds: float = 20.0, **of_tray: Any) -> list[Score | Alarm]:
@@ -105,6 +104,17 @@ def test_fans_asked_for_are_drawn_from_the_first_sample_on() -> None:
     assert {(trace.tray, *trace.fan_numbers) for trace in sink.traces} == {("tray3", 0, 1)}
     t_ns, _ = drawn(sink, Fan("tray3", 1))
     assert len(t_ns) == 500 and (np.diff(t_ns) == STEP_NS).all()
+
+
+def test_trays_with_a_plot_are_followed_for_as_long_as_they_have_it() -> None:
+    core = fleet_core(FakeSink(), show=(Fan("tray3", 1),))
+    messages = messages_of()
+    followed: list[frozenset[str]] = []
+    for message in messages:
+        play(core, [message])
+        followed.append(frozenset(core.followed() or ()))
+    assert [each for each, _ in groupby(followed)] == [{"tray3"}, {"tray2", "tray3"}, {"tray3"}]
+    assert ViewerCore([TrayConfig(name="tray1", fans=3)], FakeSink()).followed() is None, "few fans: all"
 
 
 def test_of_a_tray_without_a_plot_only_the_newest_score_is_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
