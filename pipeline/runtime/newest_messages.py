@@ -18,10 +18,10 @@ from pipeline.runtime.inbox import Inbox, Newest
 from schemas.envelope import Envelope
 
 PERIOD_S = 1.0
-TIMEOUT_S = 1.0
-PAUSE_S = 3.0
-"""how long a key is left alone after its producer did not answer in time: one such time does not make a tray silent"""
-MOST_UNDER_WAY = 64
+TIMEOUT_S = 4.0
+PAUSE_S = 5.0
+"""how long a key is left alone after its producer did not answer in time"""
+MOST_UNDER_WAY = 128
 """so many that the trays of a process that hangs do not keep those of others waiting"""
 
 
@@ -87,8 +87,7 @@ class NewestMessages:
         watched = self._watched.get(item.key)
         if watched is None:
             return None
-        has_failed = item.answer.timed_out and item.answer.published is None
-        heapq.heappush(self._due, (self._now_s() + (PAUSE_S if has_failed else PERIOD_S), item.key))
+        heapq.heappush(self._due, (self._now_s() + (PAUSE_S if item.answer.timed_out else PERIOD_S), item.key))
         known = watched.next_sequences
         newer = [each for each in envelopes if each.header.sequence >= known.get(each.header.producer, 0)]
         if watched.producer == ALL_PRODUCERS:
