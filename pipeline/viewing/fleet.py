@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.config.models import TrayConfig
 from pipeline.viewing.trace import state_codes, state_name
 from schemas.fields import LARGEST_ENUM_VALUE
-from schemas.messages import Alarm, Array, FanState, Score
+from schemas.messages import Alarm, Array, FanState, Score, Transition
 from scoring.alarms.alarm_flags import is_silenced
 
 FLEET_COLUMNS = ("state", "invalid_reason", "score")
@@ -22,6 +22,7 @@ NORMAL_LEVELS = 5
 """shades of a normal fan's cell, by its score"""
 _NEVER_NS = -(1 << 62)
 _SILENT_CODE = -1
+_ALARM_CODE = state_codes(np.array([FanState.ALARM]), np.array([0]))
 _ALARM, _SUSPECT, _SILENCED, _OTHER = 3, 2, 1, 0
 _HIGHEST_SCORE = 1e6
 
@@ -94,12 +95,17 @@ class Fleet:
         self._score[of_tray] = np.nan
 
     def add_alarm(self, alarm: Alarm) -> None:
-        """Take the state of an alarm. An alarm of a fan that the tray does not have is ignored."""
+        """Take the state of an alarm. An alarm of a fan that the tray does not have is ignored.
+
+        A fan whose alarm is raised is in alarm at once: its next sample may be a second away.
+        """
         of_tray = self._of_tray[alarm.header.tray]
         index = of_tray.start + alarm.fan
         if index < of_tray.stop:
             self._onset_t_ns[index] = alarm.onset_t_ns if alarm.active else _NEVER_NS
             self._silenced[index] = is_silenced(alarm)
+            if alarm.active and alarm.transition == Transition.RAISED and self._judged()[index]:
+                self._change(slice(index, index + 1), _ALARM_CODE, alarm.t_ns)
 
     def classes(self) -> Array:
         """The class of each fan's cell, (fans,) uint8, an index into `class_names`."""

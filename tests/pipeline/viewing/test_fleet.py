@@ -56,6 +56,18 @@ def names(fleet: Fleet, most: int = 99) -> list[str]:
     return [f"{each.fan} {each.state}" for each in fleet.worst(most)]
 
 
+def test_a_raised_alarm_shows_at_once_and_the_next_sample_says_more() -> None:
+    fleet = fleet_of(a=2)
+    fleet.update(newest("a", START_NS, (FanState.NORMAL, 0.2), (FanState.NORMAL, 0.9)))
+    fleet.add_alarm(alarm("a", 0, START_NS))
+    assert names(fleet) == ["a/0 alarm", "a/1 normal"]
+    assert class_names()[fleet.classes()[0]] == "alarm" and fleet.counts()["in alarm"] == 1
+    fleet.update(newest("a", START_NS + 1, (FanState.NORMAL, 0.2), (FanState.NORMAL, 0.9)))
+    assert names(fleet) == ["a/1 normal", "a/0 normal"]
+    fleet.add_alarm(alarm("a", 1, START_NS, transition=Transition.REPUBLISHED))
+    assert names(fleet) == ["a/1 normal", "a/0 normal"], "what is sent again for late joiners is no news"
+
+
 def test_the_worst_come_first_and_those_not_judged_are_left_out() -> None:
     fleet = fleet_of(a=4, b=4)
     fleet.add_alarm(alarm("b", 1, START_NS, shelved_until_t_ns=START_NS + 1))
