@@ -334,7 +334,10 @@ class Runner:
             envelope = self._decode(item.key, item.payload, item.received_t_ns)
             if envelope is None:
                 return
-            message = None if self._is_undecoded(envelope) else envelope.message
+            is_undecoded = self._is_undecoded(envelope)
+            if is_undecoded and envelope.key not in self._subscriptions.current:
+                return  # it was on its way when the core ceased to follow its tray
+            message = None if is_undecoded else envelope.message
             if isinstance(message, Health):
                 self._handle_health(envelope, message)
             elif isinstance(message, Clock):

@@ -129,7 +129,7 @@ class SequenceTracker:
         return True
 
     def forget(self, key: str) -> None:
-        """This consumer begins to read a key, perhaps again: what it has not read meanwhile is history, not a loss."""
+        """This consumer reads a key no more. What it has not read if it begins again is history, not a loss."""
         self._streams.forget(key)
 
     @property

@@ -19,13 +19,13 @@ class Subscriptions:
         stage: Stage,
         trays: Iterable[str],
         on_message: Callable[[str, bytes], None],
-        on_begin: Callable[[str], None],
+        on_end: Callable[[str], None],
     ) -> None:
-        """on_message is called with key and payload, from a thread of the bus; on_begin with each key before its first
-        message."""
+        """on_message is called with key and payload, from a thread of the bus; on_end with each key that is not read
+        message by message any more."""
         self._bus = bus
         self._on_message = on_message
-        self._on_begin = on_begin
+        self._on_end = on_end
         of_topic = {
             topic: {tray: tray_key(site, tray, topic) for tray in trays} for topic in stage.reads if topic != "health"
         }
@@ -51,7 +51,7 @@ class Subscriptions:
             self._others = {key for keys in self._undecoded for tray, key in keys.items() if tray not in trays}
         for key in sorted(self._others & self._ends.keys()):
             self._ends.pop(key)()
+            self._on_end(key)
         for key in sorted(self.keys - self._others - self._ends.keys()):
-            self._on_begin(key)
             self._ends[key] = self._bus.subscribe(key, self._on_message)
         return self._others
