@@ -55,7 +55,7 @@ class FanNow:
 
 
 @dataclass(frozen=True)
-class NotJudged:
+class UnscoredFans:
     """The fans that are not judged for one reason: how many, of which trays, and since when the first of them."""
 
     reason: str
@@ -153,14 +153,14 @@ class Fleet:
             "not judged": int((~self._judged() & ~in_alarm).sum()),
         }
 
-    def not_judged(self) -> list[NotJudged]:
+    def unscored(self) -> list[UnscoredFans]:
         """The fans that are neither judged nor in alarm, by reason, the most frequent first."""
         left_out = ~self._judged() & ~self.in_alarm()
-        groups: list[NotJudged] = []
+        groups: list[UnscoredFans] = []
         for code in np.unique(self._codes[left_out]).tolist():
             indexes = np.flatnonzero(left_out & (self._codes == code))
             trays = list(dict.fromkeys(self.fans[index].tray for index in indexes))
-            groups.append(NotJudged(self._name(code), len(indexes), trays, int(self._since_t_ns[indexes].min())))
+            groups.append(UnscoredFans(self._name(code), len(indexes), trays, int(self._since_t_ns[indexes].min())))
         return sorted(groups, key=lambda group: -group.fans)
 
     def _now(self, index: int, in_alarm: bool) -> FanNow:

@@ -93,7 +93,7 @@ def place_root(place: int, tray: str) -> str:
     return f"{SHOWN}/plot_{place}/{tray}"
 
 
-def place_of(root: str) -> int | None:
+def place_in(root: str) -> int | None:
     """The number of the plot whose root begins so; None: it is no root of a plot."""
     shown, _, name = root.partition("/")
     return int(name.removeprefix("plot_")) if shown == SHOWN and name.startswith("plot_") else None

@@ -28,7 +28,7 @@ from rerun.experimental import ViewerClient
 
 from pipeline.errors import UserError
 from pipeline.viewing.rerun_fleet import CELLS, MAP, bounds_of, overview_tab
-from pipeline.viewing.rerun_layout import TIMELINE, TrayLayout, blueprint, place_of, tray_tab
+from pipeline.viewing.rerun_layout import TIMELINE, TrayLayout, blueprint, place_in, tray_tab
 from pipeline.viewing.rerun_sink import APPLICATION, LOOPBACK, rerun_program
 from schemas.messages import Array
 from schemas.units import NS_PER_S, SpeedUnit
@@ -169,7 +169,7 @@ def _read(rrd: Path) -> _Rrd:
 def _add_fan(trays: dict[str, TrayLayout], path: str, name: str) -> None:
     """Add the fan with this entity of its speed, `[place/]tray/fan_3/speed`, whose first series has this name."""
     *root, tray, fan, _ = path.split("/")
-    number, place = int(fan.removeprefix("fan_")), place_of("/".join(root))
+    number, place = int(fan.removeprefix("fan_")), place_in("/".join(root))
     unit: SpeedUnit = "rpm" if name.endswith("(rpm)") else "rad/s"
     known = trays.get(tray, TrayLayout(tray, [], unit))
     places = dict(known.places)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pipeline.recordings.dates import has_date
-from pipeline.viewing.fleet import Fan, FanNow, Fleet, NotJudged
+from pipeline.viewing.fleet import Fan, FanNow, Fleet, UnscoredFans
 from pipeline.viewing.stages_page import markdown_literal
 from schemas.units import NS_PER_S
 
@@ -32,7 +32,7 @@ def worst_page(site: str, fleet: Fleet, place: Callable[[Fan], int | None], t_ns
         f"### {markdown_literal(site)}: {len(fleet.fans):,} fans, {summary}",
         _table(worst, place, t_ns) if worst else "",
         _more(counts["in alarm"] - sum(fan.is_in_alarm for fan in worst)),
-        _left_out(fleet.not_judged(), t_ns),
+        _left_out(fleet.unscored(), t_ns),
     ]
     return "\n\n".join(filter(None, parts))
 
@@ -52,7 +52,7 @@ def _more(fans: int) -> str:
     return f"and {fans:,} more in alarm: `fantwin alarms` lists them" if fans > 0 else ""
 
 
-def _left_out(groups: Sequence[NotJudged], t_ns: int) -> str:
+def _left_out(groups: Sequence[UnscoredFans], t_ns: int) -> str:
     if not groups:
         return ""
     lines = ["### Not judged", *(_reason(group, t_ns) for group in groups[:REASONS_LISTED])]
@@ -61,7 +61,7 @@ def _left_out(groups: Sequence[NotJudged], t_ns: int) -> str:
     return "\n".join(lines)
 
 
-def _reason(group: NotJudged, t_ns: int) -> str:
+def _reason(group: UnscoredFans, t_ns: int) -> str:
     named = ", ".join(markdown_literal(tray) for tray in group.trays[:TRAYS_NAMED])
     more = len(group.trays) - TRAYS_NAMED
     trays = f"{named} and {more:,} more trays" if more > 0 else named

@@ -28,6 +28,15 @@ def test_a_fleet_sends_every_sample_once_and_its_alarms_where_its_states_say_so(
     assert first == alarm.t_ns
 
 
+def test_the_cost_on_the_bus_is_that_of_the_whole_fleet(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    from bench.fleet.viewer_on_bus import cost_on_bus  # noqa: PLC0415  needs the extra `view`
+
+    cost = cost_on_bus(70, 2, 0.05, 1, tmp_path)
+    assert cost["fans"] == 70 and 0.0 < cost["rate"] < 1.1 and cost["% of a core"] > 0.0
+    assert cost["dropped"] == 0 and (tmp_path / "runs" / "view.rrd").stat().st_size > 0
+
+
 def in_alarm(score: Score) -> bool:
     return bool((score.state == FanState.ALARM).any())
 

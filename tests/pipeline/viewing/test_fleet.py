@@ -145,7 +145,7 @@ def test_fans_that_are_not_judged_are_grouped_by_reason_the_most_frequent_first(
     fleet = fleet_of(a=2, b=2, c=3)
     fleet.update(newest("a", START_NS + 7, GAP, (FanState.NORMAL, 0.0)))
     fleet.update(newest("b", START_NS + 5, GAP, GAP))
-    groups = [(group.reason, group.fans, group.trays, group.since_t_ns) for group in fleet.not_judged()]
+    groups = [(group.reason, group.fans, group.trays, group.since_t_ns) for group in fleet.unscored()]
     assert groups[0][:2] in (("silent", 3), ("unknown: gap", 3))
     assert set(map(repr, groups)) == {
         repr(("silent", 3, ["c"], 0)),
