@@ -7,6 +7,7 @@ with `fan.proto`.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, is_dataclass
 from functools import cache
 from types import NoneType
@@ -19,10 +20,12 @@ from google.protobuf.message import Message as ProtoMessage
 from schemas import fan_pb2
 from schemas.fields import Array, Column, OpenEnum, columns, other_fields, time_column
 from schemas.messages import LARGEST_PERIOD_NS, Message
+from schemas.wire_fields import LENGTH_DELIMITED, WireError, WireField, wire_fields
 
 FORMER = "former_"
 """begins the name of a field with the values of a column in older recordings"""
-_LENGTH_DELIMITED = 2
+_HEADER_KEY = 1 << 3 | LENGTH_DELIMITED  # of the field `header`, in every message
+_BOOLS = b"\0\1"
 _SHORT = 48  # values; up to this length a list is a faster way into an array than the protobuf field itself
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
@@ -130,6 +133,8 @@ class _Layout:
     proto: type[ProtoMessage]
     record: _Record
     columns: tuple[_PackedColumn, ...]
+    by_number: dict[int, _PackedColumn]
+    """the columns by the numbers of their fields"""
     time: str | None
     """name of the column of sample times; None for a message about one moment"""
 
@@ -144,13 +149,20 @@ def _layout(message_type: type[Message]) -> _Layout:
             name,
             column,
             column.dtype.newbyteorder("<"),
-            _varint(numbers[name] << 3 | _LENGTH_DELIMITED),
+            _varint(numbers[name] << 3 | LENGTH_DELIMITED),
             former if (former := f"{FORMER}{name}") in numbers else "",
         )
         for name, column in declared.items()
     )
     time = time_column(message_type)
-    return _Layout(type_name(message_type), proto, _record(message_type), packed, time if time in declared else None)
+    return _Layout(
+        name=type_name(message_type),
+        proto=proto,
+        record=_record(message_type),
+        columns=packed,
+        by_number={numbers[column.name]: column for column in packed},
+        time=time if time in declared else None,
+    )
 
 
 def _varint(value: int) -> bytes:
@@ -221,6 +233,96 @@ def decode(message_type: type[AnyMessage], data: bytes) -> AnyMessage:
     message = message_type(**values)
     _check_period(layout, message)
     return message
+
+
+def decode_header(message_type: type[Message], data: bytes) -> Any:
+    """The header of a message (`fan_pb2.Header`), without decoding the rest. Raises CodecError."""
+    try:
+        if len(data) > 2 and data[0] == _HEADER_KEY:  # `encode` puts it first
+            length, start = data[1], 2
+            if length > 0x7F:
+                length, start = (length & 0x7F) | data[2] << 7, 3
+            if length < 1 << 14:
+                return fan_pb2.Header.FromString(data[start : start + length])
+        message: Any = proto_type(message_type).FromString(data)
+    except DecodeError as error:
+        raise CodecError(f"{len(data)} bytes are not a {type_name(message_type)}: {error}") from error
+    return message.header
+
+
+def decode_columns(message_type: type[AnyMessage], data: bytes, names: Collection[str]) -> AnyMessage:
+    """Parse some columns of a message, its times, and all that is no column; its other columns are left empty.
+
+    Columns are read-only views of `data`, and keep all of it in memory. So this takes about as long for a long message
+    as for a short one.
+
+    Raises:
+        CodecError: the bytes are not such a message.
+    """
+    layout = _layout(message_type)
+    try:
+        proto, arrays = _views(layout, data, {*names, layout.time} - {None})
+    except (_OtherFormError, WireError):
+        return decode(message_type, data)
+    values = layout.record.read(proto)
+    fans, samples = values.get("fans", -1), len(arrays[layout.time]) if layout.time else -1
+    for column in layout.columns:
+        array = arrays.get(column.name)
+        if array is None:
+            continue
+        if column.declared.shape == "samples x fans" and array.size == samples * fans:
+            array = array.reshape(samples, fans)
+        _check_shape(layout, column, array, samples, array.size if fans < 0 else fans)
+        values[column.name] = array
+    message = message_type(**values)
+    _check_period(layout, message)
+    return message
+
+
+class _OtherFormError(Exception):
+    """A message of another encoder or an earlier version, which only `decode` can read."""
+
+
+def _views(layout: _Layout, data: bytes, names: Collection[str | None]) -> tuple[Any, dict[str, Array]]:
+    """The fields that are no columns, parsed, and the named columns by name, flat, as they lie in `data`.
+
+    Raises:
+        _OtherFormError: a column is missing, in several pieces, or not packed as `encode` does it.
+        CodecError: the rest cannot be parsed, or a value is out of its limits.
+        WireError: these are no fields.
+    """
+    others: list[bytes] = []
+    arrays: dict[str, Array] = {}
+    for field in wire_fields(data):
+        column = layout.by_number.get(field.number)
+        if column is None:
+            others.append(data[field.key : field.end])
+        elif field.wire_type != LENGTH_DELIMITED or column.name in arrays:
+            raise _OtherFormError
+        elif column.name in names:
+            arrays[column.name] = _view(layout, column, data, field)
+    if len(arrays) < len(names):
+        raise _OtherFormError
+    try:
+        return layout.proto.FromString(b"".join(others)), arrays
+    except DecodeError as error:
+        raise CodecError(f"{len(data)} bytes are not a {layout.name}: {error}") from error
+
+
+def _view(layout: _Layout, column: _PackedColumn, data: bytes, field: WireField) -> Array:
+    """The values of a packed field where they lie, (n,)."""
+    length, size = field.end - field.start, column.dtype.itemsize
+    if not length or length % size:
+        raise _OtherFormError
+    array = np.frombuffer(data, column.dtype, length // size, field.start)
+    if size > 1:
+        _check_limits(layout, column, array)
+    elif column.declared.enum:
+        if not data[field.start : field.end].isascii():
+            raise _out_of_limits(layout, column)
+    elif data[field.start : field.end].translate(None, _BOOLS):
+        raise _OtherFormError
+    return array
 
 
 def _array(layout: _Layout, column: _PackedColumn, field: Any) -> Array:

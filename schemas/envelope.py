@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
-from schemas.codec import decode, encode
+from schemas.codec import decode, decode_header, encode
 from schemas.messages import Message, newest_t_ns
 from schemas.topics import BY_NAME, topic_of
 
@@ -14,7 +15,8 @@ class Envelope:
     """One message as it came off the bus or out of a recording.
 
     `topic` is the name of its topic, `payload` the protobuf bytes of `message`, `received_t_ns` host time in ns since
-    the epoch. The payload is decoded when `message` is first read: readers of whole recordings need few of them.
+    the epoch. The payload is decoded when `message` is first read: readers of whole recordings need few of them, and
+    `header` is read without the rest.
     """
 
     key: str
@@ -23,6 +25,7 @@ class Envelope:
     received_t_ns: int
     _message: Message | None = field(default=None, compare=False, repr=False)
     _newest_t_ns: int | None = field(default=None, compare=False, repr=False)
+    _header: Any = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, key: str, message: Message, received_t_ns: int) -> Envelope:
@@ -35,6 +38,15 @@ class Envelope:
         if self._message is None:
             self._message = decode(BY_NAME[self.topic].message, self.payload)
         return self._message
+
+    @property
+    def header(self) -> Any:
+        """The header of the message, without decoding the rest: `Header`, or `fan_pb2.Header`. Raises CodecError."""
+        if self._message is not None:
+            return self._message.header
+        if self._header is None:
+            self._header = decode_header(BY_NAME[self.topic].message, self.payload)
+        return self._header
 
     @property
     def newest_t_ns(self) -> int:

@@ -5,32 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from google.protobuf.message import DecodeError
-
-from schemas import fan_pb2
-from schemas.codec import CodecError, decode, proto_type
+from schemas import codec
+from schemas.codec import CodecError, decode
 from schemas.envelope import Envelope
 from schemas.messages import Message
 from schemas.topics import BY_NAME
 
-_HEADER_FIELD = 0x0A
 _Kind = TypeVar("_Kind", bound=Message)
 
 
 def decode_header(envelope: Envelope) -> Any:
     """The header of a message (`fan_pb2.Header`), without decoding the rest. Raises CodecError."""
-    payload = envelope.payload
     try:
-        if len(payload) > 2 and payload[0] == _HEADER_FIELD:  # our own codec puts it first
-            length, start = payload[1], 2
-            if length > 0x7F:
-                length, start = (length & 0x7F) | payload[2] << 7, 3
-            if length < 1 << 14:
-                return fan_pb2.Header.FromString(payload[start : start + length])
-        message: Any = proto_type(BY_NAME[envelope.topic].message).FromString(payload)
-    except DecodeError as error:
+        return codec.decode_header(BY_NAME[envelope.topic].message, envelope.payload)
+    except CodecError as error:
         raise CodecError(f"{envelope.key}: {error}") from error
-    return message.header
 
 
 def decode_together(kind: type[_Kind], payloads: Sequence[bytes]) -> list[_Kind]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from itertools import islice
 
 import zenoh
 
@@ -72,8 +73,10 @@ class Publisher:
         first, last, newest = (number_in(query.parameters.get(name) or "") for name in ("first", "last", "newest"))
         first, last, newest = first or 0, LAST_SEQUENCE if last is None else last, newest or self._topic.history
         with self._of_all.lock:
-            wanted = [payload for sequence, payload in self._kept if first <= sequence <= last][-newest:]
             published = self.published
+            oldest = published - len(self._kept)  # sequence numbers have no gaps
+            first, end = max(first, oldest, min(last + 1, published) - newest), min(last + 1, published)
+            wanted = [payload for _, payload in islice(self._kept, first - oldest, max(first, end) - oldest)]
         with query:
             for payload in wanted:
                 query.reply(self._recovery_key, payload)

@@ -41,7 +41,7 @@ class Answer:
     Attributes:
         messages: (key, payload) of those that were still kept.
         published: how many messages the producer says it has published; None if it did not answer, or if all were
-            asked.
+            asked, or for the newest only.
         timed_out: a producer that was asked did not answer in time.
     """
 
@@ -65,7 +65,10 @@ class RecoveryRequest:
         last: int,
         timeout_s: float,
         on_answer: OnAnswer,
+        newest: int | None = None,
     ) -> None:
+        """newest: the last so many messages of each producer, without the number of published ones; None: as many as a
+        consumer that begins may ask for, if all producers are asked, and otherwise all."""
         self._is_of_one = producer != ALL_PRODUCERS
         self._on_answer = on_answer
         self._messages: list[tuple[str, bytes]] = []
@@ -76,9 +79,12 @@ class RecoveryRequest:
         self._lock = threading.Lock()
         self._has_ended = False
         self._cancellation = zenoh.CancellationToken()
-        newest = "" if self._is_of_one else f";newest={CATCH_UP_MESSAGES}"
+        if newest is not None:
+            more = f";newest={newest}"
+        else:
+            more = ";count=1" if self._is_of_one else f";count=1;newest={CATCH_UP_MESSAGES}"
         session.get(
-            f"{recovery_key(key, producer)}?first={first};last={last};count=1{newest}",
+            f"{recovery_key(key, producer)}?first={first};last={last}{more}",
             zenoh.handlers.Callback(self._receive, lambda: self._end(None), indirect=False),
             target=zenoh.QueryTarget.ALL,
             timeout=timeout_s,

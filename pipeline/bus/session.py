@@ -74,8 +74,9 @@ class Bus:
         """Declare an output; `encoding` is the full protobuf name of its messages."""
         return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes)
 
-    def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> None:
-        """Call `on_message(key, payload)` for what other sessions publish, from a thread of the bus.
+    def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> Callable[[], None]:
+        """Call `on_message(key, payload)` for what other sessions publish, from a thread of the bus. Returns what ends
+        that.
 
         While it blocks, publishers wait. Messages of one session arrive in the order of publishing, over all keys. A
         message that is larger than any of its topic is refused, and counted in `refused_too_large`.
@@ -90,9 +91,14 @@ class Bus:
 
         # not indirect: with a thread and a queue for each subscriber, keys lose their order and publishers never wait
         handler = zenoh.handlers.Callback(receive, indirect=False)
-        self._declared.append(
-            self._session.declare_subscriber(key_expression, handler, allowed_origin=zenoh.Locality.REMOTE)
-        )
+        subscriber = self._session.declare_subscriber(key_expression, handler, allowed_origin=zenoh.Locality.REMOTE)
+        self._declared.append(subscriber)
+
+        def unsubscribe() -> None:
+            self._declared.remove(subscriber)
+            subscriber.undeclare()
+
+        return unsubscribe
 
     def declare_alive(self, key: str) -> None:
         """Show a liveliness token until this session ends, however it ends."""
@@ -123,13 +129,20 @@ class Bus:
         return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
     def request_missed(
-        self, key: str, producer: str, first: int, last: int, timeout_s: float, on_answer: OnAnswer
+        self,
+        key: str,
+        producer: str,
+        first: int,
+        last: int,
+        timeout_s: float,
+        on_answer: OnAnswer,
+        newest: int | None = None,
     ) -> RecoveryRequest:
         """Request messages `first..last` on `key` from `producer` (`*`: all) without waiting for the answer.
 
-        `on_answer` is called once, from a thread of the bus: it must not block.
+        `on_answer` is called once, from a thread of the bus: it must not block. `newest`: see `RecoveryRequest`.
         """
-        return RecoveryRequest(self._session, key, producer, first, last, timeout_s, on_answer)
+        return RecoveryRequest(self._session, key, producer, first, last, timeout_s, on_answer, newest)
 
     def recover(self, key: str, producer: str = ALL_PRODUCERS) -> list[tuple[str, bytes]]:
         """All messages on `key` that `producer` still keeps, as (key, payload). Waits for the answer: not for a stage,

@@ -49,7 +49,15 @@ class Recovered:
     answer: Answer
 
 
-Item: TypeAlias = FromBus | FromSource | Liveness | Recovered
+@dataclass(frozen=True, slots=True)
+class Newest:
+    """The answer to a request for the newest message on a key."""
+
+    key: str
+    answer: Answer
+
+
+Item: TypeAlias = FromBus | FromSource | Liveness | Recovered | Newest
 
 
 class Inbox:

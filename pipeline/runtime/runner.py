@@ -24,7 +24,8 @@ from pipeline.errors import UsageError, UserError
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
-from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness, Recovered
+from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness, Newest, Recovered
+from pipeline.runtime.newest_messages import NewestMessages
 from pipeline.runtime.notifier import Notifier
 from pipeline.runtime.outputs import Outputs
 from pipeline.runtime.peers import Peers
@@ -33,7 +34,8 @@ from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.sessions import Session, Sessions, refuse_second
 from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage
-from schemas.codec import CodecError, decode, encode, type_name
+from pipeline.runtime.subscriptions import Subscriptions
+from schemas.codec import CodecError, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, Note, StageStatus, newest_t_ns
 from schemas.streams import stage_losses
@@ -83,7 +85,6 @@ class Runner:
         self._inbox = Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
         started_t_ns = HOST_CLOCK.now_ns()
-        reads = stage.reads_as_configured(config)
         context = Context(
             site=config.site,
             trays=trays,
@@ -95,7 +96,7 @@ class Runner:
             configuration_path=config.path,
             configuration_text=config.text,
             overrides=config.overrides,
-            reads=reads,
+            reads=stage.reads_as_configured(config),
         )
         self._parts: dict[str, BuiltStage] = (
             {t.name: stage.build(replace(context, trays=(t,))) for t in trays}
@@ -124,7 +125,11 @@ class Runner:
         self._health_publisher = self._bus.publisher(
             health_key(config.site, stage.name, self._instance), BY_NAME["health"], type_name(Health), self.producer
         )
-        self._read_keys = {tray_key(config.site, t.name, name) for t in trays for name in reads if name != "health"}
+        self._subscriptions = Subscriptions(
+            self._bus, config.site, reads, stage.undecoded, [t.name for t in trays], self._on_bus, self._tracker.forget
+        )
+        self._newest = NewestMessages(self._bus, self._inbox)
+        self._read_keys = self._subscriptions.keys
         self._peers = Peers(self._read_keys)
         main = (
             stage.reads[0] if stage.reads and not self._has_source else ""
@@ -195,8 +200,7 @@ class Runner:
         self._drain()
 
     def _start(self) -> None:
-        for key in sorted(self._read_keys):
-            self._bus.subscribe(key, self._on_bus)
+        self._follow()
         if self.stage.core_per_tray and not self._has_source:  # others use the host's time, also during a replay
             for tray in self._parts:
                 self._bus.subscribe(tray_key(self._site, tray, "clock"), self._on_bus)
@@ -213,6 +217,12 @@ class Runner:
         self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
         for name, parts in self._parts.items():
             self._sources.start(name, parts)
+
+    def _follow(self) -> None:
+        """Read what the core follows message by message, and ask for the newest of the rest."""
+        serves_all = self._parts.get("")
+        followed = serves_all.core.followed() if serves_all and self.stage.undecoded else None
+        self._newest.watch(self._subscriptions.follow(followed))
 
     def _on_bus(self, key: str, payload: bytes) -> None:
         self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()))
@@ -234,6 +244,9 @@ class Runner:
                 for name, parts in self._parts.items():
                     now_ns = self._clock.tick_ns(name)
                     self._call(name, lambda core=parts.core, now_ns=now_ns: core.tick(now_ns), from_timer=True)
+                if self.stage.undecoded:
+                    self._follow()
+                    self._newest.ask()
                 news = self._owes_answer or self._lost() > reported_lost
                 if now >= next_health or (now >= next_loss and news):
                     self._owes_answer = False
@@ -312,6 +325,8 @@ class Runner:
             self._call(item.core, lambda: core.step(item.item))
         elif isinstance(item, Recovered):
             self._handle_recovered(item)
+        elif isinstance(item, Newest):
+            self._handle_newest(item)
         elif isinstance(item, Liveness):
             self._peers.update(item)
             self._sessions.update(item.key, item.alive)
@@ -321,10 +336,14 @@ class Runner:
             envelope = self._decode(item.key, item.payload, item.received_t_ns)
             if envelope is None:
                 return
-            if isinstance(envelope.message, Health):
-                self._handle_health(envelope, envelope.message)
-            elif isinstance(envelope.message, Clock):
-                if not self._clock.update(envelope.message):
+            is_undecoded = self._is_undecoded(envelope)
+            if is_undecoded and envelope.key not in self._subscriptions.current:
+                return  # it was on its way when the core ceased to follow its tray
+            message = None if is_undecoded else envelope.message
+            if isinstance(message, Health):
+                self._handle_health(envelope, message)
+            elif isinstance(message, Clock):
+                if not self._clock.update(message):
                     self._counts["refused_clocks"] += 1
             else:
                 self._health.add_input(envelope.key, envelope.received_t_ns, HOST_CLOCK.now_ns())
@@ -333,7 +352,7 @@ class Runner:
     def _handle_recovered(self, item: Recovered) -> None:
         now_ns = HOST_CLOCK.now_ns()
         decoded = (self._decode(key, payload, now_ns) for key, payload in item.answer.messages)
-        envelopes = [e for e in decoded if e is not None and e.message.header.producer != self.producer]
+        envelopes = [e for e in decoded if e is not None and e.header.producer != self.producer]
         if self._recovery.is_catch_up(item.request):
             due = self._tracker.accept_kept(envelopes)
         else:
@@ -343,6 +362,19 @@ class Runner:
         self._due += due
         self._recovery.finish(item)
 
+    def _handle_newest(self, item: Newest) -> None:
+        now_ns = HOST_CLOCK.now_ns()
+        decoded = (self._decode(key, payload, now_ns) for key, payload in item.answer.messages)
+        newest = self._newest.finish(item, [e for e in decoded if e and self._counts_on_its_key(e)])
+        if newest is not None:
+            self._health.add_input(newest.key, now_ns, now_ns)
+            self._step(newest)
+        self._newest.ask()
+
+    def _counts_on_its_key(self, envelope: Envelope) -> bool:
+        producer = envelope.header.producer
+        return not (self._sessions.is_ignored(producer) or self._sessions.is_stranger(envelope.key, producer))
+
     def _handle_health(self, envelope: Envelope, health: Health) -> None:
         if not self._tracker.believes(health):
             return
@@ -350,20 +382,24 @@ class Runner:
         if health.stage == REPLAY:
             self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
         self._sessions.add_health(health, self._read_keys)
-        self._due += self._tracker.reconcile(health, self._read_keys)
+        self._due += self._tracker.reconcile(health, self._subscriptions.current)
         if "health" in self.stage.reads:
             self._due += self._tracker.accept(envelope)
 
     def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
         try:
-            topic = topic_of(key)
-            return Envelope(key, topic.name, payload, received_t_ns, decode(topic.message, payload))
+            envelope = Envelope(key, topic_of(key).name, payload, received_t_ns)
+            _ = envelope.header if self._is_undecoded(envelope) else envelope.message
         except (KeyError, CodecError):
             self._counts["undecodable"] += 1
             return None
+        return envelope
+
+    def _is_undecoded(self, envelope: Envelope) -> bool:
+        return envelope.topic in self.stage.undecoded
 
     def _step(self, envelope: Envelope) -> None:
-        header = envelope.message.header
+        header = envelope.header
         name = header.tray if header.tray in self._parts else ""
         if name not in self._parts:
             self._counts["unknown_tray"] += 1
@@ -380,7 +416,8 @@ class Runner:
         ):  # samples of a device do not depend on any input
             self._outputs.advance(header.tray, envelope.topic, header)
         self._owes_answer |= self._has_source
-        core, item = self._parts[name].core, envelope if self.stage.wants_envelopes else envelope.message
+        core = self._parts[name].core
+        item = envelope if self.stage.wants_envelopes or self._is_undecoded(envelope) else envelope.message
         self._call(name, lambda: core.step(item), input_tray=header.tray)
 
     def _call(

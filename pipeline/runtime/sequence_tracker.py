@@ -75,7 +75,7 @@ class SequenceTracker:
 
     def accept(self, envelope: Envelope) -> list[Envelope]:
         """The messages to process now that this one has arrived: none if it is held, a duplicate, or refused."""
-        producer = envelope.message.header.producer
+        producer = envelope.header.producer
         stream = self._streams.heard(envelope.key, producer)
         if stream is None:
             is_stranger = self._sessions.is_stranger(envelope.key, producer)
@@ -93,8 +93,8 @@ class SequenceTracker:
     def accept_kept(self, envelopes: Iterable[Envelope]) -> list[Envelope]:
         """The messages to process of those that producers keep from before this consumer started, in sequence."""
         streams: dict[StreamId, list[Envelope]] = {}
-        for envelope in sorted(envelopes, key=lambda each: each.message.header.sequence):
-            streams.setdefault((envelope.key, envelope.message.header.producer), []).append(envelope)
+        for envelope in sorted(envelopes, key=lambda each: each.header.sequence):
+            streams.setdefault((envelope.key, envelope.header.producer), []).append(envelope)
         return [due for id, kept in streams.items() for due in self._take_kept(id, kept)]
 
     def reconcile(self, health: Health, keys: Iterable[str]) -> list[Envelope]:
@@ -128,6 +128,10 @@ class SequenceTracker:
                 return False
         return True
 
+    def forget(self, key: str) -> None:
+        """This consumer reads a key no more. What it has not read if it begins again is history, not a loss."""
+        self._streams.forget(key)
+
     @property
     def is_waiting(self) -> bool:
         """Whether an answer is due."""
@@ -141,7 +145,7 @@ class SequenceTracker:
 
     def refuse_second(self, envelope: Envelope) -> None:
         """An accepted message is ignored: another process owns the stage of its producer."""
-        if stream := self._streams.get(envelope.key, envelope.message.header.producer):
+        if stream := self._streams.get(envelope.key, envelope.header.producer):
             stream.refused += 1
 
     def inputs(self, unsaved: Iterable[Envelope] = ()) -> tuple[Input, ...]:
@@ -158,7 +162,7 @@ class SequenceTracker:
         return self._refusal if self._refusal and self._now_s() - self._refused_s < REFUSAL_SHOWN_S else ""
 
     def _take(self, stream: Stream, envelope: Envelope) -> list[Envelope]:
-        sequence, expected = envelope.message.header.sequence, stream.next_sequence
+        sequence, expected = envelope.header.sequence, stream.next_sequence
         if sequence != expected and not stream.is_duplicate(sequence):
             if sequence >= MOST_PUBLISHED:
                 self._refuse_number(stream.key, stream.producer, sequence + 1, expected)
@@ -169,7 +173,7 @@ class SequenceTracker:
         return [envelope] if stream.accept(sequence) else []
 
     def _take_kept(self, id: StreamId, kept: Sequence[Envelope]) -> list[Envelope]:
-        stream, first = self._streams.heard(*id), kept[0].message.header.sequence
+        stream, first = self._streams.heard(*id), kept[0].header.sequence
         if stream and stream.next_sequence is None:
             if stream.waiting:  # its first message came live before these: they answer what it made this consumer ask
                 return self._go_on(stream, stream.waiting, Found(kept))
@@ -189,8 +193,8 @@ class SequenceTracker:
         """Process what was found, then what was held."""
         stream.waiting = None
         due: list[Envelope] = []
-        for envelope in sorted(found.envelopes, key=lambda each: each.message.header.sequence):
-            header = envelope.message.header
+        for envelope in sorted(found.envelopes, key=lambda each: each.header.sequence):
+            header = envelope.header
             if (envelope.key, header.producer) != (stream.key, stream.producer) or header.sequence >= waiting.until:
                 continue
             if header.sequence >= waiting.request.first and not stream.is_duplicate(header.sequence):

@@ -6,7 +6,7 @@ publishes what it returns. The runner is the only loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -71,6 +71,12 @@ class Core(Protocol):
     def notes(self) -> Sequence[str]:
         """What the core works with and has done, a line each, for people; nothing that is wrong."""
         return ()
+
+    def followed(self) -> Set[str] | None:
+        """The trays whose messages of the `undecoded` topics are all passed to `step`; None: all trays. Of the others
+        `step` gets the newest message, about once a second. Only a core that serves all trays is asked, at every tick.
+        """
+        return None
 
     def problem(self) -> str:
         """One line on what is wrong now and what to do; empty when all is well."""
@@ -151,6 +157,8 @@ class Stage:
         build: builds the core, and its source if it has one.
         core_per_tray: a core for each tray, or one core that serves all trays of the process.
         wants_envelopes: whether `step` is given envelopes instead of messages.
+        undecoded: topics whose messages `step` is given as envelopes, of which only the header has been decoded: for a
+            core that looks into few of them.
         may_drop: a consumer that may drop messages: its missing messages do not count as losses.
         check: lists, without side effects, what would keep the stage from working (a missing port, a twin that
             does not fit); one line each. `fantwin doctor` prints them.
@@ -168,6 +176,7 @@ class Stage:
     build: Callable[[Context], BuiltStage]
     core_per_tray: bool = True
     wants_envelopes: bool = False
+    undecoded: tuple[str, ...] = ()
     may_drop: bool = False
     check: Callable[[Context], Sequence[str]] = no_problems
     chooses: Callable[[Any, Sequence[TrayConfig]], Sequence[str]] | None = None

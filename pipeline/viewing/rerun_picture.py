@@ -21,12 +21,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+import rerun.blueprint as rrb
 from PIL import Image
 from rerun.chunk import Chunk, RrdReader
 from rerun.experimental import ViewerClient
 
 from pipeline.errors import UserError
-from pipeline.viewing.rerun_layout import TIMELINE, TrayLayout, blueprint
+from pipeline.viewing.rerun_fleet import CELLS, MAP, bounds_of, overview_tab
+from pipeline.viewing.rerun_layout import TIMELINE, TrayLayout, blueprint, place_in, tray_tab
 from pipeline.viewing.rerun_sink import APPLICATION, LOOPBACK, rerun_program
 from schemas.messages import Array
 from schemas.units import NS_PER_S, SpeedUnit
@@ -54,10 +56,16 @@ class Picture:
 
 @dataclass(frozen=True)
 class _Rrd:
-    """The contents of a view file."""
+    """The contents of a view file.
+
+    Attributes:
+        trays: by name, with the fans that have been drawn.
+        map_places: (n, 2) what is on the map of a fleet; None: it is no fleet.
+    """
 
     chunks: Sequence[Chunk]
-    trays: dict[str, tuple[list[int], SpeedUnit]]
+    trays: dict[str, TrayLayout]
+    map_places: Array | None
     first_ns: int
     last_ns: int
 
@@ -85,7 +93,7 @@ def draw_picture(
 
     Args:
         rrd: the file.
-        tray: which tray; may be left out where there is one.
+        tray: which tray; may be left out where there is one. Without tray and fans, the overview of a fleet is drawn.
         fans: which fans, counted from 0; the first eight if not given.
         at_s: end of the picture, s after the first sample of the file; its last sample if not given.
         window_s: length of time shown, s.
@@ -95,7 +103,7 @@ def draw_picture(
         PictureError: no driver, no such file, tray, fan or view, or the viewer did not draw it in time.
     """
     contents = _read(rrd)
-    layout = _layout(rrd, contents, tray, fans)
+    tab = _tab(rrd, contents, tray, fans, window_s)
     if not has_vulkan_driver():
         raise PictureError(
             "no Vulkan driver found, which the headless viewer needs: apt-get install mesa-vulkan-drivers"
@@ -107,7 +115,7 @@ def draw_picture(
     with _headless_viewer() as viewer:
         began_s = time.monotonic()
         recording = rr.RecordingStream(APPLICATION)
-        recording.connect_grpc(viewer.url, default_blueprint=blueprint([layout], window_s, for_picture=True))
+        recording.connect_grpc(viewer.url, default_blueprint=blueprint([tab], for_picture=True))
         recording.send_chunks(contents.chunks)
         recording.flush()
         _wait_until_loaded(viewer, contents.last_ns)
@@ -136,23 +144,38 @@ def _read(rrd: Path) -> _Rrd:
             chunks = list(RrdReader(rrd).stream())
     except (RuntimeError, ValueError, OSError) as error:
         raise PictureError(f"{rrd}: not a Rerun file: {error}") from error
-    trays: dict[str, tuple[list[int], SpeedUnit]] = {}
+    trays: dict[str, TrayLayout] = {}
+    on_map: list[Array] = []
     times: list[Array] = []
     for chunk in chunks:
-        parts = chunk.entity_path.strip("/").split("/")
-        if len(parts) != 3 or parts[2] != "speed":
-            continue
-        batch = chunk.to_record_batch()
-        if chunk.is_static:
-            name = batch.column("Measurements:names")[0].as_py()[0]
-            unit: SpeedUnit = "rpm" if name.endswith("(rpm)") else "rad/s"
-            trays.setdefault(parts[0], ([], unit))[0].append(int(parts[1].removeprefix("fan_")))
-        else:
-            times.append(_times_ns(batch))
+        path = chunk.entity_path.strip("/")
+        if path.endswith("/speed"):
+            batch = chunk.to_record_batch()
+            if chunk.is_static:
+                _add_fan(trays, path, batch.column("Measurements:names")[0].as_py()[0])
+            else:
+                times.append(_times_ns(batch))
+        elif path.startswith(MAP) and chunk.is_static and "Points2D:positions" in chunk.to_record_batch().schema.names:
+            on_map.append(np.array(chunk.to_record_batch().column("Points2D:positions")[0].as_py()))
+        elif path == CELLS:
+            times.append(_times_ns(chunk.to_record_batch()))
     if not times:
         raise PictureError(f"{rrd}: holds no speeds drawn by the viewer stage")
     all_times = np.concatenate(times)
-    return _Rrd(chunks, trays, int(all_times.min()), int(all_times.max()))
+    map_places = np.concatenate(on_map) if on_map else None
+    return _Rrd(chunks, trays, map_places, int(all_times.min()), int(all_times.max()))
+
+
+def _add_fan(trays: dict[str, TrayLayout], path: str, name: str) -> None:
+    """Add the fan with this entity of its speed, `[place/]tray/fan_3/speed`, whose first series has this name."""
+    *root, tray, fan, _ = path.split("/")
+    number, place = int(fan.removeprefix("fan_")), place_in("/".join(root))
+    unit: SpeedUnit = "rpm" if name.endswith("(rpm)") else "rad/s"
+    known = trays.get(tray, TrayLayout(tray, [], unit))
+    places = dict(known.places)
+    if place is not None:
+        places[number] = [*places.get(number, ()), place]
+    trays[tray] = replace(known, fans=sorted({*known.fans, number}), places=places)
 
 
 def _until(contents: _Rrd, end_ns: int) -> _Rrd:
@@ -173,18 +196,28 @@ def _times_ns(batch: pa.RecordBatch) -> Array:
     return np.asarray(batch.column(TIMELINE)).astype("datetime64[ns]").astype(np.int64)
 
 
+def _tab(rrd: Path, contents: _Rrd, tray: str | None, fans: Sequence[int] | None, window_s: float) -> rrb.Container:
+    if contents.map_places is not None and tray is None and fans is None:
+        return overview_tab(bounds_of(contents.map_places), window_s)
+    return tray_tab(_layout(rrd, contents, tray, fans), window_s)
+
+
 def _layout(rrd: Path, contents: _Rrd, tray: str | None, fans: Sequence[int] | None) -> TrayLayout:
     if tray is None:
-        if len(contents.trays) > 1:
-            raise PictureError(f"{rrd}: there are several trays; choose one with --tray: {', '.join(contents.trays)}")
+        if len(contents.trays) != 1:
+            names = ", ".join(contents.trays) or "none, as no fan had a plot"
+            raise PictureError(f"{rrd}: there are several trays; choose one with --tray: {names}")
         (tray,) = contents.trays
     if tray not in contents.trays:
         raise PictureError(f"{rrd}: no tray called {tray!r}; there are {', '.join(contents.trays)}")
-    known, unit = contents.trays[tray]
+    known = contents.trays[tray]
     for fan in fans or ():
-        if fan not in known:
-            raise PictureError(f"{rrd}: {tray} has no fan {fan}; it has fans {min(known)} to {max(known)}")
-    return TrayLayout(tray, list(fans) if fans else sorted(known)[:8], unit)
+        if fan not in known.fans:
+            if known.places:
+                drawn = ", ".join(map(str, known.fans))
+                raise PictureError(f"{rrd}: no plot has shown fan {fan} of {tray}; those shown are {drawn}")
+            raise PictureError(f"{rrd}: {tray} has no fan {fan}; it has fans {min(known.fans)} to {max(known.fans)}")
+    return replace(known, fans=list(fans) if fans else known.fans[:8])
 
 
 @contextmanager
@@ -204,7 +237,7 @@ def _headless_viewer() -> Iterator[ViewerClient]:
         )
         try:
             yield _connect(process, port)
-        except (ConnectionError, RuntimeError) as error:
+        except (ConnectionError, TimeoutError, RuntimeError) as error:
             output.seek(0)
             lines = output.read().decode(errors="replace").strip().splitlines()
             raise PictureError(

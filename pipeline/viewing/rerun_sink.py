@@ -1,8 +1,4 @@
-"""The viewer's sink: a Rerun recording that goes to a file and to live viewers on this host.
-
-Each fan has one entity with its series side by side, and one `send_columns` per flush. Deviations in alarm, samples
-outside the band and samples without a score are sent only if there are any.
-"""
+"""The viewer's sink: a Rerun recording that goes to a file and to live viewers on this host."""
 
 from __future__ import annotations
 
@@ -12,6 +8,8 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -21,20 +19,27 @@ import rerun as rr
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import StageError
+from pipeline.viewing.alarm_log import LogLine
+from pipeline.viewing.fleet import Fan
+from pipeline.viewing.fleet_view import Overview
 from pipeline.viewing.loopback import LOOPBACK, check_free
+from pipeline.viewing.plot_places import FleetPlots
+from pipeline.viewing.rerun_bands import RerunBands
+from pipeline.viewing.rerun_fleet import RerunFleet, overview_tab, plots_tab
 from pipeline.viewing.rerun_layout import (
+    FLEET_LOG,
     STAGES_PATH,
     TIMELINE,
     TrayLayout,
     blueprint,
-    fan_path,
     log_path,
     log_styles,
-    state_path,
+    tray_tab,
 )
 from pipeline.viewing.trace import Trace
 from pipeline.viewing.view_file import ViewFile
 from schemas.messages import Array
+from schemas.units import SpeedUnit
 
 APPLICATION = "fantwin"
 FLUSH_LIMIT_S = 2.0
@@ -85,6 +90,7 @@ class RerunSink:
         *,
         name: str,
         trays: Sequence[TrayConfig],
+        fleet: FleetPlots | None,
         started_t_ns: int,
         window_s: float,
         file: Path | None,
@@ -94,15 +100,22 @@ class RerunSink:
     ) -> None:
         """Open `file`, a data server at `grpc_port` and a page for browsers at `web_port`; None leaves one out.
 
+        fleet: None shows every fan with its band.
+
         Raises:
             StageError: the file cannot be written, or a port is taken.
         """
         for key, port in (("grpc_port", grpc_port), ("web_port", web_port)):
             if port is not None:
                 check_free(port, f"viewer.{key}", "viewer.serve = false")
-        layouts = [TrayLayout(tray.name, range(tray.fans), tray.speed_unit) for tray in trays]
         self._recording = rr.RecordingStream(APPLICATION)
-        self._open_paths: set[str] = set()
+        self._bands = RerunBands(self._recording)
+        self._fleet = RerunFleet(self._recording, trays) if fleet else None
+        layouts = [] if fleet else [TrayLayout(tray.name, range(tray.fans), tray.speed_unit) for tray in trays]
+        tabs = [tray_tab(layout, window_s) for layout in layouts]
+        if fleet and self._fleet:
+            tabs = [overview_tab(self._fleet.bounds, window_s)]
+            tabs += [plots_tab(fleet, window_s)] if fleet.count else []
         self._late = False
         self._file = _open_view(file) if file is not None else None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
@@ -112,29 +125,49 @@ class RerunSink:
         if grpc_port is not None:
             server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=memory_limit)
             sinks.append(server)
-        self._recording.set_sinks(*sinks, default_blueprint=blueprint(layouts, window_s))
+        self._recording.set_sinks(*sinks, default_blueprint=blueprint(tabs))
         if self._file is not None:
             self._file.release_pipe()
         self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
         for layout in layouts:
             log_styles(self._recording, layout)
+        if fleet and self._fleet:
+            self._fleet.log_styles(fleet.count)
         self.flush()  # the styles reach the file first, so that the file of a killed viewer has them
         self._page = _serve_page(web_port, grpc_port) if web_port is not None and grpc_port is not None else None
 
     def draw(self, trace: Trace) -> None:
         """Send the next stretch of a tray."""
-        for fan in range(trace.fans):
-            self._draw_fan(trace, fan)
+        self._bands.draw(trace)
 
     def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
         """Set the state of a fan's lane from each time on."""
-        self._send(state_path(tray, fan), t_ns, rr.StateChange.columns(state=list(names)))
+        self._bands.change_states(tray, fan, t_ns, names)
 
-    def log(self, tray: str, t_ns: int, level: str, text: str) -> None:
-        """Add a line to the log of a tray, with its time of day (UTC)."""
-        times = np.array([t_ns])
-        clock = np.datetime_as_string(times.astype("datetime64[ns]"), unit="ms")[0].split("T")[1]
-        self._send(log_path(tray), times, rr.TextLog.columns(text=[f"{clock}  {text}"], level=[level]))
+    def show_fan(self, fan: Fan, place: int, unit: SpeedUnit) -> None:
+        """From now on a fan of a fleet is drawn in this place."""
+        self._bands.show(fan, place, unit)
+
+    def hide_fan(self, fan: Fan, t_ns: int) -> None:
+        """From `t_ns` on a fan of a fleet has no place."""
+        self._bands.hide(fan, t_ns)
+
+    def draw_overview(self, overview: Overview) -> None:
+        """Send what has changed in the overview of a fleet."""
+        assert self._fleet is not None, "the view has no overview"
+        self._fleet.draw(overview)
+
+    def log(self, lines: Sequence[LogLine]) -> None:
+        """Add lines to the log of their tray, or of the fleet, with their time of day (UTC)."""
+        placed = [(FLEET_LOG if self._fleet else log_path(line.tray), line) for line in lines]
+        for path, group in groupby(sorted(placed, key=itemgetter(0)), key=itemgetter(0)):
+            of_log = [line for _, line in group]
+            times = np.array([line.t_ns for line in of_log]).astype("datetime64[ns]")
+            clocks = [text.split("T")[1] for text in np.datetime_as_string(times, unit="ms").tolist()]
+            trays = [f"{line.tray}: " if self._fleet else "" for line in of_log]
+            texts = [f"{clock}  {tray}{line.text}" for clock, tray, line in zip(clocks, trays, of_log, strict=True)]
+            columns = rr.TextLog.columns(text=texts, level=[line.level for line in of_log])
+            self._recording.send_columns(path, [rr.TimeColumn(TIMELINE, timestamp=times)], columns)
 
     def show_stages(self, page: str) -> None:
         """Replace the page about the stages. It has no time and so does not move a cursor that follows the newest."""
@@ -171,59 +204,6 @@ class RerunSink:
                 self._page.wait(FLUSH_LIMIT_S)
             except subprocess.TimeoutExpired:
                 self._page.kill()
-
-    def _draw_fan(self, trace: Trace, fan: int) -> None:
-        measured, predicted, half_width = trace.measured[:, fan], trace.predicted[:, fan], trace.half_width[:, fan]
-        scored = trace.valid[:, fan]
-        ends = _ends_of_band(predicted, half_width)
-        shown = np.stack([np.where(scored, measured, np.nan), predicted, *ends], axis=1)
-        none = np.zeros_like(half_width)
-        variances = np.stack([none, half_width**2, none, none], axis=1)
-        self._send_measurements(fan_path(trace.tray, fan, "speed"), trace.t_ns, shown, variances)
-        self._draw_deviation(trace, fan)
-        outside = trace.outside[:, fan]
-        if outside.any():
-            columns = rr.Scalars.columns(scalars=measured[outside])
-            self._send(fan_path(trace.tray, fan, "outside"), trace.t_ns[outside], columns)
-        self._send_where(fan_path(trace.tray, fan, "not_scored"), trace.t_ns, np.where(scored, np.nan, measured))
-
-    def _draw_deviation(self, trace: Trace, fan: int) -> None:
-        """Send the red area between twin and measured speed while an alarm is active."""
-        path = fan_path(trace.tray, fan, "deviation")
-        measured, predicted = trace.measured[:, fan], trace.predicted[:, fan]
-        middle = np.where(trace.in_alarm[:, fan], (measured + predicted) / 2, np.nan)
-        if self._has_news(path, middle):
-            self._send_measurements(path, trace.t_ns, middle[:, None], ((measured - predicted)[:, None] / 2) ** 2)
-
-    def _send_where(self, path: str, t_ns: Array, values: Array) -> None:
-        if self._has_news(path, values):
-            self._send(path, t_ns, rr.Scalars.columns(scalars=values))
-
-    def _has_news(self, path: str, values: Array) -> bool:
-        """Whether there are values, or a NaN is needed to end the line or zone that is still open."""
-        was_open = path in self._open_paths
-        if np.isfinite(values[-1]):
-            self._open_paths.add(path)
-        else:
-            self._open_paths.discard(path)
-        return was_open or bool(np.isfinite(values).any())
-
-    def _send_measurements(self, path: str, t_ns: Array, values: Array, variances: Array) -> None:
-        columns = rr.Measurements.columns(values=values.reshape(-1), variances=variances.reshape(-1))
-        self._send(path, t_ns, columns.partition([values.shape[1]] * len(values)))
-
-    def _send(self, path: str, t_ns: Array, columns: rr.ComponentColumnList) -> None:
-        time = rr.TimeColumn(TIMELINE, timestamp=t_ns.astype("datetime64[ns]"))
-        self._recording.send_columns(path, indexes=[time], columns=columns)
-
-
-def _ends_of_band(predicted: Array, half_width: Array) -> tuple[Array, Array]:
-    """The lowest and the highest value (n,) of a stretch of the band, each where it lies; NaN elsewhere."""
-    low, high = np.full_like(predicted, np.nan), np.full_like(predicted, np.nan)
-    if np.isfinite(predicted).any():
-        lowest, highest = np.nanargmin(predicted - half_width), np.nanargmax(predicted + half_width)
-        low[lowest], high[highest] = (predicted - half_width)[lowest], (predicted + half_width)[highest]
-    return low, high
 
 
 def _serve_page(web_port: int, grpc_port: int) -> subprocess.Popen[bytes]:

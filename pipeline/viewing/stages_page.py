@@ -18,6 +18,10 @@ from schemas.topics import key_in_words
 CHANGES_SHOWN = 20
 PROBLEM_LENGTH = 200
 SILENT_AFTER_NS = 5_000_000_000
+INSTANCES_LISTED = 8
+"""of a stage with more, those that are well are one row; trays with one twin are one line"""
+PROBLEMS_LISTED = 20
+INPUTS_NAMED = 3
 
 
 def markdown_literal(text: str) -> str:
@@ -50,7 +54,8 @@ class _Latest:
 class StagesPage:
     """Collects the health of the stages and renders it in Markdown.
 
-    Its length is bounded: a row per stage, a line per tray and `CHANGES_SHOWN` changes.
+    Its length is bounded: a row for each stage, and for each of its instances that is not well; a line for each twin;
+    `PROBLEMS_LISTED` problems and `CHANGES_SHOWN` changes.
     """
 
     def __init__(self) -> None:
@@ -75,23 +80,54 @@ class StagesPage:
         """The page at host time `now_ns`. A stage without a new health for `SILENT_AFTER_NS` is silent."""
         rows = ["| stage | state | lost |", "|:--|:--|--:|"]
         problems: list[str] = []
-        for name, latest in sorted(self._stages.items()):
-            state, literal = latest.state(now_ns), markdown_literal(name)
-            lost = rounded(latest.health.lost)
-            rows.append(f"| {literal} | {_bold(state, 'ok')} | {_bold(lost, '0')} |")
-            if latest.health.problem and state != "stopped":
-                problems.append(f"- **{literal}**: {_problem(latest.health)}")
-            if latest.health.waiting_for and state == StageStatus.OK.words:
-                awaited = ", ".join(key_in_words(each.key) for each in latest.health.waiting_for)
-                problems.append(f"- **{literal}**: waits for {markdown_literal(awaited)}")
-        twins = [
-            f"- {markdown_literal(tray)}: {markdown_literal(card.twin)} ({markdown_literal(card.kind)}), "
-            f"since {_time(card.t_ns)}"
-            for tray, card in sorted(self._twins.items())
-        ]
+        by_stage: dict[str, list[str]] = {}
+        for name in sorted(self._stages):
+            by_stage.setdefault(name.partition("/")[0], []).append(name)
+        for stage, names in by_stage.items():
+            states = {name: self._stages[name].state(now_ns) for name in names}
+            well = [name for name in names if states[name] == "ok" and not self._stages[name].health.lost]
+            are_many = len(names) > INSTANCES_LISTED
+            for name in names:
+                if not are_many or name not in well:
+                    lost = rounded(self._stages[name].health.lost)
+                    rows.append(f"| {markdown_literal(name)} | {_bold(states[name], 'ok')} | {_bold(lost, '0')} |")
+                problems += _problems(name, self._stages[name].health, states[name])
+            if are_many and well:
+                rows.append(f"| {markdown_literal(stage)}: {len(well):,} of {len(names):,} | ok | 0 |")
+        if problems[PROBLEMS_LISTED:]:
+            problems[PROBLEMS_LISTED:] = [f"- and {len(problems) - PROBLEMS_LISTED:,} more"]
+        twins = self._twins_in_force()
         parts = [("Stages now", rows), ("What is wrong", problems), ("Twins in force", twins)]
         parts.append(("Last changes (UTC), newest first", [*self._changes]))
         return "\n\n".join(f"## {title}\n\n" + "\n".join(lines) for title, lines in parts if lines)
+
+    def _twins_in_force(self) -> list[str]:
+        by_twin: dict[str, dict[str, ModelCard]] = {}
+        for tray, card in sorted(self._twins.items()):
+            by_twin.setdefault(f"{markdown_literal(card.twin)} ({markdown_literal(card.kind)})", {})[tray] = card
+        lines: list[str] = []
+        for twin, cards in by_twin.items():
+            if len(cards) > INSTANCES_LISTED:
+                since_t_ns = max(card.t_ns for card in cards.values())
+                lines.append(f"- {len(cards):,} trays: {twin}, the last since {_time(since_t_ns)}")
+            else:
+                lines += [
+                    f"- {markdown_literal(tray)}: {twin}, since {_time(card.t_ns)}" for tray, card in cards.items()
+                ]
+        return lines
+
+
+def _problems(name: str, health: Health, state: str) -> list[str]:
+    """What is wrong with an instance, a line each."""
+    lines: list[str] = []
+    if health.problem and state != "stopped":
+        lines.append(f"- **{markdown_literal(name)}**: {_problem(health)}")
+    if health.waiting_for and state == StageStatus.OK.words:
+        awaited = ", ".join(key_in_words(each.key) for each in health.waiting_for[:INPUTS_NAMED])
+        more = len(health.waiting_for) - INPUTS_NAMED
+        awaited += f" and {more:,} more" if more > 0 else ""
+        lines.append(f"- **{markdown_literal(name)}**: waits for {markdown_literal(awaited)}")
+    return lines
 
 
 def _describe(health: Health) -> str:

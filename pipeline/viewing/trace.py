@@ -12,6 +12,15 @@ from schemas.messages import Array, FanState, InvalidReason, Score
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
 IN_ALARM = (FanState.ALARM, FanState.RETURNING)
+TRACE_COLUMNS = (
+    "measured_speed_rad_s",
+    "predicted_speed_rad_s",
+    "band_variance",
+    "valid",
+    "state",
+    "invalid_reason",
+)
+"""the columns of a score that a trace is made of, its times apart"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,6 +28,7 @@ class Trace:
     """A stretch of one tray. Columns are (n, fans) unless noted; speeds are in `speed_unit`.
 
     Attributes:
+        fan_numbers: (fans,) the fan of each column, counted from 0.
         t_ns: (n,) time of the samples, ns since the epoch.
         measured: NaN without a tacho reading.
         predicted, half_width: the twin and half the height of its band; NaN if the sample is not scored.
@@ -29,6 +39,7 @@ class Trace:
 
     tray: str
     speed_unit: SpeedUnit
+    fan_numbers: Sequence[int]
     t_ns: Array
     measured: Array
     predicted: Array
@@ -41,23 +52,33 @@ class Trace:
 
     @property
     def fans(self) -> int:
-        """Number of fans of the tray."""
+        """Number of fans in the trace."""
         return self.measured.shape[1]
 
 
-def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit) -> Trace:
-    """Join the scores of one tray. `scores` must not be empty and must have the same number of fans."""
+def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit, fans: Sequence[int] | None = None) -> Trace:
+    """Join the scores of one tray, of which only `TRACE_COLUMNS` are needed.
+
+    Args:
+        tray: its name.
+        scores: at least one, all with the same number of fans.
+        speed_unit: unit of the speeds in the trace.
+        fans: which fans, counted from 0; all if not given.
+    """
     scale = 1.0 / RAD_S_PER_UNIT[speed_unit]
+    fan_numbers = range(scores[0].fans) if fans is None else fans
+    chosen = slice(None) if fans is None else np.asarray(fans, np.intp)
 
     def column(name: str) -> Array:
-        return np.concatenate([getattr(score, name) for score in scores])
+        return np.concatenate([getattr(score, name)[:, chosen] for score in scores])
 
     valid = column("valid")
     state = column("state")
     return Trace(
         tray=tray,
         speed_unit=speed_unit,
-        t_ns=column("t_ns"),
+        fan_numbers=fan_numbers,
+        t_ns=np.concatenate([score.t_ns for score in scores]),
         measured=column("measured_speed_rad_s") * scale,
         predicted=np.where(valid, column("predicted_speed_rad_s") * scale, np.nan),
         half_width=np.where(valid, np.sqrt(column("band_variance")) * scale, np.nan),
@@ -82,13 +103,17 @@ def state_names() -> list[str]:
     return known + [state_name(FanState.UNKNOWN, reason) for reason in InvalidReason]
 
 
-def state_changes(trace: Trace, fan: int, previous: str | None) -> tuple[Array, list[str]]:
-    """Times (k,) in ns of a fan's state changes, and the k new names. `previous` is the state before the trace."""
-    codes = trace.state[:, fan].astype(np.int64) * (LARGEST_ENUM_VALUE + 1) + np.where(
-        trace.state[:, fan] == FanState.UNKNOWN, trace.invalid_reason[:, fan], 0
-    )
+def state_codes(state: Array, invalid_reason: Array) -> Array:
+    """A number for each state and, if it is UNKNOWN, its reason: equal numbers have the same `state_name`."""
+    return state.astype(np.int64) * (LARGEST_ENUM_VALUE + 1) + np.where(state == FanState.UNKNOWN, invalid_reason, 0)
+
+
+def state_changes(trace: Trace, column: int, previous: str | None) -> tuple[Array, list[str]]:
+    """Times (k,) in ns of the state changes of the fan in a column, and the k new names. `previous` is the state before
+    the trace."""
+    codes = state_codes(trace.state[:, column], trace.invalid_reason[:, column])
     first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
-    names = [state_name(trace.state[i, fan], trace.invalid_reason[i, fan]) for i in first]
+    names = [state_name(trace.state[i, column], trace.invalid_reason[i, column]) for i in first]
     if names and names[0] == previous:
         first, names = first[1:], names[1:]
     return trace.t_ns[first], names

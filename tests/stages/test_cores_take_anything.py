@@ -14,7 +14,11 @@ from hypothesis import strategies as st
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Core
 from pipeline.runtime.twin_file import TwinFile
+from pipeline.viewing.fleet import Fan
+from pipeline.viewing.fleet_view import FleetView
+from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
 from schemas.codec import decode, encode
+from schemas.envelope import Envelope
 from schemas.messages import (
     Alarm,
     Grid,
@@ -28,15 +32,17 @@ from schemas.messages import (
     Score,
     ScorerSnapshot,
 )
+from schemas.topics import TOPICS
 from stages.resampler import ResamplerConfig, ResamplerCore
 from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
-from stages.viewer import ViewerCore
+from stages.viewer import STAGE, ViewerCore
 from tests.stages.test_viewer import FakeSink
 from tests.support.message_strategies import any_message
 from tests.support.scored_blocks import CALIBRATION, core_of, prediction_of
 from tests.support.twin_files import write_twin
 
 FANS = 2
+TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 NO_SLOW_CHECK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
@@ -46,13 +52,15 @@ def sessions(*kinds: type[Message]) -> st.SearchStrategy[list[Message]]:
     return st.lists(messages, max_size=6)
 
 
-def survives(core: Core, session: list[Message], tray: str = "tray1") -> None:
-    """Feed a session as the runner does; all outputs can be encoded."""
+def survives(core: Core, session: list[Message], tray: str = "tray1", undecoded: tuple[str, ...] = ()) -> None:
+    """Feed a session as the runner does; all outputs can be encoded. undecoded: see `Stage`."""
     out: list[Any] = []
     with np.errstate(all="ignore"):
         for number, message in enumerate(session):
             stamped = replace(message, header=Header("p", number, tray))
-            out += core.step(decode(type(message), encode(stamped)))
+            payload, topic = encode(stamped), TOPIC_OF[type(message)]
+            item = Envelope("", topic, payload, 0) if topic in undecoded else decode(type(message), payload)
+            out += core.step(item)
             out += core.tick(number * 50_000_000)
             assert core.problem() is not None and core.counters() is not None
         out += core.close()
@@ -141,6 +149,8 @@ def test_the_scorer_survives_any_snapshot(memory: ScorerSnapshot) -> None:
 
 
 @NO_SLOW_CHECK
-@given(sessions(Score, Alarm, ModelCard, Health), st.sampled_from(["tray1", "tray1", "elsewhere"]))
-def test_the_viewer_survives_any_message(session: list[Message], tray: str) -> None:
-    survives(ViewerCore([TrayConfig(name="tray1", fans=FANS)], FakeSink()), session, tray)
+@given(sessions(Score, Alarm, ModelCard, Health), st.sampled_from(["tray1", "tray1", "elsewhere"]), st.booleans())
+def test_the_viewer_survives_any_message(session: list[Message], tray: str, is_fleet: bool) -> None:
+    trays, plots = [TrayConfig(name="tray1", fans=FANS)], FleetPlots([Fan("tray1", 0)], 1)
+    fleet = FleetView("site", trays, PlotPlaces(plots, 0), 2_000_000_000) if is_fleet else None
+    survives(ViewerCore(trays, FakeSink(), fleet), session, tray, STAGE.undecoded)

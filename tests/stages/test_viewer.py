@@ -17,21 +17,28 @@ import pytest
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Context, Core, StageError
+from pipeline.viewing.alarm_log import LogLine, log_line
+from pipeline.viewing.fleet import Fan
+from pipeline.viewing.fleet_view import Overview
 from pipeline.viewing.loopback import check_free
 from pipeline.viewing.trace import Trace
+from schemas.codec import encode
+from schemas.envelope import Envelope
 from schemas.messages import (
     Alarm,
     FanState,
     Header,
     Health,
     InvalidReason,
+    Message,
     ModelCard,
     Score,
     Severity,
     StageStatus,
     Transition,
 )
-from schemas.units import RAD_S_PER_UNIT
+from schemas.topics import tray_key
+from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 from stages.viewer import (
     FLUSH_PERIOD_NS,
     PAGE_PERIOD_NS,
@@ -39,7 +46,6 @@ from stages.viewer import (
     SAMPLES_HELD,
     ViewerConfig,
     ViewerCore,
-    alarm_line,
     build,
 )
 from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
@@ -53,7 +59,10 @@ class FakeSink:
 
     traces: list[Trace] = field(default_factory=list)
     states: list[tuple[str, int, list[int], list[str]]] = field(default_factory=list)
-    lines: list[tuple[str, int, str, str]] = field(default_factory=list)
+    lines: list[LogLine] = field(default_factory=list)
+    places: dict[Fan, int] = field(default_factory=dict)
+    hidden: list[tuple[Fan, int]] = field(default_factory=list)
+    overviews: list[Overview] = field(default_factory=list)
     pages: list[str] = field(default_factory=list)
     flushed: int = 0
     closed: bool = False
@@ -65,8 +74,18 @@ class FakeSink:
     def change_states(self, tray: str, fan: int, t_ns: Any, names: Sequence[str]) -> None:
         self.states.append((tray, fan, t_ns.tolist(), list(names)))
 
-    def log(self, tray: str, t_ns: int, level: str, text: str) -> None:
-        self.lines.append((tray, t_ns, level, text))
+    def show_fan(self, fan: Fan, place: int, unit: SpeedUnit) -> None:
+        self.places[fan] = place
+
+    def hide_fan(self, fan: Fan, t_ns: int) -> None:
+        self.hidden.append((fan, t_ns))
+        del self.places[fan]
+
+    def draw_overview(self, overview: Overview) -> None:
+        self.overviews.append(overview)
+
+    def log(self, lines: Sequence[LogLine]) -> None:
+        self.lines += lines
 
     def show_stages(self, page: str) -> None:
         self.pages.append(page)
@@ -94,10 +113,18 @@ def core_of(sink: FakeSink, fans: int = 3, **tray: Any) -> ViewerCore:
     return ViewerCore([TrayConfig(name="tray1", fans=fans, **tray)], sink)
 
 
+def sent(message: Message) -> Message | Envelope:
+    """A message as the runner hands it over: a score has not been decoded."""
+    if not isinstance(message, Score):
+        return message
+    key = tray_key("site", message.header.tray, "score")
+    return Envelope(key, "score", encode(message), 0)
+
+
 def play(core: Core, scores: Sequence[Score]) -> None:
     """Hand over scores with a tick after each, as the runner does."""
     for score in scores:
-        core.step(score)
+        core.step(sent(score))
         core.tick(int(score.t_ns[-1]))
 
 
@@ -127,7 +154,8 @@ def play(core: Core, scores: Sequence[Score]) -> None:
 def test_the_log_shows_transition_and_severity_of_an_alarm(more: dict[str, Any], level: str, text: str) -> None:
     fields = {"fan": 0, "active": True, "severity": Severity.WARNING, "t_ns": 1, "onset_t_ns": 1, "acknowledged": True}
     fields |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so", "confirmed": True}
-    assert alarm_line(Alarm(**fields | more)) == (level, text)
+    line = log_line(Alarm(header=Header("p", 0, "tray1"), **fields | more))
+    assert line == ("tray1", 1, level, text)
 
 
 def test_samples_are_drawn_twice_a_second_and_each_exactly_once() -> None:
@@ -150,7 +178,7 @@ def test_without_ticks_a_bounded_number_of_samples_is_held() -> None:
     scores, _ = made_up_tray(seconds=100, fans=1, block=64, gap_fan=None, faulty_fan=None)
     core = core_of(sink, fans=1)
     for score in scores:
-        core.step(score)
+        core.step(sent(score))
     assert [len(trace.t_ns) for trace in sink.traces] == [SAMPLES_HELD, SAMPLES_HELD]
 
 
@@ -168,7 +196,7 @@ def test_a_change_of_reason_is_a_change_of_state() -> None:
     state = np.full((10, 1), FanState.UNKNOWN, np.uint8)
     invalid_reason = np.array([[InvalidReason.WARMING_UP]] * 4 + [[InvalidReason.SATURATED]] * 6, np.uint8)
     core = core_of(sink, fans=1)
-    core.step(changed(score, state=state, invalid_reason=invalid_reason, valid=np.zeros((10, 1), bool)))
+    core.step(sent(changed(score, state=state, invalid_reason=invalid_reason, valid=np.zeros((10, 1), bool))))
     core.close()
     assert sink.lane(0) == [(0, "unknown: warming up"), (0.04, "unknown: saturated")]
 
@@ -179,7 +207,7 @@ def test_states_and_reasons_of_a_newer_scorer_are_shown_with_their_number() -> N
     state = np.array([[FanState.UNKNOWN]] * 3 + [[FanState.NORMAL]] * 3 + [[99]] * 4, np.uint8)
     reason = np.array([[len(InvalidReason)]] * 3 + [[InvalidReason.NONE]] * 7, np.uint8)
     core = core_of(sink, fans=1)
-    core.step(changed(score, state=state, invalid_reason=reason, valid=reason == 0))
+    core.step(sent(changed(score, state=state, invalid_reason=reason, valid=reason == 0)))
     core.close()
     assert sink.lane(0) == [(0, f"unknown: unknown ({len(InvalidReason)})"), (0.03, "normal"), (0.06, "unknown (99)")]
 
@@ -223,7 +251,7 @@ def test_speeds_are_shown_in_the_unit_of_the_tray() -> None:
     sink = FakeSink()
     scores, alarms = made_up_tray(seconds=1, gap_fan=None, faulty_fan=2, fault_s=(0.0, 1.0))
     core = core_of(sink, speed_unit="rpm")
-    core.step(scores[0])
+    core.step(sent(scores[0]))
     core.step(alarms[0])
     core.close()
     rpm = 60 / (2 * np.pi)
@@ -238,6 +266,7 @@ def test_alarms_go_to_the_log_of_their_tray_at_the_samples_time() -> None:
     core = core_of(sink)
     for alarm in alarms:
         core.step(alarm)
+    core.tick(LATER_NS)
     assert [line[:3] for line in sink.lines] == [
         ("tray1", alarms[0].t_ns, "ERROR"),
         ("tray1", alarms[1].t_ns, "INFO"),
@@ -301,7 +330,7 @@ def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp
     scores, alarms = made_up_tray(seconds=20)
     core = build(context(tmp_path, speed_unit="rpm")).core
     for item in (*scores, *alarms):
-        core.step(item)
+        core.step(sent(item))
         core.tick(item.t_ns if isinstance(item.t_ns, int) else int(item.t_ns[-1]))
     core.close()
     rows = rows_of(tmp_path / "view.rrd")
@@ -327,7 +356,7 @@ def test_a_replay_of_an_old_recording_has_no_data_at_the_host_time(tmp_path: Pat
     scores, alarms = made_up_tray(seconds=2)
     core = build(context(tmp_path)).core
     for number, item in enumerate((health(), card(), *scores, *alarms, health(lost=3, problem="two | *lines*"))):
-        core.step(item)
+        core.step(sent(item))
         core.tick(LATER_NS + number * FLUSH_PERIOD_NS)
     core.close()
     rows = rows_of(tmp_path / "view.rrd")
@@ -371,7 +400,7 @@ def test_an_area_open_at_the_end_of_a_flush_is_ended_by_the_next_one(tmp_path: P
     in_alarm = np.full((10, 1), FanState.ALARM, np.uint8)
     core = build(context(tmp_path, fans=1)).core
     for number, score in enumerate((changed(scores[0], state=in_alarm), *scores[1:])):
-        core.step(score)
+        core.step(sent(score))
         core.tick((number + 1) * FLUSH_PERIOD_NS)
     core.close()
     area = rows_of(tmp_path / "view.rrd")["/tray1/fan_0/deviation"]
@@ -384,7 +413,7 @@ def test_samples_without_a_score_are_drawn_apart_in_grey(tmp_path: Path) -> None
     valid = np.ones((20, 1), bool)
     valid[5:10] = False
     core = build(context(tmp_path, fans=1)).core
-    core.step(changed(score, valid=valid))
+    core.step(sent(changed(score, valid=valid)))
     core.close()
     rows = rows_of(tmp_path / "view.rrd")
     scored = np.array([row["Measurements:values"][0] for _, row in rows["/tray1/fan_0/speed"]])
@@ -538,7 +567,7 @@ def test_messages_of_a_tray_that_is_not_configured_are_counted_and_ignored() -> 
     core = core_of(sink)
     scores, alarms = made_up_tray(tray="elsewhere", seconds=1)
     for message in (*scores, *alarms):
-        core.step(message)
+        core.step(sent(message))
     core.close()
     assert core.counters()["unknown_tray"] == len(scores) + len(alarms) > 2
     assert not sink.traces and not sink.lines
@@ -546,7 +575,7 @@ def test_messages_of_a_tray_that_is_not_configured_are_counted_and_ignored() -> 
 
 def test_a_wrong_number_of_fans_is_reported_until_correct_scores_arrive() -> None:
     core = core_of(FakeSink(), fans=3)
-    core.step(made_up_tray(fans=2, seconds=1, faulty_fan=None)[0][0])
+    core.step(sent(made_up_tray(fans=2, seconds=1, faulty_fan=None)[0][0]))
     assert core.problem() == "scores have 2 fans, [[tray]] tray1 has fans = 3: correct `fans`"
-    core.step(made_up_tray(fans=3, seconds=1)[0][0])
+    core.step(sent(made_up_tray(fans=3, seconds=1)[0][0]))
     assert core.problem() == ""

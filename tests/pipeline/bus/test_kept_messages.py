@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from queue import SimpleQueue
+
+import pytest
+
 from pipeline.bus import publisher as publisher_module
+from pipeline.bus.recovery import Answer
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, CATCH_UP_MESSAGES, tray_key
@@ -22,6 +27,27 @@ def test_row_16_what_is_sent_while_a_link_is_lost_for_30_s_is_kept(endpoint):
         eventually(lambda: asker.recover(key, "p"), "they have met")
         assert len(asker.recover(key, "p")) == LOST_S * RATE_HZ + CATCH_UP_MESSAGES
         assert len(asker.recover(key)) == CATCH_UP_MESSAGES
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "newest"), [(0, 99, 3), (0, 99, None), (5, 7, 2), (97, 200, 1), (100, 200, 1)]
+)
+def test_a_request_for_a_range_is_answered_with_what_is_kept_of_it_or_its_newest(
+    endpoint, monkeypatch, first: int, last: int, newest: int | None
+):
+    monkeypatch.setattr(publisher_module, "KEPT_BYTES", 60)
+    key, answers = tray_key("s", "a", "raw"), SimpleQueue[Answer]()
+    config = BusConfig(endpoint=endpoint)
+    with Bus(config) as bus, Bus(config) as asker:
+        publisher = bus.publisher(key, BY_NAME["raw"], "", "p")
+        for number in range(100):
+            publisher.put(bytes([number]))
+        eventually(lambda: asker.recover(key, "p"), "they have met")
+        asker.request_missed(key, "p", first, last, 20.0, answers.put, newest)
+        answer = answers.get(timeout=20)
+    kept = [number for number in range(40, 100) if first <= number <= last]
+    assert [payload[0] for _, payload in answer.messages] == (kept[-newest:] if newest else kept)
+    assert answer.published == (None if newest else 100)
 
 
 def test_row_16_publishers_of_a_process_keep_a_bounded_number_of_bytes_together(endpoint, monkeypatch):

@@ -180,6 +180,19 @@ def test_row_18_what_a_killed_stage_had_received_and_not_saved_is_lost_if_nobody
     assert losses([sent, killed, follower], launched)["resampler"] == 5
 
 
+def test_a_topic_declared_undecoded_reaches_the_core_with_its_header_only_and_in_sequence(config):
+    holder = Holder()
+    bench = Bench(toy(lambda _context: BuiltStage(holder), undecoded=("raw",)), config)
+    bench.feed(TRAY_A, 0)
+    broken = encode(replace(raw(1), header=Header("feeder", 1, TRAY_A))) + b"\xff"
+    bench.publisher[TRAY_A].put(broken)
+    eventually(lambda: len(holder.held) == 2, "both reach the core")
+    first, second = holder.held
+    assert (first.header.sequence, first.message.header.sequence) == (0, 0)
+    assert second.header.sequence == 1 and second.payload == broken
+    assert all(counter.name != "undecodable" for counter in bench.end().counters)
+
+
 def test_row_18_undecodable_bytes_of_a_stranger_are_counted_and_are_no_loss_of_the_stage(config):
     bench = Bench(toy(), config)
     bench.publisher[TRAY_A]._publisher.put(b"\xff\xff\xff")

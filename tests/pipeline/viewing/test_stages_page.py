@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from pipeline.viewing.stages_page import CHANGES_SHOWN, SILENT_AFTER_NS, StagesPage, rounded
+from pipeline.viewing.stages_page import CHANGES_SHOWN, PROBLEMS_LISTED, SILENT_AFTER_NS, StagesPage, rounded
 from schemas.messages import AwaitedInput, Header, Health, ModelCard, StageStatus
 
 NOW_NS = 1_760_000_000_000_000_000  # 2025-10-09 08:53:20
@@ -117,3 +117,31 @@ def test_row_01_a_stage_that_waits_for_its_input_is_named() -> None:
     awaited = AwaitedInput(key="fantwin/s/tray1/grid", since_t_ns=0)
     page = page_of(replace(health("scorer"), waiting_for=(awaited,)))
     assert section(page.text(NOW_NS), "What is wrong")[0] == "- **scorer**: waits for grid of tray1"
+
+
+def test_of_many_instances_only_those_that_are_not_well_have_a_row() -> None:
+    page = page_of(*(health("acquisition", f"rack{number}") for number in range(157)))
+    page.add_health(health("acquisition", "rack3", lost=2))
+    page.add_health(health("acquisition", "rack5", status=StageStatus.DEGRADED, problem="no port"))
+    assert [row for row in section(page.text(NOW_NS), "Stages now") if row][2:] == [
+        "| acquisition/rack3 | ok | **2** |",
+        "| acquisition/rack5 | **degraded** | 0 |",
+        "| acquisition: 155 of 157 | ok | 0 |",
+    ]
+
+
+def test_a_fleet_in_trouble_has_a_short_page() -> None:
+    awaited = tuple(AwaitedInput(key=f"fantwin/s/rack{number}/grid", since_t_ns=0) for number in range(157))
+    page = page_of(replace(health("scorer"), waiting_for=awaited))
+    assert section(page.text(NOW_NS), "What is wrong")[0] == (
+        "- **scorer**: waits for grid of rack0, grid of rack1, grid of rack2 and 154 more"
+    )
+    for number in range(157):
+        page.add_health(health("acquisition", f"rack{number}", status=StageStatus.DEGRADED, problem="no port"))
+        card = ModelCard(header=Header("x", 0, ""), t_ns=NOW_NS, twin="f40", kind="hybrid", sha256="")
+        page.add_twin(f"rack{number}", card)
+    wrong = [line for line in section(page.text(NOW_NS), "What is wrong") if line]
+    assert len(wrong) == PROBLEMS_LISTED + 1 and wrong[-1] == "- and 138 more"
+    assert section(page.text(NOW_NS), "Twins in force")[0] == (
+        "- 157 trays: f40 (hybrid), the last since 2025-10-09 08:53:20"
+    )

@@ -14,6 +14,7 @@ from pipeline.viewing.rerun_sink import RerunSink
 from pipeline.viewing.view_file import ViewFile
 from schemas.units import NS_PER_S
 from stages.viewer import ViewerCore
+from tests.stages.test_viewer import sent
 from tests.support.score_data import START_NS, made_up_tray
 
 
@@ -37,6 +38,7 @@ def test_row_09_a_view_on_a_full_disk_is_reported_and_the_viewer_goes_on_and_end
     sink = RerunSink(
         name="x",
         trays=trays,
+        fleet=None,
         started_t_ns=START_NS,
         window_s=30.0,
         file=small_disk / "view.rrd",
@@ -52,7 +54,7 @@ def test_row_09_a_view_on_a_full_disk_is_reported_and_the_viewer_goes_on_and_end
     half = len(scores) // 2
     for second, some in enumerate((scores[:half], scores[half:])):
         for score in some:
-            core.step(score)
+            core.step(sent(score))
         core.tick(START_NS + second * NS_PER_S)
         assert "view.rrd: the view is not written any more: No space left on device; what is in" in core.problem()
     core.close()

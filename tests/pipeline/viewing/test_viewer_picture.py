@@ -14,7 +14,7 @@ from PIL import Image
 from pipeline.cli.recordings.picture import picture
 from pipeline.errors import UserError
 from stages.viewer import PAGE_PERIOD_NS, build
-from tests.stages.test_viewer import LATER_NS, card, changed, context, free_port, health, play
+from tests.stages.test_viewer import LATER_NS, card, changed, context, free_port, health, play, sent
 from tests.support.running_chain import eventually
 from tests.support.score_data import START_NS, made_up_tray
 
@@ -109,7 +109,7 @@ def test_a_live_viewer_follows_an_old_recording_while_health_is_of_today(tmp_pat
     with rerun_picture._headless_viewer() as viewer:
         viewer.open(f"rerun+http://127.0.0.1:{port}/proxy")
         for number, item in enumerate((card(), health(), *scores, health(problem="something is wrong"))):
-            core.step(item)
+            core.step(sent(item))
             core.tick(LATER_NS + number * PAGE_PERIOD_NS)
         last_ns = int(scores[-1].t_ns[-1])
         eventually(lambda: abs(shown_ns(viewer) - last_ns) < 1000, "the last sample is under the cursor")

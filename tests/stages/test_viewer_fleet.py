@@ -1,0 +1,279 @@
+"""The viewer with more fans than it can draw: an overview of all, and plots of a few."""
+
+from __future__ import annotations
+
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import stages.viewer
+from pipeline.config.models import TrayConfig
+from pipeline.runtime.stage import Context, StageError
+from pipeline.viewing.fleet import SILENT, Fan, class_names
+from pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
+from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
+from schemas.codec import decode_columns
+from schemas.messages import Alarm, Score
+from stages.viewer import FLUSH_PERIOD_NS, ViewerConfig, ViewerCore, build, check
+from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
+from tests.support.score_data import START_NS, STEP_NS, made_up_tray
+
+HOLD_S, WINDOW_S = 3, 4
+TRAYS = ("tray1", "tray2", "tray3")
+
+
+def fleet_core(sink: FakeSink, *, show: tuple[Fan, ...] = (), for_alarms: int = 2, hold_s: int = HOLD_S) -> ViewerCore:
+    trays = [TrayConfig(name=name, fans=3) for name in TRAYS]
+    places = PlotPlaces(FleetPlots(show, for_alarms), hold_s * 1_000_000_000)
+    return ViewerCore(trays, sink, FleetView("site", trays, places, WINDOW_S * 1_000_000_000))
+
+
+def messages_of(seconds: float = 20.0, **of_tray: Any) -> list[Score | Alarm]:
+    """Of three trays, in order of time; fan 2 of tray2 is in alarm from 8.5 to 14.5 s. of_tray: for `made_up_tray`."""
+    found: list[Score | Alarm] = []
+    for tray in TRAYS:
+        options = {"faulty_fan": 2 if tray == "tray2" else None, "gap_fan": None}
+        scores, alarms = made_up_tray(tray=tray, seconds=seconds, **{**options, **of_tray})
+        found += [*scores, *alarms]
+    return sorted(found, key=last_t_ns)
+
+
+def last_t_ns(message: Any) -> int:
+    return int(message.t_ns[-1]) if isinstance(message, Score) else message.t_ns
+
+
+def play(core: ViewerCore, messages: list[Score | Alarm]) -> None:
+    """With a tick after each message, at the time of its last sample."""
+    for message in messages:
+        core.step(sent(message))
+        core.tick(last_t_ns(message))
+
+
+def drawn(sink: FakeSink, fan: Fan) -> tuple[np.ndarray, np.ndarray]:
+    """Times and measured speeds that were drawn of a fan."""
+    traces = [trace for trace in sink.traces if trace.tray == fan.tray and fan.number in trace.fan_numbers]
+    columns = [list(trace.fan_numbers).index(fan.number) for trace in traces]
+    measured = [trace.measured[:, column] for trace, column in zip(traces, columns, strict=True)]
+    return np.concatenate([trace.t_ns for trace in traces]), np.concatenate(measured)
+
+
+def test_only_the_fan_in_alarm_is_drawn_with_what_was_before_and_for_a_while_after() -> None:
+    sink, messages = FakeSink(), messages_of()
+    core = fleet_core(sink)
+    play(core, messages)
+    faulty = Fan("tray2", 2)
+    assert {(trace.tray, *trace.fan_numbers) for trace in sink.traces} == {("tray2", 2)}
+    t_ns, measured = drawn(sink, faulty)
+    assert (np.diff(t_ns) > 0).all(), "each sample once, in order"
+    seconds = (t_ns - START_NS) / 1e9
+    begin_s = 9.0  # the first flush after the alarm
+    before = seconds[seconds < begin_s]
+    assert begin_s - WINDOW_S <= before[0] <= begin_s - WINDOW_S + 0.5 and np.allclose(np.diff(before), 0.5, atol=0.11)
+    after = seconds[seconds >= begin_s + 0.1]
+    assert np.allclose(np.diff(after), STEP_NS / 1e9), "from then on every sample"
+    (hidden,) = sink.hidden
+    assert hidden[0] == faulty and hidden[1] == t_ns[-1] + 1
+    assert 14.5 + HOLD_S <= (hidden[1] - START_NS) / 1e9 <= 14.5 + HOLD_S + 1
+    recorded = {int(t): s for m in messages if isinstance(m, Score) and m.header.tray == "tray2" for t, s in rows(m)}
+    np.testing.assert_allclose(measured, [recorded[int(t)] for t in t_ns])
+
+
+def rows(score: Score) -> list[tuple[int, float]]:
+    return list(zip(score.t_ns.tolist(), score.measured_speed_rad_s[:, 2].tolist(), strict=True))
+
+
+def test_a_plot_that_begins_again_repeats_no_sample() -> None:
+    sink = FakeSink()
+    core = fleet_core(sink, hold_s=0)
+    first, second = (messages_of(seconds=10, fault_s=fault_s) for fault_s in ((2.0, 3.0), (5.0, 6.0)))
+    middle_ns = START_NS + 4_500_000_000
+    play(core, [m for m in first if last_t_ns(m) < middle_ns] + [m for m in second if last_t_ns(m) >= middle_ns])
+    t_ns, _ = drawn(sink, Fan("tray2", 2))
+    assert len(sink.hidden) == 2 and (np.diff(t_ns) > 0).all()
+
+
+def test_fans_asked_for_are_drawn_from_the_first_sample_on() -> None:
+    sink = FakeSink()
+    core = fleet_core(sink, show=(Fan("tray3", 1), Fan("tray3", 0)), for_alarms=0)
+    play(core, messages_of(seconds=5))
+    core.close()
+    assert sink.places == {Fan("tray3", 1): 1, Fan("tray3", 0): 2}
+    assert {(trace.tray, *trace.fan_numbers) for trace in sink.traces} == {("tray3", 0, 1)}
+    t_ns, _ = drawn(sink, Fan("tray3", 1))
+    assert len(t_ns) == 500 and (np.diff(t_ns) == STEP_NS).all()
+
+
+def test_trays_with_a_plot_are_followed_for_as_long_as_they_have_it() -> None:
+    core = fleet_core(FakeSink(), show=(Fan("tray3", 1),))
+    messages = messages_of()
+    followed: list[frozenset[str]] = []
+    for message in messages:
+        play(core, [message])
+        followed.append(frozenset(core.followed() or ()))
+    assert [each for each, _ in groupby(followed)] == [{"tray3"}, {"tray2", "tray3"}, {"tray3"}]
+    assert ViewerCore([TrayConfig(name="tray1", fans=3)], FakeSink()).followed() is None, "few fans: all"
+
+
+def test_of_a_tray_without_a_plot_only_the_newest_score_is_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[int] = []
+
+    def counting(kind: type[Score], data: bytes, names: Any) -> Score:
+        score = decode_columns(kind, data, names)
+        decoded.append(int(score.t_ns[-1]))
+        return score
+
+    monkeypatch.setattr(stages.viewer, "decode_columns", counting)
+    core = fleet_core(FakeSink())
+    messages = messages_of(seconds=10, block=1, faulty_fan=None)
+    play(core, messages)
+    assert len(messages) == 3000 and len(decoded) <= 3 * 21
+
+
+def test_the_overview_follows_every_fan_and_repeats_what_does_not_change() -> None:
+    sink = FakeSink()
+    core = fleet_core(sink)
+    play(core, messages_of())
+    core.close()
+    steady = [overview for overview in sink.overviews[1:] if overview.classes is not None]
+    assert steady[0].classes is not None and len(steady[0].classes) == 9
+    times = np.array([overview.t_ns for overview in sink.overviews])
+    assert (np.diff(times) > 0).all() and len(times) in (40, 41)
+    of_faulty = {
+        round((each.t_ns - START_NS) / 1e9, 1): class_names()[each.classes[5]]
+        for each in steady
+        if each.classes is not None
+    }
+    assert "alarm" in {name for at_s, name in of_faulty.items() if 9 < at_s < 14}
+    assert {name for at_s, name in of_faulty.items() if at_s < 8 or at_s > 15} <= set(class_names()[:5])
+    marked = [((each.t_ns - START_NS) / 1e9, each.alarms) for each in sink.overviews if each.alarms is not None]
+    assert max(np.diff([at_s for at_s, _ in marked])) <= 5.1
+    changes = [next(group) for _, group in groupby(marked, key=lambda pair: pair[1])]
+    assert [alarms for _, alarms in changes] == [[], [5], []]
+    assert 8.5 <= changes[1][0] <= 9.1 and 14.5 <= changes[2][0] <= 15.1
+    assert [each.counts["in alarm"] for each in sink.overviews].count(1) in (12, 13)
+    pages = [(each.t_ns, each.page) for each in sink.overviews if each.page is not None]
+    assert min(np.diff([t for t, _ in pages])) >= 1_000_000_000
+    assert any("**tray2/2** | alarm" in page for _, page in pages) and "9 fans" in pages[0][1]
+
+
+def test_a_tray_that_sends_no_more_becomes_silent_and_its_alarm_gives_up_its_plot() -> None:
+    sink = FakeSink()
+    core = fleet_core(sink)
+    play(core, [m for m in messages_of() if m.header.tray != "tray2" or last_t_ns(m) < START_NS + 10_000_000_000])
+    in_time = [
+        (each.t_ns - START_NS) / 1e9
+        for each in sink.overviews[1:]
+        if each.classes is not None and class_names()[each.classes[5]] == SILENT
+    ]
+    assert 10 + SILENT_AFTER_NS / 1e9 <= in_time[0] <= 11 + SILENT_AFTER_NS / 1e9
+    page = next(each.page for each in reversed(sink.overviews) if each.page)
+    assert "- silent: 2 fans of tray2, since 22:13:29" in page, "the third has an active alarm"
+    assert "**tray2/2** | alarm, silent" in page
+    assert [fan for fan, _ in sink.hidden] == [Fan("tray2", 2)]
+
+
+def test_the_lane_of_a_silent_fan_says_so_until_it_is_heard_again() -> None:
+    sink = FakeSink()
+    core = fleet_core(sink, show=(Fan("tray2", 0),))
+    gap_s = 3.0, 3.0 + SILENT_AFTER_NS / 1e9 + 2.0
+
+    def is_lost(message: Score | Alarm) -> bool:
+        return message.header.tray == "tray2" and gap_s[0] <= (last_t_ns(message) - START_NS) / 1e9 < gap_s[1]
+
+    play(core, [message for message in messages_of(seconds=12) if not is_lost(message)])
+    lane = [(round(at_s, 2), name) for at_s, name in sink.lane(0)]
+    assert [next(group) for _, group in groupby(lane, key=lambda pair: pair[1])] == [
+        (0.0, "normal"),
+        (2.99, SILENT),
+        (10.0, "normal"),
+    ]
+
+
+def test_the_log_of_a_fleet_has_the_alarms_of_all_trays() -> None:
+    sink = FakeSink()
+    core = fleet_core(sink)
+    play(core, messages_of(faulty_fan=1))
+    core.close()
+    assert sorted(line.tray for line in sink.lines) == [tray for tray in TRAYS for _ in range(2)]
+
+
+def test_scores_that_do_not_fit_or_decode_are_counted_and_the_rest_is_shown() -> None:
+    sink = FakeSink()
+    core = fleet_core(sink)
+    play(core, messages_of(seconds=1, faulty_fan=None))
+    wrong: Any = sent(made_up_tray(tray="tray1", fans=2, seconds=1, faulty_fan=None)[0][0])
+    core.step(wrong)
+    core.tick(START_NS + 5 * FLUSH_PERIOD_NS)
+    assert core.counters()["wrong_fan_count"] == 1 and "scores have 2 fans" in core.problem()
+    wrong.payload += b"\xff"
+    core.step(wrong)
+    core.tick(START_NS + 6 * FLUSH_PERIOD_NS)
+    assert core.counters()["undecodable"] == 1
+    assert sink.overviews[-1].counts == {"in alarm": 0, "suspect": 0, "not judged": 0}
+
+
+def context(folder: Path, trays: int, fans: int, **config: Any) -> Context:
+    return Context(
+        site="site",
+        trays=tuple(TrayConfig(name=f"tray{number}", fans=fans) for number in range(1, trays + 1)),
+        config=ViewerConfig(serve=False, **config),
+        folder=folder,
+        run_folder=folder,
+        started_t_ns=START_NS,
+    )
+
+
+@pytest.mark.parametrize(("fans", "is_fleet"), [(32, False), (33, True)])
+def test_a_site_of_more_than_64_fans_is_a_fleet(tmp_path: Path, fans: int, is_fleet: bool) -> None:
+    core = build(context(tmp_path, 2, fans)).core
+    for score in made_up_tray(fans=fans, seconds=1, faulty_fan=None)[0]:
+        core.step(sent(score))
+        core.tick(last_t_ns(score))
+    core.close()
+    rows = rows_of(tmp_path / "view.rrd")
+    assert ("/fleet/map/cells" in rows, "/tray1/fan_0/speed" in rows) == (is_fleet, not is_fleet)
+
+
+def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Path) -> None:
+    core = build(context(tmp_path, 3, 3, fleet_above=3, show=("tray1/0",), alarm_plot_hold_s=HOLD_S)).core
+    assert isinstance(core, ViewerCore)
+    play(core, messages_of())
+    core.close()
+    path = tmp_path / "view.rrd"
+    rows = rows_of(path)
+    assert styles_of(path, "/fleet/map/cells", "Points2D:labels")[5] == "tray2/2"
+    plots = {entity.split("/fan")[0] for entity in rows if entity.endswith("/speed")}
+    assert plots == {"/shown/plot_1/tray1", "/shown/plot_2/tray2"}
+    assert styles_of(path, "/shown/plot_2/tray2/fan_2/speed", "Measurements:names")[0] == "tray2/2 measured (rad/s)"
+    speed = rows["/shown/plot_2/tray2/fan_2/speed"]
+    assert np.isnan(np.array(speed[-1][1]["Measurements:values"], float)).all(), "its lines end"
+    states = [row["StateChange:state"][0] for _, row in rows["/shown/state/plot_2"]]
+    assert states[0] in ("normal", "suspect") and "alarm" in states and states[-1] == "free"
+    cells = {t_ns: row["Points2D:class_ids"] for t_ns, row in rows["/fleet/map/cells"]}
+    assert class_names()[cells[min(cells, key=lambda t_ns: abs(t_ns - START_NS - 11_000_000_000))][5]] == "alarm"
+    in_alarm = [row["Scalars:scalars"][0] for _, row in rows["/fleet/counts/in_alarm"]]
+    assert max(in_alarm) == 1.0 and in_alarm[0] == in_alarm[-1] == 0.0
+    assert [row["Points2D:labels"] for _, row in rows["/fleet/map/alarm_names"]].count(["tray2/2"]) >= 2
+    texts = [row["TextLog:text"][0] for _, row in rows["/fleet/log"]]
+    assert texts[0].startswith("22:13:28.500  tray2: alarm raised") and len(texts) == 2
+    assert "TextDocument:text" in rows["/fleet/worst"][0][1]
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("tray1", 'viewer.show: \'tray1\' is no fan; write "tray/number", for example "tray1/0"'),
+        ("tray1/x", 'viewer.show: \'tray1/x\' is no fan; write "tray/number", for example "tray1/0"'),
+        ("tary1/0", "viewer.show: 'tary1/0': no tray called 'tary1'; did you mean 'tray1'?"),
+        ("tray1/3", "viewer.show: 'tray1/3': tray1 has fans 0 to 2"),
+    ],
+)
+def test_a_fan_to_show_that_does_not_exist_is_a_one_line_error(tmp_path: Path, name: str, problem: str) -> None:
+    wrong = context(tmp_path, 1, 3, show=("tray1/1", name))
+    assert check(wrong) == [problem]
+    with pytest.raises(StageError) as caught:
+        build(wrong)
+    assert str(caught.value) == problem and list(tmp_path.iterdir()) == []
