@@ -62,6 +62,12 @@ def can_join(one: Message, other: Message) -> bool:
     return not form.optional or _has_columns(one, form) == _has_columns(other, form)
 
 
+def samples_of(message: Message) -> int:
+    """The number of samples of a message; 0 of one whose kind has none."""
+    by_sample = _form(type(message)).by_sample
+    return len(getattr(message, by_sample[0])) if by_sample else 0
+
+
 def join(messages: Sequence[AnyMessage]) -> AnyMessage:
     """One message with the samples of all messages in order, and the header of the first.
 
@@ -102,5 +108,4 @@ def select(message: AnyMessage, rows: Array) -> AnyMessage:
 
 
 def _has_columns(message: Message, form: _Form) -> list[bool]:
-    samples = len(getattr(message, form.by_sample[0]))
-    return [len(getattr(message, name)) == samples for name in form.optional]
+    return [len(getattr(message, name)) == samples_of(message) for name in form.optional]

@@ -11,7 +11,7 @@ import functools
 import secrets
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -22,9 +22,10 @@ from pipeline.config.registry import STAGES
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.errors import UsageError, UserError
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
+from pipeline.runtime.due_messages import DueMessages
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
-from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness, Newest, Recovered
+from pipeline.runtime.inbox import INBOX_SIZE, FromBus, FromSource, Inbox, Item, Liveness, Newest, Recovered
 from pipeline.runtime.newest_messages import NewestMessages
 from pipeline.runtime.notifier import Notifier
 from pipeline.runtime.outputs import Outputs
@@ -35,6 +36,7 @@ from pipeline.runtime.sessions import Session, Sessions, refuse_second
 from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage
 from pipeline.runtime.subscriptions import Subscriptions
+from schemas.blocks import join
 from schemas.codec import CodecError, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, Note, StageStatus, newest_t_ns
@@ -104,9 +106,10 @@ class Runner:
             else {"": stage.build(context)}
         )
         """by the tray that a core serves; an empty name: all"""
-        self._due: deque[Envelope] = deque()
-        """messages in sequence, to be processed before anything else: recovered ones are many at a time"""
         self._has_source = any(parts.source for parts in self._parts.values())
+        joins = stage.core_per_tray and not stage.wants_envelopes and not self._has_source
+        self._due = DueMessages(self._parts, joins=joins)
+        """to be processed before anything else"""
         self._sources = Sources(self._inbox)
         self._clock = StageClock()
         self._sessions = Sessions()
@@ -126,7 +129,13 @@ class Runner:
             health_key(config.site, stage.name, self._instance), BY_NAME["health"], type_name(Health), self.producer
         )
         self._subscriptions = Subscriptions(
-            self._bus, config.site, reads, stage.undecoded, [t.name for t in trays], self._on_bus, self._tracker.forget
+            self._bus,
+            config.site,
+            stage.reads_as_configured(config),
+            stage.undecoded,
+            [t.name for t in trays],
+            self._on_bus,
+            self._tracker.forget,
         )
         self._newest = NewestMessages(self._bus, self._inbox)
         self._read_keys = self._subscriptions.keys
@@ -235,9 +244,11 @@ class Runner:
         reported_lost = 0
         while not until():
             if self._due:
-                self._step(self._due.popleft())
+                self._step(self._due.pop())
             elif (item := self._inbox.get(max(0.0, next_tick - time.monotonic()))) is not None:
                 self._handle(item)
+                if self._due.joins:
+                    self._handle_what_waits()
             now = time.monotonic()
             if now >= next_tick:
                 next_tick = now + TICK_S
@@ -269,7 +280,7 @@ class Runner:
                 self._discard_waiting()
                 return
             if self._due:
-                self._step(self._due.popleft())
+                self._step(self._due.pop())
                 continue
             awaits_more = self._peers.awaits_last_health() or self._tracker.is_waiting
             if left is None and sources.wait(0) and not awaits_more:
@@ -317,6 +328,12 @@ class Runner:
         self._ending.run("reporting the last health", report, HEALTH_SENT)
         return reported[0] if reported else self._build_health(StageStatus.DEGRADED, with_counts=False)
 
+    def _handle_what_waits(self) -> None:
+        """Take what else is in the inbox now, up to as much as it holds: messages of a tray are then joined."""
+        for _ in range(min(self._inbox.waiting(), INBOX_SIZE - len(self._due))):
+            if (item := self._inbox.get(0)) is not None:
+                self._handle(item)
+
     def _handle(self, item: Item) -> None:
         if isinstance(item, FromSource):
             now_ns = HOST_CLOCK.now_ns()
@@ -347,7 +364,7 @@ class Runner:
                     self._counts["refused_clocks"] += 1
             else:
                 self._health.add_input(envelope.key, envelope.received_t_ns, HOST_CLOCK.now_ns())
-                self._due += self._tracker.accept(envelope)
+                self._due.add(self._tracker.accept(envelope))
 
     def _handle_recovered(self, item: Recovered) -> None:
         now_ns = HOST_CLOCK.now_ns()
@@ -359,7 +376,7 @@ class Runner:
             due = self._tracker.answer(item.request, Found(envelopes, item.answer.published))
         for key in dict.fromkeys(envelope.key for envelope in due if envelope.topic != "health"):
             self._health.add_input(key, now_ns, now_ns)
-        self._due += due
+        self._due.add(due)
         self._recovery.finish(item)
 
     def _handle_newest(self, item: Newest) -> None:
@@ -368,7 +385,7 @@ class Runner:
         newest = self._newest.finish(item, [e for e in decoded if e and self._counts_on_its_key(e)])
         if newest is not None:
             self._health.add_input(newest.key, now_ns, now_ns)
-            self._step(newest)
+            self._step([newest])
         self._newest.ask()
 
     def _counts_on_its_key(self, envelope: Envelope) -> bool:
@@ -382,9 +399,9 @@ class Runner:
         if health.stage == REPLAY:
             self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
         self._sessions.add_health(health, self._read_keys)
-        self._due += self._tracker.reconcile(health, self._subscriptions.current)
+        self._due.add(self._tracker.reconcile(health, self._subscriptions.current))
         if "health" in self.stage.reads:
-            self._due += self._tracker.accept(envelope)
+            self._due.add(self._tracker.accept(envelope))
 
     def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
         try:
@@ -398,26 +415,29 @@ class Runner:
     def _is_undecoded(self, envelope: Envelope) -> bool:
         return envelope.topic in self.stage.undecoded
 
-    def _step(self, envelope: Envelope) -> None:
-        header = envelope.header
+    def _step(self, envelopes: Sequence[Envelope]) -> None:
+        """Process one message, or several of a tray that differ only in their samples."""
+        first, count = envelopes[0], len(envelopes)
+        header = first.header
         name = header.tray if header.tray in self._parts else ""
         if name not in self._parts:
-            self._counts["unknown_tray"] += 1
+            self._counts["unknown_tray"] += count
             return
         if self._has_source and is_of_replay(header.producer):  # a recorded command must not drive today's fan
-            self._counts["refused_of_replay"] += 1
+            self._counts["refused_of_replay"] += count
             return
-        if self._sessions.is_ignored(header.producer) and envelope.topic != "health":
-            self._counts["refused_of_second"] += 1
-            self._tracker.refuse_second(envelope)
+        if self._sessions.is_ignored(header.producer) and first.topic != "health":
+            self._counts["refused_of_second"] += count
+            for envelope in envelopes:
+                self._tracker.refuse_second(envelope)
             return
-        if (
-            envelope.topic == self.stage.reads[0] and not self._has_source
-        ):  # samples of a device do not depend on any input
-            self._outputs.advance(header.tray, envelope.topic, header)
+        if first.topic == self.stage.reads[0] and not self._has_source:  # samples of a device depend on no input
+            for envelope in envelopes:
+                self._outputs.advance(header.tray, first.topic, envelope.header)
         self._owes_answer |= self._has_source
         core = self._parts[name].core
-        item = envelope if self.stage.wants_envelopes or self._is_undecoded(envelope) else envelope.message
+        as_it_is = self.stage.wants_envelopes or self._is_undecoded(first)
+        item = first if as_it_is else join([envelope.message for envelope in envelopes])
         self._call(name, lambda: core.step(item), input_tray=header.tray)
 
     def _call(
@@ -489,5 +509,5 @@ class Runner:
         self._on_health(health)
         if "health" in self.stage.reads:
             # the bus does not return a session's own messages
-            self._step(Envelope(self._health_publisher.key, "health", payload, HOST_CLOCK.now_ns(), health))
+            self._step([Envelope(self._health_publisher.key, "health", payload, HOST_CLOCK.now_ns(), health)])
         return health

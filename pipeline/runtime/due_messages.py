@@ -1,0 +1,71 @@
+"""Messages in sequence that a stage has yet to process: those of a tray that differ only in samples come together.
+
+What a message costs hardly depends on the number of its samples, and the output of a core does not depend on how its
+input is cut (schemas.blocks). A stage that is behind joins what waits, so each sample costs it less. A stage that keeps
+up finds one message at a time, and waits for no other.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+
+from schemas.blocks import can_join, samples_of
+from schemas.envelope import Envelope
+
+MOST_JOINED_VALUES = 8192
+"""samples times fans: beyond that a sample hardly costs less, and health and other trays wait for longer"""
+
+
+class DueMessages:
+    """A queue of messages. Those of a tray keep their order; trays take turns."""
+
+    def __init__(self, trays: Iterable[str], *, joins: bool) -> None:
+        """trays: those with a core of their own; all other messages keep their order among them. joins: whether
+        messages of these trays come together."""
+        self._trays = frozenset(trays)
+        self.joins = joins
+        self._waiting: dict[str, deque[Envelope]] = {}
+        """by tray, the next one to take its turn first; none is empty"""
+
+    def __len__(self) -> int:
+        return sum(map(len, self._waiting.values()))
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    def __iter__(self) -> Iterator[Envelope]:
+        for waiting in self._waiting.values():
+            yield from waiting
+
+    def add(self, envelopes: Iterable[Envelope]) -> None:
+        """Messages that are in sequence now."""
+        for envelope in envelopes:
+            tray = envelope.header.tray
+            self._waiting.setdefault(tray if tray in self._trays else "", deque()).append(envelope)
+
+    def pop(self) -> list[Envelope]:
+        """The next message; or several of one tray, topic and producer that differ only in their samples.
+
+        Raises:
+            StopIteration: none is left.
+        """
+        tray = next(iter(self._waiting))
+        waiting = self._waiting.pop(tray)
+        taken = [waiting.popleft()]
+        if self.joins and tray:
+            left = MOST_JOINED_VALUES - _values(taken[0])
+            while waiting and _differ_in_samples(taken[0], waiting[0]) and (left := left - _values(waiting[0])) >= 0:
+                taken.append(waiting.popleft())
+        if waiting:
+            self._waiting[tray] = waiting
+        return taken
+
+
+def _differ_in_samples(one: Envelope, other: Envelope) -> bool:
+    same = one.key == other.key and one.header.producer == other.header.producer
+    return same and can_join(one.message, other.message)
+
+
+def _values(envelope: Envelope) -> int:
+    return samples_of(envelope.message) * getattr(envelope.message, "fans", 1)

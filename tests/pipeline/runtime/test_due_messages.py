@@ -1,0 +1,97 @@
+"""Messages that wait: whose turn it is, and which of them come together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.runtime.due_messages import MOST_JOINED_VALUES, DueMessages
+from schemas.blocks import can_join
+from schemas.envelope import Envelope
+from schemas.messages import Action, Header, Message, Raw, Request
+from schemas.topics import tray_key
+
+TRAYS = ("a", "b")
+
+
+def raw(tray: str, sequence: int, samples: int = 1, fans: int = 2, producer: str = "acquisition-1") -> Envelope:
+    message = Raw(
+        header=Header(producer, sequence, tray),
+        fans=fans,
+        host_receive_t_ns=np.arange(samples, dtype=np.int64) + sequence,
+        device_clock_us=np.zeros(samples, np.uint32),
+        device_sequence=np.zeros(samples, np.uint32),
+        command=np.full((samples, fans), 0.5),
+        speed_rad_s=np.full((samples, fans), 100.0),
+    )
+    return envelope("raw", message)
+
+
+def request(tray: str, sequence: int) -> Envelope:
+    return envelope("request", Request(t_ns=1, action=Action.RESET, header=Header("operator", sequence, tray)))
+
+
+def envelope(topic: str, message: Message) -> Envelope:
+    return Envelope.of(tray_key("s", message.header.tray, topic), message, 0)
+
+
+def popped(due: DueMessages) -> list[list[Envelope]]:
+    found = []
+    while due:
+        found.append(due.pop())
+    return found
+
+
+def test_messages_of_a_tray_come_together_and_trays_take_turns():
+    due = DueMessages(TRAYS, joins=True)
+    a, b = [raw("a", k) for k in range(3)], [raw("b", k) for k in range(2)]
+    between = request("a", 0)
+    due.add([a[0], b[0], a[1], between, a[2], b[1]])
+    assert len(due) == 6
+    assert popped(due) == [a[:2], b, [between], [a[2]]]
+
+
+def test_another_producer_or_number_of_fans_is_not_joined():
+    due = DueMessages(TRAYS, joins=True)
+    mixed = [raw("a", 0), raw("a", 0, producer="acquisition-2"), raw("a", 1, fans=3)]
+    due.add(mixed)
+    assert popped(due) == [[each] for each in mixed]
+
+
+def test_so_many_values_come_together_at_most():
+    due = DueMessages(TRAYS, joins=True)
+    half = [raw("a", k, samples=MOST_JOINED_VALUES // 4, fans=2) for k in range(3)]
+    larger = raw("a", 3, samples=MOST_JOINED_VALUES, fans=2)
+    due.add([*half, larger])
+    assert popped(due) == [half[:2], half[2:], [larger]]
+
+
+def test_one_core_for_all_trays_gets_every_message_in_order():
+    due = DueMessages([""], joins=True)
+    mixed = [raw("a", 0), raw("a", 1), raw("b", 0), request("", 0), raw("a", 2)]
+    due.add(mixed)
+    assert popped(due) == [[each] for each in mixed]
+
+
+STEPS = st.lists(st.one_of(st.none(), st.tuples(st.sampled_from(["a", "b", "c"]), st.booleans())), max_size=40)
+
+
+@given(STEPS, st.booleans())
+def test_nothing_is_lost_or_overtaken_within_a_tray(steps: Sequence[tuple[str, bool] | None], joins: bool) -> None:
+    due, added, taken = DueMessages(TRAYS, joins=joins), [], []
+    for step in steps:
+        if step is not None:
+            added.append(request(step[0], len(added)) if step[1] else raw(step[0], len(added)))
+            due.add(added[-1:])
+        elif due:
+            taken.append(due.pop())
+    taken += popped(due)
+    for group in taken:
+        assert all(can_join(group[0].message, other.message) for other in group[1:])
+        assert joins or len(group) == 1
+    for tray in ("a", "b", "c"):
+        of_tray = [each for group in taken for each in group if each.message.header.tray == tray]
+        assert of_tray == [each for each in added if each.message.header.tray == tray]
