@@ -50,7 +50,8 @@ class RecorderConfig(StageConfig):
 
     file: Path = Field(
         default=Path("recording.mcap"),
-        description="relative to run_folder; its parts are NAME.mcap, NAME-2.mcap and so on",
+        description="relative to run_folder; its parts are NAME.mcap, NAME-2.mcap and so on, of a shard "
+        "SHARD.NAME.mcap",
     )
     flush_interval_s: float = Field(default=1.0, gt=0, description="a crash loses at most this much")
     part_bytes: int = Field(default=100_000_000, ge=0, description="a new part begins at this size; 0: never")
@@ -338,7 +339,7 @@ def build(context: Context) -> BuiltStage:
     metadata, attachments = recording_metadata(context)
     metadata["flush_interval_s"] = f"{config.flush_interval_s:g}"
     try:
-        parts = RecordingParts(context.run_folder / config.file, metadata, attachments, session=secrets.token_hex(4))
+        parts = RecordingParts(context.own_file(config.file), metadata, attachments, session=secrets.token_hex(4))
         for recovery in parts.repaired:
             found = recovery.found
             _LOG.warning(
@@ -363,7 +364,7 @@ def build(context: Context) -> BuiltStage:
 
 def check(context: Context) -> list[str]:
     """Problems with the folder: it cannot be written, or its disk is too full."""
-    folder = (context.run_folder / context.config.file).parent
+    folder = context.own_file(context.config.file).parent
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
         return [f"{folder}: {existing} is not a folder that this user can write to; change run_folder or recorder.file"]

@@ -13,6 +13,7 @@ import importlib.util
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -42,8 +43,15 @@ class ViewerConfig(StageConfig):
         description='file in run_folder for the view; an older file is kept, and view-2.rrd is written; "": no file',
     )
     serve: bool = Field(default=True, description="serve live viewers on this host (127.0.0.1)")
-    grpc_port: int = Field(default=9876, ge=1, le=65535, description="port of the data, for native and browser viewer")
-    web_port: int = Field(default=9090, ge=0, le=65535, description="port of the browser viewer's page; 0: no page")
+    grpc_port: int = Field(
+        default=9876,
+        ge=1,
+        le=65535,
+        description="port of the data, for native and browser viewer; of shard K the K-th from here on",
+    )
+    web_port: int = Field(
+        default=9090, ge=0, le=65535, description="port of the browser viewer's page, counted alike; 0: no page"
+    )
     window_s: float = Field(default=30.0, gt=0, description="length of the rolling window, s")
     memory_limit: str = Field(
         default="256MB", pattern=r"^\d+(MB|GB|MiB|GiB)$", description="history kept for viewers that join late"
@@ -225,27 +233,32 @@ def build(context: Context) -> BuiltStage:
             raise
         raise StageError(NO_RERUN) from error
     config: ViewerConfig = context.config
+    ports = _ports(context)
     sink = RerunSink(
         name=context.site,
         trays=context.trays,
         started_t_ns=context.started_t_ns,
         window_s=config.window_s,
-        file=context.run_folder / config.file if config.file else None,
-        grpc_port=config.grpc_port if config.serve else None,
-        web_port=(config.web_port or None) if config.serve else None,
+        file=context.own_file(Path(config.file)) if config.file else None,
+        grpc_port=ports.get("grpc_port"),
+        web_port=ports.get("web_port"),
         memory_limit=config.memory_limit,
     )
     return BuiltStage(ViewerCore(context.trays, sink))
 
 
+def _ports(context: Context) -> dict[str, int]:
+    """The ports that are served, by key: as configured, and one more for each further shard, which may be on this
+    host."""
+    config: ViewerConfig = context.config
+    configured = {"grpc_port": config.grpc_port, "web_port": config.web_port} if config.serve else {}
+    return {key: port + context.shard_number - 1 for key, port in configured.items() if port}
+
+
 def check(context: Context) -> list[str]:
     """Report a missing extra, and ports that another program has taken."""
-    config: ViewerConfig = context.config
     problems = [] if importlib.util.find_spec("rerun") else [NO_RERUN]
-    ports = (
-        {"grpc_port": config.grpc_port, "web_port": config.web_port} if config.serve and not context.is_running else {}
-    )
-    for key, port in ports.items():
+    for key, port in ({} if context.is_running else _ports(context)).items():
         try:
             check_free(port, f"viewer.{key}", "viewer.serve = false")
         except StageError as error:

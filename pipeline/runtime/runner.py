@@ -18,9 +18,9 @@ from itertools import chain
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
-from pipeline.config.registry import STAGES
+from pipeline.config.shards import Shard, chosen_shard
 from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.errors import UsageError, UserError
+from pipeline.errors import UserError
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
@@ -37,7 +37,7 @@ from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, Note, StageStatus, newest_t_ns
 from schemas.streams import stage_losses
-from schemas.topics import BY_NAME, alive_key, health_key, sessions_key, topic_of, tray_key
+from schemas.topics import ALL_TRAYS, BY_NAME, alive_key, health_key, sessions_key, topic_of, tray_key
 
 TICK_S = 0.05
 HEALTH_PERIOD_S = 1.0
@@ -57,29 +57,27 @@ class Runner:
         self,
         stage: Stage,
         config: Config,
-        tray: str | None,
+        shard: Shard | None,
         stop: threading.Event,
         on_health: Callable[[Health], None] | None = None,
     ) -> None:
-        """Build the stage. `tray` names the tray of a stage that has one process for each; `stop` ends `run`;
-        `on_health` is called with each health message while it runs.
+        """Build the stage. `shard` says which trays it has, None: all; `stop` ends `run`; `on_health` is called with
+        each health message while it runs.
 
         Raises:
             StageError, ConfigError, BusError: it cannot be built; nothing has been published.
         """
-        trays = (config.tray(tray),) if tray else config.trays
-        is_per_tray = STAGES[stage.name].scope == "tray"
-        if is_per_tray and len(trays) != 1:
-            names = ", ".join(t.name for t in trays)
-            raise UsageError(f"{stage.name} runs one process for each tray: say which with --tray (one of {names})")
+        shard = shard or chosen_shard(stage.name, config)
+        trays = tuple(map(config.tray, shard.trays))
         self.stage = stage
         self.stop = stop
         self._on_health = on_health or (lambda _health: None)
         self.launcher_gone = threading.Event()
         """Set when the process that started this stage has gone: it ends as soon as its producers have ended."""
         self._site = config.site
-        self._instance = trays[0].name if is_per_tray else "all"
-        self.producer = f"{stage.name}-{self._instance}-{secrets.token_hex(4)}"
+        self._shard = shard
+        self._trays = frozenset(shard.trays)
+        self.producer = f"{stage.name}-{self._shard.name}-{secrets.token_hex(4)}"
         self._inbox = Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
         started_t_ns = HOST_CLOCK.now_ns()
@@ -90,6 +88,8 @@ class Runner:
             folder=config.folder,
             run_folder=config.run_folder,
             started_t_ns=started_t_ns,
+            instance=shard.name,
+            shard_number=shard.number,
             snapshot_folder=config.run_folder,
             configuration_path=config.path,
             configuration_text=config.text,
@@ -107,7 +107,7 @@ class Runner:
         self._sources = Sources(self._inbox)
         self._clock = StageClock()
         self._sessions = Sessions()
-        self._session = Session.of_this_process(stage.name, self._instance, started_t_ns, self.producer)
+        self._session = Session.of_this_process(stage.name, shard, started_t_ns, self.producer)
         self._bus = Bus(config.bus, stop)
         try:
             refuse_second(self._bus, config.site, self._session, stop)
@@ -120,7 +120,7 @@ class Runner:
         self._tracker = SequenceTracker(self._recovery.ask, sessions=self._sessions)
         self._outputs = Outputs(self._bus, config.site, stage, [t.name for t in trays], self.producer)
         self._health_publisher = self._bus.publisher(
-            health_key(config.site, stage.name, self._instance), BY_NAME["health"], type_name(Health), self.producer
+            health_key(config.site, stage.name, self._shard.name), BY_NAME["health"], type_name(Health), self.producer
         )
         self._read_keys = {
             tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
@@ -131,10 +131,11 @@ class Runner:
         )  # the core of a source reports its silence
         self._health = HealthBuilder(
             stage.name,
-            self._instance,
+            self._shard.name,
             started_t_ns,
             may_drop=stage.may_drop,
             main_keys=self._read_keys & {tray_key(config.site, t.name, main) for t in trays},
+            trays=() if shard.is_whole else shard.trays,
         )
         self._notifier = Notifier.from_environment()
         self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
@@ -209,7 +210,7 @@ class Runner:
             self._catch_up()
             self._loop(self._has_caught_up, StageStatus.STARTING)
             self._health.has_caught_up()
-        self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
+        self._bus.declare_alive(alive_key(self._site, self.stage.name, self._shard.name))
         for name, parts in self._parts.items():
             self._sources.start(name, parts)
 
@@ -314,7 +315,7 @@ class Runner:
         elif isinstance(item, Liveness):
             self._peers.update(item)
             self._sessions.update(item.key, item.alive)
-            if item.key == alive_key(self._site, REPLAY, "all"):
+            if item.key == alive_key(self._site, REPLAY, ALL_TRAYS):
                 self._clock.set_replay_alive(item.alive)
         else:
             envelope = self._decode(item.key, item.payload, item.received_t_ns)
@@ -332,7 +333,7 @@ class Runner:
     def _handle_recovered(self, item: Recovered) -> None:
         now_ns = HOST_CLOCK.now_ns()
         decoded = (self._decode(key, payload, now_ns) for key, payload in item.answer.messages)
-        envelopes = [e for e in decoded if e is not None and e.message.header.producer != self.producer]
+        envelopes = [e for e in decoded if e and e.message.header.producer != self.producer and self._concerns(e)]
         if self._recovery.is_catch_up(item.request):
             due = self._tracker.accept_kept(envelopes)
         else:
@@ -350,8 +351,16 @@ class Runner:
             self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
         self._sessions.add_health(health, self._read_keys)
         self._due += self._tracker.reconcile(health, self._read_keys)
-        if "health" in self.stage.reads:
+        if "health" in self.stage.reads and self._concerns(envelope):
             self._due += self._tracker.accept(envelope)
+
+    def _concerns(self, envelope: Envelope) -> bool:
+        """Whether a message is of a tray of this process. Health is of all trays of its process: so each recorder has
+        the health of all processes that work on its trays, whatever becomes of the others."""
+        message = envelope.message
+        if not isinstance(message, Health) or not message.trays or self._shard.is_whole:
+            return True
+        return not self._trays.isdisjoint(message.trays.split(","))
 
     def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
         try:
@@ -370,7 +379,7 @@ class Runner:
         if self._has_source and is_of_replay(header.producer):  # a recorded command must not drive today's fan
             self._counts["refused_of_replay"] += 1
             return
-        if self._sessions.is_ignored(header.producer) and envelope.topic != "health":
+        if envelope.topic != "health" and self._sessions.is_ignored(header.producer, header.tray):
             self._counts["refused_of_second"] += 1
             self._tracker.refuse_second(envelope)
             return

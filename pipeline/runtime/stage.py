@@ -13,11 +13,12 @@ from typing import Any, Protocol
 
 from pipeline.config.models import Section, TrayConfig
 from pipeline.config.registry import STAGES
+from pipeline.config.shards import own_file
 from pipeline.errors import UserError
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from schemas.envelope import Envelope
 from schemas.messages import Message
-from schemas.topics import BY_NAME
+from schemas.topics import ALL_TRAYS, BY_NAME
 
 
 class StageConfig(Section):
@@ -100,6 +101,10 @@ class Context:
     folder: Path
     run_folder: Path
     started_t_ns: int
+    instance: str = ALL_TRAYS
+    """the name of the process"""
+    shard_number: int = 1
+    """of a numbered shard"""
     snapshot_folder: Path | None = None
     """where a stage keeps the state that survives a restart; None: nothing is kept, as in a replay"""
     configuration_path: Path | None = None
@@ -117,6 +122,10 @@ class Context:
         """The one tray of a core that serves one tray."""
         (tray,) = self.trays
         return tray
+
+    def own_file(self, path: Path) -> Path:
+        """A file of this process in the run folder."""
+        return self.run_folder / own_file(self.instance, path)
 
     def resolve(self, path: Path) -> Path:
         """A path of the configuration file, taken relative to that file."""

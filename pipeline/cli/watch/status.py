@@ -30,6 +30,7 @@ from pipeline.launch.stage_notes import note_lines, notes_as_json
 from pipeline.runtime.signals import stop_on_signals
 from schemas.messages import Severity
 from schemas.streams import LOSS_PREFIX
+from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.current_alarms import CurrentAlarm, clock
@@ -142,7 +143,7 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Gro
 
 def _has_scorer(states: Sequence[StageState]) -> bool:
     """Whether the configuration asks for a scorer, or one is heard."""
-    return any(state.label == "scorer" for state in states)
+    return any(state.stage == "scorer" for state in states)
 
 
 def unjudged(states: Sequence[StageState], judged: JudgedFans) -> list[Unjudged]:
@@ -204,8 +205,14 @@ def as_json(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> dict[st
 
 
 def _state_as_json(state: StageState, lost: int) -> dict[str, object]:
-    stage, _, tray = state.label.partition("/")
-    about = {"stage": stage, "instance": tray or "all", "state": str(state.word), "detail": state.detail}
+    stage, _, instance = state.label.partition("/")
+    about = {
+        "stage": stage,
+        "instance": instance or ALL_TRAYS,
+        "trays": list(state.trays),
+        "state": str(state.word),
+        "detail": state.detail,
+    }
     view = state.view
     if view is None:
         return {**about, "alive": False}
