@@ -29,8 +29,9 @@ from pipeline.runtime.notifier import Notifier
 from pipeline.runtime.outputs import Outputs
 from pipeline.runtime.peers import Peers
 from pipeline.runtime.recovery import Recovery
+from pipeline.runtime.second_owner import refuse_second
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from pipeline.runtime.sessions import Session, Sessions, refuse_second
+from pipeline.runtime.sessions import Session, Sessions
 from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage
 from schemas.codec import CodecError, decode, encode, type_name

@@ -13,25 +13,14 @@ from __future__ import annotations
 import os
 import re
 import socket
-import threading
-import time
 from collections.abc import Collection, Iterable, Iterator, Set
 from dataclasses import dataclass
 
-from pipeline.bus.session import Bus
-from pipeline.config.registry import STAGES
 from pipeline.config.shards import Shard
-from pipeline.runtime.clock import REPLAY
-from pipeline.runtime.stage import StageError
 from schemas.messages import Health
-from schemas.topics import ALL_TRAYS, SESSION_CHUNK, alive_key, health_key, sessions_key, stage_label
+from schemas.topics import ALL_TRAYS, SESSION_CHUNK, health_key, sessions_key, stage_label
 
-GOSSIP_S = 0.2
-"""how long a starting stage waits for further processes after it has met the first: they took 6 ms"""
-LEAVING_LIMIT_S = 2.0
-"""how long it waits for a predecessor that is about to leave"""
 MOST_SESSIONS = 4096
-_POLL_S = 0.02
 _BETWEEN_TRAYS = "+"
 """in a token: no tray has it in its name"""
 _TRAYS_SHOWN = 3
@@ -172,7 +161,8 @@ class Sessions:
     def is_ignored(self, producer: str, tray: str) -> bool:
         """Whether this producer is a session that has a tray of which another one is the owner."""
         session = self._by_producer.get(producer)
-        return session is not None and self._owners[session.stage].of(tray) is not session
+        owner = self._owners[session.stage].of(tray) if session else None
+        return owner is not None and owner is not session
 
     def named(self, stage: str, instance: str) -> Session | None:
         """The session of this stage and instance, the one that started last; None: there is none."""
@@ -236,55 +226,16 @@ def _conflict(ignored: Session, owner: Session, trays: Collection[str]) -> str:
             "stop one of them"
         )
     return (
-        f"two owners of {_named(trays)} in {ignored.stage}: {ignored.name}, {ignored.process}, is ignored, because "
-        f"{owner.name}, {owner.process}, started later; stop one of them, or give it other trays"
+        f"two owners of {trays_in_words(trays)} in {ignored.stage}: {ignored.name}, {ignored.process}, is ignored, "
+        f"because {owner.name}, {owner.process}, started later; stop one of them, or give it other trays"
     )
 
 
-def _named(trays: Collection[str]) -> str:
-    """trays: none: all."""
+def trays_in_words(trays: Collection[str]) -> str:
+    """Some trays for people, the first ones by name; none are all."""
     first = list(trays)[:_TRAYS_SHOWN]
     more = f" and {len(trays) - len(first)} more" if len(trays) > len(first) else ""
     return f"tray{'s' * (len(trays) > 1)} {', '.join(first)}{more}" if first else "all trays"
-
-
-def refuse_second(bus: Bus, site: str, session: Session, stop: threading.Event) -> None:
-    """Return if no other process has a tray of this session in its stage, and no replay presents the site to a stage
-    with a device; wait a moment for one that is about to leave.
-
-    Raises:
-        StageError: one does.
-        BusError: a program that is not fantwin listens at the endpoint.
-    """
-    replay = alive_key(site, REPLAY, ALL_TRAYS) if STAGES[session.stage].scope == "tray" else ""
-    bus.wait_for_others(stop)
-    met_s = time.monotonic()
-    while True:
-        others, is_replayed = _others(bus, site, session), bool(replay and bus.alive(replay))
-        limit_s = LEAVING_LIMIT_S if others or is_replayed else GOSSIP_S
-        if time.monotonic() - met_s >= limit_s or not bus.came_second or stop.wait(_POLL_S):
-            break
-    if is_replayed:
-        raise StageError(
-            f"a replay presents site {site!r}: stop it, or give {session.name} another site or bus.endpoint"
-        )
-    if others and others[0].instance == session.instance:
-        raise StageError(
-            f"{session.name} of site {site!r} already runs: {others[0].process}; stop that, or give this one another "
-            "site, tray or bus.endpoint"
-        )
-    if others:
-        shared = [tray for tray in session.trays or others[0].trays if others[0].has(tray)]
-        raise StageError(
-            f"{session.name} of site {site!r} cannot start: {others[0].name} already has {_named(shared)}: "
-            f"{others[0].process}; stop that, or give this one other trays"
-        )
-
-
-def _others(bus: Bus, site: str, session: Session) -> list[Session]:
-    found = filter(None, map(Session.of_key, bus.alive(sessions_key(site, session.stage))))
-    others = (each for each in found if each != session and each.shares_a_tray_with(session))
-    return [each for each in others if each.may_live(session.host)]
 
 
 def _is_number(text: str) -> bool:

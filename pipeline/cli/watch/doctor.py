@@ -27,7 +27,8 @@ from pipeline.config.models import Config, ConfigError
 from pipeline.config.registry import STAGES
 from pipeline.launch.processes import process_list
 from pipeline.optional_dependencies import how_to_install
-from pipeline.runtime.sessions import GOSSIP_S, Session
+from pipeline.runtime.second_owner import GOSSIP_S
+from pipeline.runtime.sessions import Session
 from pipeline.runtime.stage import Context, load_stage
 from schemas.topics import sessions_key
 

@@ -100,7 +100,7 @@ def test_row_07_a_session_of_all_trays_and_one_of_some(whole_started, is_whole_i
 
 
 def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(config, monkeypatch):
-    monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     stop = threading.Event()
     stop.set()
     with Bus(config.bus) as bus:
@@ -123,7 +123,7 @@ def test_row_07_the_sessions_remembered_are_bounded():
 
 
 def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_the_first(config, monkeypatch):
-    monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     aborted: list[bool] = []
 
     class Aborts(Passer):
@@ -146,7 +146,7 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
 def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_site_and_others_are_not(
     config, monkeypatch
 ):
-    monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     with Bus(config.bus) as replay:
         replay.declare_alive(alive_key("s", "replay", "all"))
         with pytest.raises(StageError) as refused:
@@ -161,7 +161,7 @@ def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_sit
 
 @pytest.mark.parametrize("process_id", [2**22 + 1, os.getpid()], ids=["ended", "our number, as in a container"])
 def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(config, monkeypatch, process_id):
-    monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     ours = Session.of_this_process("resampler", Shard("all", (TRAY_A, TRAY_B)), 1, "p")
     with Bus(config.bus) as bus:
         bus.declare_alive(replace(ours, process_id=process_id).key("s"))
