@@ -43,7 +43,9 @@ _DECIDING = "Scoring again, without a bus"
 
 
 def replay(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE", help="Parts of one recording, in any order.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE", help="Parts of one run, in any order, or a run folder.")
+    ],
     rate: Annotated[
         str | None,
         typer.Option(
