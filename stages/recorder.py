@@ -19,6 +19,7 @@ from pathlib import Path
 
 from pydantic import Field, field_validator
 
+from pipeline.config.registry import RECORDER, STAGES
 from pipeline.recordings.disk import DiskError
 from pipeline.recordings.held_messages import HeldMessages
 from pipeline.recordings.interference import Interference
@@ -31,7 +32,7 @@ from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from schemas.envelope import Envelope
 from schemas.messages import Health, Message
 from schemas.streams import StreamId
-from schemas.topics import TOPICS
+from schemas.topics import TOPICS, tray_key
 from schemas.units import NS_PER_S
 
 HELD_BYTES = 16 << 20
@@ -42,6 +43,8 @@ DISK_CHECK_NS = NS_PER_S
 """how often the free space is checked"""
 ROOM_TO_RESUME = 1 << 20
 """bytes that must be free beyond the minimum to resume, so that recording does not pause again at once"""
+KEEPS = STAGES[RECORDER].keeps
+"""topics whose last messages it keeps for others, also from recordings of before its start"""
 _LOG = logging.getLogger(__name__)
 
 
@@ -357,7 +360,9 @@ def build(context: Context) -> BuiltStage:
                 "start again, or use `fantwin recover`",
                 path,
             )
-        return BuiltStage(Recorder(parts, config, context.started_t_ns))
+        own = {tray_key(context.site, tray.name, topic) for tray in context.trays for topic in KEEPS}
+        kept = {key: last for topic in KEEPS for key, last in parts.last_messages(topic).items() if key in own}
+        return BuiltStage(Recorder(parts, config, context.started_t_ns), kept=kept)
     except RecordingError as error:
         raise StageError(f"{error} (recorder.file)") from error
 

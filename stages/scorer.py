@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -200,7 +200,8 @@ class ScorerCore(Core):
         score, alarms = self._tray.score(item if new.all() else select(item, new))
         self._unscored.update(item.period_ns, score.valid, score.invalid_reason)
         self._judged_share.add(score.valid, score.invalid_reason)
-        return [*before_score, score, *alarms, *self._take_snapshot(at_once=bool(alarms))]
+        # the snapshot first: whoever takes over from one that is killed now must not raise these alarms again
+        return [*before_score, score, *self._take_snapshot(at_once=bool(alarms)), *alarms]
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md says what each counts."""
@@ -212,9 +213,11 @@ class ScorerCore(Core):
         return {**self._counts, **of_alarms}
 
     def notes(self) -> list[str]:
-        """Which share of the samples was judged, and why the others were not; fans that change slowly."""
+        """Where it continued from, if not from its file; which share of the samples was judged, and why the others were
+        not; fans that change slowly."""
         of_twin = [] if self._twin.is_calibrated else [NOT_CALIBRATED]
-        return [*of_twin, *self._judged_share.notes, *self._tray.wear.notices(), *self._tray.followed]
+        of_store = [self._snapshot_store.note] if self._snapshot_store and self._snapshot_store.note else []
+        return [*of_twin, *of_store, *self._judged_share.notes, *self._tray.wear.notices(), *self._tray.followed]
 
     def problem(self) -> str:
         """What people should look at: input, snapshot, fans without a score, baselines at their limit, wear."""
@@ -334,7 +337,12 @@ def build(context: Context) -> BuiltStage:
     """
     tray = context.tray
     path = context.snapshot_folder / f"scorer-{tray.name}.snapshot" if context.snapshot_folder else None
-    store = SnapshotStore(path) if path else None
+    kept = context.kept if context.config.asks_for_snapshots else None
+
+    def elsewhere(is_patient: bool) -> Sequence[ScorerSnapshot]:
+        return kept.of(tray.name, is_patient=is_patient) if kept else ()
+
+    store = SnapshotStore(path, elsewhere, context.started_t_ns) if path else None
 
     def core_of(twin: TrayTwin, continues: ScorerSnapshot | None = None) -> ScorerCore:
         return ScorerCore(

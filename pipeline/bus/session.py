@@ -24,6 +24,7 @@ import zenoh
 
 from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program, somebody_listens
 from pipeline.bus.errors import BusError, reason
+from pipeline.bus.kept_messages import KeptMessages, ask_for_kept
 from pipeline.bus.link import LEASE_MS
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
@@ -139,6 +140,14 @@ class Bus:
         answer = answers.get()
         request.cancel()
         return answer.messages
+
+    def keep(self, key_expression: str, kept_by: str) -> KeptMessages:
+        """Keep the last message on each key of a topic for others; `put` adds them."""
+        return KeptMessages(self._session, key_expression, kept_by)
+
+    def ask_for_kept(self, key: str, timeout_s: float) -> tuple[list[bytes], bool]:
+        """The messages that others keep for one key, and whether all of them have answered in time. Waits for it."""
+        return ask_for_kept(self._session, key, timeout_s)
 
     def close(self) -> None:
         """Leave the bus. What was published before has left this process."""

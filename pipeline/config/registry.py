@@ -24,6 +24,7 @@ class StageRow:
             with a process for each tray may have a device.
         has_common_shards: a `launcher.shards` that is one number for all stages applies to it.
         may_drop: that of its declaration, for those who count losses and would wait long for its imports.
+        keeps: topics whose last message about each of its trays it keeps for others, also when the producer has gone.
         needs_twin: it cannot start unless every tray has a twin, or learns one.
     """
 
@@ -33,6 +34,7 @@ class StageRow:
     scope: Literal["site", "tray"] = "site"
     has_common_shards: bool = True
     may_drop: bool = False
+    keeps: tuple[str, ...] = ()
     needs_twin: bool = False
 
     def load(self) -> Any:
@@ -52,7 +54,7 @@ STAGES: dict[str, StageRow] = {
         StageRow(LEARNER, "stages.learner:STAGE", enabled_by="tray without twin", may_drop=True),
         StageRow("twin_integrator", "stages.twin_integrator:STAGE", enabled_by="default", needs_twin=True),
         StageRow("scorer", "stages.scorer:STAGE", enabled_by="default", needs_twin=True),
-        StageRow(RECORDER, "stages.recorder:STAGE", enabled_by="default"),
+        StageRow(RECORDER, "stages.recorder:STAGE", enabled_by="default", keeps=("snapshot",)),
         StageRow("viewer", "stages.viewer:STAGE", enabled_by="default", has_common_shards=False, may_drop=True),
     )
 }

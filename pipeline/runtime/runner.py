@@ -18,13 +18,15 @@ from itertools import chain
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
+from pipeline.config.registry import STAGES
 from pipeline.config.shards import Shard, chosen_shard
 from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.errors import UserError
+from pipeline.runtime.building import abort, build_parts
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
 from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness, Recovered
+from pipeline.runtime.kept_snapshots import KeptForOthers, KeptSnapshots, keeps_snapshots
 from pipeline.runtime.notifier import Notifier
 from pipeline.runtime.outputs import Outputs
 from pipeline.runtime.peers import Peers
@@ -62,8 +64,8 @@ class Runner:
         stop: threading.Event,
         on_health: Callable[[Health], None] | None = None,
     ) -> None:
-        """Build the stage. `shard` says which trays it has, None: all; `stop` ends `run`; `on_health` is called with
-        each health message while it runs.
+        """Join the bus and build the stage. `shard` says which trays it has, None: all; `stop` ends `run`; `on_health`
+        is called with each health message while it runs.
 
         Raises:
             StageError, ConfigError, BusError: it cannot be built; nothing has been published.
@@ -82,6 +84,7 @@ class Runner:
         self._inbox = Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
         started_t_ns = HOST_CLOCK.now_ns()
+        self._bus = Bus(config.bus, stop)  # before the stage is built: it may continue from what others keep
         context = Context(
             site=config.site,
             trays=trays,
@@ -92,31 +95,35 @@ class Runner:
             instance=shard.name,
             shard_number=shard.number,
             snapshot_folder=config.run_folder,
+            kept=KeptSnapshots(
+                self._bus,
+                config.site,
+                stop,
+                config.bus.recovery_timeout_s,
+                is_one_expected=any(map(keeps_snapshots, config.stages)),
+            ),
             configuration_path=config.path,
             configuration_text=config.text,
             overrides=config.overrides,
         )
-        self._parts: dict[str, BuiltStage] = (
-            {t.name: stage.build(replace(context, trays=(t,))) for t in trays}
-            if stage.core_per_tray
-            else {"": stage.build(context)}
-        )
-        """by the tray that a core serves; an empty name: all"""
         self._due: deque[Envelope] = deque()
         """messages in sequence, to be processed before anything else: recovered ones are many at a time"""
-        self._has_source = any(parts.source for parts in self._parts.values())
         self._sources = Sources(self._inbox)
         self._clock = StageClock()
         self._sessions = Sessions()
         self._session = Session.of_this_process(stage.name, shard, started_t_ns, self.producer)
-        self._bus = Bus(config.bus, stop)
+        self._parts: dict[str, BuiltStage] = {}
+        """by the tray that a core serves; an empty name: all"""
         try:
+            self._parts = build_parts(stage, context)
             refuse_second(self._bus, config.site, self._session, stop)
-        except UserError:
-            for parts in self._parts.values():
-                parts.core.abort()
+        except BaseException:
+            abort(self._parts)
             self._bus.close()
             raise
+        before = {key: payload for parts in self._parts.values() for key, payload in parts.kept.items()}
+        self._kept = KeptForOthers(self._bus, config.site, STAGES[stage.name].keeps, self.producer, before)
+        self._has_source = any(parts.source for parts in self._parts.values())
         self._recovery = Recovery(self._bus, self._inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
         self._tracker = SequenceTracker(self._recovery.ask, sessions=self._sessions)
         self._outputs = Outputs(self._bus, config.site, stage, [t.name for t in trays], self.producer)
@@ -384,6 +391,7 @@ class Runner:
             self._counts["refused_of_second"] += 1
             self._tracker.refuse_second(envelope)
             return
+        self._kept.add(envelope)
         if (
             envelope.topic == self.stage.reads[0] and not self._has_source
         ):  # samples of a device do not depend on any input

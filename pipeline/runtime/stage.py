@@ -17,7 +17,7 @@ from pipeline.config.shards import own_file
 from pipeline.errors import UserError
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from schemas.envelope import Envelope
-from schemas.messages import Message
+from schemas.messages import Message, ScorerSnapshot
 from schemas.topics import ALL_TRAYS, BY_NAME
 
 
@@ -91,6 +91,14 @@ class Source(Protocol):
         ...
 
 
+class Kept(Protocol):
+    """The snapshots that other stages keep: `pipeline.runtime.kept_snapshots`."""
+
+    def of(self, tray: str, *, is_patient: bool) -> Sequence[ScorerSnapshot]:
+        """The last one of a tray that each stage keeps. is_patient: wait for a stage that is not there yet."""
+        ...
+
+
 @dataclass(frozen=True)
 class Context:
     """What a stage is built from: its own section, the trays it serves, and where relative paths start."""
@@ -107,6 +115,8 @@ class Context:
     """of a numbered shard"""
     snapshot_folder: Path | None = None
     """where a stage keeps the state that survives a restart; None: nothing is kept, as in a replay"""
+    kept: Kept | None = field(default=None, repr=False)
+    """what others keep of that state; None: nobody is asked"""
     configuration_path: Path | None = None
     """the configuration file; None: there is none, as in a replay"""
     configuration_text: str = field(default="", repr=False)
@@ -134,10 +144,16 @@ class Context:
 
 @dataclass(frozen=True)
 class BuiltStage:
-    """A built stage: the core, and the source that feeds it, if it has one."""
+    """A built stage.
+
+    Attributes:
+        source: feeds the core; None: the bus does.
+        kept: messages from before that it keeps for others, by key.
+    """
 
     core: Core
     source: Source | None = None
+    kept: Mapping[str, bytes] = field(default_factory=dict)
 
 
 def no_problems(_context: Context) -> Sequence[str]:
