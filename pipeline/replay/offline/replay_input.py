@@ -28,7 +28,7 @@ from schemas.envelope import Envelope
 from schemas.messages import Alarm, Message, ModelCard
 
 _OF_THE_PLACE = ("bus.", "launcher.", "run_folder")
-"""beginnings of keys that say where a process runs"""
+"""how the names of keys begin that say where a process runs"""
 
 
 @dataclass
