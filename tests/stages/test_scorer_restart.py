@@ -151,6 +151,12 @@ def test_every_alarm_and_answer_is_in_the_snapshot_before_it_is_emitted(tmp_path
     assert noted()["shelved_until_t_ns"] > 0
 
 
+def test_a_snapshot_is_published_before_the_alarms_that_it_contains() -> None:
+    scorer = commissioned(core_of())
+    messages = scorer.step(prediction_of(np.full(100, 20.0)))
+    assert [type(message) for message in messages] == [Score, ScorerSnapshot, Alarm]
+
+
 def test_without_events_there_is_a_snapshot_every_minute() -> None:
     scorer = core_of()
     notes = [

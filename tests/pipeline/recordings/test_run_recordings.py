@@ -45,7 +45,8 @@ def shard(folder: Path, number: int, configuration: str = OF_BOTH, overrides: st
     metadata |= {"recording": f"{number}-of-2.recording.mcap", "overrides": overrides}
     attachments = {"configuration.toml": configuration.encode(), f"{tray}.onnx": head.attachments[f"{TRAY}.onnx"]}
     with RecordingWriter(folder / f"{number}-of-2.recording.mcap", metadata, attachments) as writer:
-        for entry in read_recording(path):
+        entries = list(read_recording(path))
+        for entry in entries:
             header = replace(entry.message.header, tray=tray)
             message = replace(entry.message, header=header)
             writer.add_message(tray_key(SITE, tray, entry.topic), message, entry.received_t_ns)
@@ -56,7 +57,7 @@ def shard(folder: Path, number: int, configuration: str = OF_BOTH, overrides: st
                 counters=(Counter(name="lost_late", value=sequence),),
                 lost=sequence,
             )
-            writer.add_message(health_key(SITE, "resampler", "all"), health, entry.received_t_ns)
+            writer.add_message(health_key(SITE, "resampler", "all"), health, entries[-1].received_t_ns)
     return writer.path
 
 
