@@ -54,6 +54,7 @@ class FanScorer:
         begins_still: bool = True,
         keeps_shared: bool = True,
         shares_at_first: bool = True,
+        compares_fast: bool = True,
     ) -> None:
         """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits.
 
@@ -66,10 +67,12 @@ class FanScorer:
         keeps_shared: False only to decide as for recordings made when fans that were commissioned again, all of them,
         shared nothing at first.
         shares_at_first: False only to decide as for recordings made when nothing was shared before fans had baselines.
+        compares_fast: False only to decide as for recordings made when slow fans were compared with fast ones.
         """
         self.limits = limits
         self.residuals: dict[Signal, Residual] = {
-            source: Residual(fans, source, limits, shares_at_first=shares_at_first) for source in RESIDUALS
+            source: Residual(fans, source, limits, shares_at_first=shares_at_first, compares_fast=compares_fast)
+            for source in RESIDUALS
         }
         contexts = {
             source: residual.context(fans, capped=not for_calibration) for source, residual in self.residuals.items()

@@ -32,8 +32,10 @@ LARGEST_SIGMAS = 1e6  # so that sums and squares stay finite
 class Residual:
     """The speed residual or the torque balance, with the baseline of every fan."""
 
-    def __init__(self, fans: int, source: Signal, limits: Limits, *, shares_at_first: bool) -> None:
-        """shares_at_first: what fans share is found before they have baselines; see SharedOffset."""
+    def __init__(
+        self, fans: int, source: Signal, limits: Limits, *, shares_at_first: bool, compares_fast: bool
+    ) -> None:
+        """shares_at_first: what fans share is found before they have baselines. compares_fast: see SharedOffset."""
         healthy = limits.residual(source)
         offsets = healthy.fan_offsets
         self._fan_offsets = np.array(offsets.offset_sigmas).T if offsets else np.zeros((1, fans))
@@ -56,6 +58,7 @@ class Residual:
                 interval_s=limits.timing.baseline_s,
                 adaptation_s=limits.timing.adaptation_s,
                 reach_sigmas=healthy.baseline.adaptation_limit_sigmas,
+                compares_fast=compares_fast,
             )
         self._shares_at_first = shares_at_first
         self._low_pass = LowPass(fans, self._smoothing_s)

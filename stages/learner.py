@@ -3,7 +3,8 @@
 Reads: topic `raw` (samples), `score` (whether a fan has an alarm), and `request` (fans that are commissioned again).
 Writes: topic `new_twin`: the version in force, at start and when it changes; while a fan has an alarm, the one before.
 Timing: a version is made when the healthy history has doubled, at least once in a week of healthy running, and after
-four hours of healthy running since an operator has commissioned fans again.
+four hours of healthy running since an operator has commissioned fans again; none while a fan has an alarm. The fans are
+checked against the reference after a day of running, also with alarms.
 
 It keeps the healthy history (pipeline.learning.healthy_history) and starts `fantwin learn` beside the stages, which
 makes the next version and decides whether it takes over (pipeline.cli.twins.next_version). An operator can change the
@@ -116,7 +117,7 @@ class LearnerCore(Core):
         self._read_list()
         self._schedule.forget_what_is_over(self._listed)
         cards = self._published(now_ns)
-        if self._may_start and (due := self._schedule.due(self._listed)):
+        if self._may_start and (due := self._schedule.due(self._listed, has_alarm=bool(self._alarm_fans))):
             self._start(due)
         return cards
 
@@ -142,7 +143,7 @@ class LearnerCore(Core):
             found.append(f"{current.name} waits: it takes over when no fan has an alarm, by the scores of all fans")
         if fans := self._alarm_fans:
             named = f"fan {fans[0]} has" if len(fans) == 1 else f"fans {', '.join(map(str, fans))} have"
-            found.append(f"no learning while {named} an alarm")
+            found.append(f"no new version while {named} an alarm")
         work_s = self._learning.seconds
         return [*found, f"making the next version, for {work_s:.0f} s"] if work_s is not None else found
 
@@ -161,8 +162,7 @@ class LearnerCore(Core):
 
     @property
     def _may_start(self) -> bool:
-        can_learn = self._learning.is_free and not self._learning.obstacle
-        return can_learn and self._is_list_read and not self._alarm_fans
+        return self._learning.is_free and not self._learning.obstacle and self._is_list_read
 
     @property
     def _last(self) -> Version | None:

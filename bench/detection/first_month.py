@@ -103,14 +103,15 @@ def month_faults(of: Racks) -> list[Fault]:
     return found
 
 
-def run(of: Racks, watched: Sequence[int], rate_hz: float, folder: Path, console: Console) -> None:
-    """Let the racks live; what becomes of those that are watched is in files of the folder."""
+def run(of: Racks, watched: Sequence[int], rate_hz: float, noted: int, folder: Path, console: Console) -> None:
+    """Let the racks live; what becomes of those that are watched is in files of the folder. noted: of the changes that
+    operators make, these first ones are commissioned."""
     days = of.seconds / DAY_S
     of_racks: dict[int, tuple[Queue[Raw | None], SpawnProcess]] = {}
     context = get_context("spawn")
     for rack in watched:
         queue: Queue[Raw | None] = context.Queue(QUEUED_BLOCKS)
-        given = folder, run_of(rack), (FILTER_CHANGED * days, FIRMWARE * days), queue
+        given = folder, run_of(rack), (FILTER_CHANGED * days, FIRMWARE * days)[:noted], queue
         process = context.Process(target=_live, args=given, name=run_of(rack), daemon=True)
         process.start()
         of_racks[rack] = queue, process
@@ -277,6 +278,9 @@ def main() -> None:
     parser.add_argument("--report-hz", type=float, default=2.0)
     parser.add_argument("--keep", type=Path, required=True, help="folder for what is learned and the figures")
     parser.add_argument("--only", type=_numbers, help="the racks to watch, from 1; default: all")
+    parser.add_argument(
+        "--noted", type=int, choices=(0, 1, 2), default=2, help="1: operators commission fans after the filter only"
+    )
     parser.add_argument("--show", action="store_true", help="only print the tables of what is in FOLDER")
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the processes of the racks end with this one
@@ -284,7 +288,7 @@ def main() -> None:
     given.keep.mkdir(parents=True, exist_ok=True)
     of = racks(given.racks, given.days * DAY_S, given.seed, fans_seed=given.seed)
     if not given.show:
-        run(of, given.only or range(given.racks), given.report_hz, given.keep, console)
+        run(of, given.only or range(given.racks), given.report_hz, given.noted, given.keep, console)
     figures = found(of, given.keep)
     (given.keep / "found.json").write_text(json.dumps(figures, indent=1))
     tables(figures, console)

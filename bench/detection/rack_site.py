@@ -212,7 +212,7 @@ class RackSite:
         """What operators do about the changes that they made themselves."""
         if self._seen.not_noted and day >= self._seen.not_noted[0] + NOTED_AFTER_D:
             self._seen.not_noted.pop(0)
-            header = Header("operator", len(self._seen.not_noted), "")
+            header = Header("operator", self._seen.sent, "")  # rising: a scorer ignores a request that comes again
             request = Request(t_ns=now_ns, action=Action.COMMISSION, header=header)
             self._learner.step(request)
             for message in self._stages[-1].step(request):

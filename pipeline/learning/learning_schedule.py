@@ -1,6 +1,7 @@
 """When the next version of a tray's twin is due, and when its fans are to be checked against the reference.
 
-Only recordings outside the excluded time spans count: versions and checks are made from no others.
+Only recordings outside the excluded time spans count: versions and checks are made from no others. Running near alarms
+counts for checks only.
 """
 
 from __future__ import annotations
@@ -8,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from pipeline.learning.healthy_history import SHORTEST_RECORDING_S, HealthyHistory
+from pipeline.learning.healthy_history import HealthyHistory
+from pipeline.learning.history_recordings import SHORTEST_RECORDING_S
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.learning.versions import VersionList
 
@@ -17,9 +19,9 @@ Work: TypeAlias = Literal["version", "check"]
 LONGEST_WAIT_S = 7 * 24 * 3600.0
 """of healthy running between two versions"""
 CHECK_AFTER_S = 24 * 3600.0
-"""of healthy running between two checks of the fans against the reference"""
+"""of running between two checks of the fans against the reference"""
 COMMISSIONED_CHECK_S = 4000.0
-"""of healthy running after fans were commissioned again until they are checked: a little more than a check needs. If
+"""of running after fans were commissioned again until they are checked: a little more than a check needs. If
 the twin no longer fits them, they have one alarm after the other"""
 AFTER_COMMISSIONING_S = 4 * 3600.0
 """of healthy running after fans were commissioned again until a version is made"""
@@ -37,7 +39,7 @@ class _Failure:
     end_t_ns: int
     """of the history then"""
     needed_s: float
-    """healthy running after that before the next attempt"""
+    """running after that before the next attempt"""
     listed: VersionList
     """when it was begun"""
 
@@ -82,9 +84,10 @@ class LearningSchedule:
             if has_version or (work == "check" and listed.check != failure.listed.check):
                 del self._failures[work]
 
-    def due(self, listed: VersionList) -> Work | None:
-        """What is due: a version, or a check of the fans against the reference."""
-        if self.version_wait_s(listed) == 0.0:
+    def due(self, listed: VersionList, *, has_alarm: bool) -> Work | None:
+        """What is due: a version, or a check of the fans against the reference. No version is made while a fan has an
+        alarm."""
+        if not has_alarm and self.version_wait_s(listed) == 0.0:
             return "version"
         return "check" if self._is_check_due(listed) and not self._retry_wait_s("check") else None
 
@@ -95,9 +98,12 @@ class LearningSchedule:
         return None if needed_s is None else max(needed_s, self._retry_wait_s("version"), 0.0)
 
     def _retry_wait_s(self, work: Work) -> float:
-        """Healthy running before the next attempt at what failed; 0: it may be made now."""
+        """Running before the next attempt at what failed; 0: it may be made now."""
         failure = self._failures.get(work)
-        return max(failure.needed_s - self._history.seconds_since(failure.end_t_ns), 0.0) if failure else 0.0
+        if failure is None:
+            return 0.0
+        of_work = self._history.all_seconds_since if work == "check" else self._history.seconds_since
+        return max(failure.needed_s - of_work(failure.end_t_ns), 0.0)
 
     def _needed_s(self, listed: VersionList) -> float | None:
         """As `version_wait_s`, but not above 0 where a version is due, and without failures."""
@@ -118,4 +124,4 @@ class LearningSchedule:
         checked_t_ns = listed.check.t_ns if listed.check else 0
         newest_t_ns = max(listed.versions[-1].made_t_ns, listed.commissioned_t_ns, checked_t_ns)
         needed_s = COMMISSIONED_CHECK_S if newest_t_ns == listed.commissioned_t_ns else CHECK_AFTER_S
-        return self._history.seconds_since(newest_t_ns) >= needed_s
+        return self._history.all_seconds_since(newest_t_ns) >= needed_s

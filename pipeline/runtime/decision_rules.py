@@ -74,6 +74,10 @@ class DecisionRules(IntEnum):
     SHARED_AT_FIRST = 19
     """What the fans share is found while they are commissioned, from their residuals, and their baselines are found
     without it. Before, nothing was shared until fans had baselines, which took it as their own."""
+    FAST_FANS = 20
+    """What the fans share, a share of their speed, is found from those that turn at least half as fast as the second
+    fastest one, and its limit is measured from its value once they have turned fast. Before, idling fans, which say
+    little about it, held it back."""
 
 
 CURRENT_RULES = max(DecisionRules)

@@ -62,6 +62,7 @@ class TrayScorer:
             begins_still=decision_rules >= DecisionRules.FIRST_BASELINE,
             keeps_shared=decision_rules >= DecisionRules.SHARED_STAYS,
             shares_at_first=decision_rules >= DecisionRules.SHARED_AT_FIRST,
+            compares_fast=decision_rules >= DecisionRules.FAST_FANS,
         )
         advice = Advice(twin.command_unit) if self._holds else None
         if judges_rest:

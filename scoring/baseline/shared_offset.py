@@ -7,7 +7,9 @@ if it lies outside of the (inner) two. So one fan that is off by itself does not
 
 Until the first fan has its baseline, offsets are residuals as they are, and the shared one follows their mean at once:
 baselines are then found without it. A baseline that took a share of the speed as its own would be wrong at all other
-speeds.
+speeds. Idling fans say little about a share of the speed. Where at least two others turn fast, only these are compared.
+And if all were commissioned at low speed, the offset from which the limit is measured is found again, within bounds,
+when they first turn faster.
 
 While only one of the fans turns it cannot be compared. Then the shared offset takes the place of the fan's own
 baseline, as slow and with as short a reach: otherwise both would have followed the same weather when the others turn
@@ -27,7 +29,14 @@ from scoring.detectors.state import ColumnState
 
 SMOOTHING_S = 8.0  # longer than a tacho counts, shorter than supply and air take to change by much
 LEAST_FANS = 2
+MIN_RELATIVE_SPEED = 0.5  # of the second fastest fan, in sigmas: residuals of slower ones are mostly errors of the twin
 MIN_VALID_SHARE = 0.5  # of an interval's samples
+# Information, 0 to 1, is what an interval says of a share of the speed beside the ridge: 0.5 where both say as much.
+WELL_KNOWN = 0.8  # information at the commissioning from which its value is not looked for again
+LEAST_INFORMATION = 0.5  # of an interval in which it is looked for
+MORE_INFORMATION = 0.1  # at least so much more than at the commissioning
+ENOUGH_INFORMATION = 60.0  # the sum, beyond these, after which it stays
+SEARCHED_S = 86400.0  # and it stays after so long with fans that could be compared
 LARGEST_SIGMAS = 1e3  # larger offsets are clipped to this
 FIXED_POINT_ONE = 1 << 6  # integer sums do not depend on how samples are cut
 
@@ -39,12 +48,28 @@ class SharedOverIntervals(NamedTuple):
     """(intervals,) the offset for each rad/s, in each"""
     compared: Array
     """(intervals,) the one when fans were last compared"""
+    commissioned: Array
+    """(intervals,) the one of the commissioning, as far as it is known"""
+    informed: Array
+    """(intervals,) the sum of the information from which it was found again"""
+    searched: Array
+    """(intervals,) in how many intervals it was looked for"""
     products: Array
     squares: Array
     counts: Array
     """(intervals, fans) the sums of each; in the first with those before"""
     ends: int
     """so many of the intervals these hold for"""
+
+
+class _State(NamedTuple):
+    """What is shared, for each rad/s; see the columns of SharedOffset."""
+
+    value: float
+    compared: float
+    commissioned: float
+    informed: float
+    searched: float
 
 
 class SharedOffset(ColumnState):
@@ -59,9 +84,11 @@ class SharedOffset(ColumnState):
         interval_s: float,
         adaptation_s: float,
         reach_sigmas: float,
+        compares_fast: bool = True,
     ) -> None:
         """limit: of the offset, for each rad/s. residual_std: of the healthy residual, sigma. interval_s: length of an
-        interval. adaptation_s, reach_sigmas: how slowly, and how far, the baseline of a fan may move.
+        interval. adaptation_s, reach_sigmas: how slowly, and how far, the baseline of a fan may move. compares_fast:
+        False only to decide as for recordings made when slow fans were compared with fast ones.
 
         Offsets at low speed are drawn towards zero, or what was shared when all fans were commissioned again (ridge
         regression): errors of the twin there, as large as half of its residual, must not become large offsets at high
@@ -71,11 +98,18 @@ class SharedOffset(ColumnState):
         self._ridge = (residual_std / limit) ** 2
         self._gain, self._gain_alone = (-np.expm1(-interval_s / time_s) for time_s in (SMOOTHING_S, adaptation_s))
         self._reach_sigmas = reach_sigmas
+        self._compares_fast = compares_fast
+        self._most_searched = SEARCHED_S / interval_s
         self._value = np.zeros(1)
         self._compared = np.zeros(1)
         """the value when fans were last compared"""
         self._commissioned = np.zeros(1)
-        """the value when fans had their baselines, or all were commissioned again; the limit is from there"""
+        """what fans shared when the first of them got its baseline, or all were commissioned again, as far as it is
+        known; the limit is from there"""
+        self._informed, self._searched = np.zeros((2, 1))
+        """since then: the sum of the information from which it was found again, and the intervals searched"""
+        self._begun, self._begun_information = np.zeros((2, 1))
+        """its value at that time, and how much of it was known, 0 to 1: it may still move by the rest, in limits"""
         self._first = np.zeros(1, np.int64)
         """intervals in which fans were compared before any of them had a baseline"""
         self._products = np.zeros(fans, np.int64)
@@ -121,10 +155,13 @@ class SharedOffset(ColumnState):
         products[0] += self._products
         squares[0] += self._squares
         counts[0] += self._counts
-        values, compared, ends = self._values(products, squares, counts, intervals.expected, commissioned, moving)
-        return SharedOverIntervals(values, compared, products, squares, counts, ends)
+        states, ends = self._states(products, squares, counts, intervals.expected, commissioned, moving)
+        values, compared, at_commissioning, informed, searched = states.T
+        return SharedOverIntervals(
+            values, compared, at_commissioning, informed, searched, products, squares, counts, ends
+        )
 
-    def _values(
+    def _states(
         self,
         products: Array,
         squares: Array,
@@ -132,35 +169,77 @@ class SharedOffset(ColumnState):
         expected: int,
         commissioned: Array,
         moving: Array | None,
-    ) -> tuple[Array, Array, int]:
-        """(intervals,) the value in each, and the one when fans were last compared; and up to which these hold: until
-        the end of the first interval in which a fan turned alone, itself counted."""
+    ) -> tuple[Array, int]:
+        """(intervals, 5) the state in each, see _State; and up to which these hold: until the end of the first interval
+        in which a fan turned alone, itself counted."""
+        state = self._now
         if len(counts) == 1:
-            return self._value.copy(), self._compared.copy(), 1
+            return np.array([state]), 1
         known = (counts >= MIN_VALID_SHARE * expected) & (squares > 0)
         if moving is not None:
             known &= ~moving
-        number = known.sum(axis=1)
-        is_compared = number >= LEAST_FANS
-        alone = (number > 0) & ~is_compared & (commissioned.sum() >= LEAST_FANS)
+        turning = known.sum(axis=1)
+        is_compared = turning >= LEAST_FANS
+        alone = (turning > 0) & ~is_compared & (commissioned.sum() >= LEAST_FANS)
+        fast = self._fast(known, squares, counts)
         ridge = self._ridge * FIXED_POINT_ONE * counts
-        divisor = np.where(known, squares + ridge, 1.0)
-        offsets = np.sort(np.where(known, self._towards_commissioned(products, ridge) / divisor, np.inf), axis=1)
-        each, middle = np.arange(len(counts)), np.maximum(number - 1, 0) // 2
+        states, k = np.empty((len(counts), len(state))), 0
+        while k < len(counts) and self._is_becoming_known(state):
+            states[k] = state
+            if is_compared[k]:
+                state = self._compared_once(
+                    state, self._gain, products[k, fast[k]], squares[k, fast[k]], ridge[k, fast[k]]
+                )
+            k += 1
+        states[k:] = self._compared_often(state, is_compared[k:], fast[k:], products[k:], squares[k:], ridge[k:])
+        return states, first_end(alone)
+
+    def _compared_once(self, state: _State, gain: float, products: Array, squares: Array, ridge: Array) -> _State:
+        """After an interval in which fans were compared; products, squares, ridge: of these."""
+        value = self._moved(state, gain, products, squares, ridge)
+        if not self._is_becoming_known(state):
+            return state._replace(value=value, compared=value)
+        begun, known = float(self._begun[0]), float(self._begun_information[0])
+        least = max(known + MORE_INFORMATION, LEAST_INFORMATION)
+        weight = max(_information(squares, ridge) - least, 0.0)
+        informed = state.informed + weight
+        commissioned = state.commissioned + weight / (1.0 + informed) * (value - state.commissioned)
+        reach = self._limit * (1.0 - known)
+        return _State(
+            value, value, _between(commissioned, begun - reach, begun + reach), informed, state.searched + 1.0
+        )
+
+    def _moved(self, state: _State, gain: float, products: Array, squares: Array, ridge: Array) -> float:
+        """The value, moved towards the offsets in the middle."""
+        offsets = np.sort(_drawn(products, ridge, state.commissioned) / (squares + ridge))
+        middle = (len(offsets) - 1) // 2
+        nearest = _between(state.value, float(offsets[middle]), float(offsets[-1 - middle]))
+        value = state.value + gain * (nearest - state.value)
+        return _between(value, state.commissioned - self._limit, state.commissioned + self._limit)
+
+    def _compared_often(
+        self, state: _State, is_compared: Array, fast: Array, products: Array, squares: Array, ridge: Array
+    ) -> Array:
+        """(intervals, 5) the state in each interval, once it is known what was shared at the commissioning."""
+        number = fast.sum(axis=1)
+        divisor = np.where(fast, squares + ridge, 1.0)
+        offsets = np.sort(np.where(fast, _drawn(products, ridge, state.commissioned) / divisor, np.inf), axis=1)
+        each, middle = np.arange(len(number)), np.maximum(number - 1, 0) // 2
         low, high = offsets[each, middle].tolist(), offsets[each, np.maximum(number - 1, 0) - middle].tolist()
-        value, last_compared = float(self._value[0]), float(self._compared[0])
-        least, most = self._range
-        values, compared = np.empty((2, len(counts)))
+        least, most = state.commissioned - self._limit, state.commissioned + self._limit
+        states, value, compared = np.tile(state, (len(number), 1)), state.value, state.compared
         for k, compares in enumerate(is_compared.tolist()):
-            values[k], compared[k] = value, last_compared
+            states[k, :2] = value, compared
             if compares:
-                value += self._gain * (min(max(value, low[k]), high[k]) - value)
-                value = last_compared = min(max(value, least), most)
-        return values, compared, first_end(alone)
+                value += self._gain * (_between(value, low[k], high[k]) - value)
+                value = compared = _between(value, least, most)
+        return states
 
     def take(self, of: SharedOverIntervals) -> None:
         """Go on in the last of some intervals."""
-        self._value[:], self._compared[:] = of.values[-1], of.compared[-1]
+        self._set(
+            _State(*(column[-1] for column in (of.values, of.compared, of.commissioned, of.informed, of.searched)))
+        )
         self._products[:], self._squares[:], self._counts[:] = of.products[-1], of.squares[-1], of.counts[-1]
 
     def end_interval(
@@ -178,29 +257,49 @@ class SharedOffset(ColumnState):
             known &= ~moving
         is_compared = known.sum() >= LEAST_FANS
         alone = known & (not is_compared) & (commissioned.sum() >= LEAST_FANS)
-        used, gain = (known, self._gain) if is_compared else (alone & learns, self._gain_alone)
+        fast = self._fast(known, self._squares, self._counts)
+        used, gain = (fast, self._gain) if is_compared else (alone & learns, self._gain_alone)
         if at_first and is_compared:
             self._first += 1
             gain = max(gain, 1.0 / float(self._first[0]))
+            information = _information(self._squares[used], self._ridge * FIXED_POINT_ONE * self._counts[used])
+            self._begun_information += gain * (information - self._begun_information)
         if used.any():
-            ridge = self._ridge * FIXED_POINT_ONE * self._counts[used]
-            products = self._towards_commissioned(self._products[used], ridge)
-            offsets = np.sort(products / (self._squares[used] + ridge))
-            middle = (len(offsets) - 1) // 2
-            self._value += gain * (self._value.clip(offsets[middle], offsets[-1 - middle]) - self._value)
-            self._value[:] = self._value.clip(*self._range)
+            products, squares, counts = self._products[used], self._squares[used], self._counts[used]
+            ridge = self._ridge * FIXED_POINT_ONE * counts
             if is_compared:
-                self._compared[:] = self._value
+                self._set(self._compared_once(self._now, gain, products, squares, ridge))
             else:
-                speed_sigmas = np.sqrt(self._squares[used] / (self._counts[used] * FIXED_POINT_ONE))
-                reach = self._reach_sigmas / speed_sigmas
-                self._value[:] = self._value.clip(self._compared - reach, self._compared + reach)
+                compared = float(self._compared[0])
+                reach = self._reach_sigmas / float(np.sqrt(squares / (counts * FIXED_POINT_ONE))[0])
+                value = self._moved(self._now, gain, products, squares, ridge)
+                self._value[:] = _between(value, compared - reach, compared + reach)
         self._products[:] = self._squares[:] = self._counts[:] = 0
         return alone
 
+    def _is_becoming_known(self, state: _State) -> bool:
+        """Whether it is still being found what fans shared when they were commissioned."""
+        if not self._compares_fast or self.is_known or self._begun_information[0] >= WELL_KNOWN:
+            return False
+        return state.informed < ENOUGH_INFORMATION and state.searched < self._most_searched
+
+    @property
+    def _now(self) -> _State:
+        return _State(*(float(column[0]) for column in self._columns_of_state))
+
+    def _set(self, state: _State) -> None:
+        for column, value in zip(self._columns_of_state, state, strict=True):
+            column[:] = value
+
+    @property
+    def _columns_of_state(self) -> tuple[Array, ...]:
+        return self._value, self._compared, self._commissioned, self._informed, self._searched
+
     def begin_from_here(self) -> None:
         """The first fan has its baseline, found without what is shared now."""
-        self._commissioned[:], self._first[:] = self._value, 0
+        self._commissioned[:] = self._begun[:] = self._value
+        self._informed[:] = self._searched[:] = 0.0
+        self._first[:] = 0
 
     def restart(self, fans: Array, *, keeps_value: bool) -> None:
         """Some fans, (fans,) of bool, are commissioned again.
@@ -214,21 +313,22 @@ class SharedOffset(ColumnState):
         if not keeps_value:
             self._value[:] = self._compared[:] = 0.0
         self._commissioned[:] = self._compared[:] = self._value
+        self._begun[:] = self._value
         self._first[:] = 0
+        self._informed[:] = self._searched[:] = self._begun_information[:] = 0.0
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """See ColumnState. Earlier snapshots do not say what was shared when fans were commissioned, or at first."""
-        super().restore({"commissioned": [0.0], "first": [0], **state})
+        """See ColumnState. Earlier snapshots do not say what was shared at first, or how well that is known."""
+        known = {"informed": [0.0], "searched": [0.0], "begun": [0.0], "begun_information": [1.0]}
+        super().restore({"commissioned": [0.0], "first": [0], **known, **state})
 
-    def _towards_commissioned(self, products: Array, ridge: Array) -> Array:
-        """The products, such that the ridge draws towards the value at the last commissioning of all fans, or zero."""
-        commissioned = float(self._commissioned[0])
-        return products + commissioned * ridge if commissioned else products
-
-    @property
-    def _range(self) -> tuple[float, float]:
-        commissioned = float(self._commissioned[0])
-        return commissioned - self._limit, commissioned + self._limit
+    def _fast(self, known: Array, squares: Array, counts: Array) -> Array:
+        """(..., fans) those of the known ones that are not much slower than the second fastest of them."""
+        if not self._compares_fast:
+            return known
+        mean_square = np.where(known, squares / np.maximum(counts, 1), 0.0)
+        second = np.partition(mean_square, -LEAST_FANS, axis=-1)[..., -LEAST_FANS, np.newaxis]
+        return known & (mean_square >= MIN_RELATIVE_SPEED**2 * second)
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
@@ -237,7 +337,25 @@ class SharedOffset(ColumnState):
             "compared": self._compared,
             "commissioned": self._commissioned,
             "first": self._first,
+            "informed": self._informed,
+            "searched": self._searched,
+            "begun": self._begun,
+            "begun_information": self._begun_information,
             "products": self._products,
             "squares": self._squares,
             "counts": self._counts,
         }
+
+
+def _drawn(products: Array, ridge: Array, commissioned: float) -> Array:
+    """The products, such that the ridge draws towards the value of the commissioning."""
+    return products + commissioned * ridge if commissioned else products
+
+
+def _information(squares: Array, ridge: Array) -> float:
+    """0 to 1: how much of a share of the speed is known from the second fastest of some fans, against the ridge."""
+    return float(np.sort(squares / (squares + ridge))[-LEAST_FANS])
+
+
+def _between(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)

@@ -130,7 +130,7 @@ def test_a_snapshot_of_a_card_without_a_shared_part_is_continued() -> None:
 @pytest.mark.parametrize("shares_at_first", [True, False])
 def test_fans_that_are_all_slower_than_their_twin_are_healthy_at_all_speeds(shares_at_first: bool) -> None:
     """They begin at a low speed, where that is half a sigma: as with a new twin of the time before a filter change."""
-    scorer = FanScorer(FANS, limits(), shares_at_first=shares_at_first)
+    scorer = FanScorer(FANS, limits(), shares_at_first=shares_at_first, compares_fast=shares_at_first)
     speed_rad_s = np.repeat(np.tile([50.0, 200.0], 2), 12 * PER_S)[:, np.newaxis] * np.ones(FANS)
     residual = 0.2 * autoregressive(len(speed_rad_s), FANS, 0.0, 1) + WEATHER * speed_rad_s / SIGMA_RAD_S
     made = samples_of(residual, np.zeros(residual.shape), period_ns=PERIOD_NS)
@@ -145,7 +145,7 @@ def test_fans_that_are_all_slower_than_their_twin_are_healthy_at_all_speeds(shar
 
 @pytest.mark.parametrize("keeps_shared", [True, False])
 def test_fans_that_all_became_slower_and_are_commissioned_again_are_healthy_at_all_speeds(keeps_shared: bool) -> None:
-    scorer = FanScorer(FANS, limits(), keeps_shared=keeps_shared, shares_at_first=False)
+    scorer = FanScorer(FANS, limits(), keeps_shared=keeps_shared, shares_at_first=False, compares_fast=False)
     speed_rad_s = np.repeat(np.tile([50.0, 200.0], 5), 12 * PER_S)[:, np.newaxis] * np.ones(FANS)  # for 12 s each
     residual = 0.2 * autoregressive(len(speed_rad_s), FANS, 0.0, 1)
     residual[24 * PER_S :] += WEATHER * speed_rad_s[24 * PER_S :] / SIGMA_RAD_S
@@ -173,7 +173,7 @@ def test_the_baseline_of_a_fan_that_turns_alone_learns_nothing_and_all_start_aga
     shared = scorer.snapshot()["speed"]["shared"]["value"]
     scorer.recommission(np.ones(FANS, np.bool_))
     assert scorer.snapshot()["speed"]["shared"]["value"] == shared
-    former = FanScorer(FANS, limits(), keeps_shared=False, shares_at_first=False)
+    former = FanScorer(FANS, limits(), keeps_shared=False, shares_at_first=False, compares_fast=False)
     former.update(rows_of(samples, slice(0, 30 * PER_S)))
     former.recommission(np.ones(FANS, np.bool_))
     assert former.snapshot()["speed"]["shared"]["value"] == [0.0]

@@ -224,7 +224,7 @@ def test_while_the_list_of_versions_cannot_be_read_nothing_is_learned_and_the_re
 def test_learning_is_tried_again_when_the_history_grows_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.learning.healthy_history.LONGEST_RECORDING_NS", 200 * NS_PER_S)
+    monkeypatch.setattr("pipeline.learning.history_recordings.LONGEST_RECORDING_NS", 200 * NS_PER_S)
     learner = Learner(tmp_path, kept_s=1000.0)
     learner.run(2000)
     learner.learning.fails_with = "a failure"
@@ -276,7 +276,7 @@ def test_a_check_that_failed_is_over_when_anybody_has_made_one(tmp_path: Path, m
 def test_a_version_is_due_at_the_latest_when_as_much_was_added_as_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.learning.healthy_history.LONGEST_RECORDING_NS", 200 * NS_PER_S)
+    monkeypatch.setattr("pipeline.learning.history_recordings.LONGEST_RECORDING_NS", 200 * NS_PER_S)
     learner = Learner(tmp_path, kept_s=1000.0)
     learner.run(600)
     made_t_ns = START_NS + learner.now_s * NS_PER_S

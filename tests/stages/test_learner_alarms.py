@@ -24,6 +24,25 @@ def test_nothing_is_learned_beside_an_alarm(tmp_path: Path) -> None:
     assert all(each.span[1] < START_NS + 600 * NS_PER_S for each in healthy_recordings(tmp_path))
 
 
+def test_fans_are_checked_each_day_beside_an_alarm(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    before = len(learner.learning.starts)
+    learner.run(50 * 3600, state=FanState.ALARM)
+    first_h, second_h = ((t_ns - START_NS) / NS_PER_S / 3600.0 for t_ns in learner.learning.checked_t_ns)
+    assert 24.0 < first_h < 24.5
+    assert second_h - first_h == pytest.approx(24.0, abs=0.1)
+    assert len(learner.learning.starts) == before
+
+
+def test_a_check_that_failed_beside_an_alarm_is_made_again_later(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(24 * 3600)
+    learner.learning.checks_fail_with = "too little"
+    learner.run(45 * 3600, state=FanState.ALARM)
+    assert 3 <= len(learner.learning.checks) <= 6, "after a quarter of the history each time, not each second"
+
+
 def test_a_restarted_learner_publishes_the_version_in_force_at_once(tmp_path: Path) -> None:
     first = Learner(tmp_path)
     first.run(600)
@@ -73,7 +92,7 @@ def test_while_a_fan_has_an_alarm_the_notes_say_that_nothing_is_learned(tmp_path
     learner.run(600)
     learner.run(20, state=FanState.ALARM)
     learner.run(20, state=FanState.UNKNOWN)
-    assert learner.core.notes()[1:] == ["no learning while fan 0 has an alarm"]
+    assert learner.core.notes()[1:] == ["no new version while fan 0 has an alarm"]
     learner.run(20)
     assert len(learner.core.notes()) == 1
 

@@ -18,9 +18,16 @@ KEPT_EVERY = 5
 
 
 def add_recording(
-    folder: Path, first_s: int, seconds: float, seed: int, factor: tuple[float, float] = (1.0, 1.0)
+    folder: Path,
+    first_s: int,
+    seconds: float,
+    seed: int,
+    factor: tuple[float, float] = (1.0, 1.0),
+    *,
+    has_alarm: bool = False,
 ) -> None:
-    """Two published fans under stairs from 0 to 100, from first_s after START_S on. factor: on their speeds."""
+    """Two published fans under stairs from 0 to 100, from first_s after START_S on. factor: on their speeds. has_alarm:
+    one of them has an alarm all the time."""
     history = HealthyHistory(folder, "site", "tray1", {"trays": "tray1"}, {}, hold_back_s=0.0, kept_s=1e9)
     run = published_run(seed, seconds, FANS)
     t_s, command, speed = (each[::KEPT_EVERY] for each in (run.t_s, run.command, run.speed_rad_s * np.array(factor)))
@@ -33,5 +40,5 @@ def add_recording(
             command=command[rows],
             speed_rad_s=speed[rows],
         )
-        history.add(raw, has_alarm=False, is_watched=False)
+        history.add(raw, has_alarm=has_alarm, is_watched=False)
     history.close()

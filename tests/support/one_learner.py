@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.config.models import TrayConfig
-from pipeline.learning.healthy_history import HealthyHistory, healthy_recordings
+from pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.learning.versions import Check, TwinVersions
 from schemas.messages import FanState, Message, NewTwin, Raw, Score
@@ -32,6 +32,8 @@ class FakeLearning:
         """how many recordings there were"""
         self.checks: list[float] = []
         """how much healthy running there was"""
+        self.checked_t_ns: list[int] = []
+        """up to when"""
         self._is_working = False
 
     def start(self, *, only_if_changed: bool) -> str:
@@ -40,7 +42,9 @@ class FakeLearning:
             self.checks.append(sum(each.seconds for each in found))
             if self.checks_fail_with:
                 return self.checks_fail_with
-            self.versions.add_check(Check(t_ns=found[-1].span[1], reference="", change=(), found="", spans=()))
+            everything = (*found, *recordings_near_alarms(self.versions.folder))
+            self.checked_t_ns.append(max(each.span[1] for each in everything))
+            self.versions.add_check(Check(t_ns=self.checked_t_ns[-1], reference="", change=(), found="", spans=()))
             return ""
         self.starts.append(len(found))
         self._is_working = True

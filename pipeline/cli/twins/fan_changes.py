@@ -72,16 +72,27 @@ def changes_from_list(change: Sequence[float | None]) -> Array:
     return np.array([math.nan if each is None else each for each in change])
 
 
+def fans_changed_alike(change: Array) -> Array:
+    """(n,) the fans that have changed alike, if these are most of those that can be compared, and one of them has
+    changed more than healthy fans do; else none.
+
+    change: (fans,), since the reference; NaN for a fan that is not comparable.
+    """
+    compared = np.flatnonzero(np.isfinite(change))
+    if not len(compared) or np.max(np.abs(change[compared])) <= MOST_CHANGE:
+        return compared[:0]
+    most = change[compared[np.argmax(np.abs(change[compared]))]]
+    alike = compared[change[compared] / most > 0.5]
+    return alike if len(alike) > 1 and 2 * len(alike) > len(compared) else compared[:0]
+
+
 def changed_fans(change: Array, reference: str) -> str:
-    """What has changed more than healthy fans do, in words; empty if nothing has. change: (fans,), since the
-    reference; NaN for a fan that is not comparable."""
+    """What has changed more than healthy fans do, in words; empty if nothing has. change: as above."""
     far = np.flatnonzero(np.abs(change) > MOST_CHANGE)
     if not len(far):
         return ""
-    compared = np.flatnonzero(np.isfinite(change))
-    most = change[far[np.argmax(np.abs(change[far]))]]
-    alike = compared[change[compared] / most > 0.5]
-    if len(alike) > 1 and 2 * len(alike) > len(compared):
+    compared, alike = np.flatnonzero(np.isfinite(change)), fans_changed_alike(change)
+    if len(alike):
         others = "".join(f", fan {fan} is {_faster(float(change[fan]))}" for fan in compared if fan not in alike)
         if others:
             which = f"{len(alike)} of {len(compared)} fans"

@@ -1,9 +1,10 @@
 """The next version of a learned twin, from the healthy history of its tray.
 
 First the speeds of the fans over the newest healthy hours are checked against the reference. Where they changed more
-than those of healthy fans do, the new version is trained on what came after, and is offered to the operator. Otherwise
-a new twin is compared with the one in force on what neither has seen. Unless it is clearly better, the new version is
-the twin in force with new limits.
+than those of healthy fans do, the new version is trained on what came after, and is offered to the operator. Whether
+most fans have changed alike is checked near alarms as well: it is no fault of a fan, and may raise one alarm after the
+other. Otherwise a new twin is compared with the one in force on what neither has seen. Unless it is clearly better, the
+new version is the twin in force with new limits.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from pipeline.cli.twins.fan_changes import (
     changed_fans,
     changes_from_list,
     changes_to_list,
+    fans_changed_alike,
     mean_changes,
     residual_of,
 )
@@ -36,7 +38,8 @@ from pipeline.cli.twins.train import fit_twin
 from pipeline.cli.twins.training_data import TrainingData, twin_errors
 from pipeline.cli.twins.version_data import Split, newest_long, newest_recordings, split, spread_parts
 from pipeline.errors import UserError
-from pipeline.learning.healthy_history import HealthyRecording, healthy_recordings
+from pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
+from pipeline.learning.history_recordings import HistoryRecording
 from pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList, overlap
 from pipeline.recordings.excerpts import ExcerptReader
 from pipeline.runtime.tray_twin import load_tray_twin
@@ -82,13 +85,17 @@ def _next_version(
 ) -> Version | None:
     folder, listed, name = versions.folder, versions.read(), versions.next_name()
     recordings = healthy_recordings(folder, listed.excluded_spans)
+    near_alarms = recordings_near_alarms(folder, listed.excluded_spans)
     if not recordings:
         raise UserError(f"{folder}: no healthy history to learn from yet")
     for left in folder.glob(f"{WORK_PREFIX}*"):  # of a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(prefix=WORK_PREFIX, dir=folder) as place:
-        work = _Work(Path(place), name, versions.file, listed, recordings, per_day, say)
-        check = work.checked()
+        work = _Work(Path(place), name, versions.file, listed, recordings, near_alarms, per_day, say)
+        check = work.checked_alike()
+        if check is None:
+            work = _Work(Path(place), name, versions.file, listed, recordings, [], per_day, say)
+            check = work.checked(max(each.span[1] for each in (*recordings, *near_alarms)))
         is_needed = work.needs_offer() if check.found else not only_if_changed
         if not is_needed:
             versions.add_check(check)
@@ -125,43 +132,62 @@ class _Work:
         name: str,
         file_of: Callable[[str], Path],
         listed: VersionList,
-        recordings: Sequence[HealthyRecording],
+        healthy: Sequence[HistoryRecording],
+        near_alarms: Sequence[HistoryRecording],
         per_day: float,
         say: Callable[[str], None],
     ) -> None:
-        """file_of: the file of a version. listed: the versions before this one."""
+        """file_of: the file of a version. listed: the versions before this one. healthy, near_alarms: what it is made
+        from."""
         self._place, self._name, self._file_of, self._listed = place, name, file_of, listed
-        self._recordings, self._before, self._per_day, self._say = recordings, listed.current, per_day, say
+        self._before, self._per_day, self._say = listed.current, per_day, say
+        self._near_alarms = set(near_alarms)
+        self._recordings = recordings = sorted([*healthy, *near_alarms], key=lambda each: each.span)
         self._rate_hz, self._fans = _rate_and_fan_count(recordings[-1])
         needed_s = 3600.0 * too_little(0.0, per_day).needed_fan_hours / self._fans
         self._calibration_recordings = newest_recordings(recordings, max(WANTED_S, MARGIN * needed_s))
         since_t_ns = max(listed.commissioned_t_ns, listed.waiting.made_t_ns if listed.waiting else 0)
         self._newest = newest_recordings([each for each in recordings if each.span[0] >= since_t_ns], CHECKED_S)
 
-    def checked(self) -> Check:
+    def checked_alike(self) -> Check | None:
+        """The check, if the newest hours were partly near alarms, and most fans have changed alike; else None."""
+        reference = self._reference()
+        if reference is None or not self._knows_enough or self._near_alarms.isdisjoint(self._newest):
+            return None
+        self._say(f"{self._name}: checking the fans against {reference.name}, near alarms too")
+        check = self._check(reference, self._recordings[-1].span[1])
+        return check if check.found else None
+
+    def checked(self, t_ns: int) -> Check:
         """The speeds of the fans over the newest hours beside the reference. Without a reference nothing has changed.
-        What was found stays while too little is known since then.
+        What was found stays while too little is known since then. t_ns: time of the newest sample that was looked at.
 
         Raises:
             UserError: too little is known since fans were commissioned again.
         """
-        reference, newest_t_ns = self._reference(), self._recordings[-1].span[1]
+        reference = self._reference()
         if reference is None:
-            return Check(t_ns=newest_t_ns, reference="", change=(), found="", spans=())
+            return Check(t_ns=t_ns, reference="", change=(), found="", spans=())
         if not self._knows_enough:
             if self._listed.waiting and self._listed.check:
-                return self._listed.check
+                return self._listed.check.model_copy(update={"t_ns": t_ns})
             raise UserError(
                 f"there is less than {_hours(LEAST_CHECKED_S)} of healthy running since fans were commissioned again: "
                 "too little to compare them with the reference; try again later"
             )
         self._say(f"{self._name}: checking the fans against {reference.name}")
+        return self._check(reference, t_ns)
+
+    def _check(self, reference: Version, t_ns: int) -> Check:
         change = self._change_since(reference)
-        found = changed_fans(change, reference.name)
+        found = self._changed(change, reference)
         spans = tuple(each.span for each in self._recordings if found and each.span[1] > self._unchanged_t_ns())
-        return Check(
-            t_ns=newest_t_ns, reference=reference.name, change=changes_to_list(change), found=found, spans=spans
-        )
+        return Check(t_ns=t_ns, reference=reference.name, change=changes_to_list(change), found=found, spans=spans)
+
+    def _changed(self, change: Array, since: Version) -> str:
+        """What has changed, in words; near alarms only what most fans have alike."""
+        counts = not self._near_alarms or len(fans_changed_alike(change)) > 0
+        return changed_fans(change, since.name) if counts else ""
 
     def _unchanged_t_ns(self) -> int:
         """Until then the fans are known to have been as when the reference was made."""
@@ -171,22 +197,22 @@ class _Work:
     def needs_offer(self) -> bool:
         """Whether the fans have changed otherwise than when a version was last offered, or none is."""
         last = self._listed.waiting
-        return last is None or (self._knows_enough and bool(changed_fans(self._change_since(last), last.name)))
+        return last is None or (self._knows_enough and bool(self._changed(self._change_since(last), last)))
 
     @property
     def _knows_enough(self) -> bool:
         """Whether there is enough since fans were commissioned again or a version was offered."""
         return self._newest == self._recordings or sum(each.seconds for each in self._newest) >= LEAST_CHECKED_S
 
-    def _change_since(self, version: Version) -> Array:
-        """(fans,) by which share the mean speeds over the newest hours have changed since a version was made."""
-        parts = spread_parts(self._newest, CHECKED_S)
+    def _change_since(self, version: Version, over: Sequence[HistoryRecording] | None = None) -> Array:
+        """(fans,) by which share the mean speeds have changed since a version was made; over: None: by the newest
+        hours."""
+        parts = spread_parts(over or self._newest, CHECKED_S)
         return mean_changes(self._file_of(version.name), parts) - changes_from_list(version.change)
 
     def offered(self, changed: str) -> tuple[Version, bytes]:
         """A version of the fans after their change. changed: it, in words."""
-        first = self._recordings.index(newest_long(self._newest))
-        after = self._recordings[first:]
+        after = self._recordings[self._recordings.index(self._first_after_change()) :]
         self._calibration_recordings = self._newest = list(after)
         parts = split(after, self._rate_hz, self._fans)
         return self._made(
@@ -194,10 +220,19 @@ class _Work:
             "trained",
             read_excerpts(parts.comparison),
             "offered",
-            changed,
+            f"{changed}; it was learned from running near alarms too" if self._near_alarms else changed,
             learned=after,
             since_t_ns=after[0].span[0],
         )
+
+    def _first_after_change(self) -> HistoryRecording:
+        """From this recording on, the fans are surely as they are now. Near alarms recordings are short: these are the
+        newest hours, if the fans had changed in the first half of these."""
+        reference, first_half = self._reference(), self._newest[: len(self._newest) // 2]
+        if not (self._near_alarms and reference and first_half):
+            return newest_long(self._newest)
+        had_changed = len(fans_changed_alike(self._change_since(reference, first_half))) > 0
+        return self._newest[0] if had_changed else newest_long(self._newest)
 
     def taken(self) -> tuple[Version, bytes]:
         """A version that takes over: a newly trained twin if it is better than the one in force, or new limits."""
@@ -228,7 +263,7 @@ class _Work:
         why: str,
         reference: Version | None = None,
         *,
-        learned: Sequence[HealthyRecording] | None = None,
+        learned: Sequence[HistoryRecording] | None = None,
         since_t_ns: int | None = None,
     ) -> tuple[Version, bytes]:
         """The version of a twin, with limits. reference: None: itself. learned, since_t_ns: None: all recordings, and
@@ -262,8 +297,10 @@ class _Work:
         ), limited.file
 
     def _alarms_since(self, t_ns: int) -> int:
-        """Alarms that began since then outside of what is marked as faulty: the time around them is not in the history,
-        so limits would become lower with each version."""
+        """Alarms that began since then outside of what is marked as faulty, if the time around them is left out: limits
+        would fall with each version."""
+        if self._near_alarms:
+            return 0
         began = (each for each in self._listed.alarms_t_ns if each >= t_ns)
         return sum(not overlap([(each, each)], self._listed.faulty) for each in began)
 
@@ -313,7 +350,7 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _rate_and_fan_count(recording: HealthyRecording) -> tuple[float, int]:
+def _rate_and_fan_count(recording: HistoryRecording) -> tuple[float, int]:
     """Samples a second of a tray, from the first minute, and its number of fans."""
     runs = ExcerptReader(recording.path).read(0.0, 60.0).runs
     seconds = sum(float(run.t_s[-1] - run.t_s[0]) for run in runs)

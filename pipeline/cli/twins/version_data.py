@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.cli.twins.excerpts import MOST_HZ, Excerpt
 from pipeline.cli.twins.windows import Windows, joined, windows_of
 from pipeline.errors import UserError
-from pipeline.learning.healthy_history import HealthyRecording
+from pipeline.learning.history_recordings import HistoryRecording
 
 WINDOW_S = 60.0
 """long enough for many time constants of a fan; windows are longer where samples are few"""
@@ -44,7 +44,7 @@ class Split:
     comparison: tuple[Excerpt, ...]
 
 
-def split(recordings: Sequence[HealthyRecording], rate_hz: float, fans: int) -> Split:
+def split(recordings: Sequence[HistoryRecording], rate_hz: float, fans: int) -> Split:
     """Windows of the newest long recording for validation and comparison, of the others for training.
 
     Where the others are not enough, only every fifth window of that recording is held out. rate_hz, fans: of the line.
@@ -78,22 +78,22 @@ def _halves(held_out: Windows) -> tuple[tuple[Excerpt, ...], tuple[Excerpt, ...]
     return (chosen[::2], chosen[1::2]) if len(chosen) > 3 else (chosen, chosen)
 
 
-def newest_long(recordings: Sequence[HealthyRecording]) -> HealthyRecording:
+def newest_long(recordings: Sequence[HistoryRecording]) -> HistoryRecording:
     """The newest recording of at least LEAST_COMPARED_S, or the longest."""
     long = [each for each in recordings if each.seconds >= LEAST_COMPARED_S]
     return long[-1] if long else max(recordings, key=lambda each: each.seconds)
 
 
-def newest_recordings(recordings: Sequence[HealthyRecording], wanted_s: float) -> list[HealthyRecording]:
+def newest_recordings(recordings: Sequence[HistoryRecording], wanted_s: float) -> list[HistoryRecording]:
     """The newest recordings that together are at least this long, or all."""
-    chosen: list[HealthyRecording] = []
+    chosen: list[HistoryRecording] = []
     for each in reversed(recordings):
         if sum(one.seconds for one in chosen) < wanted_s:
             chosen.insert(0, each)
     return chosen
 
 
-def spread_parts(recordings: Sequence[HealthyRecording], last_s: float = np.inf) -> list[Excerpt]:
+def spread_parts(recordings: Sequence[HistoryRecording], last_s: float = np.inf) -> list[Excerpt]:
     """Parts of CHECKED_PART_S evenly over the last seconds of the recordings, at most CHECKED_PARTS of them; shorter
     where a recording begins or ends."""
     ends_s = np.cumsum([each.seconds for each in recordings])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.cli.twins.excerpts import Excerpt
 from pipeline.errors import UserError
-from pipeline.learning.healthy_history import HealthyRecording
+from pipeline.learning.history_recordings import HistoryRecording
 from pipeline.recordings.excerpts import ExcerptReader
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class Windows:
         return (self.activity[:, :, :TENTHS].sum(axis=0) >= CHANGE_COUNTS_S).sum(axis=1)
 
 
-def windows_of(recordings: Sequence[HealthyRecording], window_s: float) -> Windows:
+def windows_of(recordings: Sequence[HistoryRecording], window_s: float) -> Windows:
     """Successive windows of the recordings, without those that lack many samples.
 
     Raises:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,12 +13,13 @@ from pipeline.cli.twins import next_version
 from pipeline.cli.twins.next_version import make_next_version
 from pipeline.cli.twins.version_data import newest_recordings
 from pipeline.errors import UserError
-from pipeline.learning.healthy_history import HealthyRecording, healthy_recordings
+from pipeline.learning.healthy_history import healthy_recordings
+from pipeline.learning.history_recordings import HistoryRecording
 from pipeline.learning.versions import TwinVersions, Version
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.units import NS_PER_S
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.healthy_recordings import FANS, add_recording
+from tests.support.healthy_recordings import FANS, START_S, add_recording
 
 pytestmark = pytest.mark.slow
 
@@ -42,6 +44,31 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     made(folder)
     yield folder
     patch.undo()
+
+
+def test_near_alarms_only_a_change_of_all_fans_is_offered(site: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(site, tmp_path / "tray1")
+    add_recording(folder, 2000, 120.0, 5, (0.7, 1.0), has_alarm=True)
+    assert make_next_version(folder, "tray1", 1.0, lambda _line: None, only_if_changed=True) is None
+    check = TwinVersions(folder, "tray1").read().check
+    assert check
+    assert check.found == ""
+    assert check.t_ns / NS_PER_S > START_S + 2100, "or it would be made again at once"
+    for first_s in (3000, 3100, 3200):
+        add_recording(folder, first_s, 70.0, 6, (1.06, 1.05), has_alarm=True)
+    offered = make_next_version(folder, "tray1", 1.0, lambda _line: None, only_if_changed=True)
+    assert offered
+    assert offered.outcome == "offered"
+    assert offered.why.startswith("all fans are ")
+    assert "it was learned from running near alarms too" in offered.why
+    assert offered.learned_spans[0][0] / NS_PER_S == pytest.approx(START_S + 3100, abs=1.0), "that of the newest hours"
+    assert offered.error_before
+    assert offered.error < 0.5 * offered.error_before
+    in_force = TwinVersions(folder, "tray1").in_force()
+    assert in_force
+    assert in_force.name == "tray1-2"
+    again = make_next_version(folder, "tray1", 1.0, lambda _line: None, only_if_changed=True)
+    assert again is None, "it is offered already"
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +176,7 @@ def test_a_tray_with_a_twin_of_its_own_and_wrong_times_are_refused_in_one_line(t
 
 def test_limits_are_from_as_many_of_the_newest_recordings_as_are_wanted_and_not_from_fewer() -> None:
     hours = [8, 8, 8, 8, 3]
-    history = [HealthyRecording(Path(f"{k}.mcap"), (k, k + hours[k] * 3600 * NS_PER_S)) for k in range(len(hours))]
+    history = [HistoryRecording(Path(f"{k}.mcap"), (k, k + hours[k] * 3600 * NS_PER_S)) for k in range(len(hours))]
     assert newest_recordings(history, 24 * 3600.0) == history[1:]
     assert newest_recordings(history, 3600.0) == history[-1:]
     assert newest_recordings(history, 100 * 3600.0) == history

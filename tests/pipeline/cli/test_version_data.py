@@ -13,7 +13,8 @@ from pipeline.cli.twins.train import TrainingSettings, fit_twin
 from pipeline.cli.twins.version_data import CHECKED_PART_S, CHECKED_PARTS, split, spread_parts
 from pipeline.cli.twins.windows import windows_of
 from pipeline.errors import UserError
-from pipeline.learning.healthy_history import HealthyRecording, healthy_recordings
+from pipeline.learning.healthy_history import healthy_recordings
+from pipeline.learning.history_recordings import HistoryRecording
 from schemas.units import NS_PER_S
 from tests.support.commanded_fans import HELD, RATE_HZ, held, moving, recorded
 
@@ -24,10 +25,10 @@ def overlapping(some: Sequence[Excerpt], others: Sequence[Excerpt]) -> bool:
     return any(a.path == b.path and a.from_s < b.to_s and b.from_s < a.to_s for a in some for b in others)
 
 
-def spans(seconds: Sequence[float]) -> list[HealthyRecording]:
+def spans(seconds: Sequence[float]) -> list[HistoryRecording]:
     ends = np.cumsum(seconds)
     return [
-        HealthyRecording(Path(f"{k}.mcap"), (round((end - each) * NS_PER_S), round(end * NS_PER_S)))
+        HistoryRecording(Path(f"{k}.mcap"), (round((end - each) * NS_PER_S), round(end * NS_PER_S)))
         for k, (each, end) in enumerate(zip(seconds, ends, strict=True))
     ]
 
@@ -111,7 +112,7 @@ def test_the_same_windows_are_chosen_again_and_equal_ones_are_spread(tmp_path: P
 def test_windows_that_lack_most_of_their_samples_are_not_used(tmp_path: Path) -> None:
     recorded(tmp_path, 0.0, moving(300.0))
     (path,) = [each.path for each in healthy_recordings(tmp_path)]
-    longer = HealthyRecording(path, (0, 900 * NS_PER_S))
+    longer = HistoryRecording(path, (0, 900 * NS_PER_S))
     assert [each.from_s for each in windows_of([longer], 60.0).excerpts] == [0.0, 60.0, 120.0, 180.0, 240.0]
 
 

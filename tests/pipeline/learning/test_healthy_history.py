@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.learning import healthy_history
+from pipeline.learning import history_recordings
 from pipeline.learning.healthy_history import (
     LONGEST_LAG_NS,
-    OPEN_NAME,
     HealthyHistory,
     healthy_recordings,
     recorded_raws,
+    recordings_near_alarms,
 )
+from pipeline.learning.history_recordings import OPEN_NAME
 from pipeline.recordings.disk import AtomicAppendFile
 from pipeline.recordings.reading import read_metadata
 from schemas.messages import Header, Raw
@@ -92,6 +93,46 @@ def test_what_came_shortly_before_an_alarm_and_after_it_is_never_kept(tmp_path: 
     assert before == (10, 399), "100 s before the alarm are left out"
     assert after[0] >= 690, "and 100 s after its end"
     assert after[1] <= 1100
+
+
+def near_alarms_s(folder: Path) -> list[tuple[int, int]]:
+    """First and last second of each recording of running near alarms."""
+    spans = [each.span for each in recordings_near_alarms(folder)]
+    return [(round(first / NS_PER_S) - START_S, round(last / NS_PER_S) - START_S) for first, last in spans]
+
+
+def test_samples_are_either_healthy_or_near_an_alarm(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    watch(history, 0, 500)
+    watch(history, 500, 600, has_alarm=True)
+    watch(history, 600, 1200)
+    history.finish()
+    ((first_s, last_s),) = near_alarms_s(tmp_path)
+    (before, after) = kept_s(tmp_path)
+    assert first_s == before[1] + 1
+    assert last_s == after[0] - 1
+    everything_s = sum(last - first for first, last in (before, after, (first_s, last_s)))
+    assert history.all_seconds_since(0) == everything_s
+    assert history.seconds == everything_s - (last_s - first_s)
+
+
+def test_running_near_alarms_is_kept_for_some_time_and_begins_again_when_fans_are_commissioned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.learning.healthy_history.NEAR_ALARMS_KEPT_S", 4.5 * 3600)
+    history = history_in(tmp_path, hold_back_s=0.0)
+    hour_s, day_s = 3600, 24 * 3600
+    for first_s in range(0, 2 * day_s, 10 * hour_s):
+        watch(history, first_s, first_s + hour_s, has_alarm=True)
+        watch(history, first_s + hour_s, first_s + 9 * hour_s)
+        watch(history, first_s + 9 * hour_s, first_s + 10 * hour_s, has_alarm=True)
+    history.begin_after((START_S + 3 * day_s) * NS_PER_S)
+    watch(history, 3 * day_s - hour_s, 3 * day_s + hour_s, has_alarm=True)
+    history.close()
+    kept = near_alarms_s(tmp_path)
+    assert kept[-1][0] > 3 * day_s
+    assert kept[-2][1] == 5 * 10 * hour_s - 1
+    assert 3 * hour_s < sum(last - first for first, last in kept) <= 4.5 * hour_s
 
 
 def test_a_short_recording_is_deleted_and_a_pause_begins_a_new_one(tmp_path: Path) -> None:
@@ -239,7 +280,7 @@ def test_the_folder_is_not_read_for_each_sum(tmp_path: Path, monkeypatch: pytest
     history = history_in(tmp_path, hold_back_s=0.0)
     add(history, 0, 300)
     history.finish()
-    monkeypatch.setattr(healthy_history, "healthy_recordings", lambda *_: pytest.fail("the folder is read"))
+    monkeypatch.setattr(history_recordings, "recordings_in", lambda *_: pytest.fail("the folder is read"))
     assert history.seconds == history.seconds_since(0) == 299.0
 
 
@@ -284,7 +325,7 @@ def test_a_recording_that_a_full_disk_refused_to_finish_is_kept_and_said_until_t
     assert kept_s(tmp_path) == [(0, 299)]
     add(history, 400, 700)
     history.flush()
-    assert "the healthy history cannot be kept" in history.problem
+    assert "the history cannot be kept" in history.problem
     history.finish()
     assert history.problem == ""
     assert kept_s(tmp_path) == [(0, 299), (400, 699)]

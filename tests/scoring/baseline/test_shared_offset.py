@@ -4,19 +4,22 @@ import numpy as np
 import pytest
 
 from schemas.messages import Array
+from scoring.baseline.intervals import Intervals
 from scoring.baseline.shared_offset import SharedOffset
 from tests.support.one_interval import one_interval
 
 SAMPLES = 10
 ALL = np.ones(8, np.bool_)
 LIMIT, ADAPTATION_S, REACH_SIGMAS = 0.03, 300.0, 1.2
+STATE = ("value", "compared", "commissioned", "informed", "searched")
 
 
 def shared_offset(fans: int) -> SharedOffset:
-    return of_residual_std(fans, 1e-3)  # hardly drawn towards zero
+    """Hardly drawn towards zero; the fans were commissioned at a high speed, and shared nothing."""
+    return commissioned(of_residual_std(fans, 1e-3), 50.0)
 
 
-def of_residual_std(fans: int, residual_std: float) -> SharedOffset:
+def of_residual_std(fans: int, residual_std: float, *, compares_fast: bool = True) -> SharedOffset:
     return SharedOffset(
         fans,
         limit=LIMIT,
@@ -24,7 +27,24 @@ def of_residual_std(fans: int, residual_std: float) -> SharedOffset:
         interval_s=1.0,
         adaptation_s=ADAPTATION_S,
         reach_sigmas=REACH_SIGMAS,
+        compares_fast=compares_fast,
     )
+
+
+def commissioned(shared: SharedOffset, speed_sigmas: float, share: float = 0.0) -> SharedOffset:
+    """After the fans got their baselines at this speed."""
+    fans = len(shared.columns()["counts"])
+    for _ in range(10):
+        turn(shared, np.full(fans, speed_sigmas), share, at_first=True)
+    shared.begin_from_here()
+    return shared
+
+
+def turn(shared: SharedOffset, speed_sigmas: Array, share: float, *, at_first: bool = False) -> None:
+    """An interval in which all fans, (fans,), turn, and share this."""
+    speed, fans = np.tile(speed_sigmas, (SAMPLES, 1)), ALL[: len(speed_sigmas)]
+    add(shared, share * speed, speed, np.ones(speed.shape, np.bool_))
+    shared.end_interval(SAMPLES, fans, fans, None, at_first=at_first)
 
 
 def add(shared: SharedOffset, offset: Array, speed_sigmas: Array, valid: Array) -> None:
@@ -155,8 +175,87 @@ def test_it_stays_when_all_fans_are_commissioned_again_and_its_limit_is_from_the
     assert settle() == LIMIT, "some of the fans"
     shared.restart(ALL[:3], keeps_value=True)
     assert (shared.columns()["value"][0], shared.since_commissioning) == (LIMIT, 0.0)
+    commissioned(shared, 50.0, LIMIT)
     assert settle() == 2 * LIMIT
     assert shared.since_commissioning == pytest.approx(LIMIT)
+
+
+@pytest.mark.parametrize("compares_fast", [True, False])
+def test_idling_fans_say_nothing_about_what_fast_ones_share(compares_fast: bool) -> None:
+    shared = commissioned(of_residual_std(4, 1.0, compares_fast=compares_fast), 100.0)
+    speed_sigmas = np.array([10.0, 10.0, 100.0, 100.0])
+    for _ in range(60):
+        turn(shared, speed_sigmas, 0.02)
+    found = shared.columns()["value"][0]
+    assert found == pytest.approx(0.02, rel=0.15) if compares_fast else found < 0.005
+
+
+@pytest.mark.parametrize("compares_fast", [True, False])
+def test_what_fans_shared_when_they_were_commissioned_idling_is_found_when_they_turn_fast(compares_fast: bool) -> None:
+    shared, share = of_residual_std(4, 1.0, compares_fast=compares_fast), 1.8 * LIMIT
+    commissioned(shared, 20.0, share)
+    for _ in range(1000):
+        turn(shared, np.full(4, 100.0), share)
+    found = shared.columns()["value"][0]
+    assert found == pytest.approx(share, rel=0.1) if compares_fast else found < 1.55 * LIMIT
+    before = shared.columns()["commissioned"][0]
+    for _ in range(1000):
+        turn(shared, np.full(4, 100.0), 4.0 * LIMIT)
+    assert shared.columns()["commissioned"][0] == before, "once it is known, it stays"
+    assert shared.columns()["value"][0] == pytest.approx(before + LIMIT)
+
+
+def test_many_intervals_at_once_are_the_same_as_one_after_the_other() -> None:
+    rng, intervals, fans = np.random.default_rng(1), 900, 4
+    speed = np.repeat(rng.choice([15.0, 90.0], (intervals, fans)), SAMPLES, axis=0)
+    offset = 0.02 * speed + rng.normal(0.0, 0.3, speed.shape)
+    valid = np.repeat(rng.random((intervals, fans)) < 0.9, SAMPLES, axis=0)
+    valid[:, :2] = True
+    one, many = (commissioned(of_residual_std(fans, 1.0), 15.0, 0.02) for _ in range(2))
+    once = many.over(
+        offset, speed, valid, Intervals(np.arange(intervals) * SAMPLES, len(speed), SAMPLES), ALL[:fans], None
+    )
+    states = []
+    for k in range(once.ends):
+        states.append([float(one.columns()[name][0]) for name in STATE])
+        rows = slice(k * SAMPLES, (k + 1) * SAMPLES)
+        add(one, offset[rows], speed[rows], valid[rows])
+        one.end_interval(SAMPLES, ALL[:fans], ALL[:fans], None, at_first=False)
+    assert once.ends == intervals
+    together = np.array([once.values, once.compared, once.commissioned, once.informed, once.searched]).T[: once.ends]
+    np.testing.assert_array_equal(together, states)
+    assert states[0][3] == 0.0, "it is still being found at first"
+    assert states[-1][3] == states[-100][3] >= 60.0, "and known at last"
+
+
+def test_fans_commissioned_again_one_by_one_begin_from_where_they_are_then() -> None:
+    shared = commissioned(of_residual_std(4, 1.0), 100.0, 0.01)
+    for fan in range(4):
+        shared.restart(np.arange(4) == fan, keeps_value=True)
+    commissioned(shared, 15.0, 0.02)
+    begun = shared.columns()["begun_information"][0]
+    assert 0.1 < begun < 0.3, "of the last commissioning only"
+    for _ in range(600):
+        turn(shared, np.full(4, 100.0), 0.02)
+    assert shared.columns()["commissioned"][0] == pytest.approx(0.02, rel=0.15)
+    assert shared.since_commissioning == pytest.approx(0.0, abs=0.003)
+
+
+def test_a_snapshot_of_before_it_was_found_again_continues_and_begins_with_the_next_commissioning() -> None:
+    before = commissioned(of_residual_std(4, 1.0), 15.0, 0.02)
+    earlier = {
+        key: value for key, value in before.snapshot().items() if not key.startswith(("begun", "informed", "sea"))
+    }
+    after = of_residual_std(4, 1.0)
+    after.restore(earlier)
+    for _ in range(600):
+        turn(after, np.full(4, 100.0), 0.02)
+    assert after.columns()["commissioned"][0] == before.columns()["commissioned"][0], "as it was decided then"
+    after.restart(ALL[:4], keeps_value=True)
+    commissioned(after, 15.0, 0.0)
+    for _ in range(600):
+        turn(after, np.full(4, 100.0), 0.0)
+    assert after.columns()["commissioned"][0] == pytest.approx(0.0, abs=0.003)
 
 
 def test_turning_backwards_is_slowed_by_the_same_air() -> None:
