@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +25,7 @@ from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, healthy_twi
 from pipeline.runtime.judged_share import JudgedShare
 from pipeline.runtime.learned_scorer import LearnedTwinScorer
 from pipeline.runtime.old_samples import OldSamples
-from pipeline.runtime.snapshot_store import SnapshotStore
+from pipeline.runtime.snapshot_store import Elsewhere, SnapshotStore
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from pipeline.runtime.tray_scorer import DATA_LOST_AFTER_NS, TrayScorer
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
@@ -39,6 +39,7 @@ from schemas.messages import (
     ScorerSnapshot,
     Transition,
 )
+from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_text import AlarmText
 from scoring.alarms.unscored_monitor import UnscoredMonitor
@@ -307,7 +308,7 @@ class ScorerCore(Core):
         commissioned[[alarm.fan for alarm in alarms if alarm.transition == Transition.COMMISSIONING]] = True
         self._tray.recommission(commissioned, self._last_t_ns)
         self._counts["requests"] += 1
-        return [*alarms, *self._take_snapshot(at_once=True)]
+        return [*self._take_snapshot(at_once=True), *alarms]  # whoever has the answer can rely on it
 
     def _take_snapshot(self, *, at_once: bool) -> list[ScorerSnapshot]:
         """The state for a restart, at once or when the last snapshot is old enough."""
@@ -329,6 +330,13 @@ def _json(state: Mapping[str, Any]) -> str:
     return json.dumps(state, allow_nan=False)
 
 
+def _kept_by_others(context: Context) -> Elsewhere | None:
+    """What others keep of the state of a tray; None: they are not asked."""
+    kept, tray, config = context.kept, context.tray.name, context.config
+    asks = config.asks_for_snapshots if config.asks_for_snapshots is not None else context.instance != ALL_TRAYS
+    return (lambda is_patient: kept.of(tray, is_patient=is_patient)) if kept and asks else None
+
+
 def build(context: Context) -> BuiltStage:
     """The core of one tray; without a twin in the configuration, of the twins that are learned.
 
@@ -337,12 +345,7 @@ def build(context: Context) -> BuiltStage:
     """
     tray = context.tray
     path = context.snapshot_folder / f"scorer-{tray.name}.snapshot" if context.snapshot_folder else None
-    kept = context.kept if context.config.asks_for_snapshots else None
-
-    def elsewhere(is_patient: bool) -> Sequence[ScorerSnapshot]:
-        return kept.of(tray.name, is_patient=is_patient) if kept else ()
-
-    store = SnapshotStore(path, elsewhere, context.started_t_ns) if path else None
+    store = SnapshotStore(path, _kept_by_others(context), context.started_t_ns) if path else None
 
     def core_of(twin: TrayTwin, continues: ScorerSnapshot | None = None) -> ScorerCore:
         return ScorerCore(

@@ -7,7 +7,8 @@ received them: their headers name those that published them.
 
 from __future__ import annotations
 
-import threading
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import zenoh
 
@@ -16,28 +17,34 @@ from schemas.topics import largest_bytes
 _KEPT = "/kept/"
 
 
-class KeptMessages:
-    """What one stage keeps for others, on the keys of one topic."""
+@dataclass(frozen=True, slots=True)
+class KeptQuery:
+    """Somebody asks for the last message on `key`."""
 
-    def __init__(self, session: zenoh.Session, key_expression: str, kept_by: str) -> None:
-        """key_expression: of the topic, of any tray; kept_by: the producer that keeps them."""
-        self._kept_by = kept_by
-        self._messages: dict[str, bytes] = {}
-        self._lock = threading.Lock()
-        self._queryable = session.declare_queryable(f"{key_expression}{_KEPT}{kept_by}", self._answer)
+    key: str
+    _kept_by: str
+    _query: zenoh.Query
 
-    def put(self, key: str, payload: bytes) -> None:
-        """The newest message on a key, which takes the place of the one before."""
-        with self._lock:
-            self._messages[key] = payload
-
-    def _answer(self, query: zenoh.Query) -> None:
-        asked = str(query.key_expr).partition(_KEPT)[0]
-        with self._lock:
-            payload = self._messages.get(asked)
-        with query:
+    def answer(self, payload: bytes | None) -> None:
+        """Send the message; None: there is none."""
+        with self._query:
             if payload is not None:
-                query.reply(f"{asked}{_KEPT}{self._kept_by}", payload)
+                self._query.reply(f"{self.key}{_KEPT}{self._kept_by}", payload)
+
+
+def answer_for_kept(
+    session: zenoh.Session, key_expression: str, kept_by: str, on_query: Callable[[KeptQuery], object]
+) -> zenoh.Queryable[None]:
+    """Call `on_query`, from a thread of the bus, when somebody asks.
+
+    key_expression: of the topic, of any tray; kept_by: the producer that keeps the messages.
+    """
+
+    def receive(query: zenoh.Query) -> None:
+        on_query(KeptQuery(str(query.key_expr).partition(_KEPT)[0], kept_by, query))
+
+    handler = zenoh.handlers.Callback(receive, indirect=False)
+    return session.declare_queryable(f"{key_expression}{_KEPT}{kept_by}", handler)
 
 
 def ask_for_kept(session: zenoh.Session, key: str, timeout_s: float) -> tuple[list[bytes], bool]:

@@ -42,8 +42,8 @@ class Shard:
 
     @property
     def is_whole(self) -> bool:
-        """Whether it has all trays of the site, as its name says."""
-        return self.name == ALL_TRAYS
+        """Whether it has all trays of the site, because nothing selects some."""
+        return not self.words
 
 
 def chosen_trays(config: Config, trays: str | None, shard: str | None) -> list[str]:

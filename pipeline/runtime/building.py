@@ -4,7 +4,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from pipeline.runtime.stage import BuiltStage, Context, Stage
+from pipeline.config.models import Config
+from pipeline.config.shards import Shard
+from pipeline.runtime.stage import BuiltStage, Context, Kept, Stage
+
+
+def context_of(stage: Stage, config: Config, shard: Shard, started_t_ns: int, kept: Kept) -> Context:
+    """What a process of a stage is built from. kept: what others keep of its state."""
+    return Context(
+        site=config.site,
+        trays=tuple(map(config.tray, shard.trays)),
+        config=config.sections[stage.name],
+        folder=config.folder,
+        run_folder=config.run_folder,
+        started_t_ns=started_t_ns,
+        instance=shard.name,
+        shard_number=shard.number,
+        snapshot_folder=config.run_folder,
+        kept=kept,
+        configuration_path=config.path,
+        configuration_text=config.text,
+        overrides=config.overrides,
+    )
 
 
 def build_parts(stage: Stage, context: Context) -> dict[str, BuiltStage]:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from pipeline.bus.kept_messages import KeptQuery
 from pipeline.bus.session import Bus
 from pipeline.config.registry import STAGES
 from pipeline.runtime.second_owner import GOSSIP_S
@@ -20,6 +21,8 @@ from schemas.messages import ScorerSnapshot
 from schemas.topics import sessions_key, topic_of, tray_key
 
 SNAPSHOT = "snapshot"
+KEEPER_LIMIT_S = 60.0
+"""how long a stage without a recent file waits for one that keeps snapshots; what it misses meanwhile, others keep"""
 IMPATIENT_S = 0.5
 """how long further answers are waited for, once one has not come in time"""
 _POLL_S = 0.05
@@ -28,54 +31,90 @@ _POLL_S = 0.05
 class KeptForOthers:
     """The last messages that this process keeps."""
 
-    def __init__(self, bus: Bus, site: str, topics: Iterable[str], producer: str, before: Mapping[str, bytes]) -> None:
-        """topics: those that are kept; producer: of this process; before: messages from before its start, by key."""
-        self._topics = {topic: bus.keep(tray_key(site, "*", topic), producer) for topic in topics}
-        for key, payload in before.items():
-            self._topics[topic_of(key).name].put(key, payload)
+    def __init__(
+        self,
+        bus: Bus,
+        site: str,
+        topics: Iterable[str],
+        producer: str,
+        before: Mapping[str, bytes],
+        on_query: Callable[[KeptQuery], object],
+    ) -> None:
+        """topics: those that are kept; producer: of this process; before: messages from before its start, by key.
+
+        on_query: called from a thread of the bus. `answer` must be called after what had arrived before the query has
+        been added: whoever asks has seen the end of a process, whose last message may still be on the way.
+        """
+        self._topics = frozenset(topics)
+        self._last = dict(before)
+        for topic in self._topics:
+            bus.answer_for_kept(tray_key(site, "*", topic), producer, on_query)
 
     def add(self, envelope: Envelope) -> None:
         """Keep a message if it is of such a topic."""
         if envelope.topic in self._topics:
-            self._topics[envelope.topic].put(envelope.key, envelope.payload)
+            self._last[envelope.key] = envelope.payload
+
+    def answer(self, query: KeptQuery) -> None:
+        """Give the last message to whoever asks for it."""
+        is_kept = topic_of(query.key).name in self._topics
+        query.answer(self._last.get(query.key) if is_kept else None)
 
 
 class KeptSnapshots:
     """Asks the stages of a site for the snapshots that they keep."""
 
-    def __init__(self, bus: Bus, site: str, stop: threading.Event, timeout_s: float, *, is_one_expected: bool) -> None:
-        """timeout_s: how long to wait for an answer, and for a stage that keeps snapshots to appear; is_one_expected:
-        whether the configuration has one."""
+    def __init__(
+        self,
+        bus: Bus,
+        site: str,
+        stop: threading.Event,
+        wait_for_predecessor: Callable[[], None],
+        answer_limit_s: float,
+        *,
+        is_one_expected: bool,
+        keeper_limit_s: float = KEEPER_LIMIT_S,
+    ) -> None:
+        """wait_for_predecessor: returns when no other process has these trays, so that no snapshot is still to come.
+        answer_limit_s: how long to wait for an answer. is_one_expected: whether the configuration has a stage that
+        keeps snapshots; if so, it is waited for up to keeper_limit_s."""
         self._bus = bus
         self._site = site
         self._stop = stop
-        self._timeout_s = timeout_s
+        self._wait_for_predecessor = wait_for_predecessor
+        self._answer_limit_s = answer_limit_s
         self._is_one_expected = is_one_expected
+        self._keeper_limit_s = keeper_limit_s
         self._began_s: float | None = None
 
-    def of(self, tray: str, *, is_patient: bool) -> list[ScorerSnapshot]:
-        """The last snapshot of a tray that each stage keeps. is_patient: wait for a stage that is not there yet."""
+    def of(self, tray: str, *, is_patient: bool) -> tuple[Sequence[ScorerSnapshot], str]:
+        """The last snapshot of a tray that each stage keeps, and why there may be others, for people. is_patient: wait
+        for a stage that is not there yet.
+
+        Raises:
+            StageError: another process has the tray.
+        """
         if self._began_s is None:
-            self._bus.wait_for_others(self._stop)
+            self._wait_for_predecessor()
             self._began_s = time.monotonic()
-        self._wait_for_one(tray, self._began_s + self._limit_s(is_patient))
-        payloads, have_answered = self._bus.ask_for_kept(tray_key(self._site, tray, SNAPSHOT), self._timeout_s)
+        is_patient = is_patient and self._is_one_expected
+        limit_s = self._keeper_limit_s if is_patient else GOSSIP_S if self._bus.came_second else 0.0
+        is_kept = self._wait_for_keeper(tray, self._began_s + limit_s)
+        payloads, have_answered = self._bus.ask_for_kept(tray_key(self._site, tray, SNAPSHOT), self._answer_limit_s)
+        why = f"no recorder of this tray was there within {limit_s:g} s" if is_patient and not is_kept else ""
         if not have_answered:
-            self._timeout_s = min(self._timeout_s, IMPATIENT_S)
-        return [snapshot for snapshot in map(_decoded, payloads) if snapshot is not None]
+            why = f"a recorder did not answer within {self._answer_limit_s:g} s"
+            self._answer_limit_s = min(self._answer_limit_s, IMPATIENT_S)
+        return [snapshot for snapshot in map(_decoded, payloads) if snapshot is not None], why
 
-    def _limit_s(self, is_patient: bool) -> float:
-        """How long to wait for a stage: until the first process met has introduced it, or until it has started."""
-        if is_patient and self._is_one_expected:
-            return self._timeout_s
-        return GOSSIP_S if self._bus.came_second else 0.0
-
-    def _wait_for_one(self, tray: str, until_s: float) -> None:
-        while not self._is_kept(tray) and time.monotonic() < until_s:
+    def _wait_for_keeper(self, tray: str, until_s: float) -> bool:
+        """Whether a stage that keeps the snapshots of a tray is there in time."""
+        while not (is_there := self._has_keeper(tray)) and time.monotonic() < until_s:
             if self._stop.wait(_POLL_S):
-                return
+                break
+        return is_there
 
-    def _is_kept(self, tray: str) -> bool:
+    def _has_keeper(self, tray: str) -> bool:
         sessions = map(Session.of_key, self._bus.alive(sessions_key(self._site)))
         return any(each is not None and keeps_snapshots(each.stage) and each.has(tray) for each in sessions)
 

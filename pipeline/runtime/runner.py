@@ -16,12 +16,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 
+from pipeline.bus.kept_messages import KeptQuery
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.config.shards import Shard, chosen_shard
 from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.runtime.building import abort, build_parts
+from pipeline.runtime.building import abort, build_parts, context_of
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
@@ -35,7 +36,7 @@ from pipeline.runtime.second_owner import refuse_second
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.sessions import Session, Sessions
 from pipeline.runtime.sources import Sources
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage
+from pipeline.runtime.stage import BuiltStage, Core, Stage
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, Note, StageStatus, newest_t_ns
@@ -71,7 +72,6 @@ class Runner:
             StageError, ConfigError, BusError: it cannot be built; nothing has been published.
         """
         shard = shard or chosen_shard(stage.name, config)
-        trays = tuple(map(config.tray, shard.trays))
         self.stage = stage
         self.stop = stop
         self._on_health = on_health or (lambda _health: None)
@@ -85,27 +85,6 @@ class Runner:
         self._counts: Counter[str] = Counter()
         started_t_ns = HOST_CLOCK.now_ns()
         self._bus = Bus(config.bus, stop)  # before the stage is built: it may continue from what others keep
-        context = Context(
-            site=config.site,
-            trays=trays,
-            config=config.sections[stage.name],
-            folder=config.folder,
-            run_folder=config.run_folder,
-            started_t_ns=started_t_ns,
-            instance=shard.name,
-            shard_number=shard.number,
-            snapshot_folder=config.run_folder,
-            kept=KeptSnapshots(
-                self._bus,
-                config.site,
-                stop,
-                config.bus.recovery_timeout_s,
-                is_one_expected=any(map(keeps_snapshots, config.stages)),
-            ),
-            configuration_path=config.path,
-            configuration_text=config.text,
-            overrides=config.overrides,
-        )
         self._due: deque[Envelope] = deque()
         """messages in sequence, to be processed before anything else: recovered ones are many at a time"""
         self._sources = Sources(self._inbox)
@@ -114,24 +93,35 @@ class Runner:
         self._session = Session.of_this_process(stage.name, shard, started_t_ns, self.producer)
         self._parts: dict[str, BuiltStage] = {}
         """by the tray that a core serves; an empty name: all"""
+        refuse_others = functools.partial(refuse_second, self._bus, config.site, self._session, stop)
+        kept = KeptSnapshots(
+            self._bus,
+            config.site,
+            stop,
+            refuse_others,
+            config.bus.recovery_timeout_s,
+            is_one_expected=any(map(keeps_snapshots, config.stages)),
+        )
         try:
-            self._parts = build_parts(stage, context)
-            refuse_second(self._bus, config.site, self._session, stop)
+            self._parts = build_parts(stage, context_of(stage, config, shard, started_t_ns, kept))
+            refuse_others()
         except BaseException:
             abort(self._parts)
             self._bus.close()
             raise
         before = {key: payload for parts in self._parts.values() for key, payload in parts.kept.items()}
-        self._kept = KeptForOthers(self._bus, config.site, STAGES[stage.name].keeps, self.producer, before)
+        self._kept = KeptForOthers(
+            self._bus, config.site, STAGES[stage.name].keeps, self.producer, before, self._inbox.put
+        )
         self._has_source = any(parts.source for parts in self._parts.values())
         self._recovery = Recovery(self._bus, self._inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
         self._tracker = SequenceTracker(self._recovery.ask, sessions=self._sessions)
-        self._outputs = Outputs(self._bus, config.site, stage, [t.name for t in trays], self.producer)
+        self._outputs = Outputs(self._bus, config.site, stage, list(shard.trays), self.producer)
         self._health_publisher = self._bus.publisher(
             health_key(config.site, stage.name, self._shard.name), BY_NAME["health"], type_name(Health), self.producer
         )
         self._read_keys = {
-            tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
+            tray_key(config.site, tray, name) for tray in shard.trays for name in stage.reads if name != "health"
         }
         self._peers = Peers(self._read_keys)
         main = (
@@ -142,7 +132,7 @@ class Runner:
             self._shard.name,
             started_t_ns,
             may_drop=stage.may_drop,
-            main_keys=self._read_keys & {tray_key(config.site, t.name, main) for t in trays},
+            main_keys=self._read_keys & {tray_key(config.site, tray, main) for tray in shard.trays},
             trays=() if shard.is_whole else shard.trays,
         )
         self._notifier = Notifier.from_environment()
@@ -320,6 +310,8 @@ class Runner:
             self._call(item.core, lambda: core.step(item.item))
         elif isinstance(item, Recovered):
             self._handle_recovered(item)
+        elif isinstance(item, KeptQuery):
+            self._kept.answer(item)
         elif isinstance(item, Liveness):
             self._peers.update(item)
             self._sessions.update(item.key, item.alive)

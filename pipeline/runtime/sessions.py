@@ -71,7 +71,7 @@ class Session:
         """The key of its token."""
         prefix = sessions_key(site, self.stage, self.instance).removesuffix("/**")
         own = f"{prefix}/{self.started_t_ns}/{self.producer}/{self.host}/{self.process_id}"
-        is_named = self.trays in ((), (self.instance,))
+        is_named = not self.trays or (self.trays == (self.instance,) and self.instance != ALL_TRAYS)
         return own if is_named else f"{own}/{_BETWEEN_TRAYS.join(self.trays)}"
 
     def has(self, tray: str) -> bool:

@@ -25,8 +25,8 @@ RECENT_NS = 120 * NS_PER_S
 """a file that is no older, two periods of snapshots, is that of the last session, unless somebody knows a newer one"""
 AHEAD_NS = NS_PER_S
 """a snapshot that is further ahead of the present is of a clock that was wrong"""
-Elsewhere = Callable[[bool], Sequence[ScorerSnapshot]]
-"""the snapshots that others keep; given whether to wait for those who are not there yet"""
+Elsewhere = Callable[[bool], tuple[Sequence[ScorerSnapshot], str]]
+"""the snapshots that others keep, and why there may be more; given whether to wait for those who are not there yet"""
 
 
 class SnapshotStore:
@@ -36,13 +36,14 @@ class SnapshotStore:
     user who later removes the new file, to start without, must not get back the state from before the upgrade.
     """
 
-    def __init__(self, path: Path, elsewhere: Elsewhere = lambda _is_patient: (), now_ns: int = 0) -> None:
-        """elsewhere: asked once, by the first `load`. now_ns: the present time."""
+    def __init__(self, path: Path, elsewhere: Elsewhere | None = None, now_ns: int = 0) -> None:
+        """elsewhere: asked once, by the first `load`; None: nobody is. now_ns: the present time."""
         self.path = path
         self.note = ""
-        """one line, if `load` has found a newer snapshot than that of the file"""
+        """one line, if `load` has found a newer snapshot than that of the file, or may have missed one"""
         self._elsewhere = elsewhere
-        self._kept: Sequence[ScorerSnapshot] | None = None
+        self._kept: Sequence[ScorerSnapshot] = ()
+        self._is_asked = False
         self._now_ns = now_ns
         self._former = path.with_suffix(FORMER_SUFFIX)
         self._lock: int | None = None
@@ -92,9 +93,14 @@ class SnapshotStore:
             StageError: there is a file, and it cannot be read.
         """
         own = self._read()
-        if self._kept is None:
+        if self._elsewhere is None:
+            return own
+        if not self._is_asked:
             is_recent = own is not None and own.t_ns > self._now_ns - RECENT_NS
-            self._kept = self._elsewhere(not is_recent)
+            self._kept, why = self._elsewhere(not is_recent)
+            self._is_asked = True
+            from_what = "from the file here" if own else "without a snapshot"
+            self.note = f"continued {from_what}: {why}" if why else ""
         found = [*([own] if own else []), *self._kept]
         last = max(found, key=lambda each: (each.t_ns <= self._now_ns + AHEAD_NS, each.t_ns), default=None)
         if last is not None and last is not own:
@@ -113,9 +119,10 @@ class SnapshotStore:
         except OSError as error:
             raise StageError(f"{path}: cannot read the scorer's snapshot: {error.strerror}") from error
         except CodecError as error:
+            start = "continue from the one that the recorder keeps, or" if self._elsewhere else "start"
             raise StageError(
-                f"{path}: not a scorer's snapshot ({error}); remove it to continue from the one that the recorder "
-                "keeps, or without one: all fans are then commissioned again"
+                f"{path}: not a scorer's snapshot ({error}); remove it to {start} without one: all fans are then "
+                "commissioned again"
             ) from error
 
     def save(self, snapshot: ScorerSnapshot) -> None:

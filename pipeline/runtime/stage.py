@@ -94,8 +94,9 @@ class Source(Protocol):
 class Kept(Protocol):
     """The snapshots that other stages keep: `pipeline.runtime.kept_snapshots`."""
 
-    def of(self, tray: str, *, is_patient: bool) -> Sequence[ScorerSnapshot]:
-        """The last one of a tray that each stage keeps. is_patient: wait for a stage that is not there yet."""
+    def of(self, tray: str, *, is_patient: bool) -> tuple[Sequence[ScorerSnapshot], str]:
+        """The last one of a tray that each stage keeps, and why there may be others, for people; empty: there are none.
+        is_patient: wait for a stage that is not there yet."""
         ...
 
 

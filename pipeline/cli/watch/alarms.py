@@ -247,7 +247,8 @@ def wait_for_stages(
         if time.monotonic() > until_s or stop.wait(_POLL_S):
             break
     if not scorers:
-        of_tray = f" for tray {tray}" if tray else ""
+        has_others = any(key.startswith(scorer) for key in alive)
+        of_tray = f" for tray {tray}" if tray and has_others else ""
         where = f"no scorer of site {config.site!r} answers at {config.bus.endpoint}{of_tray}"
         raise UserError(f"{what} unknown: {where}; is `fantwin up -c {config.path}` running?")
 

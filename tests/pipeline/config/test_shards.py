@@ -19,6 +19,7 @@ from pipeline.config.shards import (
 )
 from pipeline.errors import UserError
 from pipeline.launch.processes import process_list
+from pipeline.runtime.sessions import Session
 
 NAMES = ("a", "b", "c", "d", "e")
 WHOLE = Shard("all", NAMES)
@@ -44,6 +45,13 @@ def test_the_shards_of_a_stage_have_every_tray_once_and_differ_by_one_at_most(nu
     sizes = [len(shard.trays) for shard in shards]
     assert len(sizes) == number
     assert max(sizes) - min(sizes) <= 1
+
+
+def test_a_tray_called_all_is_one_tray():
+    first, second = shards_of("acquisition", site(names=("all", "b")))
+    sessions = [Session.of_this_process("acquisition", shard, 1, "p") for shard in (first, second)]
+    assert [session.trays for session in sessions] == [("all",), ("b",)]
+    assert not sessions[0].shares_a_tray_with(sessions[1])
 
 
 def test_a_tray_that_is_added_at_the_end_moves_no_other_one():

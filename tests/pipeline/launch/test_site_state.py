@@ -144,13 +144,13 @@ def test_a_stage_that_stopped_in_order_is_a_fault_only_where_the_configuration_a
 
 
 def test_a_replay_takes_the_place_of_acquisition():
-    rows = [StageProcess("acquisition", Shard("tray1", ("tray1",)))]
+    rows = [StageProcess("acquisition", Shard("tray1", ("tray1",), ("--trays", "tray1")))]
     assert [state.word for state in stage_states([], [], rows)] == [Word.MISSING]
     assert stage_states([], [("replay", "all")], rows) == []
 
 
 def test_processes_that_were_started_with_other_shards_are_in_the_place_of_those_that_have_the_same_trays():
-    halves = [StageProcess("resampler", Shard(f"{n}-of-2", (f"tray{n}",))) for n in (1, 2)]
+    halves = [StageProcess("resampler", Shard(f"{n}-of-2", (f"tray{n}",), ("--shard", f"{n}/2"))) for n in (1, 2)]
     seen = [("resampler", "all")]
     whole = view(PRODUCER, published_before=800)
     assert [(state.label, state.is_expected) for state in stage_states([whole], seen, halves)] == [("resampler", True)]

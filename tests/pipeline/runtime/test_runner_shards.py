@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from pipeline.runtime.stage import BuiltStage
-from schemas.codec import encode, type_name
-from schemas.messages import Grid, Header, Health, Message, StageStatus
-from schemas.topics import BY_NAME, health_key
+from schemas.codec import decode, encode, type_name
+from schemas.messages import Grid, Header, Health, Message, ScorerSnapshot, StageStatus
+from schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.running_chain import eventually
-from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, toy
+from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, Silent, ToyConfig, toy
 
 
 def test_a_shard_reads_its_trays_only_and_says_in_its_health_which_they_are(config):
@@ -60,3 +62,34 @@ def test_a_shard_receives_the_health_of_every_process_that_has_one_of_its_trays_
     bench.end()
     assert [instance for stage, instance in heard if stage == "scorer"] == ["2-of-2", "a+b", "all"]
     assert ("resampler", TRAY_B) in heard, "its own"
+
+
+def test_a_recorder_that_is_behind_gives_the_last_snapshot_that_had_arrived(config):
+    is_behind, may_go_on = threading.Event(), threading.Event()
+
+    class Behind(Silent):
+        def step(self, item: Any) -> Sequence[Message]:
+            is_behind.set()
+            assert may_go_on.wait(20)
+            return []
+
+    config = replace(config, sections={"recorder": ToyConfig()})
+    stage = toy(lambda _context: BuiltStage(Behind()), name="recorder", reads=("raw", "snapshot"), writes=())
+    bench = Bench(stage, config)
+    key = tray_key("s", TRAY_A, "snapshot")
+    scorer = bench.bus.publisher(key, BY_NAME["snapshot"], type_name(ScorerSnapshot), "scorer-all-1")
+    for number in (0, 1):
+        message = ScorerSnapshot(
+            header=Header("scorer-all-1", number, TRAY_A), t_ns=number, twin_sha256="", state_json=""
+        )
+        scorer.put(encode(message))
+        assert is_behind.wait(20)
+    found: list[tuple[list[bytes], bool]] = []
+    thread = threading.Thread(target=lambda: found.append(bench.bus.ask_for_kept(key, 20.0)))
+    thread.start()
+    eventually(lambda: bench.runner._inbox.waiting() > 1, "the second snapshot and the question wait")
+    may_go_on.set()
+    thread.join(20)
+    bench.end()
+    ((payload,), have_answered) = found[0]
+    assert (decode(ScorerSnapshot, payload).t_ns, have_answered) == (1, True)

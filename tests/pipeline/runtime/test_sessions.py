@@ -24,7 +24,7 @@ from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, raw, toy
 
 FIRST = Session("acquisition", TRAY_A, 100, "acquisition-a-1111", "board", 4711, (TRAY_A,))
 SECOND = Session("acquisition", TRAY_A, 200, "acquisition-a-2222", "rack", 4712, (TRAY_A,))
-SHARD_A = Shard(TRAY_A, (TRAY_A,))
+SHARD_A = Shard(TRAY_A, (TRAY_A,), ("--trays", TRAY_A))
 ONE_LINE = (
     "acquisition/a runs twice: process 4711 on board is ignored, because process 4712 on rack started later; "
     "stop one of them"
@@ -68,7 +68,9 @@ def known(*sessions: Session) -> Sessions:
     return found
 
 
-@pytest.mark.parametrize("session", [shard("all", 1), shard("a", 2, "a"), shard("2-of-4", 3, "b", "c-d")])
+@pytest.mark.parametrize(
+    "session", [shard("all", 1), shard("a", 2, "a"), shard("2-of-4", 3, "b", "c-d"), shard("all", 4, "all")]
+)
 def test_row_07_a_token_says_the_trays_of_its_session(session):
     assert Session.of_key(session.key("s")) == session
 
@@ -111,7 +113,7 @@ def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(
             "resampler of site 's' cannot start: resampler/a+x already has trays a, x: process 1 on board; stop that, "
             "or give this one other trays"
         )
-        Runner(toy(), config, Shard(TRAY_B, (TRAY_B,)), stop).run()
+        Runner(toy(), config, Shard(TRAY_B, (TRAY_B,), ("--trays", TRAY_B)), stop).run()
 
 
 def test_row_07_the_sessions_remembered_are_bounded():

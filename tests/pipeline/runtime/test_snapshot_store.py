@@ -85,17 +85,17 @@ def test_a_file_that_is_no_snapshot_is_refused_in_one_line(tmp_path: Path) -> No
     with pytest.raises(StageError) as refused:
         SnapshotStore(path).load()
     assert str(refused.value).startswith(f"{path}: not a scorer's snapshot")
-    assert "remove it to continue from the one that the recorder keeps" in str(refused.value) and "\n" not in str(
-        refused.value
-    )
+    assert "remove it to start without" in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_half_a_snapshot_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "m.snapshot"
     SnapshotStore(path).save(snapshot(100))
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(StageError, match="remove it to continue from the one that the recorder keeps"):
+    with pytest.raises(StageError, match="remove it to start without"):
         SnapshotStore(path).load()
+    with pytest.raises(StageError, match="remove it to continue from the one that the recorder keeps, or without"):
+        SnapshotStore(path, lambda _is_patient: ((), "")).load()
 
 
 def test_a_file_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_a_removed_snapshot_does_not_bring_back_the_one_of_an_earlier_version(tm
 
 
 def test_of_a_file_and_what_others_keep_the_newest_counts(tmp_path: Path) -> None:
-    store = SnapshotStore(tmp_path / "m.snapshot", lambda _is_patient: [snapshot(5), snapshot(9)])
+    store = SnapshotStore(tmp_path / "m.snapshot", lambda _is_patient: ([snapshot(5), snapshot(9)], ""))
     store.save(snapshot(7))
     found = store.load()
     assert found and found.t_ns == 9
@@ -133,7 +133,7 @@ def test_of_a_file_and_what_others_keep_the_newest_counts(tmp_path: Path) -> Non
 
 def test_a_snapshot_of_a_clock_that_was_ahead_does_not_hide_the_last_one(tmp_path: Path) -> None:
     SnapshotStore(tmp_path / "m.snapshot").save(snapshot(3 * AHEAD_NS))
-    store = SnapshotStore(tmp_path / "m.snapshot", lambda _is_patient: [snapshot(AHEAD_NS)], now_ns=AHEAD_NS)
+    store = SnapshotStore(tmp_path / "m.snapshot", lambda _is_patient: ([snapshot(AHEAD_NS)], ""), now_ns=AHEAD_NS)
     found = store.load()
     assert found and found.t_ns == AHEAD_NS
 
@@ -144,9 +144,9 @@ def test_others_are_waited_for_where_there_is_no_recent_file_and_are_asked_once(
 ) -> None:
     asked: list[bool] = []
 
-    def elsewhere(is_patient: bool) -> list[ScorerSnapshot]:
+    def elsewhere(is_patient: bool) -> tuple[list[ScorerSnapshot], str]:
         asked.append(is_patient)
-        return []
+        return [], "no recorder was there"
 
     store = SnapshotStore(tmp_path / "m.snapshot", elsewhere, now_ns=2 * RECENT_NS + 1)
     if t_ns is not None:
@@ -154,3 +154,5 @@ def test_others_are_waited_for_where_there_is_no_recent_file_and_are_asked_once(
     store.load()
     store.load()
     assert asked == [is_patient]
+    from_what = "without a snapshot" if t_ns is None else "from the file here"
+    assert store.note == f"continued {from_what}: no recorder was there", "nothing is forgotten without a word"
