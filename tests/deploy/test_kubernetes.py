@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,13 @@ def container(stateful_set: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("version", [OLDEST, NEWEST])
 @pytest.mark.parametrize(
-    "values", [{}, {"stages": MANY, "files": {"configMap": {"name": "twins"}}}, {"router": {"enabled": False}}], ids=str
+    "values",
+    [
+        {},
+        {"stages": MANY, "files": {"configMap": {"name": "twins"}}, "image": {"pullSecrets": [{"name": "registry"}]}},
+        {"router": {"enabled": False}},
+    ],
+    ids=str,
 )
 def test_what_is_rendered_fits_the_schemas_of_kubernetes(values, version):
     documents = rendered(**values)
@@ -75,6 +82,7 @@ def test_helm_finds_nothing_to_complain_about():
     [
         {"stages": {"scorer": {"shards": -1}}},
         {"stages": {"scorer": {"shards": 1, "storage": "much"}}},
+        {"image": {"pullSecrets": ["registry"]}},
         {"stage": {}},
         {"config": ""},
     ],
@@ -90,7 +98,33 @@ def test_the_values_name_every_stage_in_the_order_of_the_data_flow():
 
 
 def test_a_stage_without_shards_has_no_pods():
-    assert "plant-scorer" not in of_kind("StatefulSet", rendered(stages={"scorer": {"shards": 0}}))
+    assert set(of_kind("StatefulSet", rendered(stages={"scorer": {"shards": 0}}))) == {
+        f"plant-{stage}-of-1" for stage in ("resampler", "twin-integrator", "recorder")
+    }
+
+
+def test_another_number_of_shards_is_another_set_with_pods_and_a_service_of_its_own():
+    for shards in (2, 3):
+        (of_scorer,) = (
+            each
+            for name, each in of_kind("StatefulSet", rendered(stages={"scorer": {"shards": shards}})).items()
+            if "scorer" in name
+        )
+        assert of_scorer["metadata"]["name"] == of_scorer["spec"]["serviceName"] == f"plant-scorer-of-{shards}"
+    long = "a-release-whose-name-is-as-long-as-helm-allows-53-cha"
+    with helm.Chart.load(str(CHART)) as chart:
+        files = chart.render(
+            {"config": CONFIGURATION, "stages": {"scorer": {"shards": 4096}}}, name=long, namespace="f"
+        )
+    names = of_kind("StatefulSet", [each for text in files.values() for each in yaml.safe_load_all(text) if each])
+    assert all(re.fullmatch(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?", name) for name in names)
+    assert max(map(len, names)) <= 52, "the hash of the revision is appended to it in a label of 63 characters"
+
+
+def test_the_pods_of_the_scorer_ask_for_the_snapshots_of_those_before_them(stages):
+    for stage, stateful_set in stages.items():
+        words = container(stateful_set)["args"]
+        assert ("--set=scorer.asks_for_snapshots=true" in words) == (stage == "scorer")
 
 
 @pytest.mark.parametrize("stage", STAGES)

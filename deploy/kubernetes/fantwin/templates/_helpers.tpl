@@ -18,6 +18,12 @@ app.kubernetes.io/component: {{ .part }}
 {{ printf "%s-%s" .root.Release.Name (.part | replace "_" "-") | trunc 52 | trimSuffix "-" }}
 {{- end }}
 
+{{- /* The name of the set of a stage. The number of shards is in it: where that changes, every pod gets other trays. So a
+new set takes the place of the old one; a rolling update would wait for pods that the old ones keep from starting. */}}
+{{- define "fantwin.set" -}}
+{{ printf "%s-%s" .root.Release.Name (.part | replace "_" "-") | trunc 44 | trimSuffix "-" }}-of-{{ .shards }}
+{{- end }}
+
 {{- define "fantwin.image" -}}
 {{ .Values.image.repository }}:{{ .Values.image.tag | default .Chart.AppVersion }}
 {{- end }}
@@ -28,6 +34,9 @@ app.kubernetes.io/component: {{ .part }}
 
 {{- define "fantwin.podSecurity" -}}
 automountServiceAccountToken: false
+{{- with .Values.image.pullSecrets }}
+imagePullSecrets: {{- toYaml . | nindent 2 }}
+{{- end }}
 securityContext:
   runAsNonRoot: true
   runAsUser: 1000
