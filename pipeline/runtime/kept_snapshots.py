@@ -66,7 +66,7 @@ class KeptSnapshots:
 
     def __init__(
         self,
-        bus: Bus,
+        bus: Callable[[], Bus],
         site: str,
         stop: threading.Event,
         wait_for_predecessor: Callable[[], None],
@@ -75,9 +75,9 @@ class KeptSnapshots:
         is_one_expected: bool,
         keeper_limit_s: float = KEEPER_LIMIT_S,
     ) -> None:
-        """wait_for_predecessor: returns when no other process has these trays, so that no snapshot is still to come.
-        answer_limit_s: how long to wait for an answer. is_one_expected: whether the configuration has a stage that
-        keeps snapshots; if so, it is waited for up to keeper_limit_s."""
+        """bus: joins it, if it is not joined yet. wait_for_predecessor: returns when no other process has these trays,
+        so that no snapshot is still to come. answer_limit_s: how long to wait for an answer. is_one_expected: whether
+        the configuration has a stage that keeps snapshots; if so, it is waited for up to keeper_limit_s."""
         self._bus = bus
         self._site = site
         self._stop = stop
@@ -98,25 +98,27 @@ class KeptSnapshots:
             self._wait_for_predecessor()
             self._began_s = time.monotonic()
         is_patient = is_patient and self._is_one_expected
-        limit_s = self._keeper_limit_s if is_patient else GOSSIP_S if self._bus.came_second else 0.0
-        is_kept = self._wait_for_keeper(tray, self._began_s + limit_s)
-        payloads, have_answered = self._bus.ask_for_kept(tray_key(self._site, tray, SNAPSHOT), self._answer_limit_s)
+        bus = self._bus()
+        limit_s = self._keeper_limit_s if is_patient else GOSSIP_S if bus.came_second else 0.0
+        is_kept = self._wait_for_keeper(bus, tray, self._began_s + limit_s)
+        payloads, have_answered = bus.ask_for_kept(tray_key(self._site, tray, SNAPSHOT), self._answer_limit_s)
         why = f"no recorder of this tray was there within {limit_s:g} s" if is_patient and not is_kept else ""
         if not have_answered:
             why = f"a recorder did not answer within {self._answer_limit_s:g} s"
             self._answer_limit_s = min(self._answer_limit_s, IMPATIENT_S)
         return [snapshot for snapshot in map(_decoded, payloads) if snapshot is not None], why
 
-    def _wait_for_keeper(self, tray: str, until_s: float) -> bool:
+    def _wait_for_keeper(self, bus: Bus, tray: str, until_s: float) -> bool:
         """Whether a stage that keeps the snapshots of a tray is there in time."""
-        while not (is_there := self._has_keeper(tray)) and time.monotonic() < until_s:
+        while not (is_there := self._has_keeper(bus, tray)) and time.monotonic() < until_s:
             if self._stop.wait(_POLL_S):
                 break
         return is_there
 
-    def _has_keeper(self, tray: str) -> bool:
-        sessions = map(Session.of_key, self._bus.alive(sessions_key(self._site)))
-        return any(each is not None and keeps_snapshots(each.stage) and each.has(tray) for each in sessions)
+    def _has_keeper(self, bus: Bus, tray: str) -> bool:
+        keepers = filter(keeps_snapshots, STAGES)
+        tokens = (token for stage in keepers for token in bus.alive(sessions_key(self._site, stage)))
+        return any(each is not None and each.has(tray) for each in map(Session.of_key, tokens))
 
 
 def keeps_snapshots(stage: str) -> bool:

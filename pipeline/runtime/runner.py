@@ -17,22 +17,20 @@ from dataclasses import replace
 from itertools import chain
 
 from pipeline.bus.kept_messages import KeptQuery
-from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.config.shards import Shard, chosen_shard
 from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.runtime.building import abort, build_parts, context_of
+from pipeline.runtime.building import build_and_join
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
 from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness, Recovered
-from pipeline.runtime.kept_snapshots import KeptForOthers, KeptSnapshots, keeps_snapshots
+from pipeline.runtime.kept_snapshots import KeptForOthers
 from pipeline.runtime.notifier import Notifier
 from pipeline.runtime.outputs import Outputs
 from pipeline.runtime.peers import Peers
 from pipeline.runtime.recovery import Recovery
-from pipeline.runtime.second_owner import refuse_second
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.sessions import Session, Sessions
 from pipeline.runtime.sources import Sources
@@ -65,7 +63,7 @@ class Runner:
         stop: threading.Event,
         on_health: Callable[[Health], None] | None = None,
     ) -> None:
-        """Join the bus and build the stage. `shard` says which trays it has, None: all; `stop` ends `run`; `on_health`
+        """Build the stage and join the bus. `shard` says which trays it has, None: all; `stop` ends `run`; `on_health`
         is called with each health message while it runs.
 
         Raises:
@@ -84,31 +82,13 @@ class Runner:
         self._inbox = Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
         started_t_ns = HOST_CLOCK.now_ns()
-        self._bus = Bus(config.bus, stop)  # before the stage is built: it may continue from what others keep
         self._due: deque[Envelope] = deque()
         """messages in sequence, to be processed before anything else: recovered ones are many at a time"""
         self._sources = Sources(self._inbox)
         self._clock = StageClock()
         self._sessions = Sessions()
         self._session = Session.of_this_process(stage.name, shard, started_t_ns, self.producer)
-        self._parts: dict[str, BuiltStage] = {}
-        """by the tray that a core serves; an empty name: all"""
-        refuse_others = functools.partial(refuse_second, self._bus, config.site, self._session, stop)
-        kept = KeptSnapshots(
-            self._bus,
-            config.site,
-            stop,
-            refuse_others,
-            config.bus.recovery_timeout_s,
-            is_one_expected=any(map(keeps_snapshots, config.stages)),
-        )
-        try:
-            self._parts = build_parts(stage, context_of(stage, config, shard, started_t_ns, kept))
-            refuse_others()
-        except BaseException:
-            abort(self._parts)
-            self._bus.close()
-            raise
+        self._bus, self._parts = build_and_join(stage, config, shard, self._session, stop)
         before = {key: payload for parts in self._parts.values() for key, payload in parts.kept.items()}
         self._kept = KeptForOthers(
             self._bus, config.site, STAGES[stage.name].keeps, self.producer, before, self._inbox.put

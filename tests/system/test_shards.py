@@ -10,6 +10,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +22,10 @@ from pipeline.config.models import BusConfig
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.reading import read_recording
 from schemas.codec import decode, encode, type_name
-from schemas.messages import Action, Alarm, Header, Prediction, Request, Score, ScorerSnapshot, Transition
+from schemas.messages import Alarm, Header, Score, ScorerSnapshot, Transition
 from schemas.topics import BY_NAME, tray_key
 from tests.support.running_chain import RunningCommand, eventually, fantwin
-from tests.support.scored_blocks import EPOCH_NS, LIVELY, STEP_NS, prediction_of, request_of
+from tests.support.scored_blocks import EPOCH_NS, LIVELY, STEP_NS, prediction_of
 from tests.support.twin_files import write_twin
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
@@ -65,7 +66,6 @@ class Shards:
         self.bus = Bus(BusConfig(endpoint=endpoint))
         self.watcher = SiteWatcher(self.bus, SITE)
         self._publishers = {name: self._publisher(name, "prediction", "twin_integrator-all-1") for name in TRAYS}
-        self._operator = self._publisher("b", "request", "operator-1")
         self.bus.subscribe(tray_key(SITE, "*", "alarm"), self._hear_alarm)
         self.bus.subscribe(tray_key(SITE, "*", "score"), self._hear_score)
         self.bus.subscribe(tray_key(SITE, "*", "snapshot"), self._count_snapshot)
@@ -111,14 +111,8 @@ class Shards:
                     residual[:, FAULTY] += 20.0 * (numbers[:, 0] >= FAULT_FROM)
                 header = Header("twin_integrator-all-1", publisher.published, tray)
                 message = prediction_of(residual.astype(np.float64), first=first)
-                publisher.put(encode(Prediction(**{**vars_of(message), "header": header})))
+                publisher.put(encode(replace(message, header=header)))
                 self._sent[tray] += BLOCK
-
-    def ask(self, action: Action) -> None:
-        """Publish a request about the faulty fan."""
-        request = request_of(action, FAULTY)
-        header = Header("operator-1", self._operator.published, "b")
-        self._operator.put(encode(Request(**{**vars_of(request), "header": header})))
 
     def scored(self, tray: str) -> int:
         with self._lock:
@@ -151,10 +145,6 @@ class Shards:
             self._scored[key.split("/")[2]].update(decode(Score, payload).t_ns.tolist())
 
 
-def vars_of(message: Prediction | Request) -> dict[str, object]:
-    return {name: getattr(message, name) for name in message.__dataclass_fields__}
-
-
 @pytest.fixture
 def shards(tmp_path: Path, endpoint: str) -> Iterator[Shards]:
     shards = Shards(tmp_path, endpoint)
@@ -177,7 +167,8 @@ def counter(shards: Shards, stage: str, name: str) -> int:
 def alarm_is_raised_and_acknowledged(shards: Shards) -> Alarm:
     shards.feed(20)
     eventually(lambda: shards.heard(Transition.DIAGNOSED), "the fault has an alarm and a cause")
-    shards.ask(Action.ACKNOWLEDGE)
+    asked = fantwin("alarms", "ack", "b", FAULTY, *shards.words("here"))
+    assert asked.returncode == 0, asked.stderr
     (acknowledged,) = eventually(lambda: shards.heard(Transition.ACKNOWLEDGED), "it is acknowledged")
     assert (acknowledged.header.tray, acknowledged.fan, acknowledged.active) == ("b", FAULTY, True)
     return acknowledged

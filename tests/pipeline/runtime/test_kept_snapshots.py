@@ -45,7 +45,7 @@ def asking(
     wait_for_predecessor: Callable[[], None] = lambda: None,
 ) -> KeptSnapshots:
     return KeptSnapshots(
-        bus,
+        lambda: bus,
         "s",
         threading.Event(),
         wait_for_predecessor,
@@ -57,7 +57,6 @@ def asking(
 
 def keeping(bus: Bus, before: Mapping[str, bytes], producer: str = RECORDER.producer) -> KeptForOthers:
     """What a recorder keeps that answers at once."""
-
 
     def answer(query: KeptQuery) -> None:
         kept.answer(query)

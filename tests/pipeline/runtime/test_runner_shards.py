@@ -7,7 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from pipeline.runtime.stage import BuiltStage
+import pytest
+
+from pipeline.runtime.runner import Runner
+from pipeline.runtime.stage import BuiltStage, Context, StageError
 from schemas.codec import decode, encode, type_name
 from schemas.messages import Grid, Header, Health, Message, ScorerSnapshot, StageStatus
 from schemas.topics import BY_NAME, health_key, tray_key
@@ -93,3 +96,12 @@ def test_a_recorder_that_is_behind_gives_the_last_snapshot_that_had_arrived(conf
     bench.end()
     ((payload,), have_answered) = found[0]
     assert (decode(ScorerSnapshot, payload).t_ns, have_answered) == (1, True)
+
+
+def test_a_stage_that_cannot_be_built_says_so_although_its_router_is_away(config):
+    def build(_context: Context) -> BuiltStage:
+        raise StageError("there is no twin")
+
+    config = replace(config, bus=config.bus.model_copy(update={"mode": "client"}))
+    with pytest.raises(StageError, match="there is no twin"):
+        Runner(toy(build), config, None, threading.Event())
