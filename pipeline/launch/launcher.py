@@ -323,24 +323,30 @@ class Launcher:
         return child is None or child.exit_status() is not None or self._watcher.is_ready(child.process_id)
 
     def _stop_all(self) -> None:
-        """Stop in the order of the data flow: each stage ends when it has processed all that was sent to it."""
-        for slot in self._slots:
-            if slot.child is None:
-                continue
-            status = slot.child.stop(self._config.launcher.stop_timeout_s)
-            if status is None:
-                self.outcome.killed.append(slot.row.label)
-                self._say(f"{slot.row.label}: did not stop in {self._config.launcher.stop_timeout_s:.0f} s, killed")
-            elif status not in _ORDERLY:
-                self.outcome.failed.append(slot.row.label)
-                self._say(f"{slot.row.label}: ended with status {status}: {slot.child.last_line}")
-            elif not self._has_reported(slot):
-                self.outcome.failed.append(slot.row.label)
-                self._say(f"{slot.row.label}: its last health message did not arrive: what it lost is unknown")
-            elif self._is_started and not slot.was_ready:
-                self.outcome.failed.append(slot.row.label)
-                self._say(f"{slot.row.label}: was never ready: it has received nothing")
-            slot.child = None
+        """Stop in the order of the data flow: each stage ends when it has processed all that was sent to it. Its
+        processes end together."""
+        for stage in dict.fromkeys(slot.row.stage for slot in self._slots):
+            of_stage = [(slot, slot.child) for slot in self._slots if slot.row.stage == stage and slot.child]
+            for _, child in of_stage:
+                child.terminate()
+            for slot, child in of_stage:
+                self._stop(slot, child)
+
+    def _stop(self, slot: _Slot, child: Child) -> None:
+        status = child.stop(self._config.launcher.stop_timeout_s)
+        if status is None:
+            self.outcome.killed.append(slot.row.label)
+            self._say(f"{slot.row.label}: did not stop in {self._config.launcher.stop_timeout_s:.0f} s, killed")
+        elif status not in _ORDERLY:
+            self.outcome.failed.append(slot.row.label)
+            self._say(f"{slot.row.label}: ended with status {status}: {child.last_line}")
+        elif not self._has_reported(slot):
+            self.outcome.failed.append(slot.row.label)
+            self._say(f"{slot.row.label}: its last health message did not arrive: what it lost is unknown")
+        elif self._is_started and not slot.was_ready:
+            self.outcome.failed.append(slot.row.label)
+            self._say(f"{slot.row.label}: was never ready: it has received nothing")
+        slot.child = None
 
     def _has_reported(self, slot: _Slot) -> bool:
         """Whether the last health message of a stage, with its counts, has arrived; it may arrive after the process

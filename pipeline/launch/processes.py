@@ -71,6 +71,7 @@ class Child:
         for override in overrides:
             command += ["--set", override]
         self.row = row
+        self._is_asked_to_end = False
         self.started_s = time.monotonic()
         self.last_line = ""
         self._on_line = on_line
@@ -120,13 +121,18 @@ class Child:
         """End it at once: it hangs, and catches no other signal."""
         self._process.kill()
 
+    def terminate(self) -> None:
+        """Ask it to end, once: a second signal would end it at once."""
+        if not self._is_asked_to_end and self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+        self._is_asked_to_end = True
+
     def stop(self, timeout_s: float) -> int | None:
         """Terminate it and wait; returns its exit status, None when it had to be killed.
 
         A process that was still starting does not catch the signal yet. It ends by it, as asked: status 0.
         """
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGTERM)
+        self.terminate()
         try:
             status = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:

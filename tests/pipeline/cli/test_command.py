@@ -18,7 +18,7 @@ from pipeline.config.models import BusConfig, TrayConfig
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode, type_name
 from schemas.messages import Header, Health, StageStatus
-from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from schemas.topics import BY_NAME, alive_key, health_key
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO, Chain, RunningCommand, eventually, fantwin
 
