@@ -59,7 +59,7 @@ class Host:
         _ip(f"link set {self.name} up")
 
     def vanish(self) -> None:
-        """Cut it off and kill all of its processes; nobody is told."""
+        """Cut it off and kill all of its processes: no connection is closed."""
         self.cut()
         self.kill()
 
