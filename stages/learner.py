@@ -3,8 +3,8 @@
 Reads: topic `raw` (samples), `score` (whether a fan has an alarm), and `request` (fans that are commissioned again).
 Writes: topic `new_twin`: the version in force, at start and when it changes; while a fan has an alarm, the one before.
 Timing: a version is made when the healthy history has doubled, at least once in a week of healthy running, and after
-four hours of healthy running since an operator has commissioned fans again; none while a fan has an alarm. The fans are
-checked against the reference after a day of running, also with alarms.
+four hours of healthy running since an operator has commissioned fans again. While a fan has an alarm, only a version
+that is offered may be made, for most fans have changed alike: that is checked beside alarms as well.
 
 It keeps the healthy history (pipeline.learning.healthy_history) and starts `fantwin learn` beside the stages, which
 makes the next version and decides whether it takes over (pipeline.cli.twins.next_version). An operator can change the
@@ -143,9 +143,12 @@ class LearnerCore(Core):
             found.append(f"{current.name} waits: it takes over when no fan has an alarm, by the scores of all fans")
         if fans := self._alarm_fans:
             named = f"fan {fans[0]} has" if len(fans) == 1 else f"fans {', '.join(map(str, fans))} have"
-            found.append(f"no new version while {named} an alarm")
+            found.append(f"no version takes over while {named} an alarm")
         work_s = self._learning.seconds
-        return [*found, f"making the next version, for {work_s:.0f} s"] if work_s is not None else found
+        if work_s is None:
+            return found
+        doing = "checking the fans" if self._schedule.work == "check" else "making the next version"
+        return [*found, f"{doing}, for {work_s:.0f} s"]
 
     def problem(self) -> str:
         """Why nothing is learned, or that a version waits for the operator."""

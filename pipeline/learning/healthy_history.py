@@ -5,7 +5,7 @@
 
 A sample counts as healthy only when the fans have been judged for `hold_back_s` after it without an alarm, since a
 fault begins before its alarm. Until there is a twin, nobody can raise an alarm, and nothing is held back: the fans must
-be healthy. No twin takes over that was learned from samples near an alarm; they show when all fans have changed alike.
+be healthy. No twin takes over that was learned from samples near an alarm; they show when most fans have changed alike.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 
 from pipeline.learning.history_recordings import (
     LONGEST_GAP_NS,
+    HistoryProblems,
     HistoryRecording,
     HistoryRecordings,
     last_t_ns,
@@ -31,7 +32,7 @@ from schemas.units import NS_PER_S
 
 HEALTHY, NEAR_ALARMS = "healthy", "near_alarms"
 NEAR_ALARMS_KEPT_S = 24 * 3600.0
-"""of running near alarms"""
+"""of running near alarms: about so much, in whole recordings"""
 LONGEST_LAG_NS = 1800 * NS_PER_S
 """of the scores behind the samples; samples that wait longer to be judged are discarded"""
 
@@ -73,9 +74,11 @@ class HealthyHistory:
         """hold_back_s: see above. kept_s: of healthy running outside the excluded time spans, and as much within them;
         older recordings are deleted, except for the first."""
         key = tray_key(site, tray, "raw")
-        self._healthy = HistoryRecordings(folder / HEALTHY, key, metadata, attachments, kept_s=kept_s, keeps_first=True)
+        self._problems = HistoryProblems()
+        given = key, metadata, attachments, self._problems
+        self._healthy = HistoryRecordings(folder / HEALTHY, *given, kept_s=kept_s, keeps_first=True)
         self._near_alarms = HistoryRecordings(
-            folder / NEAR_ALARMS, key, metadata, attachments, kept_s=NEAR_ALARMS_KEPT_S, keeps_first=False
+            folder / NEAR_ALARMS, *given, kept_s=NEAR_ALARMS_KEPT_S, keeps_first=False
         )
         self._both = self._healthy, self._near_alarms
         self._hold_back_ns = round(hold_back_s * NS_PER_S)
@@ -93,7 +96,7 @@ class HealthyHistory:
     @property
     def problem(self) -> str:
         """Why samples are not kept, or a recording was not; empty if all is well."""
-        return "; ".join(filter(None, (each.problem for each in self._both)))
+        return "; ".join(filter(None, (self._problems.write, self._problems.finish)))
 
     @property
     def end_t_ns(self) -> int:
@@ -109,9 +112,9 @@ class HealthyHistory:
         """The same of those recordings that begin at a time or later."""
         return self._healthy.seconds_since(t_ns)
 
-    def all_seconds_since(self, t_ns: int) -> float:
-        """The same with the running near alarms."""
-        return sum(each.seconds_since(t_ns) for each in self._both)
+    def seconds_near_alarms_since(self, t_ns: int) -> float:
+        """The same of running near alarms."""
+        return self._near_alarms.seconds_since(t_ns)
 
     @property
     def kept_since_t_ns(self) -> int:
@@ -140,6 +143,7 @@ class HealthyHistory:
         if first_t_ns <= self._resumes_t_ns:
             self._near_alarms.write(raw)
             return
+        self._near_alarms.finish()
         self._waiting.append(raw)
         if is_watched:
             self._discard_up_to(t_ns - self._hold_back_ns - LONGEST_LAG_NS)

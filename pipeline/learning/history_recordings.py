@@ -55,6 +55,16 @@ def recordings_in(place: Path, excluded: Sequence[TimeSpan] = ()) -> list[Histor
     return sorted((each for each in found if not overlap((each.span,), excluded)), key=lambda each: each.span)
 
 
+@dataclass
+class HistoryProblems:
+    """Why samples are not kept, of all folders of a tray."""
+
+    write: str = ""
+    """shown until samples are on the disk again, in any folder"""
+    finish: str = ""
+    """of a recording that could not be finished or repaired; shown until another one is finished"""
+
+
 class HistoryRecordings:
     """Writes the recordings of one folder; nobody else writes or deletes them."""
 
@@ -64,15 +74,17 @@ class HistoryRecordings:
         key: str,
         metadata: Mapping[str, str],
         attachments: Mapping[str, bytes],
+        problems: HistoryProblems,
         *,
         kept_s: float,
         keeps_first: bool,
     ) -> None:
-        """key: of the samples on the bus. kept_s: of running in the recordings outside the excluded time spans, and as
-        much in the others; older ones are deleted. keeps_first: except for the first."""
+        """key: of the samples on the bus. problems: of the tray, kept up to date. kept_s: of running in the recordings
+        outside the excluded time spans, and as much in the others; older ones are deleted. keeps_first: except for the
+        first."""
         self._place = place
         self._key = key
-        self._metadata, self._attachments = metadata, attachments
+        self._metadata, self._attachments, self._problems = metadata, attachments, problems
         self._kept_s, self._first_deleted = kept_s, int(keeps_first)
         self._writer: RecordingWriter | None = None
         self._span: TimeSpan = (0, 0)
@@ -82,16 +94,7 @@ class HistoryRecordings:
         self._excluded: Sequence[TimeSpan] = ()
         self.end_t_ns = 0
         """end of the newest finished recording; 0: none yet"""
-        self._write_problem = ""
-        """shown until samples are on the disk again"""
-        self._finish_problem = ""
-        """of a recording that could not be finished or repaired; shown until the next one is finished"""
         self._name_left()
-
-    @property
-    def problem(self) -> str:
-        """Why samples are not kept, or a recording was not; empty if all is well."""
-        return "; ".join(filter(None, (self._write_problem, self._finish_problem)))
 
     def seconds_since(self, t_ns: int) -> float:
         """Running in the recordings outside the excluded time spans that begin at a time or later, the open one as
@@ -140,9 +143,9 @@ class HistoryRecordings:
             writer.path.rename(self._path(span))
             self._list_finished()
             self._delete_oldest()
-            self._write_problem = self._finish_problem = ""
+            self._problems.write = self._problems.finish = ""
         except (OSError, RecordingError) as error:
-            self._finish_problem = f"{writer.path}: the history cannot be kept: {error}"
+            self._problems.finish = f"{writer.path}: the history cannot be kept: {error}"
             self._name_left()
 
     def flush(self) -> None:
@@ -150,7 +153,7 @@ class HistoryRecordings:
         if self._writer:
             try:
                 self._writer.flush()
-                self._write_problem = ""
+                self._problems.write = ""
             except RecordingError as error:
                 self._fail(error)
 
@@ -169,7 +172,7 @@ class HistoryRecordings:
         if writer:
             with suppress(OSError):
                 writer.discard()  # if it has not ended
-        self._write_problem = f"nothing is learned: {error}"
+        self._problems.write = f"samples are not kept for learning: {error}"
         self._name_left()
 
     def _path(self, span: TimeSpan) -> Path:
@@ -199,11 +202,11 @@ class HistoryRecordings:
             try:
                 self._name(path)
             except (OSError, RecordingError) as error:
-                self._finish_problem = f"{path}: cannot be repaired, so it is not learned from: {error}"
+                self._problems.finish = f"{path}: cannot be repaired, so it is not learned from: {error}"
         try:
             self._list_finished()
         except OSError as error:
-            self._finish_problem = f"{self._place}: cannot be read: {error.strerror}"
+            self._problems.finish = f"{self._place}: cannot be read: {error.strerror}"
 
     def _name(self, path: Path) -> None:
         """Repair it if it was not ended, and name it by its times; too short a recording is deleted."""

@@ -1,7 +1,7 @@
 """When the next version of a tray's twin is due, and when its fans are to be checked against the reference.
 
 Only recordings outside the excluded time spans count: versions and checks are made from no others. Running near alarms
-counts for checks only.
+counts for checks only: whether most fans have changed alike is seen there, too.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ Work: TypeAlias = Literal["version", "check"]
 LONGEST_WAIT_S = 7 * 24 * 3600.0
 """of healthy running between two versions"""
 CHECK_AFTER_S = 24 * 3600.0
-"""of running between two checks of the fans against the reference"""
+"""of healthy running between two checks of the fans against the reference; of all running if much was near alarms"""
 COMMISSIONED_CHECK_S = 4000.0
-"""of running after fans were commissioned again until they are checked: a little more than a check needs. If
-the twin no longer fits them, they have one alarm after the other"""
+"""of running of one kind, healthy or near alarms, after fans were commissioned again until they are checked: a little
+more than a check needs. If the twin no longer fits them, they have one alarm after the other"""
 AFTER_COMMISSIONING_S = 4 * 3600.0
 """of healthy running after fans were commissioned again until a version is made"""
 AGAIN_AFTER = 0.25
-"""after a failure, healthy running before the next attempt, as a share of the history"""
+"""after a failure, running before the next attempt, as a share of the history: healthy running for a version, all for a
+check"""
 AGAIN_AFTER_AT_MOST_S = 24 * 3600.0
-"""of healthy running before the next attempt"""
+"""of running before the next attempt"""
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,11 @@ class LearningSchedule:
         self._failures: dict[Work, _Failure] = {}
 
     @property
+    def work(self) -> Work:
+        """What was started last."""
+        return self._started
+
+    @property
     def failures(self) -> list[str]:
         """Why the last version and the last check failed, if they did."""
         return [failure.why for failure in self._failures.values()]
@@ -69,7 +75,8 @@ class LearningSchedule:
 
     def failed(self, why: str) -> None:
         """What was started last has failed."""
-        needed_s = max(min(AGAIN_AFTER * self._history.seconds, AGAIN_AFTER_AT_MOST_S), SHORTEST_RECORDING_S)
+        history_s = self._running_s(self._started, 0)
+        needed_s = max(min(AGAIN_AFTER * history_s, AGAIN_AFTER_AT_MOST_S), SHORTEST_RECORDING_S)
         self._failures[self._started] = _Failure(why, self._history.end_t_ns, needed_s, self._listed)
 
     def succeeded(self) -> None:
@@ -102,8 +109,12 @@ class LearningSchedule:
         failure = self._failures.get(work)
         if failure is None:
             return 0.0
-        of_work = self._history.all_seconds_since if work == "check" else self._history.seconds_since
-        return max(failure.needed_s - of_work(failure.end_t_ns), 0.0)
+        return max(failure.needed_s - self._running_s(work, failure.end_t_ns), 0.0)
+
+    def _running_s(self, work: Work, since_t_ns: int) -> float:
+        """Running since a time that counts for such work."""
+        healthy_s = self._history.seconds_since(since_t_ns)
+        return healthy_s + self._history.seconds_near_alarms_since(since_t_ns) if work == "check" else healthy_s
 
     def _needed_s(self, listed: VersionList) -> float | None:
         """As `version_wait_s`, but not above 0 where a version is due, and without failures."""
@@ -121,7 +132,13 @@ class LearningSchedule:
     def _is_check_due(self, listed: VersionList) -> bool:
         if not listed.versions:
             return False
-        checked_t_ns = listed.check.t_ns if listed.check else 0
-        newest_t_ns = max(listed.versions[-1].made_t_ns, listed.commissioned_t_ns, checked_t_ns)
-        needed_s = COMMISSIONED_CHECK_S if newest_t_ns == listed.commissioned_t_ns else CHECK_AFTER_S
-        return self._history.all_seconds_since(newest_t_ns) >= needed_s
+        made_t_ns, commissioned_t_ns = listed.versions[-1].made_t_ns, listed.commissioned_t_ns
+        checked_t_ns, looked_t_ns = (listed.check.t_ns, listed.check.near_t_ns) if listed.check else (0, 0)
+        newest_t_ns = max(made_t_ns, commissioned_t_ns, checked_t_ns)
+        near_t_ns = max(newest_t_ns, looked_t_ns)
+        near_s = self._history.seconds_near_alarms_since(near_t_ns)
+        is_near_due = near_s >= COMMISSIONED_CHECK_S and (
+            near_t_ns == commissioned_t_ns or self._running_s("check", near_t_ns) >= CHECK_AFTER_S
+        )
+        needed_s = COMMISSIONED_CHECK_S if newest_t_ns == commissioned_t_ns else CHECK_AFTER_S
+        return is_near_due or self._history.seconds_since(newest_t_ns) >= needed_s

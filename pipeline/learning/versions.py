@@ -45,7 +45,8 @@ class Drop(_Record):
 class Version(_Record):
     """One version, and why it took over or did not.
 
-    made_t_ns: time of the newest sample that it was learned from. hours: healthy running that its limits were set from.
+    made_t_ns: time of the newest sample that it was learned from. hours: running that its limits were set from, healthy
+    but for a version that was learned near alarms, too.
     learned_spans: of the recordings that it was learned from. since_t_ns: recordings from before this time are not
     used, because the fans have changed since. error: root mean square of the free-run residual over a part of the
     newest recording that it was not trained on, all fans together. error_before: the same of the version that was in
@@ -90,10 +91,11 @@ class Version(_Record):
 class Check(_Record):
     """The fans beside the reference.
 
-    t_ns: time of the newest sample. reference: empty if there is none yet. change: of each fan, by which share its mean
-    speed over the newest hours of healthy running has changed since the reference was made; None where that cannot be
-    compared. found: what has changed more than healthy fans do, in words; empty if nothing has. spans: then those of
-    the recordings since the last check that found nothing.
+    t_ns: time of the newest sample of healthy running. near_t_ns: up to then it was seen near alarms, too, whether most
+    fans have changed alike; 0: never. reference: empty if there is none yet. change: of each fan, by which share its
+    mean speed over the newest hours has changed since the reference was made; None where that cannot be compared.
+    found: what has changed more than healthy fans do, in words; empty if nothing has. spans: then those of the
+    recordings of healthy running since the last check that found nothing.
     """
 
     t_ns: int
@@ -101,6 +103,7 @@ class Check(_Record):
     change: tuple[float | None, ...]
     found: str
     spans: tuple[TimeSpan, ...]
+    near_t_ns: int = 0
 
 
 class VersionList(_Record):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.learning.healthy_history import healthy_recordings
-from schemas.messages import FanState, NewTwin
+from schemas.messages import Action, FanState, NewTwin, Request
 from schemas.units import NS_PER_S
 from stages.learner import LearnerConfig
 from tests.support.one_learner import START_NS, Learner, raw, restarted
@@ -33,6 +33,20 @@ def test_fans_are_checked_each_day_beside_an_alarm(tmp_path: Path) -> None:
     assert 24.0 < first_h < 24.5
     assert second_h - first_h == pytest.approx(24.0, abs=0.1)
     assert len(learner.learning.starts) == before
+
+
+def test_after_commissioning_the_fans_are_checked_as_soon_as_one_kind_of_running_is_enough(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    learner.run(100, state=FanState.ALARM)
+    for state in (FanState.NORMAL, FanState.ALARM):
+        learner.learning.checked_t_ns.clear()
+        began_t_ns = START_NS + learner.now_s * NS_PER_S
+        learner.core.step(Request(t_ns=began_t_ns, action=Action.COMMISSION))
+        learner.run(600, state=FanState.COMMISSIONING)
+        learner.run(2 * 3600, state=state)
+        (checked_t_ns,) = learner.learning.checked_t_ns
+        assert 4000 < (checked_t_ns - began_t_ns) / NS_PER_S < 5000
 
 
 def test_a_check_that_failed_beside_an_alarm_is_made_again_later(tmp_path: Path) -> None:
@@ -87,12 +101,12 @@ def test_an_alarm_is_not_forgotten_while_scores_say_nothing_about_it(tmp_path: P
     assert learner.put_in_force == ["tray1-1", "tray1-2"]
 
 
-def test_while_a_fan_has_an_alarm_the_notes_say_that_nothing_is_learned(tmp_path: Path) -> None:
+def test_while_a_fan_has_an_alarm_the_notes_say_that_no_version_takes_over(tmp_path: Path) -> None:
     learner = Learner(tmp_path)
     learner.run(600)
     learner.run(20, state=FanState.ALARM)
     learner.run(20, state=FanState.UNKNOWN)
-    assert learner.core.notes()[1:] == ["no new version while fan 0 has an alarm"]
+    assert learner.core.notes()[1:] == ["no version takes over while fan 0 has an alarm"]
     learner.run(20)
     assert len(learner.core.notes()) == 1
 

@@ -44,7 +44,9 @@ class FakeLearning:
                 return self.checks_fail_with
             everything = (*found, *recordings_near_alarms(self.versions.folder))
             self.checked_t_ns.append(max(each.span[1] for each in everything))
-            self.versions.add_check(Check(t_ns=self.checked_t_ns[-1], reference="", change=(), found="", spans=()))
+            near_t_ns = everything[-1].span[1]
+            check = Check(t_ns=found[-1].span[1], reference="", change=(), found="", spans=(), near_t_ns=near_t_ns)
+            self.versions.add_check(check)
             return ""
         self.starts.append(len(found))
         self._is_working = True

@@ -79,11 +79,19 @@ def fans_changed_alike(change: Array) -> Array:
     change: (fans,), since the reference; NaN for a fan that is not comparable.
     """
     compared = np.flatnonzero(np.isfinite(change))
-    if not len(compared) or np.max(np.abs(change[compared])) <= MOST_CHANGE:
+    typical = float(np.median(change[compared])) if len(compared) else 0.0
+    if typical == 0.0:
         return compared[:0]
-    most = change[compared[np.argmax(np.abs(change[compared]))]]
-    alike = compared[change[compared] / most > 0.5]
-    return alike if len(alike) > 1 and 2 * len(alike) > len(compared) else compared[:0]
+    relative = change[compared] / typical
+    alike = compared[(relative > 0.5) & (relative < 2.0)]
+    is_most = len(alike) > 1 and 2 * len(alike) > len(compared)
+    return alike if is_most and np.abs(change[alike]).max() > MOST_CHANGE else compared[:0]
+
+
+def have_most_changed_alike(change: Array) -> bool:
+    """Whether most fans of a tray have changed alike, and each of them more than healthy fans do. change: as above."""
+    alike = fans_changed_alike(change)
+    return 2 * int(np.count_nonzero(np.abs(change[alike]) > MOST_CHANGE)) > len(change)
 
 
 def changed_fans(change: Array, reference: str) -> str:

@@ -30,7 +30,7 @@ from pipeline.cli.twins.fan_changes import (
     changed_fans,
     changes_from_list,
     changes_to_list,
-    fans_changed_alike,
+    have_most_changed_alike,
     mean_changes,
     residual_of,
 )
@@ -61,6 +61,7 @@ air of a room varies, and not so long that a change is diluted by the time befor
 LEAST_CHECKED_S = 3600.0
 """of healthy running since a version was offered: with less nothing is known about how the fans are since then"""
 WORK_PREFIX = "learning-"
+NO_CHECK = Check(t_ns=0, reference="", change=(), found="", spans=())
 
 
 def make_next_version(
@@ -84,18 +85,23 @@ def _next_version(
     versions: TwinVersions, per_day: float, say: Callable[[str], None], *, only_if_changed: bool
 ) -> Version | None:
     folder, listed, name = versions.folder, versions.read(), versions.next_name()
-    recordings = healthy_recordings(folder, listed.excluded_spans)
+    healthy = healthy_recordings(folder, listed.excluded_spans)
     near_alarms = recordings_near_alarms(folder, listed.excluded_spans)
-    if not recordings:
+    if not healthy and not (only_if_changed and near_alarms):
         raise UserError(f"{folder}: no healthy history to learn from yet")
     for left in folder.glob(f"{WORK_PREFIX}*"):  # of a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(prefix=WORK_PREFIX, dir=folder) as place:
-        work = _Work(Path(place), name, versions.file, listed, recordings, near_alarms, per_day, say)
-        check = work.checked_alike()
-        if check is None:
-            work = _Work(Path(place), name, versions.file, listed, recordings, [], per_day, say)
-            check = work.checked(max(each.span[1] for each in (*recordings, *near_alarms)))
+        parts = Path(place), name, versions.file, listed
+        work = _Work(*parts, healthy, near_alarms, per_day, say) if near_alarms else None
+        check = work.checked_alike() if work else None
+        if work is None or check is None:
+            looked_t_ns = near_alarms[-1].span[1] if near_alarms else 0
+            if only_if_changed and near_alarms and _is_too_little_new(healthy, listed):
+                versions.add_check((listed.check or NO_CHECK).model_copy(update={"near_t_ns": looked_t_ns}))
+                return None
+            work = _Work(*parts, healthy, [], per_day, say)
+            check = work.checked().model_copy(update={"near_t_ns": looked_t_ns})
         is_needed = work.needs_offer() if check.found else not only_if_changed
         if not is_needed:
             versions.add_check(check)
@@ -108,6 +114,16 @@ def _next_version(
         versions.file(name).unlink(missing_ok=True)
         raise
     return version
+
+
+def _is_too_little_new(healthy: Sequence[HistoryRecording], listed: VersionList) -> bool:
+    """Whether the newest hours of healthy running are partly from before the last check or version: a change since then
+    would be diluted, and the time since then be taken as unchanged. (What is from before a commissioning is left out.)
+    """
+    checked_t_ns = listed.check.t_ns if listed.check else 0
+    since_t_ns = max(checked_t_ns, listed.commissioned_t_ns, *(each.made_t_ns for each in listed.versions), 0)
+    needed_s = LEAST_CHECKED_S if since_t_ns == listed.commissioned_t_ns else CHECKED_S
+    return sum(each.seconds for each in healthy if each.span[0] >= since_t_ns) < needed_s
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -143,50 +159,57 @@ class _Work:
         self._before, self._per_day, self._say = listed.current, per_day, say
         self._near_alarms = set(near_alarms)
         self._recordings = recordings = sorted([*healthy, *near_alarms], key=lambda each: each.span)
-        self._rate_hz, self._fans = _rate_and_fan_count(recordings[-1])
+        self._rate_hz, self._fans = _rate_and_fan_count((healthy or near_alarms)[-1])
         needed_s = 3600.0 * too_little(0.0, per_day).needed_fan_hours / self._fans
         self._calibration_recordings = newest_recordings(recordings, max(WANTED_S, MARGIN * needed_s))
         since_t_ns = max(listed.commissioned_t_ns, listed.waiting.made_t_ns if listed.waiting else 0)
         self._newest = newest_recordings([each for each in recordings if each.span[0] >= since_t_ns], CHECKED_S)
 
     def checked_alike(self) -> Check | None:
-        """The check, if the newest hours were partly near alarms, and most fans have changed alike; else None."""
+        """The check, if the newest hours were partly near alarms, and most fans have changed alike; else None, also if
+        these hours cannot be read: samples near alarms may be of a line that was not in order."""
         reference = self._reference()
         if reference is None or not self._knows_enough or self._near_alarms.isdisjoint(self._newest):
             return None
-        self._say(f"{self._name}: checking the fans against {reference.name}, near alarms too")
-        check = self._check(reference, self._recordings[-1].span[1])
-        return check if check.found else None
+        self._say(f"{self._name}: checking near alarms, too, whether most fans have changed since {reference.name}")
+        try:
+            check = self._check(reference)
+        except UserError as error:
+            self._say(f"{self._name}: running near alarms cannot be used: {error}")
+            return None
+        return check.model_copy(update={"near_t_ns": self._recordings[-1].span[1]}) if check.found else None
 
-    def checked(self, t_ns: int) -> Check:
+    def checked(self) -> Check:
         """The speeds of the fans over the newest hours beside the reference. Without a reference nothing has changed.
-        What was found stays while too little is known since then. t_ns: time of the newest sample that was looked at.
+        What was found stays while too little is known since then.
 
         Raises:
             UserError: too little is known since fans were commissioned again.
         """
         reference = self._reference()
         if reference is None:
-            return Check(t_ns=t_ns, reference="", change=(), found="", spans=())
+            return NO_CHECK.model_copy(update={"t_ns": self._recordings[-1].span[1]})
         if not self._knows_enough:
             if self._listed.waiting and self._listed.check:
-                return self._listed.check.model_copy(update={"t_ns": t_ns})
+                return self._listed.check
             raise UserError(
                 f"there is less than {_hours(LEAST_CHECKED_S)} of healthy running since fans were commissioned again: "
                 "too little to compare them with the reference; try again later"
             )
         self._say(f"{self._name}: checking the fans against {reference.name}")
-        return self._check(reference, t_ns)
+        return self._check(reference)
 
-    def _check(self, reference: Version, t_ns: int) -> Check:
+    def _check(self, reference: Version) -> Check:
+        healthy = [each for each in self._recordings if each not in self._near_alarms]
         change = self._change_since(reference)
         found = self._changed(change, reference)
-        spans = tuple(each.span for each in self._recordings if found and each.span[1] > self._unchanged_t_ns())
+        spans = tuple(each.span for each in healthy if found and each.span[1] > self._unchanged_t_ns())
+        t_ns = healthy[-1].span[1] if healthy else 0
         return Check(t_ns=t_ns, reference=reference.name, change=changes_to_list(change), found=found, spans=spans)
 
     def _changed(self, change: Array, since: Version) -> str:
         """What has changed, in words; near alarms only what most fans have alike."""
-        counts = not self._near_alarms or len(fans_changed_alike(change)) > 0
+        counts = not self._near_alarms or have_most_changed_alike(change)
         return changed_fans(change, since.name) if counts else ""
 
     def _unchanged_t_ns(self) -> int:
@@ -204,10 +227,10 @@ class _Work:
         """Whether there is enough since fans were commissioned again or a version was offered."""
         return self._newest == self._recordings or sum(each.seconds for each in self._newest) >= LEAST_CHECKED_S
 
-    def _change_since(self, version: Version, over: Sequence[HistoryRecording] | None = None) -> Array:
-        """(fans,) by which share the mean speeds have changed since a version was made; over: None: by the newest
-        hours."""
-        parts = spread_parts(over or self._newest, CHECKED_S)
+    def _change_since(self, version: Version, over: Sequence[HistoryRecording] = ()) -> Array:
+        """(fans,) by which share the mean speeds have changed since a version was made: over these recordings, or over
+        the newest hours."""
+        parts = spread_parts(over) if over else spread_parts(self._newest, CHECKED_S)
         return mean_changes(self._file_of(version.name), parts) - changes_from_list(version.change)
 
     def offered(self, changed: str) -> tuple[Version, bytes]:
@@ -226,13 +249,14 @@ class _Work:
         )
 
     def _first_after_change(self) -> HistoryRecording:
-        """From this recording on, the fans are surely as they are now. Near alarms recordings are short: these are the
-        newest hours, if the fans had changed in the first half of these."""
-        reference, first_half = self._reference(), self._newest[: len(self._newest) // 2]
-        if not (self._near_alarms and reference and first_half):
-            return newest_long(self._newest)
-        had_changed = len(fans_changed_alike(self._change_since(reference, first_half))) > 0
-        return self._newest[0] if had_changed else newest_long(self._newest)
+        """From this recording on, the fans are surely as they are now. Near alarms recordings are short: those before
+        it belong to it as long as the fans had changed in each of them, too."""
+        reference, first = self._reference(), self._newest.index(newest_long(self._newest))
+        while self._near_alarms and reference and first:
+            if not have_most_changed_alike(self._change_since(reference, self._newest[first - 1 : first])):
+                break
+            first -= 1
+        return self._newest[first]
 
     def taken(self) -> tuple[Version, bytes]:
         """A version that takes over: a newly trained twin if it is better than the one in force, or new limits."""

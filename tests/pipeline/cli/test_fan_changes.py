@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from pipeline.cli.twins.excerpts import Excerpt
-from pipeline.cli.twins.fan_changes import changed_fans, changes_from_list, changes_to_list, mean_changes
+from pipeline.cli.twins.fan_changes import (
+    changed_fans,
+    changes_from_list,
+    changes_to_list,
+    fans_changed_alike,
+    have_most_changed_alike,
+    mean_changes,
+)
 from pipeline.cli.twins.versions_text import check_line
 from pipeline.learning.healthy_history import healthy_recordings
 from pipeline.learning.versions import Check
@@ -51,6 +58,25 @@ def test_a_fan_that_is_not_comparable_is_no_change_and_does_not_hide_others() ->
     assert worn.startswith("3 of 4 fans are 3.4 % faster than when t-1 was made, fan 0 is 1.0 % faster; if maintenance")
     assert changed_fans(np.array([-0.04, 0.0, 0.001, -0.04]), "t-1").startswith("fan 0 is 4.0 % slower, fan 3 is 4.0")
     assert changed_fans(np.array([-0.05, np.nan]), "t-1").startswith("fan 0 is 5.0 % slower")
+
+
+def test_a_fan_with_a_fault_does_not_hide_what_the_others_have_alike() -> None:
+    for one in (-0.30, 0.12, -1.0):
+        assert fans_changed_alike(np.array([0.05] * 7 + [one])).tolist() == list(range(7))
+        words = changed_fans(np.array([0.05] * 7 + [one]), "t-1")
+        assert words.startswith("7 of 8 fans are 5.0 % faster than when t-1 was made, fan 7 is ")
+
+
+def test_most_have_changed_only_if_most_of_a_tray_have_changed_more_than_healthy_fans_do() -> None:
+    assert have_most_changed_alike(np.array([0.05, 0.04]))
+    assert have_most_changed_alike(np.array([0.05, 0.04, 0.04, np.nan, 0.0]))
+    assert not have_most_changed_alike(np.array([-0.04, -0.021])), "one is faulty, the other drifts"
+    assert not have_most_changed_alike(np.array([-0.058, *[-0.0291] * 4]))
+    assert not have_most_changed_alike(np.array([0.05, 0.04, np.nan, np.nan]))
+    assert not have_most_changed_alike(np.array([0.05, -0.05]))
+    assert not have_most_changed_alike(np.array([0.05]))
+    assert not have_most_changed_alike(np.array([0.0, np.nan, 0.0]))
+    assert not have_most_changed_alike(np.array([np.nan]))
 
 
 def test_the_list_of_versions_holds_no_nan_and_the_text_names_the_fan() -> None:

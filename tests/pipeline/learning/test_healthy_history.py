@@ -106,14 +106,13 @@ def test_samples_are_either_healthy_or_near_an_alarm(tmp_path: Path) -> None:
     watch(history, 0, 500)
     watch(history, 500, 600, has_alarm=True)
     watch(history, 600, 1200)
-    history.finish()
     ((first_s, last_s),) = near_alarms_s(tmp_path)
+    history.finish()
     (before, after) = kept_s(tmp_path)
     assert first_s == before[1] + 1
     assert last_s == after[0] - 1
-    everything_s = sum(last - first for first, last in (before, after, (first_s, last_s)))
-    assert history.all_seconds_since(0) == everything_s
-    assert history.seconds == everything_s - (last_s - first_s)
+    assert history.seconds_near_alarms_since(0) == last_s - first_s
+    assert history.seconds == sum(last - first for first, last in (before, after))
 
 
 def test_running_near_alarms_is_kept_for_some_time_and_begins_again_when_fans_are_commissioned(
@@ -329,6 +328,25 @@ def test_a_recording_that_a_full_disk_refused_to_finish_is_kept_and_said_until_t
     history.finish()
     assert history.problem == ""
     assert kept_s(tmp_path) == [(0, 299), (400, 699)]
+
+
+def test_what_could_not_be_kept_near_an_alarm_is_said_until_healthy_running_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "near_alarms").mkdir()
+    (tmp_path / "near_alarms" / OPEN_NAME).write_bytes(b"no recording")
+    history = history_in(tmp_path)
+    assert "cannot be repaired" in history.problem
+    watch(history, 0, 500)
+    with monkeypatch.context() as full:
+        refuse_writes(full)
+        watch(history, 500, 600, has_alarm=True)
+        watch(history, 600, 750)
+        history.flush()
+    assert "samples are not kept for learning" in history.problem
+    watch(history, 750, 3000)
+    history.finish()
+    assert history.problem == ""
 
 
 def test_a_recording_that_could_not_be_repaired_is_said_until_the_next_one_is_finished(tmp_path: Path) -> None:

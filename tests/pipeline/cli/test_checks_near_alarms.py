@@ -1,0 +1,161 @@
+"""Checks of the fans where much of their running was near alarms: against a reference, without training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.cli.twins import next_version
+from pipeline.cli.twins.fan_changes import changes_to_list, mean_changes
+from pipeline.cli.twins.next_version import make_next_version
+from pipeline.cli.twins.version_data import spread_parts
+from pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
+from pipeline.learning.versions import Check, TwinVersions
+from schemas.messages import Array, Header, Raw
+from schemas.units import NS_PER_S
+from tests.pipeline.learning.test_versions import version
+from tests.support.commanded_fans import GAIN, RATE_HZ, START_S, moving
+from tests.support.twin_files import write_twin
+from twin.models.physical import PhysicalModel
+
+
+class OfferError(Exception):
+    """A version was to be made."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """With a reference of two fans, and a check that found nothing."""
+
+    def offer(_work: object, changed: str) -> None:
+        raise OfferError(changed)
+
+    monkeypatch.setattr("pipeline.learning.versions.REFERENCE_S", 60.0)
+    monkeypatch.setattr(next_version, "CHECKED_S", 400.0)
+    monkeypatch.setattr(next_version, "LEAST_CHECKED_S", 90.0)
+    monkeypatch.setattr(next_version._Work, "offered", offer)
+    run(tmp_path, 0, 400.0)
+    versions, recordings = TwinVersions(tmp_path, "tray1"), healthy_recordings(tmp_path)
+    twin = write_twin(versions.file("tray1-1"), PhysicalModel(), 2)
+    change = changes_to_list(mean_changes(twin, spread_parts(recordings)))
+    spans = tuple(each.span for each in recordings)
+    versions.add(version("tray1-1", 2, made_t_ns=spans[-1][1], learned_spans=spans, change=change))
+    check(tmp_path)
+    return tmp_path
+
+
+def run(
+    folder: Path,
+    first_s: int,
+    seconds: float,
+    factor: tuple[float, float] | Array = (1.0, 1.0),
+    *,
+    has_alarm: bool = False,
+    is_commanded: bool = True,
+) -> None:
+    """Always the same commands, so that the change of a fan is that of its factor."""
+    command = np.tile(moving(100.0), (round(seconds / 100.0), 1))
+    speed = GAIN * command * np.array(factor)
+    history = HealthyHistory(folder, "site", "tray1", {"trays": "tray1"}, {}, hold_back_s=0.0, kept_s=1e9)
+    t_ns = (START_S + first_s) * NS_PER_S + (np.arange(len(command)) / RATE_HZ * NS_PER_S).astype(np.int64)
+    for number, first in enumerate(range(0, len(command), 50)):
+        rows = slice(first, first + 50)
+        raw = Raw(
+            header=Header("acquisition", number, "tray1"),
+            fans=2,
+            host_receive_t_ns=t_ns[rows],
+            command=command[rows] if is_commanded else np.full_like(command[rows], np.nan),
+            speed_rad_s=speed[rows],
+        )
+        history.add(raw, has_alarm=has_alarm, is_watched=False)
+    history.close()
+
+
+def check(folder: Path) -> Check:
+    """The check that was kept, of fans that have not changed."""
+    assert make_next_version(folder, "tray1", 1.0, lambda _line: None, only_if_changed=True) is None
+    kept = TwinVersions(folder, "tray1").read().check
+    assert kept
+    return kept
+
+
+def usable_from_s(folder: Path) -> list[int]:
+    left = healthy_recordings(folder, TwinVersions(folder, "tray1").read().excluded_spans)
+    return [each.span[0] // NS_PER_S - START_S for each in left]
+
+
+def test_what_is_between_the_alarms_of_one_fan_is_not_taken_as_unchanged(folder: Path) -> None:
+    for day in (1, 2, 3, 4):
+        run(folder, 10_000 * day, 300.0, (1.0, 0.95), has_alarm=True)
+        run(folder, 10_000 * day + 1000, 100.0, (1.0, 0.95))
+        assert check(folder).found == "", "too little is new: what changed would be diluted by the time before"
+    run(folder, 50_000, 300.0, (1.0, 0.95), has_alarm=True)
+    run(folder, 51_000, 100.0, (1.0, 0.95))
+    with pytest.raises(OfferError, match=r"^fan 1 is \d\.\d % slower"):
+        check(folder)
+
+
+def test_when_one_fan_is_found_changed_all_since_the_last_check_is_left_out(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(next_version._Work, "needs_offer", lambda _work: False)
+    for day in range(1, 6):
+        run(folder, 10_000 * day, 300.0, (1.0, 0.95), has_alarm=True)
+        run(folder, 10_000 * day + 1000, 100.0, (1.0, 0.95))
+        check(folder)
+    assert usable_from_s(folder) == [0]
+
+
+def test_near_alarms_a_fault_of_one_fan_is_no_change_of_all(folder: Path) -> None:
+    run(folder, 5000, 400.0, (0.95, 0.9725), has_alarm=True)  # the other one has drifted by what counts as healthy
+    assert check(folder).found == ""
+    run(folder, 6000, 400.0, (0.95, 0.96), has_alarm=True)
+    with pytest.raises(OfferError, match=r"^all fans are \d\.\d % slower than when tray1-1 was made"):
+        check(folder)
+
+
+def test_shortly_after_commissioning_a_check_near_alarms_is_no_failure(folder: Path) -> None:
+    TwinVersions(folder, "tray1").commission((START_S + 5000) * NS_PER_S)
+    run(folder, 5000, 200.0, (1.0, 0.94), has_alarm=True)
+    before = check(folder)
+    assert before.near_t_ns // NS_PER_S - START_S == 5199
+    assert before.t_ns // NS_PER_S - START_S == 399, "of healthy running nothing new was checked"
+    run(folder, 5300, 100.0, (1.0, 0.94))
+    with pytest.raises(OfferError, match=r"^fan 1 is \d\.\d % slower"):
+        check(folder)
+
+
+def test_without_healthy_running_since_a_version_near_alarms_are_checked(folder: Path) -> None:
+    versions = TwinVersions(folder, "tray1")
+    since_t_ns = (START_S + 4000) * NS_PER_S
+    change = versions.all()[0].change
+    versions.add(version("tray1-2", 2, since_t_ns=since_t_ns, made_t_ns=since_t_ns, outcome="offered", change=change))
+    versions.file("tray1-2").write_bytes(versions.file("tray1-1").read_bytes())
+    versions.use("tray1-2")
+    run(folder, 5000, 200.0, has_alarm=True)
+    assert check(folder).near_t_ns // NS_PER_S - START_S == 5199
+
+
+def test_samples_near_an_alarm_without_commands_keep_nothing_from_being_checked(folder: Path) -> None:
+    run(folder, 5000, 500.0, (1.05, 1.05))
+    run(folder, 6000, 100.0, has_alarm=True, is_commanded=False)
+    with pytest.raises(OfferError, match=r"^all fans are \d\.\d % faster"):
+        check(folder)
+
+
+def test_an_offer_is_not_learned_from_a_recording_that_began_before_the_change(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(next_version, "CHECKED_S", 800.0)
+    samples = round(1600.0 * RATE_HZ)
+    run(folder, 5000, 1600.0, np.where(np.arange(samples)[:, np.newaxis] < 1000 * RATE_HZ, 1.0, 1.1))
+    run(folder, 6600, 300.0, (1.1, 1.1), has_alarm=True)
+    run(folder, 7000, 700.0, (1.1, 1.1), has_alarm=True)
+    versions = TwinVersions(folder, "tray1")
+    near_alarms = recordings_near_alarms(folder)
+    work = next_version._Work(
+        folder, "x", versions.file, versions.read(), healthy_recordings(folder), near_alarms, 1.0, lambda _line: None
+    )
+    assert work._first_after_change() == near_alarms[0]
