@@ -553,7 +553,7 @@ class Note(_message.Message):
     def __init__(self, tray: _Optional[str] = ..., text: _Optional[str] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes")
+    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STAGE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
@@ -572,6 +572,7 @@ class Health(_message.Message):
     NEWEST_INPUT_T_NS_FIELD_NUMBER: _ClassVar[int]
     NEWEST_OUTPUT_T_NS_FIELD_NUMBER: _ClassVar[int]
     NOTES_FIELD_NUMBER: _ClassVar[int]
+    TRAYS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     stage: str
     instance: str
@@ -590,4 +591,5 @@ class Health(_message.Message):
     newest_input_t_ns: int
     newest_output_t_ns: int
     notes: _containers.RepeatedCompositeFieldContainer[Note]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ...) -> None: ...
+    trays: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ...) -> None: ...

@@ -454,7 +454,12 @@ class Note:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Health:
-    """Status of a stage, and what it has received, sent and lost."""
+    """Status of a process of a stage, and what it has received, sent and lost.
+
+    Attributes:
+        trays: those that it has, separated by commas; empty: all of the site. Earlier versions do not say it: there, a
+            stage with a process for each tray has the one that its instance names.
+    """
 
     header: Header = Header()
     stage: str
@@ -474,6 +479,7 @@ class Health:
     newest_input_t_ns: int = 0
     newest_output_t_ns: int = 0
     notes: tuple[Note, ...] = ()
+    trays: str = ""
 
 
 Message: TypeAlias = (

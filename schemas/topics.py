@@ -34,6 +34,8 @@ HEALTH_CHUNK = "health"
 ALIVE_CHUNK = "alive"
 SESSION_CHUNK = "session"
 RESERVED_TRAY_NAMES = (HEALTH_CHUNK, ALIVE_CHUNK)
+ALL_TRAYS = "all"
+"""the instance of a process that has all trays of its site"""
 
 
 @dataclass(frozen=True)
@@ -142,6 +144,11 @@ def tray_of(key: str) -> str:
 def health_key(site: str, stage: str, instance: str) -> str:
     """Key of a stage's health; `*` may stand for any part."""
     return f"{ROOT}/{site}/{HEALTH_CHUNK}/{stage}/{instance}"
+
+
+def stage_label(stage: str, instance: str) -> str:
+    """The name of a process of a stage for people: `scorer`, or `scorer/2-of-8` where it does not have all trays."""
+    return stage if instance == ALL_TRAYS else f"{stage}/{instance}"
 
 
 def alive_key(site: str, stage: str, instance: str) -> str:

@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 
+from pipeline.config.registry import RECORDER, STAGES
 from pipeline.recordings.disk import DiskError
 from pipeline.recordings.held_messages import HeldMessages
 from pipeline.recordings.interference import Interference
@@ -30,7 +31,7 @@ from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from schemas.envelope import Envelope
 from schemas.messages import Health, Message
 from schemas.streams import StreamId
-from schemas.topics import TOPICS
+from schemas.topics import TOPICS, tray_key
 from schemas.units import NS_PER_S
 
 HELD_BYTES = 16 << 20
@@ -41,6 +42,8 @@ DISK_CHECK_NS = NS_PER_S
 """how often the free space is checked"""
 ROOM_TO_RESUME = 1 << 20
 """bytes that must be free beyond the minimum to resume, so that recording does not pause again at once"""
+KEEPS = STAGES[RECORDER].keeps
+"""topics whose last messages it keeps for others, also from recordings of before its start"""
 _LOG = logging.getLogger(__name__)
 
 
@@ -317,7 +320,7 @@ def build(context: Context) -> BuiltStage:
     if left_out:
         metadata[LEFT_OUT_KEY] = ",".join(left_out)
     try:
-        parts = RecordingParts(context.run_folder / config.file, metadata, attachments, session=secrets.token_hex(4))
+        parts = RecordingParts(context.own_file(config.file), metadata, attachments, session=secrets.token_hex(4))
         for recovery in parts.repaired:
             found = recovery.found
             _LOG.warning(
@@ -335,14 +338,16 @@ def build(context: Context) -> BuiltStage:
                 "start again, or use `fantwin recover`",
                 path,
             )
-        return BuiltStage(Recorder(parts, config, context.started_t_ns, left_out))
+        own = {tray_key(context.site, tray.name, topic) for tray in context.trays for topic in KEEPS}
+        kept = {key: last for topic in KEEPS for key, last in parts.last_messages(topic).items() if key in own}
+        return BuiltStage(Recorder(parts, config, context.started_t_ns, left_out), kept=kept)
     except RecordingError as error:
         raise StageError(f"{error} (recorder.file)") from error
 
 
 def check(context: Context) -> list[str]:
     """Problems with the folder: it cannot be written, or its disk is too full."""
-    folder = (context.run_folder / context.config.file).parent
+    folder = context.own_file(context.config.file).parent
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
         return [f"{folder}: {existing} is not a folder that this user can write to; change run_folder or recorder.file"]

@@ -25,7 +25,7 @@ from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, healthy_twi
 from pipeline.runtime.judged_share import JudgedShare
 from pipeline.runtime.learned_scorer import LearnedTwinScorer
 from pipeline.runtime.old_samples import OldSamples
-from pipeline.runtime.snapshot_store import SnapshotStore
+from pipeline.runtime.snapshot_store import Elsewhere, SnapshotStore
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from pipeline.runtime.tray_scorer import DATA_LOST_AFTER_NS, TrayScorer
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
@@ -40,6 +40,7 @@ from schemas.messages import (
     ScorerSnapshot,
     Transition,
 )
+from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_text import AlarmText
 from scoring.alarms.unscored_monitor import UnscoredMonitor
@@ -209,7 +210,8 @@ class ScorerCore(Core):
         self._judged_share.add(score.valid, score.invalid_reason)
         self._owes_snapshot |= bool(alarms)
         snapshots = self._take_snapshot() if self._is_snapshot_due(item.period_ns) else []
-        return [*before_score, score, *alarms, *snapshots]
+        # the snapshot first: whoever takes over from one that is killed now must not raise these alarms again
+        return [*before_score, score, *snapshots, *alarms]
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md says what each counts."""
@@ -221,9 +223,11 @@ class ScorerCore(Core):
         return {**self._counts, **of_alarms}
 
     def notes(self) -> list[str]:
-        """Which share of the samples was judged, and why the others were not; fans that change slowly."""
+        """Where it continued from, if not from its file; which share of the samples was judged, and why the others were
+        not; fans that change slowly."""
         of_twin = [] if self._twin.is_calibrated else [NOT_CALIBRATED]
-        return [*of_twin, *self._judged_share.notes, *self._tray.wear.notices(), *self._tray.followed]
+        of_store = [self._snapshot_store.note] if self._snapshot_store and self._snapshot_store.note else []
+        return [*of_twin, *of_store, *self._judged_share.notes, *self._tray.wear.notices(), *self._tray.followed]
 
     def problem(self) -> str:
         """What people should look at: input, snapshot, fans without a score, baselines at their limit, wear."""
@@ -313,7 +317,7 @@ class ScorerCore(Core):
         commissioned[[alarm.fan for alarm in alarms if alarm.transition == Transition.COMMISSIONING]] = True
         self._tray.recommission(commissioned, self._last_t_ns)
         self._counts["requests"] += 1
-        return [*alarms, *self._take_snapshot()]
+        return [*self._take_snapshot(), *alarms]  # whoever has the answer can rely on it
 
     def _is_snapshot_due(self, period_ns: int) -> bool:
         """Whether alarms have changed since the last snapshot, or it is old; period_ns: between samples."""
@@ -338,6 +342,13 @@ def _json(state: Mapping[str, Any]) -> str:
     return json.dumps(state, allow_nan=False)
 
 
+def _kept_by_others(context: Context) -> Elsewhere | None:
+    """What others keep of the state of a tray; None: they are not asked."""
+    kept, tray, config = context.kept, context.tray.name, context.config
+    asks = config.asks_for_snapshots if config.asks_for_snapshots is not None else context.instance != ALL_TRAYS
+    return (lambda is_patient: kept.of(tray, is_patient=is_patient)) if kept and asks else None
+
+
 def build(context: Context) -> BuiltStage:
     """The core of one tray; without a twin in the configuration, of the twins that are learned.
 
@@ -346,7 +357,7 @@ def build(context: Context) -> BuiltStage:
     """
     tray = context.tray
     path = context.snapshot_folder / f"scorer-{tray.name}.snapshot" if context.snapshot_folder else None
-    store = SnapshotStore(path) if path else None
+    store = SnapshotStore(path, _kept_by_others(context), context.started_t_ns) if path else None
 
     def core_of(twin: TrayTwin, continues: ScorerSnapshot | None = None) -> ScorerCore:
         return ScorerCore(

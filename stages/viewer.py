@@ -19,6 +19,7 @@ import importlib.util
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from pydantic import Field
@@ -54,8 +55,15 @@ class ViewerConfig(StageConfig):
         description='file in run_folder for the view; an older file is kept, and view-2.rrd is written; "": no file',
     )
     serve: bool = Field(default=True, description="serve live viewers on this host (127.0.0.1)")
-    grpc_port: int = Field(default=9876, ge=1, le=65535, description="port of the data, for native and browser viewer")
-    web_port: int = Field(default=9090, ge=0, le=65535, description="port of the browser viewer's page; 0: no page")
+    grpc_port: int = Field(
+        default=9876,
+        ge=1,
+        le=65535,
+        description="port of the data, for native and browser viewer; of shard K the K-th from here on",
+    )
+    web_port: int = Field(
+        default=9090, ge=0, le=65535, description="port of the browser viewer's page, counted alike; 0: no page"
+    )
     window_s: float = Field(default=30.0, gt=0, description="length of the rolling window, s")
     memory_limit: str = Field(
         default="256MB", pattern=r"^\d+(MB|GB|MiB|GiB)$", description="history kept for viewers that join late"
@@ -316,15 +324,16 @@ def build(context: Context) -> BuiltStage:
     config: ViewerConfig = context.config
     plots = FleetPlots(shown_fans(config.show, context.trays), config.alarm_plots)
     is_fleet = sum(tray.fans for tray in context.trays) > config.fleet_above
+    ports = _ports(context)
     sink = RerunSink(
         name=context.site,
         trays=context.trays,
         fleet=plots if is_fleet else None,
         started_t_ns=context.started_t_ns,
         window_s=config.window_s,
-        file=context.run_folder / config.file if config.file else None,
-        grpc_port=config.grpc_port if config.serve else None,
-        web_port=(config.web_port or None) if config.serve else None,
+        file=context.own_file(Path(config.file)) if config.file else None,
+        grpc_port=ports.get("grpc_port"),
+        web_port=ports.get("web_port"),
         memory_limit=config.memory_limit,
     )
     fleet = None
@@ -332,6 +341,14 @@ def build(context: Context) -> BuiltStage:
         places = PlotPlaces(plots, round(config.alarm_plot_hold_s * NS_PER_S))
         fleet = FleetView(context.site, context.trays, places, round(config.window_s * NS_PER_S))
     return BuiltStage(ViewerCore(context.trays, sink, fleet))
+
+
+def _ports(context: Context) -> dict[str, int]:
+    """The ports that are served, by key: as configured, and one more for each further shard, which may be on this
+    host."""
+    config: ViewerConfig = context.config
+    configured = {"grpc_port": config.grpc_port, "web_port": config.web_port} if config.serve else {}
+    return {key: port + context.shard_number - 1 for key, port in configured.items() if port}
 
 
 def check(context: Context) -> list[str]:
@@ -342,10 +359,7 @@ def check(context: Context) -> list[str]:
         shown_fans(config.show, context.trays)
     except StageError as error:
         problems.append(str(error))
-    ports = (
-        {"grpc_port": config.grpc_port, "web_port": config.web_port} if config.serve and not context.is_running else {}
-    )
-    for key, port in ports.items():
+    for key, port in ({} if context.is_running else _ports(context)).items():
         try:
             check_free(port, f"viewer.{key}", "viewer.serve = false")
         except StageError as error:

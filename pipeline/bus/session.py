@@ -24,6 +24,7 @@ import zenoh
 
 from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program, somebody_listens
 from pipeline.bus.errors import BusError, reason
+from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
 from pipeline.bus.link import LEASE_MS
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
@@ -60,7 +61,7 @@ class Bus:
         self._session = _open(config, stop, listens)
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
-        self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
+        self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
         return self
@@ -152,6 +153,14 @@ class Bus:
         answer = answers.get()
         request.cancel()
         return answer.messages
+
+    def answer_for_kept(self, key_expression: str, kept_by: str, on_query: Callable[[KeptQuery], object]) -> None:
+        """Call `on_query` when somebody asks for the last message on a key that is kept here."""
+        self._declared.append(answer_for_kept(self._session, key_expression, kept_by, on_query))
+
+    def ask_for_kept(self, key: str, timeout_s: float) -> tuple[list[bytes], bool]:
+        """The messages that others keep for one key, and whether all of them have answered in time. Waits for it."""
+        return ask_for_kept(self._session, key, timeout_s)
 
     def close(self) -> None:
         """Leave the bus. What was published before has left this process."""

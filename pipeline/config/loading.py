@@ -118,6 +118,7 @@ def _checked(
     names = [tray.name for tray in file.tray]
     if len(set(names)) != len(names):
         raise ConfigError(f"{path}: two trays have the same name; names must differ: {', '.join(names)}")
+    _require_trays_for_shards(file.launcher, len(names), path)
     folder = path.parent
     return Config(
         path=path,
@@ -131,6 +132,14 @@ def _checked(
         stages=enabled,
         sections=sections,
     )
+
+
+def _require_trays_for_shards(launcher: LauncherConfig, trays: int, path: Path) -> None:
+    for stage in STAGES:
+        number = launcher.number_of_shards(stage)
+        if number is not None and number > trays:
+            key = f"launcher.shards.{stage}" if isinstance(launcher.shards, dict) else "launcher.shards"
+            raise ConfigError(f"{path}: {key} = {number}: more shards than trays, of which there are {trays}")
 
 
 def enabled_stages(launcher: LauncherConfig, table: Mapping[str, Any]) -> tuple[str, ...]:

@@ -11,7 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from pipeline.config.registry import STAGES
 from pipeline.devices.sample_source import MOST_FANS, SourceConfig, too_many_fans
@@ -85,6 +93,12 @@ class LauncherConfig(Section):
     stages: tuple[str, ...] | None = Field(
         default=None, description="which stages run, in any order; without it, all that the configuration enables"
     )
+    shards: int | dict[str, int] | None = Field(
+        default=None,
+        description="as how many processes each stage runs, which share its trays: one number for all stages but the "
+        "viewer, or a table, as { scorer = 4, recorder = 2 }; without it, one process for the site, of acquisition one "
+        "for each tray",
+    )
     restart_delay_s: float = Field(default=0.2, gt=0, description="first delay before a dead stage is restarted")
     restart_delay_max_s: float = Field(default=10.0, gt=0, description="the delay doubles up to this")
     watchdog_s: float = Field(
@@ -97,10 +111,29 @@ class LauncherConfig(Section):
     @field_validator("stages")
     @classmethod
     def _known(cls, value: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        for name in value or ():
-            if name not in STAGES:
-                raise ValueError(f"unknown stage {name!r}{nearest(name, STAGES)}")
+        _require_stages(value or ())
         return value
+
+    @field_validator("shards", mode="before")
+    @classmethod
+    def _number_or_table(cls, value: object) -> object:
+        _require_stages(value if isinstance(value, dict) else ())
+        for number in value.values() if isinstance(value, dict) else [1 if value is None else value]:
+            if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+                raise ValueError("give a number from 1, or a table of stages with such numbers")
+        return value
+
+    def number_of_shards(self, stage: str) -> int | None:
+        """As how many processes a stage runs; None: as its row of the registry says."""
+        if isinstance(self.shards, dict):
+            return self.shards.get(stage)
+        return self.shards if STAGES[stage].has_common_shards else None
+
+
+def _require_stages(names: Iterable[str]) -> None:
+    for name in names:
+        if name not in STAGES:
+            raise ValueError(f"unknown stage {name!r}{nearest(name, STAGES)}")
 
 
 class TrayConfig(Section):

@@ -9,9 +9,11 @@ import json
 import re
 import sys
 from collections.abc import Iterable, Iterator
+from functools import reduce
 from importlib import import_module
+from operator import or_
 from pathlib import Path
-from types import NoneType
+from types import NoneType, UnionType
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
@@ -92,8 +94,9 @@ def _table(model: type[BaseModel], but: Iterable[str]) -> str:
 
 
 def _values(field: FieldInfo) -> str:
-    annotation = next((each for each in get_args(field.annotation) if each is not NoneType), None)
-    is_optional = NoneType in get_args(field.annotation)
+    arguments = get_args(field.annotation)
+    is_optional = NoneType in arguments
+    annotation = reduce(or_, (each for each in arguments if each is not NoneType)) if is_optional else None
     bounds = [
         f"{words} {_number(getattr(rule, name))}"
         for rule in field.metadata
@@ -106,6 +109,10 @@ def _values(field: FieldInfo) -> str:
 def _type_words(annotation: Any) -> str:
     if get_origin(annotation) is Literal:
         return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
+    if get_origin(annotation) is UnionType:
+        return " or ".join(_type_words(each) for each in get_args(annotation))
+    if get_origin(annotation) is dict:
+        return f"table of {_type_words(get_args(annotation)[1])}s"
     if get_origin(annotation) is tuple:
         of_one = _type_words(get_args(annotation)[0])
         return of_one if of_one == _ELSEWHERE else f"list of {of_one}"

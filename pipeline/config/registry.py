@@ -20,8 +20,11 @@ class StageRow:
         declaration: import string of its `pipeline.runtime.stage.Stage`, `module:attribute`.
         enabled_by: what enables it where `launcher.stages` is not given. "default": always; "section": a section
             `[name]` in the configuration; "tray without twin": a tray that names no twin.
-        scope: one process for the site, or one for each tray.
+        scope: one process for the site, or one for each tray, where `launcher.shards` says nothing of it. Only stages
+            with a process for each tray may have a device.
+        has_common_shards: a `launcher.shards` that is one number for all stages applies to it.
         may_drop: that of its declaration, for those who count losses and would wait long for its imports.
+        keeps: topics whose last message about each of its trays it keeps for others, also when the producer has gone.
         needs_twin: it cannot start unless every tray has a twin, or learns one.
     """
 
@@ -29,7 +32,9 @@ class StageRow:
     declaration: str
     enabled_by: Literal["default", "section", "tray without twin"] = "section"
     scope: Literal["site", "tray"] = "site"
+    has_common_shards: bool = True
     may_drop: bool = False
+    keeps: tuple[str, ...] = ()
     needs_twin: bool = False
 
     def load(self) -> Any:
@@ -40,6 +45,7 @@ class StageRow:
 
 LEARNER = "learner"
 """the stage that gives a tray its twin"""
+RECORDER = "recorder"
 STAGES: dict[str, StageRow] = {
     row.name: row
     for row in (
@@ -48,7 +54,7 @@ STAGES: dict[str, StageRow] = {
         StageRow(LEARNER, "stages.learner:STAGE", enabled_by="tray without twin", may_drop=True),
         StageRow("twin_integrator", "stages.twin_integrator:STAGE", enabled_by="default", needs_twin=True),
         StageRow("scorer", "stages.scorer:STAGE", enabled_by="default", needs_twin=True),
-        StageRow("recorder", "stages.recorder:STAGE", enabled_by="default"),
-        StageRow("viewer", "stages.viewer:STAGE", enabled_by="default", may_drop=True),
+        StageRow(RECORDER, "stages.recorder:STAGE", enabled_by="default", keeps=("snapshot",)),
+        StageRow("viewer", "stages.viewer:STAGE", enabled_by="default", has_common_shards=False, may_drop=True),
     )
 }

@@ -196,8 +196,7 @@ def _why_no_scores(tray: str, states: Sequence[StageState]) -> str:
     """The first stage on the way from the device to the scores that does not work."""
     on_the_way = list(STAGES)[: list(STAGES).index(_LAST_JUDGE) + 1]
     for state in states:
-        stage, _, of_tray = state.label.partition("/")
-        if state.is_expected and stage in on_the_way and of_tray in ("", tray):
+        if state.is_expected and state.stage in on_the_way and state.has(tray):
             problem = state.view.health.problem if state.view and state.word == Word.DEGRADED else ""
             if state.is_fault or state.word == Word.WAITING or problem:
                 return f"{state.label}: {problem or state.detail}"

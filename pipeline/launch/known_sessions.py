@@ -9,7 +9,7 @@ from __future__ import annotations
 from pipeline.launch.loss_accounting import Launched
 from pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
 from schemas.messages import Health
-from schemas.topics import topic_of
+from schemas.topics import topic_of, tray_of
 
 _WATCHED_TOPICS = {"alarm", "score", "snapshot"}
 
@@ -78,14 +78,18 @@ class KnownSessions:
         session = self._known.get(health.header.producer)
         return session is not None and (session.name, session.process_id) in self._launched
 
-    def is_ignored(self, producer: str) -> bool:
-        """Whether another process owns the stage of this producer."""
-        return self._sessions.is_ignored(producer)
+    def is_replaced(self, producer: str) -> bool:
+        """Whether another session of the same stage and instance started later."""
+        return self._sessions.is_replaced(producer)
+
+    def owner(self, stage: str, tray: str) -> Session | None:
+        """The session of a stage that owns a tray now; None: there is none."""
+        return self._sessions.owner(stage, tray)
 
     def counts(self, key: str, producer: str) -> bool:
-        """Whether a message on this key is one of the site: its producer is the session that owns its stage, or no
-        session publishes there."""
-        return not self.is_stranger(key, producer) and not self._sessions.is_ignored(producer)
+        """Whether a message on this key of a tray is one of the site: its producer is the session that owns the tray in
+        its stage, or no session publishes there."""
+        return not self.is_stranger(key, producer) and not self._sessions.is_ignored(producer, tray_of(key))
 
     def is_stranger(self, key: str, producer: str) -> bool:
         """Whether a session publishes on this key, and this producer is none and never was."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +12,8 @@ from typing import Any
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
-from pipeline.config.registry import LEARNER, STAGES
+from pipeline.config.registry import LEARNER, RECORDER, STAGES
+from pipeline.config.shards import own_file
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.errors import UserError
 from pipeline.launch.loss_accounting import Launched
@@ -27,7 +28,7 @@ from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.stage import load_stage
 from pipeline.runtime.tray_twin import load_tray_twin, twin_path
 from schemas.messages import StageStatus
-from schemas.topics import alive_key
+from schemas.topics import ALL_TRAYS, alive_key
 
 _POLL_S = 0.05
 _SEARCH_S = 2.0  # this long after meeting one process, a launcher has discovered all others
@@ -91,13 +92,26 @@ class Outcome:
 class Launcher:
     """Runs the stages of one configuration until it is stopped."""
 
-    def __init__(self, config: Config, overrides: Sequence[str], say: Callable[[str], None]) -> None:
-        """`say` is called with one line for each event."""
+    def __init__(
+        self,
+        config: Config,
+        overrides: Sequence[str],
+        say: Callable[[str], None],
+        trays: Collection[str] | None = None,
+    ) -> None:
+        """`say` is called with one line for each event. trays: of this host, see `process_list`.
+
+        Raises:
+            UserError: no process has its first tray among them.
+        """
         self._config = config
         self._path: Path = config.path
         self._overrides = tuple(overrides)
         self._say = say
-        self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in process_list(config)]
+        rows = process_list(config, trays)
+        if not rows:
+            raise UserError(f"{config.path}: no process has tray {', '.join(trays or ())} first: see launcher.shards")
+        self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in rows]
         self._watchdog = Watchdog(config.launcher.watchdog_s)
         self._is_started = False
         """all stages have been started and waited for"""
@@ -113,7 +127,7 @@ class Launcher:
         reads = {name: load_stage(name).reads_as_configured(self._config) for name in self._config.stages}
         with Bus(self._config.bus, stop) as bus:
             self._refuse_second_launcher(bus, stop)
-            before = self._parts()
+            before = set(self._parts())
             self._watcher = SiteWatcher(bus, self._config.site)
             try:
                 self._start_all(stop)
@@ -124,8 +138,7 @@ class Launcher:
                 self._restart_those_down()
             finally:
                 self._stop_all()
-                last = max(before, default=0)
-                self.outcome.recordings = [str(path) for number, path in self._parts().items() if number > last]
+                self.outcome.recordings = [str(path) for part, path in self._parts().items() if part not in before]
                 ready = [slot for slot in self._slots if slot.was_ready]  # one that was never ready has lost nothing
                 sessions = {each for slot in ready for each in slot.sessions}
                 self.outcome.lost = self._watcher.losses(sessions, reads)
@@ -141,8 +154,9 @@ class Launcher:
         learner that runs elsewhere. The stages check the rest.
         """
         learns = LEARNER in self._config.stages or not self._has_devices
-        if any(STAGES[name].needs_twin for name in self._config.stages):
-            for tray in (tray for tray in self._config.trays if tray.twin or not learns):
+        needed = {name for slot in self._slots if STAGES[slot.row.stage].needs_twin for name in slot.row.shard.trays}
+        for tray in self._config.trays:
+            if tray.name in needed and (tray.twin or not learns):
                 load_tray_twin(twin_path(tray, self._config.folder), tray.fans)
 
     def _refuse_second_launcher(self, bus: Bus, stop: threading.Event) -> None:
@@ -160,7 +174,7 @@ class Launcher:
                     f"site {self._config.site!r} already runs at {self._config.bus.endpoint} ({', '.join(running)}): "
                     "stop that, or give this one another site or bus.endpoint"
                 )
-            if self._has_devices and alive_key(self._config.site, REPLAY, "all") in alive:
+            if self._has_devices and alive_key(self._config.site, REPLAY, ALL_TRAYS) in alive:
                 raise UserError(
                     f"a replay presents site {self._config.site!r} at {self._config.bus.endpoint}: stop it, leave "
                     "acquisition out of launcher.stages, or give this one another site or bus.endpoint"
@@ -172,14 +186,17 @@ class Launcher:
     def _has_devices(self) -> bool:
         return any(not _listens_only(slot.row) for slot in self._slots)
 
-    def _parts(self) -> dict[int, Path]:
-        """The parts of the recording that are there, by number and in order, under their names when finished."""
-        recorder: Any = self._config.sections.get("recorder")
-        with suppress(OSError):
-            if recorder is not None:
-                path = self._config.run_folder / recorder.file
-                return {number: part_path(path, number) for number, _ in sorted(part_files(path))}
-        return {}
+    def _parts(self) -> dict[tuple[Path, int], Path]:
+        """The parts of the recordings that are there, by recording and number and in order, under their names when
+        finished."""
+        found: dict[tuple[Path, int], Path] = {}
+        recorder: Any = self._config.sections.get(RECORDER)
+        for slot in self._slots:
+            if slot.row.stage == RECORDER and recorder is not None:
+                path = self._config.run_folder / own_file(slot.row.instance, recorder.file)
+                with suppress(OSError):
+                    found |= {(path, number): part_path(path, number) for number, _ in sorted(part_files(path))}
+        return found
 
     def _start_all(self, stop: threading.Event) -> None:
         """Consumers first: sources start when all others are ready, so that no first sample is missed."""
@@ -308,24 +325,30 @@ class Launcher:
         return child is None or child.exit_status() is not None or self._watcher.is_ready(child.process_id)
 
     def _stop_all(self) -> None:
-        """Stop in the order of the data flow: each stage ends when it has processed all that was sent to it."""
-        for slot in self._slots:
-            if slot.child is None:
-                continue
-            status = slot.child.stop(self._config.launcher.stop_timeout_s)
-            if status is None:
-                self.outcome.killed.append(slot.row.label)
-                self._say(f"{slot.row.label}: did not stop in {self._config.launcher.stop_timeout_s:.0f} s, killed")
-            elif status not in _ORDERLY:
-                self.outcome.failed.append(slot.row.label)
-                self._say(f"{slot.row.label}: ended with status {status}: {slot.child.last_line}")
-            elif not self._has_reported(slot):
-                self.outcome.failed.append(slot.row.label)
-                self._say(f"{slot.row.label}: its last health message did not arrive: what it lost is unknown")
-            elif self._is_started and not slot.was_ready:
-                self.outcome.failed.append(slot.row.label)
-                self._say(f"{slot.row.label}: was never ready: it has received nothing")
-            slot.child = None
+        """Stop in the order of the data flow: each stage ends when it has processed all that was sent to it. Its
+        processes end together."""
+        for stage in dict.fromkeys(slot.row.stage for slot in self._slots):
+            of_stage = [(slot, slot.child) for slot in self._slots if slot.row.stage == stage and slot.child]
+            for _, child in of_stage:
+                child.terminate()
+            for slot, child in of_stage:
+                self._stop(slot, child)
+
+    def _stop(self, slot: _Slot, child: Child) -> None:
+        status = child.stop(self._config.launcher.stop_timeout_s)
+        if status is None:
+            self.outcome.killed.append(slot.row.label)
+            self._say(f"{slot.row.label}: did not stop in {self._config.launcher.stop_timeout_s:.0f} s, killed")
+        elif status not in _ORDERLY:
+            self.outcome.failed.append(slot.row.label)
+            self._say(f"{slot.row.label}: ended with status {status}: {child.last_line}")
+        elif not self._has_reported(slot):
+            self.outcome.failed.append(slot.row.label)
+            self._say(f"{slot.row.label}: its last health message did not arrive: what it lost is unknown")
+        elif self._is_started and not slot.was_ready:
+            self.outcome.failed.append(slot.row.label)
+            self._say(f"{slot.row.label}: was never ready: it has received nothing")
+        slot.child = None
 
     def _has_reported(self, slot: _Slot) -> bool:
         """Whether the last health message of a stage, with its counts, has arrived; it may arrive after the process

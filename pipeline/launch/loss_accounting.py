@@ -27,7 +27,7 @@ from pipeline.config.registry import STAGES
 from pipeline.runtime.stage import load_stage
 from schemas.messages import Health, StageStatus
 from schemas.streams import StreamId, StreamState, input_streams, output_streams
-from schemas.topics import HEALTH_CHUNK, current_name
+from schemas.topics import ALL_TRAYS, HEALTH_CHUNK, current_name, stage_label
 
 Launched: TypeAlias = tuple[str, int]
 """label and process id of a session"""
@@ -61,8 +61,17 @@ def losses(
 
 
 def label(health: Health) -> str:
-    """Name of a stage instance in messages to people: the stage, and its tray where it has one."""
-    return health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
+    """Name of a process of a stage in messages to people."""
+    return stage_label(health.stage, health.instance)
+
+
+def trays_of(health: Health) -> tuple[str, ...]:
+    """The trays of the process of a stage; none: all of the site."""
+    if health.trays:
+        return tuple(health.trays.split(","))
+    row = STAGES.get(health.stage)
+    is_of_one = row is not None and row.scope == "tray" and health.instance != ALL_TRAYS  # of an earlier version
+    return (health.instance,) if is_of_one else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +142,7 @@ class _Site:
         if stage not in STAGES:
             return False
         tray, topic = key.split("/")[-2:]
-        is_its_tray = STAGES[stage].scope == "site" or tray == health.instance
+        is_its_tray = tray in (trays_of(health) or (tray,))
         reads = self.reads[stage] if stage in self.reads else load_stage(stage).reads
         return is_its_tray and current_name(topic) in reads
 

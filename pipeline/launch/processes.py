@@ -1,4 +1,4 @@
-"""Child processes: one for each stage (and tray, where a stage has one each)."""
+"""Child processes: one for each stage, or for each shard of a stage."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.config.models import Config
-from pipeline.config.registry import STAGES
+from pipeline.config.shards import Shard, shards_of
 from pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
 from pipeline.launch.notices import Notices
 from pipeline.runtime.notifier import VARIABLE as NOTIFY_VARIABLE
+from schemas.topics import stage_label
 
 EXIT_CANNOT_START = 78  # the stage cannot run as configured; one line on stderr says why (EX_CONFIG of sysexits.h)
 
@@ -27,24 +28,27 @@ class StageProcess:
     """What to start: one row of the process list, which is data."""
 
     stage: str
-    instance: str
-    tray: str | None
+    shard: Shard
+
+    @property
+    def instance(self) -> str:
+        """The name of the process among those of its stage."""
+        return self.shard.name
 
     @property
     def label(self) -> str:
-        """Name in messages: the stage, and its tray where it has one."""
-        return f"{self.stage}/{self.tray}" if self.tray else self.stage
+        """Its name for people."""
+        return stage_label(self.stage, self.instance)
 
 
-def process_list(config: Config) -> list[StageProcess]:
-    """The processes of a configuration, in the order of the data flow."""
-    rows: list[StageProcess] = []
-    for name in config.stages:
-        if STAGES[name].scope == "tray":
-            rows += [StageProcess(name, tray.name, tray.name) for tray in config.trays]
-        else:
-            rows.append(StageProcess(name, "all", None))
-    return rows
+def process_list(config: Config, trays: Collection[str] | None = None) -> list[StageProcess]:
+    """The processes of a configuration, in the order of the data flow.
+
+    trays: only those whose first tray is one of these. So hosts that share the trays of a site among them start each
+    process once. None: all.
+    """
+    rows = (StageProcess(stage, shard) for stage in config.stages for shard in shards_of(stage, config))
+    return [row for row in rows if trays is None or row.shard.trays[0] in trays]
 
 
 class Child:
@@ -63,12 +67,11 @@ class Child:
         Raises:
             OSError: the system has no room for another process; nothing is left of it.
         """
-        command = [sys.executable, "-P", "-m", "pipeline", "run", row.stage, "-c", str(config_path)]
-        if row.tray:
-            command += ["--tray", row.tray]
+        command = [sys.executable, "-P", "-m", "pipeline", "run", row.stage, "-c", str(config_path), *row.shard.words]
         for override in overrides:
             command += ["--set", override]
         self.row = row
+        self._is_asked_to_end = False
         self.started_s = time.monotonic()
         self.last_line = ""
         self._on_line = on_line
@@ -118,13 +121,18 @@ class Child:
         """End it at once: it hangs, and catches no other signal."""
         self._process.kill()
 
+    def terminate(self) -> None:
+        """Ask it to end, once: a second signal would end it at once."""
+        if not self._is_asked_to_end and self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+        self._is_asked_to_end = True
+
     def stop(self, timeout_s: float) -> int | None:
         """Terminate it and wait; returns its exit status, None when it had to be killed.
 
         A process that was still starting does not catch the signal yet. It ends by it, as asked: status 0.
         """
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGTERM)
+        self.terminate()
         try:
             status = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:

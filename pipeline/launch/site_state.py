@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from pipeline.config.registry import STAGES
-from pipeline.launch.loss_accounting import label
+from pipeline.launch.loss_accounting import label, trays_of
 from pipeline.launch.processes import StageProcess
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.launch.watchdog import START_LIMIT_S
 from pipeline.runtime.clock import REPLAY
 from schemas.messages import Health, StageStatus
 from schemas.streams import input_streams, output_streams
-from schemas.topics import HEALTH_CHUNK, key_in_words
+from schemas.topics import ALL_TRAYS, HEALTH_CHUNK, key_in_words
 from schemas.units import NS_PER_S
 
 SILENT_AFTER_S = 5.0
@@ -59,6 +59,7 @@ class StageState:
         detail: what is wrong, in one line; empty if nothing is, or if the stage says it itself as its problem.
         view: its last session; None if it has not been heard.
         is_expected: whether the configuration asks for it.
+        trays: those that it has; none: all of the site.
     """
 
     label: str
@@ -66,6 +67,16 @@ class StageState:
     detail: str
     view: StageView | None
     is_expected: bool
+    trays: tuple[str, ...] = ()
+
+    @property
+    def stage(self) -> str:
+        """Whose process it is."""
+        return self.label.partition("/")[0]
+
+    def has(self, tray: str) -> bool:
+        """Whether it has a tray."""
+        return not self.trays or tray in self.trays
 
     @property
     def is_fault(self) -> bool:
@@ -81,30 +92,50 @@ def site_states(watcher: SiteWatcher, expected: Iterable[StageProcess]) -> list[
 def stage_states(
     views: Sequence[StageView], alive: Iterable[tuple[str, str]], expected: Iterable[StageProcess]
 ) -> list[StageState]:
-    """A state for each stage that is expected, in the order of the data flow, and for each other that was heard.
+    """A state for each process that is expected, in the order of the data flow, and for each other that was heard.
+
+    A process is not missing if others, which were started with other shards, have all of its trays.
 
     views: the latest session of each stage; alive: stage and instance of the sessions that are on the bus now.
     """
     alive = set(alive)
     by_name = {(view.health.stage, view.health.instance): view for view in views}
-    is_replayed = (REPLAY, "all") in alive
+    is_replayed = (REPLAY, ALL_TRAYS) in alive
     states: list[StageState] = []
+    in_its_place: set[str] = set()
+    """stages of which other processes have the trays of one that is expected"""
     for row in expected:
         name = (row.stage, row.instance)
         view = by_name.pop(name, None)
         if view is not None:
             states.append(_state_of(view, views, is_expected=True))
-        elif name in alive:
+            continue
+        trays = () if row.shard.is_whole else row.shard.trays
+        if name in alive:
             why = f"on the bus, but sends no health: it is still starting, or {WHY_SILENT}"
-            states.append(StageState(row.label, Word.SILENT, why, None, is_expected=True))
-        elif not (is_replayed and STAGES[row.stage].scope == "tray"):  # the replay plays what it would send
-            states.append(StageState(row.label, Word.MISSING, "not seen on the bus", None, is_expected=True))
-    return states + [_state_of(view, views, is_expected=False) for _, view in sorted(by_name.items())]
+            states.append(StageState(row.label, Word.SILENT, why, None, is_expected=True, trays=trays))
+        elif is_replayed and STAGES[row.stage].scope == "tray":
+            pass  # the replay plays what it would send
+        elif _have_all(row, views):
+            in_its_place.add(row.stage)
+        else:
+            states.append(StageState(row.label, Word.MISSING, "not seen on the bus", None, True, trays))
+    return states + [
+        _state_of(view, views, is_expected=view.alive and view.health.stage in in_its_place)
+        for _, view in sorted(by_name.items())
+    ]
+
+
+def _have_all(row: StageProcess, views: Sequence[StageView]) -> bool:
+    """Whether processes of a stage have all trays of another one that is not there."""
+    alive = [view.health for view in views if view.alive and view.health.stage == row.stage]
+    trays = [trays_of(health) for health in alive]
+    return bool(trays) and (() in trays or set(row.shard.trays) <= {tray for each in trays for tray in each})
 
 
 def _state_of(view: StageView, views: Sequence[StageView], *, is_expected: bool) -> StageState:
     word, detail = _judged(view, views)
-    return StageState(label(view.health), word, detail, view, is_expected)
+    return StageState(label(view.health), word, detail, view, is_expected, trays_of(view.health))
 
 
 def _judged(view: StageView, views: Sequence[StageView]) -> tuple[Word, str]:

@@ -15,6 +15,7 @@ from pipeline.launch.known_sessions import KnownSessions
 from pipeline.launch.loss_accounting import Launched, label, losses
 from pipeline.launch.refused_input import refused, unusable_lines
 from pipeline.launch.watched_alarms import WatchedAlarms
+from pipeline.runtime.sessions import Session
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
 from schemas.topics import alive_key, health_key, sessions_key, tray_key
@@ -101,7 +102,7 @@ class SiteWatcher:
             at_work = self._sessions.alive()
             heard = self._believed()  # as heard: a host's clock may be set back
             for each in sorted(heard, key=lambda each: self._sessions.is_alive(each.health.header.producer)):
-                if self._sessions.is_ignored(each.health.header.producer):
+                if self._sessions.is_replaced(each.health.header.producer):
                     continue
                 name = (each.health.stage, each.health.instance)
                 age_s = time.monotonic() - each.heard_s
@@ -121,6 +122,11 @@ class SiteWatcher:
         """Whether a message of this producer on this key is one of the site."""
         with self._lock:
             return self._sessions.counts(key, producer)
+
+    def owner(self, stage: str, tray: str) -> Session | None:
+        """The session of a stage that owns a tray now; None: there is none."""
+        with self._lock:
+            return self._sessions.owner(stage, tray)
 
     def alarms(self) -> list[Alarm]:
         """The last alarm message of every fan that had one, oldest first."""

@@ -15,6 +15,7 @@ from mcap.summary import Summary
 from pipeline.recordings.disk import is_being_written
 from pipeline.recordings.reading import METADATA_NAME
 from pipeline.recordings.records import CORRUPT_DATA_ERRORS, MESSAGE, chunk_at, indexed_reader, records_in
+from pipeline.recordings.run_recordings import RECORDING_KEY
 from pipeline.recordings.scan import Scan, scan
 from pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
@@ -95,13 +96,16 @@ def contents_of(path: Path) -> Contents:
 
 
 def continuity(parts: Sequence[Contents]) -> list[str]:
-    """Where parts do not continue one another as they should, one line each; parts in their order of time."""
+    """Where parts of a recording do not continue one another as they should, one line each; parts in their order of
+    time, also of several recordings."""
     by_name = {part.path.name: part for part in parts}
+    first = {part.metadata.get(RECORDING_KEY): part for part in reversed(parts)}
     lines = []
     for part in parts:
         name = part.metadata.get("continues", "")
         earlier = by_name.get(name)
-        if name and earlier is None and part is not parts[0]:  # those before the first were not asked for, or deleted
+        is_first = part is first[part.metadata.get(RECORDING_KEY)]
+        if name and earlier is None and not is_first:  # those before the first were not asked for, or deleted
             lines.append(f"{part.path.name} continues {name}, which is not among these files")
         ends_at = earlier.next if earlier else {}
         for stream, due in part.before.items():

@@ -7,15 +7,17 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from pipeline.recordings.run_recordings import recorded_files
 
 
 def in_order(parts: Iterable[Path]) -> list[Path]:
-    """The parts of a recording, the earliest first.
+    """The parts of a recording, or of the recordings of several shards, the earliest first. A folder stands for the
+    recordings in it.
 
     Raises:
         RecordingError: one cannot be read, or was not made by a recorder and so is not a part.
     """
-    paths = list(dict.fromkeys(parts))
+    paths = recorded_files(parts)
     if len(paths) > 1:
         for path in paths:
             if "source" in read_metadata(path).metadata:  # its sequence numbers start at 0, as those of the next do

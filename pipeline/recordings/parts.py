@@ -10,10 +10,12 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 
 from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
+from pipeline.recordings.rare_messages import last_messages
 from pipeline.recordings.reading import RecordingError, read_metadata
 from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.repair import (
@@ -23,8 +25,12 @@ from pipeline.recordings.repair import (
     free_original_name,
     repair_in_place,
 )
+from pipeline.recordings.run_recordings import RECORDING_KEY
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import RecordingWriter
+
+PARTS_SEARCHED = 3
+"""for the last messages of a topic"""
 
 
 def part_path(path: Path, number: int) -> Path:
@@ -62,7 +68,7 @@ class RecordingParts:
             RecordingError: nothing can be recorded there, or another recorder does.
         """
         self._path = path
-        self._metadata = dict(metadata) | {"session": session, "recording": path.name}
+        self._metadata = dict(metadata) | {"session": session, RECORDING_KEY: path.name}
         self._attachments = attachments
         self._part = 0
         self.repaired: list[Recovery] = []
@@ -117,6 +123,16 @@ class RecordingParts:
         self._writer = writer
         return writer
 
+    def last_messages(self, topic: str) -> dict[str, bytes]:
+        """The last message of a topic on each key in the last parts of this recording, as bytes."""
+        found: dict[str, bytes] = {}
+        with suppress(OSError, RecordingError):
+            files = sorted(part_files(self._path), reverse=True)
+            ours = (path for _, path in files if path.suffix == self._path.suffix and self._is_ours(path))
+            for path in islice(ours, PARTS_SEARCHED):
+                found = last_messages(path, topic) | found
+        return found
+
     def free_bytes(self) -> int:
         """Free space on the disk.
 
@@ -136,7 +152,7 @@ class RecordingParts:
 
     def _is_ours(self, path: Path) -> bool:
         try:
-            return read_metadata(path).metadata.get("recording") == self._path.name
+            return read_metadata(path).metadata.get(RECORDING_KEY) == self._path.name
         except RecordingError:
             return False
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from pipeline.recordings.reading import Reading, read_recording
@@ -24,6 +25,27 @@ def rare_messages(path: Path, topic: str) -> list[Envelope]:
         return list(_by_index(path, topic))
     except (OSError, CodecError, *CORRUPT_DATA_ERRORS):
         return list(read_recording(path, (topic,)))
+
+
+def last_messages(path: Path, topic: str) -> dict[str, bytes]:
+    """The last message of a topic on each key, as bytes. It is found by the file's index; none without one.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    reading = Reading(path, (topic,), None)
+    channels: dict[int, tuple[str, str]] = {}
+    found: dict[str, bytes] = {}
+    with suppress(*CORRUPT_DATA_ERRORS), path.open("rb") as file:
+        summary = indexed_reader(file).get_summary()
+        for channel in summary.channels.values() if summary else ():
+            reading.add_channel(channel, channels)
+        for chunk in reversed(summary.chunk_indexes) if summary else ():
+            missing = {number for number, (key, _) in channels.items() if key not in found}
+            if not missing.isdisjoint(chunk.message_index_offsets):
+                envelopes = reading.envelopes_in(chunk_at(file, chunk.chunk_start_offset, chunk.chunk_length), channels)
+                found = {envelope.key: envelope.payload for envelope in envelopes} | found
+    return found
 
 
 def _by_index(path: Path, topic: str) -> Iterator[Envelope]:

@@ -150,6 +150,11 @@ class RecordingMetadata:
     is_damaged: bool = False
     """something before the first message cannot be read: what is not here may have been there"""
 
+    @property
+    def trays(self) -> tuple[str, ...]:
+        """The trays that it names."""
+        return tuple(filter(None, self.metadata.get("trays", "").split(",")))
+
     def speed_unit(self, tray: str) -> str:
         """The unit in which people see a tray's speeds: the tray's, the recording's, or rad/s."""
         return self.metadata.get(f"speed_unit.{tray}") or self.metadata.get("speed_unit", "rad/s")

@@ -29,7 +29,8 @@ class RecorderConfig(StageConfig):
     )
     file: Path = Field(
         default=Path("recording.mcap"),
-        description="relative to run_folder; its parts are NAME.mcap, NAME-2.mcap and so on",
+        description="relative to run_folder; its parts are NAME.mcap, NAME-2.mcap and so on, of a shard "
+        "SHARD.NAME.mcap",
     )
     flush_interval_s: float = Field(default=1.0, gt=0, description="a crash loses at most this much")
     part_bytes: int = Field(default=100_000_000, ge=0, description="a new part begins at this size; 0: never")

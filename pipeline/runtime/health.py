@@ -24,13 +24,21 @@ class HealthBuilder:
     """Collects what a stage receives and sends, and builds its `Health` messages."""
 
     def __init__(
-        self, stage: str, instance: str, started_t_ns: int, *, may_drop: bool, main_keys: Iterable[str] = ()
+        self,
+        stage: str,
+        instance: str,
+        started_t_ns: int,
+        *,
+        may_drop: bool,
+        main_keys: Iterable[str] = (),
+        trays: Iterable[str] = (),
     ) -> None:
-        """main_keys: the keys of the stage's main input."""
+        """main_keys: the keys of the stage's main input. trays: those of the process; none: all of the site."""
         self._stage = stage
         self._instance = instance
         self._started_t_ns = started_t_ns
         self._may_drop = may_drop
+        self._trays = ",".join(trays)
         self.summary = "starting"
         """the status of the last health in one line"""
         self._latencies_ms: deque[tuple[float, float]] = deque(maxlen=_MAX_LATENCIES)
@@ -97,4 +105,5 @@ class HealthBuilder:
             newest_input_t_ns=self._newest_input_t_ns,
             newest_output_t_ns=self._newest_output_t_ns,
             notes=tuple(notes),
+            trays=self._trays,
         )

@@ -55,6 +55,13 @@ class ScorerConfig(StageConfig):
         description="health reports a fan without a score for this long; set it above twin_integrator.warm_up_s",
     )
 
+    asks_for_snapshots: bool | None = Field(
+        default=None,
+        description="whether it continues from the snapshot that a recorder keeps, where that is newer than its own "
+        "file, as on another host; with false and without the file, everything starts from the beginning; default: if "
+        "it is one of several shards",
+    )
+
     def timing(self, calibrated: Timing) -> Timing:
         """The times in force."""
         own = {name: getattr(self, name) for name in Timing.model_fields}

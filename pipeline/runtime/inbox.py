@@ -7,6 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from pipeline.bus.kept_messages import KeptQuery
 from pipeline.bus.recovery import Answer
 from pipeline.runtime.tracked_streams import Request
 
@@ -57,7 +58,7 @@ class Newest:
     answer: Answer
 
 
-Item: TypeAlias = FromBus | FromSource | Liveness | Recovered | Newest
+Item: TypeAlias = FromBus | FromSource | Liveness | Recovered | Newest | KeptQuery
 
 
 class Inbox:

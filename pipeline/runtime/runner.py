@@ -16,32 +16,34 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 
-from pipeline.bus.session import Bus
+from pipeline.bus.kept_messages import KeptQuery
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
+from pipeline.config.shards import Shard, chosen_shard
 from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.errors import UsageError, UserError
+from pipeline.runtime.building import build_and_join
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.due_messages import DueMessages
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
 from pipeline.runtime.inbox import INBOX_SIZE, FromBus, FromSource, Inbox, Item, Liveness, Newest, Recovered
+from pipeline.runtime.kept_snapshots import KeptForOthers
 from pipeline.runtime.newest_messages import NewestMessages
 from pipeline.runtime.notifier import Notifier
 from pipeline.runtime.outputs import Outputs
 from pipeline.runtime.peers import Peers
 from pipeline.runtime.recovery import Recovery
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from pipeline.runtime.sessions import Session, Sessions, refuse_second
+from pipeline.runtime.sessions import Session, Sessions
 from pipeline.runtime.sources import Sources
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage
+from pipeline.runtime.stage import BuiltStage, Core, Stage
 from pipeline.runtime.subscriptions import Subscriptions
 from schemas.blocks import join
 from schemas.codec import CodecError, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, Note, StageStatus, newest_t_ns
 from schemas.streams import stage_losses
-from schemas.topics import BY_NAME, alive_key, health_key, sessions_key, topic_of, tray_key
+from schemas.topics import ALL_TRAYS, BY_NAME, alive_key, health_key, sessions_key, topic_of, tray_key
 
 TICK_S = 0.05
 HEALTH_PERIOD_S = 1.0
@@ -61,79 +63,54 @@ class Runner:
         self,
         stage: Stage,
         config: Config,
-        tray: str | None,
+        shard: Shard | None,
         stop: threading.Event,
         on_health: Callable[[Health], None] | None = None,
     ) -> None:
-        """Build the stage. `tray` names the tray of a stage that has one process for each; `stop` ends `run`;
-        `on_health` is called with each health message while it runs.
+        """Build the stage and join the bus. `shard` says which trays it has, None: all; `stop` ends `run`; `on_health`
+        is called with each health message while it runs.
 
         Raises:
             StageError, ConfigError, BusError: it cannot be built; nothing has been published.
         """
-        trays = (config.tray(tray),) if tray else config.trays
-        is_per_tray = STAGES[stage.name].scope == "tray"
-        if is_per_tray and len(trays) != 1:
-            names = ", ".join(t.name for t in trays)
-            raise UsageError(f"{stage.name} runs one process for each tray: say which with --tray (one of {names})")
+        shard = shard or chosen_shard(stage.name, config)
         self.stage = stage
         self.stop = stop
         self._on_health = on_health or (lambda _health: None)
         self.launcher_gone = threading.Event()
         """Set when the process that started this stage has gone: it ends as soon as its producers have ended."""
         self._site = config.site
-        self._instance = trays[0].name if is_per_tray else "all"
-        self.producer = f"{stage.name}-{self._instance}-{secrets.token_hex(4)}"
+        self._shard = shard
+        self._trays = frozenset(shard.trays)
+        self.producer = f"{stage.name}-{self._shard.name}-{secrets.token_hex(4)}"
         self._inbox = Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
         started_t_ns = HOST_CLOCK.now_ns()
-        context = Context(
-            site=config.site,
-            trays=trays,
-            config=config.sections[stage.name],
-            folder=config.folder,
-            run_folder=config.run_folder,
-            started_t_ns=started_t_ns,
-            snapshot_folder=config.run_folder,
-            configuration_path=config.path,
-            configuration_text=config.text,
-            overrides=config.overrides,
-            reads=stage.reads_as_configured(config),
+        self._sources = Sources(self._inbox)
+        self._clock = StageClock()
+        self._sessions = Sessions()
+        self._session = Session.of_this_process(stage.name, shard, started_t_ns, self.producer)
+        self._bus, self._parts = build_and_join(stage, config, shard, self._session, stop)
+        before = {key: payload for parts in self._parts.values() for key, payload in parts.kept.items()}
+        self._kept = KeptForOthers(
+            self._bus, config.site, STAGES[stage.name].keeps, self.producer, before, self._inbox.put
         )
-        self._parts: dict[str, BuiltStage] = (
-            {t.name: stage.build(replace(context, trays=(t,))) for t in trays}
-            if stage.core_per_tray
-            else {"": stage.build(context)}
-        )
-        """by the tray that a core serves; an empty name: all"""
         self._has_source = any(parts.source for parts in self._parts.values())
         joins = stage.core_per_tray and not stage.wants_envelopes and not self._has_source
         self._due = DueMessages(self._parts, joins=joins)
         """to be processed before anything else"""
-        self._sources = Sources(self._inbox)
-        self._clock = StageClock()
-        self._sessions = Sessions()
-        self._session = Session.of_this_process(stage.name, self._instance, started_t_ns, self.producer)
-        self._bus = Bus(config.bus, stop)
-        try:
-            refuse_second(self._bus, config.site, self._session, stop)
-        except UserError:
-            for parts in self._parts.values():
-                parts.core.abort()
-            self._bus.close()
-            raise
         self._recovery = Recovery(self._bus, self._inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
         self._tracker = SequenceTracker(self._recovery.ask, sessions=self._sessions)
-        self._outputs = Outputs(self._bus, config.site, stage, [t.name for t in trays], self.producer)
+        self._outputs = Outputs(self._bus, config.site, stage, list(shard.trays), self.producer)
         self._health_publisher = self._bus.publisher(
-            health_key(config.site, stage.name, self._instance), BY_NAME["health"], type_name(Health), self.producer
+            health_key(config.site, stage.name, self._shard.name), BY_NAME["health"], type_name(Health), self.producer
         )
         self._subscriptions = Subscriptions(
             self._bus,
             config.site,
             stage.reads_as_configured(config),
             stage.undecoded,
-            [t.name for t in trays],
+            shard.trays,
             self._on_bus,
             self._tracker.forget,
         )
@@ -145,10 +122,11 @@ class Runner:
         )  # the core of a source reports its silence
         self._health = HealthBuilder(
             stage.name,
-            self._instance,
+            self._shard.name,
             started_t_ns,
             may_drop=stage.may_drop,
-            main_keys=self._read_keys & {tray_key(config.site, t.name, main) for t in trays},
+            main_keys=self._read_keys & {tray_key(config.site, tray, main) for tray in shard.trays},
+            trays=() if shard.is_whole else shard.trays,
         )
         self._notifier = Notifier.from_environment()
         self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
@@ -223,7 +201,7 @@ class Runner:
             self._catch_up()
             self._loop(self._has_caught_up, StageStatus.STARTING)
             self._health.has_caught_up()
-        self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
+        self._bus.declare_alive(alive_key(self._site, self.stage.name, self._shard.name))
         for name, parts in self._parts.items():
             self._sources.start(name, parts)
 
@@ -344,32 +322,37 @@ class Runner:
             self._handle_recovered(item)
         elif isinstance(item, Newest):
             self._handle_newest(item)
+        elif isinstance(item, KeptQuery):
+            self._kept.answer(item)
         elif isinstance(item, Liveness):
             self._peers.update(item)
             self._sessions.update(item.key, item.alive)
-            if item.key == alive_key(self._site, REPLAY, "all"):
+            if item.key == alive_key(self._site, REPLAY, ALL_TRAYS):
                 self._clock.set_replay_alive(item.alive)
         else:
-            envelope = self._decode(item.key, item.payload, item.received_t_ns)
-            if envelope is None:
-                return
-            is_undecoded = self._is_undecoded(envelope)
-            if is_undecoded and envelope.key not in self._subscriptions.current:
-                return  # it was on its way when the core ceased to follow its tray
-            message = None if is_undecoded else envelope.message
-            if isinstance(message, Health):
-                self._handle_health(envelope, message)
-            elif isinstance(message, Clock):
-                if not self._clock.update(message):
-                    self._counts["refused_clocks"] += 1
-            else:
-                self._health.add_input(envelope.key, envelope.received_t_ns, HOST_CLOCK.now_ns())
-                self._due.add(self._tracker.accept(envelope))
+            self._handle_from_bus(item)
+
+    def _handle_from_bus(self, item: FromBus) -> None:
+        envelope = self._decode(item.key, item.payload, item.received_t_ns)
+        if envelope is None:
+            return
+        is_undecoded = self._is_undecoded(envelope)
+        if is_undecoded and envelope.key not in self._subscriptions.current:
+            return  # it was on its way when the core ceased to follow its tray
+        message = None if is_undecoded else envelope.message
+        if isinstance(message, Health):
+            self._handle_health(envelope, message)
+        elif isinstance(message, Clock):
+            if not self._clock.update(message):
+                self._counts["refused_clocks"] += 1
+        else:
+            self._health.add_input(envelope.key, envelope.received_t_ns, HOST_CLOCK.now_ns())
+            self._due.add(self._tracker.accept(envelope))
 
     def _handle_recovered(self, item: Recovered) -> None:
         now_ns = HOST_CLOCK.now_ns()
         decoded = (self._decode(key, payload, now_ns) for key, payload in item.answer.messages)
-        envelopes = [e for e in decoded if e is not None and e.header.producer != self.producer]
+        envelopes = [e for e in decoded if e and e.header.producer != self.producer and self._concerns(e)]
         if self._recovery.is_catch_up(item.request):
             due = self._tracker.accept_kept(envelopes)
         else:
@@ -390,7 +373,8 @@ class Runner:
 
     def _counts_on_its_key(self, envelope: Envelope) -> bool:
         producer = envelope.header.producer
-        return not (self._sessions.is_ignored(producer) or self._sessions.is_stranger(envelope.key, producer))
+        is_ignored = self._sessions.is_ignored(producer, envelope.header.tray)
+        return not (is_ignored or self._sessions.is_stranger(envelope.key, producer))
 
     def _handle_health(self, envelope: Envelope, health: Health) -> None:
         if not self._tracker.believes(health):
@@ -400,8 +384,18 @@ class Runner:
             self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
         self._sessions.add_health(health, self._read_keys)
         self._due.add(self._tracker.reconcile(health, self._subscriptions.current))
-        if "health" in self.stage.reads:
+        if "health" in self.stage.reads and self._concerns(envelope):
             self._due.add(self._tracker.accept(envelope))
+
+    def _concerns(self, envelope: Envelope) -> bool:
+        """Whether a message is of a tray of this process. Health is of all trays of its process: so each recorder has
+        the health of all processes that work on its trays, whatever becomes of the others."""
+        if envelope.topic != "health" or self._shard.is_whole:
+            return True
+        message = envelope.message
+        if not isinstance(message, Health) or not message.trays:
+            return True
+        return not self._trays.isdisjoint(message.trays.split(","))
 
     def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
         try:
@@ -426,11 +420,13 @@ class Runner:
         if self._has_source and is_of_replay(header.producer):  # a recorded command must not drive today's fan
             self._counts["refused_of_replay"] += count
             return
-        if self._sessions.is_ignored(header.producer) and first.topic != "health":
+        if first.topic != "health" and self._sessions.is_ignored(header.producer, header.tray):
             self._counts["refused_of_second"] += count
             for envelope in envelopes:
                 self._tracker.refuse_second(envelope)
             return
+        for envelope in envelopes:
+            self._kept.add(envelope)
         if first.topic == self.stage.reads[0] and not self._has_source:  # samples of a device depend on no input
             for envelope in envelopes:
                 self._outputs.advance(header.tray, first.topic, envelope.header)

@@ -1,9 +1,11 @@
-"""One owner of each stage: which process runs it, and whose messages count where two do.
+"""One owner of each tray in each stage: which process has it, and whose messages count where two have it.
 
-Each stage session shows a liveliness token from before its first message until it ends, however it ends. A stage whose
-token another process already shows is refused at its start. Where two were started at once, or a network has healed,
-all see both tokens: the session that started later owns the stage, and what the other publishes is ignored until one of
-them ends. Ownership depends only on the tokens that exist now, so a clock that was once wrong has no effect later.
+Each session of a stage shows a liveliness token, which says its trays, from before its first message until it ends,
+however it ends. A stage is refused at its start if the token of another process already shows one of its trays. Where
+two were started at once, or a network has healed, all see both tokens: of each tray that both have, the session that
+started later is the owner, and what the other publishes for that tray is ignored until one of them ends. Ownership
+depends only on the tokens that exist now, so a clock that was once wrong has no effect later. Nobody has to be asked,
+and the one that is ignored goes on working: it takes over at once when the owner ends.
 """
 
 from __future__ import annotations
@@ -11,29 +13,29 @@ from __future__ import annotations
 import os
 import re
 import socket
-import threading
-import time
-from collections.abc import Set
+from collections.abc import Collection, Iterable, Iterator, Set
 from dataclasses import dataclass
 
-from pipeline.bus.session import Bus
-from pipeline.config.registry import STAGES
-from pipeline.runtime.clock import REPLAY
-from pipeline.runtime.stage import StageError
+from pipeline.config.shards import Shard
 from schemas.messages import Health
-from schemas.topics import SESSION_CHUNK, alive_key, health_key, sessions_key
+from schemas.topics import ALL_TRAYS, SESSION_CHUNK, health_key, sessions_key, stage_label
 
-GOSSIP_S = 0.2
-"""how long a starting stage waits for further processes after it has met the first: they took 6 ms"""
-LEAVING_LIMIT_S = 2.0
-"""how long it waits for a predecessor that is about to leave"""
 MOST_SESSIONS = 4096
-_POLL_S = 0.02
+_BETWEEN_TRAYS = "+"
+"""in a token: no tray has it in its name"""
+_TRAYS_SHOWN = 3
+"""by name, of those that two sessions have"""
 
 
 @dataclass(frozen=True)
 class Session:
-    """A process that runs a stage. `started_t_ns`: when it began, host time; `producer`: how it signs messages."""
+    """A process that runs a stage.
+
+    Attributes:
+        started_t_ns: when it began, host time.
+        producer: how it signs messages.
+        trays: those that it has; none: all of the site.
+    """
 
     stage: str
     instance: str
@@ -41,33 +43,49 @@ class Session:
     producer: str
     host: str
     process_id: int
+    trays: tuple[str, ...] = ()
 
     @classmethod
-    def of_this_process(cls, stage: str, instance: str, started_t_ns: int, producer: str) -> Session:
+    def of_this_process(cls, stage: str, shard: Shard, started_t_ns: int, producer: str) -> Session:
         """The session of a stage that runs in this process."""
         host = re.sub(r"[^A-Za-z0-9_.-]", "_", socket.gethostname()) or "unknown"
-        return cls(stage, instance, started_t_ns, producer, host, os.getpid())
+        trays = () if shard.is_whole else shard.trays
+        return cls(stage, shard.name, started_t_ns, producer, host, os.getpid(), trays)
 
     @classmethod
     def of_key(cls, key: str) -> Session | None:
-        """The session that shows the token `key`; None if it is no such token."""
+        """The session that shows the token `key`; None if it is no such token.
+
+        A token without trays, as those of earlier versions, is of all trays or of the one that its instance names.
+        """
         parts = key.split("/")
-        if len(parts) != 9 or parts[2] != SESSION_CHUNK:
+        if len(parts) not in (9, 10) or parts[2] != SESSION_CHUNK:
             return None
-        stage, instance, started, producer, host, process_id = parts[3:]
+        stage, instance, started, producer, host, process_id = parts[3:9]
         if not (_is_number(started) and _is_number(process_id)):
             return None
-        return cls(stage, instance, int(started), producer, host, int(process_id))
+        named = parts[9].split(_BETWEEN_TRAYS) if len(parts) > 9 else () if instance == ALL_TRAYS else (instance,)
+        return cls(stage, instance, int(started), producer, host, int(process_id), tuple(named))
 
     def key(self, site: str) -> str:
         """The key of its token."""
         prefix = sessions_key(site, self.stage, self.instance).removesuffix("/**")
-        return f"{prefix}/{self.started_t_ns}/{self.producer}/{self.host}/{self.process_id}"
+        own = f"{prefix}/{self.started_t_ns}/{self.producer}/{self.host}/{self.process_id}"
+        is_named = not self.trays or (self.trays == (self.instance,) and self.instance != ALL_TRAYS)
+        return own if is_named else f"{own}/{_BETWEEN_TRAYS.join(self.trays)}"
+
+    def has(self, tray: str) -> bool:
+        """Whether this tray is one of its trays."""
+        return not self.trays or tray in self.trays
+
+    def shares_a_tray_with(self, other: Session) -> bool:
+        """Whether both have a tray."""
+        return not (self.trays and other.trays and set(self.trays).isdisjoint(other.trays))
 
     @property
     def name(self) -> str:
-        """The stage and its tray, for people."""
-        return self.stage if self.instance == "all" else f"{self.stage}/{self.instance}"
+        """The process, for people: the stage, and its trays where it does not have all."""
+        return stage_label(self.stage, self.instance)
 
     @property
     def process(self) -> str:
@@ -90,12 +108,16 @@ class Session:
 
 
 class Sessions:
-    """The sessions on the bus, and which of them are ignored."""
+    """The sessions on the bus, and which of them are ignored, for which trays."""
 
     def __init__(self) -> None:
         self._alive: dict[str, Session] = {}
-        self._ignored: dict[str, tuple[Session, Session]] = {}
-        """by producer: the session that is ignored, and the one that owns its stage"""
+        self._by_producer: dict[str, Session] = {}
+        """those that are alive"""
+        self._owners: dict[str, _Owners] = {}
+        """by stage"""
+        self._problems: dict[str, str] = {}
+        """by stage, where trays have two owners"""
         self._written: dict[str, set[str]] = {}
         """by producer of a session: the keys on which it publishes"""
         self._ended: dict[str, None] = {}
@@ -107,19 +129,18 @@ class Sessions:
         if session is None or (alive and len(self._alive) >= MOST_SESSIONS):
             return
         if alive:
-            self._alive[key] = session
+            self._alive[key] = self._by_producer[session.producer] = session
             self._written.setdefault(session.producer, {health_key(key.split("/")[1], session.stage, session.instance)})
         else:
             self._alive.pop(key, None)
+            self._by_producer.pop(session.producer, None)
             if self._written.pop(session.producer, None) is not None:
                 self._ended[session.producer] = None
                 if len(self._ended) > MOST_SESSIONS:
                     del self._ended[next(iter(self._ended))]
-        owners: dict[tuple[str, str], Session] = {}
-        for each in sorted(self._alive.values(), key=lambda each: (each.started_t_ns, each.producer)):
-            owners[each.stage, each.instance] = each
-        found = ((each, owners[each.stage, each.instance]) for each in self._alive.values())
-        self._ignored = {each.producer: (each, owner) for each, owner in found if each is not owner}
+        of_stage = _Owners(each for each in self._alive.values() if each.stage == session.stage)
+        self._owners[session.stage] = of_stage
+        self._problems[session.stage] = "; ".join(of_stage.conflicts())
 
     def add_health(self, health: Health, read_keys: Set[str]) -> None:
         """A stage has said what it publishes; `read_keys`: the keys that matter here."""
@@ -137,49 +158,84 @@ class Sessions:
             return False
         return any(key in keys for keys in self._written.values())
 
-    def is_ignored(self, producer: str) -> bool:
-        """Whether another process owns the stage of this producer."""
-        return producer in self._ignored
+    def is_ignored(self, producer: str, tray: str) -> bool:
+        """Whether this producer is a session that has a tray of which another one is the owner."""
+        session = self._by_producer.get(producer)
+        owner = self._owners[session.stage].of(tray) if session else None
+        return owner is not None and owner is not session
+
+    def named(self, stage: str, instance: str) -> Session | None:
+        """The session of this stage and instance, the one that started last; None: there is none."""
+        return self._owners[stage].named(instance) if stage in self._owners else None
+
+    def is_replaced(self, producer: str) -> bool:
+        """Whether this producer is a session of whose stage and instance another one started later."""
+        session = self._by_producer.get(producer)
+        return session is not None and self.named(session.stage, session.instance) is not session
+
+    def owner(self, stage: str, tray: str) -> Session | None:
+        """The session of a stage that owns a tray; None: there is none."""
+        return self._owners[stage].of(tray) if stage in self._owners else None
 
     def problem(self) -> str:
-        """The stages that run twice; empty if none does."""
-        return "; ".join(
+        """The trays with two owners; empty if there is none."""
+        return "; ".join(filter(None, self._problems.values()))
+
+
+class _Owners:
+    """Which of the sessions of one stage is the owner of each tray: the one that started last of those that have it."""
+
+    def __init__(self, sessions: Iterable[Session]) -> None:
+        self._sessions = sorted(sessions, key=lambda each: (each.started_t_ns, each.producer))
+        self._by_name = {each.instance: each for each in self._sessions}
+        self._of_tray: dict[str, Session] = {}
+        self._of_others: Session | None = None
+        """of all trays that are not named"""
+        for each in self._sessions:
+            if not each.trays:
+                self._of_tray, self._of_others = {}, each
+            for tray in each.trays:
+                self._of_tray[tray] = each
+
+    def of(self, tray: str) -> Session | None:
+        """The owner of a tray."""
+        return self._of_tray.get(tray, self._of_others)
+
+    def named(self, instance: str) -> Session | None:
+        """The session of this name that started last."""
+        return self._by_name.get(instance)
+
+    def conflicts(self) -> Iterator[str]:
+        """A line for each two sessions of which one is ignored for the benefit of the other."""
+        by_producer = {each.producer: each for each in self._sessions}
+        for each in self._sessions:
+            lost: dict[str, list[str]] = {}
+            for tray in each.trays or self._of_tray:
+                if (owner := self.of(tray)) is not None and owner is not each:
+                    lost.setdefault(owner.producer, []).append(tray)
+            if not each.trays and self._of_others is not None and self._of_others is not each:
+                lost = {self._of_others.producer: []}
+            yield from (_conflict(each, by_producer[owner], trays) for owner, trays in lost.items())
+
+
+def _conflict(ignored: Session, owner: Session, trays: Collection[str]) -> str:
+    """trays: those that both have; none: all."""
+    if ignored.instance == owner.instance:
+        return (
             f"{ignored.name} runs twice: {ignored.process} is ignored, because {owner.process} started later; "
             "stop one of them"
-            for ignored, owner in self._ignored.values()
         )
+    return (
+        f"two owners of {trays_in_words(trays)} in {ignored.stage}: {ignored.name}, {ignored.process}, is ignored, "
+        f"because {owner.name}, {owner.process}, started later; stop one of them, or give it other trays"
+    )
 
 
-def refuse_second(bus: Bus, site: str, session: Session, stop: threading.Event) -> None:
-    """Return if no other process runs this stage, and no replay presents the site to a stage with a device; wait a
-    moment for one that is about to leave.
-
-    Raises:
-        StageError: one does.
-        BusError: a program that is not fantwin listens at the endpoint.
-    """
-    replay = alive_key(site, REPLAY, "all") if STAGES[session.stage].scope == "tray" else ""
-    bus.wait_for_others(stop)
-    met_s = time.monotonic()
-    while True:
-        others, is_replayed = _others(bus, site, session), bool(replay and bus.alive(replay))
-        limit_s = LEAVING_LIMIT_S if others or is_replayed else GOSSIP_S
-        if time.monotonic() - met_s >= limit_s or not bus.came_second or stop.wait(_POLL_S):
-            break
-    if is_replayed:
-        raise StageError(
-            f"a replay presents site {site!r}: stop it, or give {session.name} another site or bus.endpoint"
-        )
-    if others:
-        raise StageError(
-            f"{session.name} of site {site!r} already runs: {others[0].process}; stop that, or give this one another "
-            "site, tray or bus.endpoint"
-        )
-
-
-def _others(bus: Bus, site: str, session: Session) -> list[Session]:
-    found = (Session.of_key(key) for key in bus.alive(sessions_key(site, session.stage, session.instance)))
-    return [each for each in found if each is not None and each != session and each.may_live(session.host)]
+def trays_in_words(trays: Collection[str]) -> str:
+    """Some trays for people, the first ones by name; none are all."""
+    first = list(trays)[:_TRAYS_SHOWN]
+    more = f" and {len(trays) - len(first)} more" if len(trays) > len(first) else ""
+    return f"tray{'s' * (len(trays) > 1)} {', '.join(first)}{more}" if first else "all trays"
 
 
 def _is_number(text: str) -> bool:

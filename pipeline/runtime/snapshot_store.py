@@ -1,18 +1,32 @@
-"""Where a stage keeps the state that survives a restart: one small file, replaced as a whole."""
+"""Where a stage keeps the state that survives a restart: one small file, replaced as a whole.
+
+The file may be missing, or old, where the stage ran on another host since. So what other stages keep is looked at as
+well, and the newest snapshot counts.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import os
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from pipeline.runtime.stage import StageError
 from schemas.codec import CodecError, decode, encode
 from schemas.messages import ScorerSnapshot
+from schemas.units import NS_PER_S
 
 FORMER_SUFFIX = ".memory"
 """what earlier versions called the file: a site that is upgraded must not forget its baselines and alarms"""
+
+
+RECENT_NS = 120 * NS_PER_S
+"""a file that is no older, two periods of snapshots, is that of the last session, unless somebody knows a newer one"""
+AHEAD_NS = NS_PER_S
+"""a snapshot that is further ahead of the present is of a clock that was wrong"""
+Elsewhere = Callable[[bool], tuple[Sequence[ScorerSnapshot], str]]
+"""the snapshots that others keep, and why there may be more; given whether to wait for those who are not there yet"""
 
 
 class SnapshotStore:
@@ -22,8 +36,15 @@ class SnapshotStore:
     user who later removes the new file, to start without, must not get back the state from before the upgrade.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, elsewhere: Elsewhere | None = None, now_ns: int = 0) -> None:
+        """elsewhere: asked once, by the first `load`; None: nobody is. now_ns: the present time."""
         self.path = path
+        self.note = ""
+        """one line, if `load` has found a newer snapshot than that of the file, or may have missed one"""
+        self._elsewhere = elsewhere
+        self._kept: Sequence[ScorerSnapshot] = ()
+        self._is_asked = False
+        self._now_ns = now_ns
         self._former = path.with_suffix(FORMER_SUFFIX)
         self._lock: int | None = None
         self.problem = ""
@@ -64,25 +85,45 @@ class SnapshotStore:
             self._lock = None
 
     def load(self) -> ScorerSnapshot | None:
-        """The last snapshot; None when there is none.
+        """The last snapshot, of the file or of those that others keep; None when there is none.
+
+        The last one counts also if it is of another twin: what operators have set since must not be forgotten.
 
         Raises:
-            StageError: there is one, and it cannot be read.
+            StageError: there is a file, and it cannot be read.
         """
+        own = self._read()
+        if self._elsewhere is None:
+            return own
+        if not self._is_asked:
+            is_recent = own is not None and own.t_ns > self._now_ns - RECENT_NS
+            self._kept, why = self._elsewhere(not is_recent)
+            self._is_asked = True
+            from_what = "from the file here" if own else "without a snapshot"
+            self.note = f"continued {from_what}: {why}" if why else ""
+        found = [*([own] if own else []), *self._kept]
+        last = max(found, key=lambda each: (each.t_ns <= self._now_ns + AHEAD_NS, each.t_ns), default=None)
+        if last is not None and last is not own:
+            of_file = (
+                f"the file here is {(last.t_ns - own.t_ns) / NS_PER_S:.0f} s older" if own else "there is none here"
+            )
+            self.note = f"continued from the snapshot that the recorder keeps; {of_file}"
+        return last
+
+    def _read(self) -> ScorerSnapshot | None:
         path = self._former if self._former.exists() and not self.path.exists() else self.path
         try:
-            message = decode(ScorerSnapshot, path.read_bytes())
+            return decode(ScorerSnapshot, path.read_bytes())
         except FileNotFoundError:
             return None
         except OSError as error:
             raise StageError(f"{path}: cannot read the scorer's snapshot: {error.strerror}") from error
         except CodecError as error:
+            start = "continue from the one that the recorder keeps, or" if self._elsewhere else "start"
             raise StageError(
-                f"{path}: not a scorer's snapshot ({error}); remove it to start without one: all fans are then "
+                f"{path}: not a scorer's snapshot ({error}); remove it to {start} without one: all fans are then "
                 "commissioned again"
             ) from error
-        assert isinstance(message, ScorerSnapshot)
-        return message
 
     def save(self, snapshot: ScorerSnapshot) -> None:
         """Replace the snapshot. A full disk is reported in `problem` and does not stop the scorer."""

@@ -13,11 +13,12 @@ from typing import Any, Protocol
 
 from pipeline.config.models import Config, Section, TrayConfig
 from pipeline.config.registry import STAGES
+from pipeline.config.shards import own_file
 from pipeline.errors import UserError
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from schemas.envelope import Envelope
-from schemas.messages import Message
-from schemas.topics import BY_NAME
+from schemas.messages import Message, ScorerSnapshot
+from schemas.topics import ALL_TRAYS, BY_NAME
 
 
 class StageConfig(Section):
@@ -96,6 +97,15 @@ class Source(Protocol):
         ...
 
 
+class Kept(Protocol):
+    """The snapshots that other stages keep: `pipeline.runtime.kept_snapshots`."""
+
+    def of(self, tray: str, *, is_patient: bool) -> tuple[Sequence[ScorerSnapshot], str]:
+        """The last one of a tray that each stage keeps, and why there may be others, for people; empty: there are none.
+        is_patient: wait for a stage that is not there yet."""
+        ...
+
+
 @dataclass(frozen=True)
 class Context:
     """What a stage is built from: its own section, the trays it serves, and where relative paths start."""
@@ -106,8 +116,14 @@ class Context:
     folder: Path
     run_folder: Path
     started_t_ns: int
+    instance: str = ALL_TRAYS
+    """the name of the process"""
+    shard_number: int = 1
+    """of a numbered shard"""
     snapshot_folder: Path | None = None
     """where a stage keeps the state that survives a restart; None: nothing is kept, as in a replay"""
+    kept: Kept | None = field(default=None, repr=False)
+    """what others keep of that state; None: nobody is asked"""
     configuration_path: Path | None = None
     """the configuration file; None: there is none, as in a replay"""
     configuration_text: str = field(default="", repr=False)
@@ -126,6 +142,10 @@ class Context:
         (tray,) = self.trays
         return tray
 
+    def own_file(self, path: Path) -> Path:
+        """A file of this process in the run folder."""
+        return self.run_folder / own_file(self.instance, path)
+
     def resolve(self, path: Path) -> Path:
         """A path of the configuration file, taken relative to that file."""
         return path if path.is_absolute() else self.folder / path
@@ -133,10 +153,16 @@ class Context:
 
 @dataclass(frozen=True)
 class BuiltStage:
-    """A built stage: the core, and the source that feeds it, if it has one."""
+    """A built stage.
+
+    Attributes:
+        source: feeds the core; None: the bus does.
+        kept: messages from before that it keeps for others, by key.
+    """
 
     core: Core
     source: Source | None = None
+    kept: Mapping[str, bytes] = field(default_factory=dict)
 
 
 def no_problems(_context: Context) -> Sequence[str]:

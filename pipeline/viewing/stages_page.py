@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.messages import Health, ModelCard, StageStatus
-from schemas.topics import key_in_words
+from schemas.topics import key_in_words, stage_label
 
 CHANGES_SHOWN = 20
 PROBLEM_LENGTH = 200
@@ -65,7 +65,7 @@ class StagesPage:
 
     def add_health(self, health: Health) -> None:
         """Store the health of a stage."""
-        name = health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
+        name = stage_label(health.stage, health.instance)
         before = self._stages.get(name)
         self._stages[name] = _Latest(health)
         text = _describe(health)

@@ -153,6 +153,12 @@ def test_every_alarm_and_answer_is_in_the_snapshot_before_it_is_emitted(tmp_path
     assert noted()["shelved_until_t_ns"] > 0
 
 
+def test_a_snapshot_is_published_before_the_alarms_that_it_contains() -> None:
+    scorer = commissioned(core_of())
+    messages = scorer.step(prediction_of(np.full(100, 20.0)))
+    assert [type(message) for message in messages] == [Score, ScorerSnapshot, Alarm]
+
+
 @pytest.mark.parametrize(("fans", "rest_s"), [(64, 0.0), (80, 0.4)])
 def test_in_a_storm_of_alarms_a_large_tray_takes_its_snapshots_one_after_a_rest(fans: int, rest_s: float) -> None:
     scorer = commissioned(core_of(fans, calibration=LIVELY, baseline_s=0.1, on_delay_s=0.03), fans)

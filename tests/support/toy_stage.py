@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.bus.session import Bus
+from pipeline.config.shards import chosen_shard
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from schemas.codec import decode, encode, type_name
@@ -84,6 +85,7 @@ class Bench:
     """A stage running in a thread, and a second session on the bus that feeds it and listens."""
 
     def __init__(self, stage: Stage, config, tray: str | None = None) -> None:
+        """tray: as on the command line, one or several."""
         self.stop = threading.Event()
         self.heard: queue.Queue[tuple[str, Message]] = queue.Queue()
         self.bus = Bus(config.bus)
@@ -93,7 +95,7 @@ class Bench:
             name: self.bus.publisher(tray_key("s", name, "raw"), BY_NAME["raw"], type_name(Raw), "feeder")
             for name in (TRAY_A, TRAY_B)
         }
-        self.runner = Runner(stage, config, tray, self.stop)
+        self.runner = Runner(stage, config, chosen_shard(stage.name, config, tray), self.stop)
         self.last: list[Health] = []
         self.crashes: list[ZeroDivisionError] = []
         self.thread = threading.Thread(target=self._run)

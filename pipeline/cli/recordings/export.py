@@ -23,8 +23,9 @@ from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.arrays import Block, read_topics
 from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.order import in_order
-from pipeline.recordings.reading import read_metadata, read_recording
+from pipeline.recordings.reading import read_recording
 from pipeline.recordings.records import ACTIVE_SUFFIX
+from pipeline.recordings.run_recordings import run_metadata
 from pipeline.recordings.tables import Form, TableFile, open_table
 from schemas.topics import current_name
 
@@ -112,7 +113,7 @@ class _Tables:
         if output.suffix in (".csv", ".parquet") and output.suffix != f".{form}":
             raise UsageError(f"{output}: name a file that ends in .{form} with -o, or a folder")
         self.begun: dict[Path, _Table] = {}
-        self._metadata = read_metadata(parts[0])
+        self._metadata = run_metadata(parts)
         self._stem = parts[0].name.removesuffix(ACTIVE_SUFFIX).removesuffix(".mcap")
         self._form: Form = form
         self._output = output

@@ -25,8 +25,10 @@ from pipeline.recordings.dates import format_clock, format_local
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.reading import left_out_of
 from pipeline.recordings.records import active_path
+from pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
 from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 from schemas.messages import Health
+from schemas.streams import StreamId
 from schemas.units import NS_PER_S
 
 _WIDEST = 1000
@@ -34,7 +36,9 @@ _WIDEST = 1000
 
 
 def info(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="A recording, or the parts of one.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="A recording, the parts of one, or a run folder.")
+    ],
     json_output: JsonOption = False,
 ) -> None:
     """Show what a recording contains: time, trays, twins, messages and losses of each topic, problems of stages.
@@ -43,10 +47,12 @@ def info(
     far as possible; one that is still being written, up to its last flush. Exit code 3 if messages are missing or a
     file is damaged.
 
+    The recordings of the shards of a recorder are those of one run: name all, or the run folder.
+
     Example: fantwin info runs/recording.mcap
     """
     with working(f"reading {', '.join(str(file) for file in files)}"):
-        present = dict.fromkeys(map(_present, files))
+        present = recorded_files(map(_present, files), with_unfinished=True)
         parts = sorted(map(contents_of, present), key=lambda part: part.first_ns or 0)
     breaks = continuity(parts)
     if json_output:
@@ -63,17 +69,33 @@ def _present(file: Path) -> Path:
 
 
 def _sessions(parts: Iterable[Contents]) -> list[Health]:
-    """The last health of each session in all parts."""
+    """The last health of each session in all parts; recordings of two shards may both have some of a session."""
     sessions: dict[str, Health] = {}
     for health in (health for part in parts for health in part.sessions):
-        sessions.pop(health.header.producer, None)
-        sessions[health.header.producer] = health
+        before = sessions.pop(health.header.producer, health)
+        is_newer = health.header.sequence >= before.header.sequence
+        sessions[health.header.producer] = health if is_newer else before
     return list(sessions.values())
+
+
+def _streams(parts: Iterable[Contents]) -> list[tuple[StreamId, StreamCounts]]:
+    """The streams of all parts; of one that several recordings have, as that of the health of a stage, those of the
+    recording that has most of it."""
+    found: dict[StreamId, dict[str, list[StreamCounts]]] = {}
+    for part in parts:
+        recording = part.metadata.get(RECORDING_KEY, str(part.path))
+        for stream, counts in part.streams.items():
+            found.setdefault(stream, {}).setdefault(recording, []).append(counts)
+    most = {
+        stream: max(recorded.values(), key=lambda counts: sum(each.messages for each in counts))
+        for stream, recorded in found.items()
+    }
+    return [(stream, each) for stream, counts in most.items() for each in counts]
 
 
 def as_json(parts: Sequence[Contents], breaks: Sequence[str]) -> dict[str, Any]:
     """The output of --json: each file, and the topics of all files together."""
-    together = sum_by_key(item for part in parts for item in part.streams.items())
+    together = sum_by_key(_streams(parts))
     return {
         "files": [_part_as_json(part) for part in parts],
         "topics": {key: _counts_as_json(counts) for key, counts in together.items()},

@@ -52,7 +52,7 @@ def replay(
             parser=recording_path,
             callback=matching,
             metavar="FILE",
-            help="Parts of one recording, in any order; offline, of many.",
+            help="Parts of one run, in any order, or a run folder; offline, of many.",
         ),
     ],
     rate: Annotated[

@@ -117,7 +117,7 @@ def alarms(
     stop_on_signals(stop)
     with Bus(settings.bus, stop, listens=False) as bus:
         watcher = SiteWatcher(bus, settings.site)
-        wait_for_stages(bus, watcher, settings, stop)
+        wait_for_stages(bus, watcher, settings, stop, tray=name)
         fans = set(range(settings.tray(name).fans)) if number < 0 else {number}
         answers = ask(bus, settings.site, name, request, fans, timeout_s, stop, watcher)
     _report(asked, name, answers, json_output)
@@ -218,24 +218,38 @@ def _wait_until_judged(
 
 
 def wait_for_stages(
-    bus: Bus, watcher: SiteWatcher, config: Config, stop: threading.Event, what: str = "alarms"
+    bus: Bus,
+    watcher: SiteWatcher,
+    config: Config,
+    stop: threading.Event,
+    what: str = "alarms",
+    tray: str | None = None,
 ) -> None:
     """Wait until every stage that is alive has sent its health: requests and answers then reach all of them.
 
+    tray: that must have a scorer; None: one of any tray is enough.
+
     Raises:
-        UserError: no scorer is alive.
+        UserError: no such scorer is alive.
     """
     until_s = time.monotonic() + _DISCOVERY_S
-    scorer = alive_key(config.site, "scorer", "all")
+    scorer = alive_key(config.site, "scorer", "")
     while True:
         heard = {alive_key(config.site, view.health.stage, view.health.instance) for view in watcher.stages()}
         alive = bus.alive(alive_key(config.site, "*", "*"))
-        if scorer in alive & heard and alive <= heard:
+        if tray is None:
+            scorers = {key for key in alive if key.startswith(scorer)}
+        else:
+            owner = watcher.owner("scorer", tray)
+            scorers = alive & {scorer + owner.instance} if owner else set[str]()
+        if scorers & heard and alive <= heard:
             return
         if time.monotonic() > until_s or stop.wait(_POLL_S):
             break
-    if scorer not in alive:
-        where = f"no scorer of site {config.site!r} answers at {config.bus.endpoint}"
+    if not scorers:
+        has_others = any(key.startswith(scorer) for key in alive)
+        of_tray = f" for tray {tray}" if tray and has_others else ""
+        where = f"no scorer of site {config.site!r} answers at {config.bus.endpoint}{of_tray}"
         raise UserError(f"{what} unknown: {where}; is `fantwin up -c {config.path}` running?")
 
 

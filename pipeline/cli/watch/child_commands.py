@@ -24,7 +24,11 @@ from schemas.codec import CodecError, decode
 from schemas.messages import Raw
 from schemas.topics import tray_key
 
-RECORDING_ONLY = ("--set", f"launcher.stages={json.dumps(['acquisition', 'resampler', 'recorder'])}")
+RECORDING_ONLY = (
+    *("--set", f"launcher.stages={json.dumps(['acquisition', 'resampler', 'recorder'])}"),
+    *("--set", "launcher.shards={ recorder = 1 }"),
+)
+"""the options of a site that only records, all trays in one recording"""
 SILENT_S = 60.0
 """without a sample, from the start of a recording on: the line is dead"""
 STANDARD_ERROR = 2

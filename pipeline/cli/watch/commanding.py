@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UsageError, UserError
+from pipeline.runtime.sessions import Session, Sessions
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.messages import Command, Header, Health
 from schemas.topics import BY_NAME, alive_key, health_key, sessions_key, tray_key
@@ -99,9 +100,7 @@ class CommandSender:
         Raises:
             UserError: there is none.
         """
-        self._wait(lambda: self._acquisition.is_alive() or None)
-        if self._acquisition.health() is None:
-            self._acquisition.ask_for_health()
+        self._acquisition.watch_health(self._wait(self._acquisition.at_work))
         self._before = self._wait(self._acquisition.health)
 
     def send(self, message: Command) -> None:
@@ -142,37 +141,44 @@ class _Acquisition:
 
     def __init__(self, bus: Bus, site: str, tray: str) -> None:
         self._bus = bus
-        self._alive_key = alive_key(site, STAGE, tray)
-        self._health_key = health_key(site, STAGE, tray)
+        self._site = site
+        self._tray = tray
         self._lock = threading.Lock()
+        self._sessions = Sessions()
         self._tokens: set[str] = set()
+        """of stages that are at work"""
         self._healths: dict[str, Health] = {}
         """by producer, in the order heard"""
-        bus.watch_alive(self._alive_key, self._on_token)
-        bus.watch_alive(sessions_key(site, STAGE, tray), self._on_token)
-        bus.subscribe(self._health_key, self._on_health)
+        bus.watch_alive(alive_key(site, STAGE, "*"), self._on_token)
+        bus.watch_alive(sessions_key(site, STAGE), self._on_session)
 
-    def is_alive(self) -> bool:
-        """Whether it is on the bus."""
+    def at_work(self) -> Session | None:
+        """The session that has the tray, once it is at work."""
         with self._lock:
-            return self._alive_key in self._tokens
+            session = self._sessions.owner(STAGE, self._tray)
+            is_there = session is not None and alive_key(self._site, STAGE, session.instance) in self._tokens
+            return session if is_there else None
+
+    def watch_health(self, session: Session) -> None:
+        """Listen to the health of a process, also after it was restarted; fetch the last one."""
+        key = health_key(self._site, STAGE, session.instance)
+        self._bus.subscribe(key, self._on_health)
+        for its_key, payload in self._bus.recover(key):
+            self._on_health(its_key, payload)
 
     def health(self) -> Health | None:
-        """The last health of a session that is on the bus."""
+        """The last health of the session that has the tray and is at work."""
+        session = self.at_work()
         with self._lock:
-            if self._alive_key not in self._tokens:
-                return None
-            named = {word for token in self._tokens for word in token.split("/")}
-            return next((each for producer, each in reversed(self._healths.items()) if producer in named), None)
-
-    def ask_for_health(self) -> None:
-        """Fetch the last health, instead of waiting for the next one."""
-        for key, payload in self._bus.recover(self._health_key):
-            self._on_health(key, payload)
+            return self._healths.get(session.producer) if session else None
 
     def _on_token(self, key: str, alive: bool) -> None:
         with self._lock:
             (self._tokens.add if alive else self._tokens.discard)(key)
+
+    def _on_session(self, key: str, alive: bool) -> None:
+        with self._lock:
+            self._sessions.update(key, alive)
 
     def _on_health(self, _key: str, payload: bytes) -> None:
         try:
@@ -180,8 +186,9 @@ class _Acquisition:
         except CodecError:
             return
         with self._lock:
-            self._healths.pop(health.header.producer, None)
-            self._healths[health.header.producer] = health
+            before = self._healths.pop(health.header.producer, None)
+            is_older = before is not None and before.header.sequence > health.header.sequence
+            self._healths[health.header.producer] = before if before and is_older else health
             if len(self._healths) > MOST_SESSIONS:
                 del self._healths[next(iter(self._healths))]
 

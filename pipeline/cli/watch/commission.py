@@ -181,7 +181,8 @@ def _refuse_what_cannot_end_well(settings: Config, works: Sequence[TrayWork]) ->
             raise UserError(f"{work.twin}: exists already: name another with {alone}-o")
         check_writable(work.twin, ".onnx")
     if accepts_connections(settings.bus.endpoint) and (running := running_sessions(settings)):
-        raise UserError(f"site {settings.site!r} runs already ({', '.join(sorted(running))}): stop it first")
+        names = ", ".join(dict.fromkeys(session.name for session in running))
+        raise UserError(f"site {settings.site!r} runs already ({names}): stop it first")
     with twin_errors():
         import_module("twin.build")  # the extra may not be installed
 

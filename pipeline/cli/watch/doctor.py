@@ -9,7 +9,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Annotated
@@ -24,9 +24,11 @@ from pipeline.cli.options import JsonOption, SetOption
 from pipeline.cli.watch.line_check import check_line
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, ConfigError
+from pipeline.config.registry import STAGES
 from pipeline.launch.processes import process_list
 from pipeline.optional_dependencies import how_to_install
-from pipeline.runtime.sessions import GOSSIP_S, Session
+from pipeline.runtime.second_owner import GOSSIP_S
+from pipeline.runtime.sessions import Session
 from pipeline.runtime.stage import Context, load_stage
 from schemas.topics import sessions_key
 
@@ -87,7 +89,7 @@ def _findings(
         return
     yield True, f"{config}: site {settings.site!r}, trays {', '.join(tray.name for tray in settings.trays)}"
     yield from _check_run_folder(settings.run_folder)
-    running: dict[str, Session] = {}
+    running: list[Session] = []
     yield from _check_bus(settings, running)
     yield from _check_stages(settings, running, listen_s, lines)
 
@@ -129,8 +131,8 @@ def _check_run_folder(folder: Path) -> Iterator[tuple[bool, str]]:
     yield enough, f"run_folder {folder}: {free / 1e9:.1f} GB free{advice}"
 
 
-def _check_bus(settings: Config, running: dict[str, Session]) -> Iterator[tuple[bool, str]]:
-    """Whether processes can meet at the endpoint. Adds the sessions of the site that run there, by name."""
+def _check_bus(settings: Config, running: list[Session]) -> Iterator[tuple[bool, str]]:
+    """Whether processes can meet at the endpoint. Adds the sessions of the site that run there."""
     config, endpoint = settings.bus, settings.bus.endpoint
     if problem := endpoint_problem(endpoint):
         yield False, problem
@@ -141,14 +143,14 @@ def _check_bus(settings: Config, running: dict[str, Session]) -> Iterator[tuple[
         )
     else:
         try:
-            running |= running_sessions(settings)
+            running += running_sessions(settings)
             site = f"site {settings.site!r} runs there" if running else "fantwin answers there"
             yield True, f"bus.endpoint {endpoint}: {site}"
         except BusError:
             yield False, foreign_program(endpoint)
 
 
-def running_sessions(settings: Config) -> dict[str, Session]:
+def running_sessions(settings: Config) -> list[Session]:
     """The sessions of the site that run, by name; those are waited for that the first one met still introduces."""
     stop, found = threading.Event(), set[str]()
     with Bus(settings.bus, listens=False) as bus:
@@ -156,19 +158,22 @@ def running_sessions(settings: Config) -> dict[str, Session]:
         for _ in range(_LOOKS):
             found |= bus.alive(sessions_key(settings.site))
             stop.wait(GOSSIP_S)
-    sessions = filter(None, map(Session.of_key, found))
-    return {session.name: session for session in sessions}
+    return sorted(filter(None, map(Session.of_key, found)), key=lambda session: session.name)
 
 
 def _check_stages(
-    config: Config, running: Mapping[str, Session], listen_s: float, lines: Collection[str]
+    config: Config, running: Sequence[Session], listen_s: float, lines: Collection[str]
 ) -> Iterator[tuple[bool, str]]:
-    """lines: the trays whose own processes are checked."""
-    for row in (row for row in process_list(config) if row.tray is None or row.tray in lines):
-        session = running.get(row.label)
-        is_here = session is not None and session.host == Session.of_this_process(row.stage, row.instance, 0, "").host
+    """lines: the trays whose devices are checked."""
+    for row in process_list(config):
+        ours = Session.of_this_process(row.stage, row.shard, 0, "")
+        session = next((s for s in running if s.stage == row.stage and s.shares_a_tray_with(ours)), None)
+        is_here = session is not None and session.host == ours.host
         stage = load_stage(row.stage)
-        trays = (config.tray(row.tray),) if row.tray else config.trays
+        has_devices = STAGES[row.stage].scope == "tray"
+        trays = tuple(config.tray(name) for name in row.shard.trays if not has_devices or name in lines)
+        if not trays:
+            continue
         groups = [(tray,) for tray in trays] if stage.core_per_tray else [trays]
         contexts = [
             Context(
@@ -177,6 +182,8 @@ def _check_stages(
                 config=config.sections[row.stage],
                 folder=config.folder,
                 run_folder=config.run_folder,
+                instance=row.instance,
+                shard_number=row.shard.number,
                 started_t_ns=time.time_ns(),
                 is_running=is_here,
             )
@@ -185,9 +192,15 @@ def _check_stages(
         problems = [problem for context in contexts for problem in stage.check(context)]
         yield from ((False, f"{row.label}: {problem}") for problem in problems)
         if not problems:
-            yield True, f"{row.label}: {f'runs already ({session.process})' if session else 'can start'}"
+            yield True, f"{row.label}: {_runs_already(session, row.label) if session else 'can start'}"
         if row.stage == "acquisition" and listen_s and not problems:
-            yield from check_line(contexts[0], config, listen_s, is_running=session is not None)
+            for context in contexts:
+                yield from check_line(context, config, listen_s, is_running=session is not None)
+
+
+def _runs_already(session: Session, label: str) -> str:
+    other = "" if session.name == label else f" as {session.name}"
+    return f"runs already{other} ({session.process})"
 
 
 def _version(package: str) -> str:

@@ -20,16 +20,19 @@ from pipeline.bus.session import Bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
-from pipeline.errors import UserError
+from pipeline.config.registry import STAGES
+from pipeline.config.shards import chosen_shard
+from pipeline.errors import UsageError, UserError
 from pipeline.launch.judged_fans import JudgedFans, Unjudged
-from pipeline.launch.processes import process_list
+from pipeline.launch.processes import StageProcess, process_list
 from pipeline.launch.refused_input import refused_lines
-from pipeline.launch.site_state import StageState, Word, site_states
+from pipeline.launch.site_state import AT_WORK, StageState, Word, site_states
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.launch.stage_notes import note_lines, notes_as_json
 from pipeline.runtime.signals import stop_on_signals
 from schemas.messages import Severity
 from schemas.streams import LOSS_PREFIX
+from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.current_alarms import CurrentAlarm, clock
@@ -38,12 +41,18 @@ from scoring.diagnosis.shown_causes import most_probable
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 _LISTEN_S = 2.5  # two health messages of every stage, which give rates
 _LISTEN_MAX_S = 6.0
+_POLL_S = 0.2
 _STATE_STYLES = {Word.OK: "green", Word.DEGRADED: "red"}
 
 
 def status(
     config: ConfigOption = DEFAULT_CONFIG,
     once: Annotated[bool, typer.Option("--once", help="Print once and exit, on a terminal too.")] = False,
+    stage: Annotated[
+        str | None, typer.Option(help="Only whether this one process is at work: for a probe, with --trays or --shard.")
+    ] = None,
+    trays: Annotated[str | None, typer.Option(metavar="A,B", help="With --stage: the trays of the process.")] = None,
+    shard: Annotated[str | None, typer.Option(metavar="K/N", help="With --stage: the shard of the process.")] = None,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -58,11 +67,20 @@ def status(
     Exit code 1 if a stage is missing, gone, silent, starved or late, or if a fan is not judged though the configuration
     has a scorer; 3 if a stage has lost data.
 
+    With --stage: 0 if that process is heard and has caught up, 1 if not, whatever the others do.
+
     Example: fantwin status -c fantwin.toml --once
+
+    Example: fantwin status -c fantwin.toml --stage scorer --shard 2/8
     """
     settings = load_config(config, overrides or (), stages=())
     stop = threading.Event()
     stop_on_signals(stop)
+    if stage is not None:
+        _probe(settings, _process(settings, stage, trays, shard), stop, json_output=json_output)
+        return
+    if trays or shard:
+        raise UsageError("--trays and --shard need --stage: which process?")
     with Bus(settings.bus, listens=False) as bus:
         watcher = SiteWatcher(bus, settings.site)
         judged = JudgedFans(bus, settings.site, settings.trays, watcher)
@@ -85,6 +103,33 @@ def status(
             raise typer.Exit(1)
         if any(watcher.losses().values()):
             raise typer.Exit(3)
+
+
+def _process(config: Config, stage: str, trays: str | None, shard: str | None) -> StageProcess:
+    if stage not in STAGES:
+        raise UsageError(f"--stage {stage}: no such stage; known: {', '.join(STAGES)}")
+    return StageProcess(stage, chosen_shard(stage, config, trays, shard))
+
+
+def _probe(config: Config, process: StageProcess, stop: threading.Event, *, json_output: bool) -> None:
+    """Say whether one process is at work: as soon as it is known, or when it has not been heard for long enough."""
+    with Bus(config.bus, listens=False) as bus:
+        watcher = SiteWatcher(bus, config.site)
+        until_s = time.monotonic() + _LISTEN_MAX_S
+        while True:
+            watcher.ask_for_health(process.stage, process.instance)
+            states = (each for each in site_states(watcher, [process]) if each.label == process.label)
+            state = next(states, None) or StageState(process.label, Word.MISSING, "not seen on the bus", None, True)
+            is_at_work = state.word in AT_WORK - {Word.STARTING} and state.view is not None and state.view.alive
+            if is_at_work or time.monotonic() > until_s or stop.wait(_POLL_S):
+                break
+    problem = state.view.health.problem if state.view else ""
+    if json_output:
+        typer.echo(json.dumps(_state_as_json(state, state.view.health.lost if state.view else 0)))
+    else:
+        typer.echo(f"{state.label}: {state.word}{''.join(f': {each}' for each in (state.detail, problem) if each)}")
+    if not is_at_work:
+        raise typer.Exit(1)
 
 
 def _listen(watcher: SiteWatcher, config: Config, judged: JudgedFans, stop: threading.Event) -> None:
@@ -142,7 +187,7 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Gro
 
 def _has_scorer(states: Sequence[StageState]) -> bool:
     """Whether the configuration asks for a scorer, or one is heard."""
-    return any(state.label == "scorer" for state in states)
+    return any(state.stage == "scorer" for state in states)
 
 
 def unjudged(states: Sequence[StageState], judged: JudgedFans) -> list[Unjudged]:
@@ -204,8 +249,14 @@ def as_json(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> dict[st
 
 
 def _state_as_json(state: StageState, lost: int) -> dict[str, object]:
-    stage, _, tray = state.label.partition("/")
-    about = {"stage": stage, "instance": tray or "all", "state": str(state.word), "detail": state.detail}
+    stage, _, instance = state.label.partition("/")
+    about = {
+        "stage": stage,
+        "instance": instance or ALL_TRAYS,
+        "trays": list(state.trays),
+        "state": str(state.word),
+        "detail": state.detail,
+    }
     view = state.view
     if view is None:
         return {**about, "alive": False}

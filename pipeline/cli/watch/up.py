@@ -13,6 +13,7 @@ import typer
 
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.config.loading import load_config
+from pipeline.config.shards import chosen_trays
 from pipeline.errors import UserError
 from pipeline.launch.event_log import EventLog
 from pipeline.launch.launcher import Launcher, Outcome
@@ -22,6 +23,13 @@ from pipeline.runtime.signals import ignore_hangup, set_when_stdin_closes, stop_
 
 def up(
     config: ConfigOption = DEFAULT_CONFIG,
+    trays: Annotated[
+        str | None,
+        typer.Option(metavar="A,B", help="Only the processes whose first tray is one of these: a host of several."),
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="K/N", help="The same for the trays of host K of N: see `fantwin run`.")
+    ] = None,
     overrides: SetOption = None,
     json_output: JsonOption = False,
     until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
@@ -34,6 +42,8 @@ def up(
     that a device sent was refused; 3 data were lost.
 
     Example: fantwin up -c fantwin.toml
+
+    Example: fantwin up -c fantwin.toml --shard 1/2
     """
     stop = threading.Event()
     stop_on_signals(stop)  # first: what follows takes a second or two
@@ -41,8 +51,9 @@ def up(
     if until_stdin_closes:
         set_when_stdin_closes(stop)
     settings = load_config(config, overrides or ())
+    of_host = chosen_trays(settings, trays, shard)
     log = EventLog(sys.stderr.fileno())
-    launcher = Launcher(settings, overrides or (), log.say)
+    launcher = Launcher(settings, overrides or (), log.say, of_host)
     try:
         outcome = launcher.run(stop)
         if not json_output:

@@ -14,10 +14,11 @@ from pipeline.launch.loss_accounting import label
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.replay.stage_chain import replay_starts
 from pipeline.runtime.clock import REPLAY
+from pipeline.runtime.sessions import Sessions
 from pipeline.runtime.stage import Stage, load_stage
 from schemas.messages import Health
 from schemas.streams import StreamId, input_streams, output_streams
-from schemas.topics import BY_NAME, alive_key
+from schemas.topics import ALL_TRAYS, BY_NAME, alive_key, sessions_key, stage_label
 
 _POLL_S = 0.02
 _ANY_STAGE_S = 2.0  # to find any stage: one whose first peer has died tries its endpoint every second
@@ -32,11 +33,13 @@ class Present:
 
     stage: Stage
     instance: str
+    trays: tuple[str, ...] = ()
+    """none: all of the site"""
 
     @property
     def label(self) -> str:
         """Its name for people."""
-        return self.stage.name if self.instance == "all" else f"{self.stage.name}/{self.instance}"
+        return stage_label(self.stage.name, self.instance)
 
 
 def conflict(present: Collection[Present], topics: Collection[str], trays: Collection[str], site: str) -> str:
@@ -51,7 +54,7 @@ def conflict(present: Collection[Present], topics: Collection[str], trays: Colle
                 "stop it, or replay on a site or bus.endpoint of its own"
             )
     for each in present:
-        if STAGES[each.stage.name].scope == "tray" and each.instance not in trays:
+        if each.trays and set(each.trays).isdisjoint(trays):
             continue
         for topic in each.stage.writes:
             if topic in topics:
@@ -91,6 +94,8 @@ class Listeners:
         self._site = site
         self._watcher = SiteWatcher(bus, site)
         self._alive: set[str] = set()
+        self._sessions = Sessions()
+        bus.watch_alive(sessions_key(site), self._sessions.update)
         bus.watch_alive(alive_key(site, "*", "*"), self._set_alive)
         self._before: dict[str, int] = {}
         self._present_at_start: set[str] = set()
@@ -113,11 +118,16 @@ class Listeners:
     def present(self) -> list[Present]:
         """The running stages."""
         names = [tuple(key.split("/")[3:]) for key in sorted(self._alive)]
-        return [Present(load_stage(stage), instance) for stage, instance in names if stage in STAGES]
+        sessions = {name: self._sessions.named(*name) for name in names}
+        return [
+            Present(load_stage(stage), instance, session.trays if session else ())
+            for (stage, instance), session in sessions.items()
+            if stage in STAGES
+        ]
 
     def is_replaying(self) -> bool:
         """Whether a replay, this one or another, is on the bus."""
-        return alive_key(self._site, REPLAY, "all") in self._alive
+        return alive_key(self._site, REPLAY, ALL_TRAYS) in self._alive
 
     def readers(self, topics: Collection[str]) -> list[str]:
         """The running stages that read any of these topics."""

@@ -1,9 +1,10 @@
-"""The messages to play: a stretch of a recording, its parts in order, each message once."""
+"""The messages to play: a stretch of the recordings of a run, their parts in order, each message once."""
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from itertools import islice
@@ -13,6 +14,7 @@ from typing import Any
 from pipeline.recordings.order import Seen, in_order
 from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
+from pipeline.recordings.run_recordings import recordings_of
 from pipeline.replay.live.recorded_versions import NEW_TWIN, TWIN, ComingVersions, read_versions
 from pipeline.replay.live.sample_times import sample_times
 from schemas.envelope import Envelope
@@ -43,6 +45,7 @@ class RecordingPlayback:
         if not firsts:
             raise RecordingError(f"{files[0]}: there is no message in it")
         self.files = list(firsts)
+        self._recordings = recordings_of(self.files)
         first = self.first = firsts[self.files[0]]
         # with start_s = 0 everything is played, also messages that were recorded out of order
         self._start_ns = first.received_t_ns + round(start_s * NS_PER_S) if start_s else 0
@@ -84,28 +87,38 @@ class RecordingPlayback:
         versions = ComingVersions(self._versions, self._end_ns, is_first_round=is_first)
         seen: dict[tuple[str, str], Seen] = {}
         latched: dict[str, Envelope] = {}
-        damage: list[str] = []
-        for file in self.files:
+        damage: dict[Path, str] = {}
+        recordings = [self._messages(parts, damage) for parts in self._recordings]
+        try:
+            for entry in heapq.merge(*recordings, key=lambda each: each.received_t_ns):
+                header = entry.message.header
+                if not seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
+                    continue  # also in the part before, or in the recording of another shard
+                if self._end_ns is not None and entry.received_t_ns > self._end_ns:
+                    if entry.received_t_ns > self._end_ns + OUT_OF_ORDER_NS:
+                        return
+                    continue
+                if entry.received_t_ns >= self._start_ns:
+                    yield from latched.values()
+                    latched.clear()
+                    yield from versions.before(entry)
+                    yield entry
+                elif entry.topic == LATCHED_TOPIC:
+                    latched[entry.key] = entry.received_at(self._start_ns)
+        finally:  # also when the stretch or the playback ends before the files
+            for messages in recordings:
+                messages.close()
+            self.damage = tuple(damage.values())
+
+    def _messages(self, parts: Sequence[Path], damage: dict[Path, str]) -> Generator[Envelope, None, None]:
+        """The messages of one recording. damage: of each part what could not be read, added when it has been played."""
+        for file in parts:
             reading = read_recording(file, self.topics)
             try:
-                for entry in reading:
-                    header = entry.message.header
-                    if not seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
-                        continue  # also in the part before
-                    if self._end_ns is not None and entry.received_t_ns > self._end_ns:
-                        if entry.received_t_ns > self._end_ns + OUT_OF_ORDER_NS:
-                            return
-                        continue
-                    if entry.received_t_ns >= self._start_ns:
-                        yield from latched.values()
-                        latched.clear()
-                        yield from versions.before(entry)
-                        yield entry
-                    elif entry.topic == LATCHED_TOPIC:
-                        latched[entry.key] = entry.received_at(self._start_ns)
-            finally:  # also when the stretch or the playback ends before the file
-                damage += filter(None, [reading.damage])
-                self.damage = tuple(damage)
+                yield from reading
+            finally:
+                if reading.damage:
+                    damage[file] = reading.damage
 
 
 class TimeExtent:

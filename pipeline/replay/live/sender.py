@@ -16,7 +16,7 @@ from pipeline.runtime.health import HealthBuilder
 from schemas.codec import encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Message, Output, StageStatus
-from schemas.topics import BY_NAME, alive_key, health_key, tray_key, tray_of
+from schemas.topics import ALL_TRAYS, BY_NAME, alive_key, health_key, tray_key, tray_of
 
 
 class Sender:
@@ -31,10 +31,10 @@ class Sender:
         self._site = site
         self._publishers: dict[str, Publisher] = {}
         self._clocks = {tray: self._publisher(tray_key(site, tray, "clock"), "clock") for tray in trays}
-        self._health = self._publisher(health_key(site, REPLAY, "all"), "health")
-        self._builder = HealthBuilder(REPLAY, "all", time.time_ns(), may_drop=False)
+        self._health = self._publisher(health_key(site, REPLAY, ALL_TRAYS), "health")
+        self._builder = HealthBuilder(REPLAY, ALL_TRAYS, time.time_ns(), may_drop=False)
         self.publish_health(StageStatus.STARTING)
-        bus.declare_alive(alive_key(site, REPLAY, "all"))
+        bus.declare_alive(alive_key(site, REPLAY, ALL_TRAYS))
 
     def send(self, entry: Envelope) -> None:
         """Publish a message; blocks while a reader is behind.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -11,8 +12,10 @@ from pathlib import Path
 
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
+from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.order import in_order
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
+from pipeline.recordings.run_recordings import run_metadata
 from pipeline.replay.default_config import default_config, first_raw
 from pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
@@ -25,6 +28,9 @@ from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Message, ModelCard
+
+_OF_THE_PLACE = ("bus.", "launcher.", "run_folder")
+"""how the names of keys begin that say where a process runs"""
 
 
 @dataclass
@@ -52,6 +58,8 @@ class ReplayInput:
     """the part that is replayed, in seconds since the tray's first raw sample"""
     damage: dict[Path, str] = field(default_factory=dict)
     """what could not be read of a file, one line"""
+    trays_of: dict[Path, tuple[str, ...]] = field(default_factory=dict)
+    """what the files say that they have; none: they do not say it"""
 
     @property
     def is_part(self) -> bool:
@@ -66,6 +74,8 @@ class ReplayInput:
     def envelopes(self, tray: str, topics: Iterable[str]) -> Iterator[Envelope]:
         """The undecoded messages of a tray, in the order they were recorded."""
         for path in self.paths:
+            if tray not in (self.trays_of.get(path) or (tray,)):
+                continue
             reading = read_recording(path, tuple(topics), tray)
             yield from reading.undecoded()
             if reading.damage:
@@ -152,9 +162,10 @@ def open_replay_input(
     if twin is not None and not twin.is_file():
         raise RecordingError(f"{twin}: there is no such twin; correct --twin")
     ordered = tuple(in_order(paths))
-    metadata = read_metadata(ordered[0])
+    each = {path: read_metadata(path) for path in ordered}
     for path in ordered[1:]:
-        _refuse_another_run(ordered[0], metadata, path)
+        _refuse_another_run(ordered[0], each[ordered[0]], path, each[path])
+    metadata = run_metadata(ordered)
     first = first_raw(ordered, metadata)
     if tray is not None and tray not in first:
         raise RecordingError(f"{ordered[0]}: no raw samples of tray {tray!r}; it has {', '.join(first)}")
@@ -189,22 +200,35 @@ def open_replay_input(
             decision_rules=recorded_rules(ordered[0], metadata) if is_as_recorded else CURRENT_RULES,
             start_s=start_s,
             end_s=end_s,
+            trays_of={path: found.trays for path, found in each.items()},
         )
 
 
-def _refuse_another_run(first: Path, metadata: RecordingMetadata, path: Path) -> None:
-    """The parts of one recording have one site, one configuration and one twin."""
-    other = read_metadata(path)
-    keys = ("site", "site"), ("keys set on the command line", "overrides"), ("version of the rules", "decision_rules")
-    for what, key in keys:
-        if metadata.metadata.get(key) != other.metadata.get(key):
-            raise RecordingError(
-                f"{first} and {path} belong to two runs: they differ in {what}; replay them one by one"
-            )
-    if dict(metadata.attachments) != dict(other.attachments):
+def _refuse_another_run(first: Path, metadata: RecordingMetadata, path: Path, other: RecordingMetadata) -> None:
+    """The parts of one recording, and the recordings of the shards of one run, have one site, one configuration and one
+    twin for each tray."""
+    keys = ("site", "site"), ("version of the rules", "decision_rules")
+    differ = [what for what, key in keys if metadata.metadata.get(key) != other.metadata.get(key)]
+    if _deciding_overrides(metadata) != _deciding_overrides(other):
+        differ.append("keys set on the command line")
+    names = {*metadata.attachments, *other.attachments}
+    if metadata.trays and other.trays:
+        names = {CONFIGURATION, *(f"{tray}.onnx" for tray in {*metadata.trays} & {*other.trays})}
+    if any(metadata.attachments.get(name) != other.attachments.get(name) for name in names):
+        differ.append("configuration or twin")
+    if differ:
         raise RecordingError(
-            f"{first} and {path} belong to two runs: they differ in configuration or twin; replay them one by one"
+            f"{first} and {path} belong to two runs: they differ in {differ[0]}; replay them one by one"
         )
+
+
+def _deciding_overrides(metadata: RecordingMetadata) -> list[str]:
+    """The recorded overrides but for those of the place, which differ from host to host."""
+    try:
+        overrides = list(map(str, json.loads(metadata.metadata.get("overrides", "[]"))))
+    except (ValueError, TypeError):
+        return [metadata.metadata["overrides"]]  # damaged: reported where they are used
+    return [override for override in overrides if not override.startswith(_OF_THE_PLACE)]
 
 
 def _recorded_twins(metadata: RecordingMetadata, folder: Path, trays: Iterable[str]) -> dict[str, Path]:

@@ -5,14 +5,20 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.commanding import command_of, share_note
-from pipeline.config.models import TrayConfig
+from pipeline.bus.session import Bus
+from pipeline.cli.watch.commanding import CommandSender, command_of, share_note
+from pipeline.config.models import BusConfig, TrayConfig
+from pipeline.runtime.sessions import Session
+from schemas.codec import encode, type_name
+from schemas.messages import Header, Health, StageStatus
+from schemas.topics import BY_NAME, alive_key, health_key
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO, Chain, RunningCommand, eventually, fantwin
 
@@ -44,6 +50,34 @@ def test_without_an_acquisition_the_command_is_reported_as_not_received(chain):
     assert done.returncode == 1
     expected = "fantwin: no acquisition of tray tray1 received the command: is `fantwin up` running?\n"
     assert done.stderr == expected
+
+
+def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
+    def session(number: int, *trays: str) -> Session:
+        return Session("acquisition", f"{number}-of-2", number, f"acquisition-{number}", "board", number, trays)
+
+    config, stop = BusConfig(endpoint=endpoint), threading.Event()
+    with Bus(config) as site, Bus(config, listens=False) as ours:
+        site.wait_for_others(stop)
+        for each in (session(1, "a", "c"), session(2, "b")):
+            site.declare_alive(each.key("plant"))
+            site.declare_alive(alive_key("plant", each.stage, each.instance))
+            key = health_key("plant", each.stage, each.instance)
+            publisher = site.publisher(key, BY_NAME["health"], type_name(Health), each.producer)
+            health = Health(
+                header=Header(each.producer, 0, ""),
+                stage=each.stage,
+                instance=each.instance,
+                status=StageStatus.OK,
+                t_ns=1,
+                uptime_s=0.0,
+            )
+            publisher.put(encode(health))
+        sender = CommandSender(ours, "plant", "c", stop)
+        sender.connect()
+        answers = sender._acquisition.health()
+    assert answers
+    assert answers.header.producer == "acquisition-1"
 
 
 def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():

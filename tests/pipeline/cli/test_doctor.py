@@ -19,6 +19,7 @@ from pipeline.bus.session import Bus
 from pipeline.cli.watch import doctor as module
 from pipeline.cli.watch.doctor import doctor
 from pipeline.config.models import BusConfig
+from pipeline.config.shards import Shard
 from pipeline.runtime.sessions import Session
 from tests.support.fantwin_command import fantwin
 from tests.support.running_chain import DEMO
@@ -120,7 +121,7 @@ def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_strange
         assert f"viewer: viewer.grpc_port: port {viewer_port} on 127.0.0.1 is taken" in found["problems"][0]
         assert f"bus.endpoint {endpoint}: fantwin answers there" in found["good"]
 
-        session = Session.of_this_process("viewer", "all", 1, "viewer-all-1")
+        session = Session.of_this_process("viewer", Shard("all", ()), 1, "viewer-all-1")
         bus.declare_alive(session.key("demo"))
         code, found = examine(capsys, DEMO / "demo.toml", *settings)
         assert (code, found["problems"]) == (0, [])

@@ -19,6 +19,7 @@ from rich.console import Console
 
 from pipeline.bus.publisher import Publisher
 from pipeline.bus.session import Bus
+from pipeline.cli.watch import status as status_command
 from pipeline.cli.watch.status import as_json, loss_lines, stage_table, unjudged
 from pipeline.config.loading import load_config
 from pipeline.config.models import BusConfig
@@ -42,6 +43,8 @@ from schemas.messages import (
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import clock
+from tests.support.fantwin_command import fantwin as fantwin_here
+from tests.support.fantwin_command import usage_error_of
 from tests.support.running_chain import DEMO, FANS, SITE, TRAY, RunningCommand, eventually, fantwin
 from tests.support.score_data import one_sample
 
@@ -373,6 +376,27 @@ def test_into_a_pipe_a_running_site_is_shown_once_and_a_loss_is_exit_code_3(site
         alive[0].join(0.1)
     assert [answer.returncode for answer in done] == [3, 3, 3], done
     assert all("scorer" in answer.stdout for answer in done)
+
+
+def test_a_probe_asks_for_one_process_only_and_is_answered_as_soon_as_that_is_known(site, monkeypatch):
+    name, *words = status_words(site)
+    site.health.put(encode(replace(HEALTH, problem="the disk is full", status=StageStatus.DEGRADED)))
+
+    def asked(*more: str) -> tuple[int, str]:
+        done = fantwin_here(str(name), *words, *more)
+        return done.exit_code, done.stdout
+
+    monkeypatch.setattr(status_command, "_LISTEN_MAX_S", 60.0)
+    assert asked("--stage", "scorer") == (0, "scorer: degraded: the disk is full\n"), (
+        "it is at work, with losses or not"
+    )
+    monkeypatch.setattr(status_command, "_LISTEN_MAX_S", 0.3)
+    assert asked("--stage", "recorder") == (1, "recorder: missing: not seen on the bus\n")
+    site.health.put(encode(replace(HEALTH, status=StageStatus.STARTING)))
+    code, line = asked("--stage", "scorer", "--json")
+    assert (code, json.loads(line)["state"]) == (1, "starting"), "it has not caught up"
+    assert "no such stage" in usage_error_of(str(name), *words, "--stage", "scorr")
+    assert "need --stage" in usage_error_of(str(name), *words, "--shard", "1/1")
 
 
 @pytest.mark.parametrize("words", [(), ("--once",)], ids=str)

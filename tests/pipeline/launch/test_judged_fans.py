@@ -44,7 +44,8 @@ def listener() -> Listener:
 
 
 def state(label: str, word: Word, detail: str = "") -> StageState:
-    return StageState(label, word, detail, None, is_expected=True)
+    tray = label.partition("/")[2]
+    return StageState(label, word, detail, None, True, (tray,) if tray else ())
 
 
 def test_row_01_every_fan_with_a_valid_score_is_judged(listener):

@@ -16,11 +16,12 @@ from typing import Any, cast
 import pytest
 
 from pipeline.config.loading import load_config
+from pipeline.config.shards import Shard
 from pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
 from pipeline.errors import UserError
-from pipeline.launch.launcher import Launcher, Outcome
+from pipeline.launch.launcher import Launcher, Outcome, _Slot
 from pipeline.launch.notices import Notices
-from pipeline.launch.processes import Child, process_list
+from pipeline.launch.processes import Child, StageProcess, process_list
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.messages import Header, Health, StageStatus
 from schemas.topics import alive_key
@@ -285,8 +286,40 @@ class EndedChild:
     def exit_status(self) -> int:
         return 0
 
+    def terminate(self) -> None:
+        pass
+
     def stop(self, _timeout_s: float) -> int:
         return 0
+
+
+def test_the_processes_of_a_stage_end_together_and_before_those_of_the_next(monkeypatch):
+    called: list[str] = []
+
+    class Shown(EndedChild):
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def terminate(self) -> None:
+            called.append(f"asked {self.name}")
+
+        def stop(self, _timeout_s: float) -> int:
+            called.append(f"ended {self.name}")
+            return 0
+
+    launcher = Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)
+    monkeypatch.setattr(launcher, "_has_reported", lambda _slot: True)
+    rows = [
+        StageProcess(stage, Shard(f"{n}-of-2", ("tray1",), ("--shard", f"{n}/2")))
+        for stage in ("resampler", "scorer")
+        for n in (1, 2)
+    ]
+    launcher._slots = [_Slot(row, cast("Any", Shown(row.label))) for row in rows]
+    launcher._stop_all()
+    assert called == [
+        *("asked resampler/1-of-2", "asked resampler/2-of-2", "ended resampler/1-of-2", "ended resampler/2-of-2"),
+        *("asked scorer/1-of-2", "asked scorer/2-of-2", "ended scorer/1-of-2", "ended scorer/2-of-2"),
+    ]
 
 
 class Heard:

@@ -111,6 +111,14 @@ LAUNCHED = {
 SENT = health("a1", "acquisition", 5, published=90)
 
 
+def test_only_the_shard_that_has_a_tray_is_due_its_messages():
+    ours, other = (replace(health(name, "recorder", 9), trays=trays) for name, trays in (("w1", "t,u"), ("w2", "x")))
+    launched = {("recorder/1-of-2", 1), ("recorder/2-of-2", 2), ("acquisition/t", 1)}
+    shards = [replace(each, instance=f"{number}-of-2") for number, each in enumerate((ours, other), start=1)]
+    found = losses([SENT, *shards], launched)
+    assert found == {"acquisition/t": 0, "recorder/1-of-2": 90, "recorder/2-of-2": 0}
+
+
 def test_row_18_the_first_messages_that_the_only_session_of_a_stage_never_had_are_lost():
     recorder = health("w1", "recorder", 9, inputs=(line("a1", 8, 90),))
     assert losses([SENT, recorder], LAUNCHED)["recorder"] == 8

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from pipeline.config.shards import Shard
 from pipeline.launch.processes import StageProcess
 from pipeline.launch.site_state import StageState, Word, stage_states
 from pipeline.launch.site_watcher import StageView
@@ -33,7 +34,8 @@ CONSUMER = Health(
     inputs=(Input(key=GRID, producer="resampler-all-1", received=800, missing=0, duplicated=0, next_sequence=800),),
 )
 WAITS = replace(CONSUMER, waiting_for=(AwaitedInput(key=GRID, since_t_ns=NOW_NS - 12 * NS_PER_S),))
-ROWS = [StageProcess("resampler", "all", None), StageProcess("twin_integrator", "all", None)]
+WHOLE = Shard("all", ("tray1", "tray2"))
+ROWS = [StageProcess("resampler", WHOLE), StageProcess("twin_integrator", WHOLE)]
 
 
 def view(health: Health, *, alive: bool = True, age_s: float = 0.5, published_before: int = 0) -> StageView:
@@ -142,6 +144,25 @@ def test_a_stage_that_stopped_in_order_is_a_fault_only_where_the_configuration_a
 
 
 def test_a_replay_takes_the_place_of_acquisition():
-    rows = [StageProcess("acquisition", "tray1", "tray1")]
+    rows = [StageProcess("acquisition", Shard("tray1", ("tray1",), ("--trays", "tray1")))]
     assert [state.word for state in stage_states([], [], rows)] == [Word.MISSING]
     assert stage_states([], [("replay", "all")], rows) == []
+
+
+def test_processes_that_were_started_with_other_shards_are_in_the_place_of_those_that_have_the_same_trays():
+    halves = [StageProcess("resampler", Shard(f"{n}-of-2", (f"tray{n}",), ("--shard", f"{n}/2"))) for n in (1, 2)]
+    seen = [("resampler", "all")]
+    whole = view(PRODUCER, published_before=800)
+    assert [(state.label, state.is_expected) for state in stage_states([whole], seen, halves)] == [("resampler", True)]
+    one = view(replace(PRODUCER, instance="tray1", trays="tray1"), published_before=800)
+    found = stage_states([one], [("resampler", "tray1")], halves)
+    assert [(state.label, state.word, state.is_expected) for state in found] == [
+        ("resampler/2-of-2", Word.MISSING, True),
+        ("resampler/tray1", Word.OK, True),
+    ]
+    assert [state.trays for state in found] == [("tray2",), ("tray1",)]
+    gone = replace(one, alive=False)
+    assert [state.label for state in stage_states([gone], [], halves) if state.word == Word.MISSING] == [
+        "resampler/1-of-2",
+        "resampler/2-of-2",
+    ]

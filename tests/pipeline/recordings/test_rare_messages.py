@@ -8,11 +8,13 @@ import pytest
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
+import pipeline.recordings.rare_messages as rare
 from pipeline.recordings.index import SHORT_ENDING
-from pipeline.recordings.rare_messages import rare_messages
+from pipeline.recordings.rare_messages import last_messages, rare_messages
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.records import RecordReader
 from pipeline.recordings.writing import RecordingWriter
+from schemas.codec import decode
 from schemas.messages import Header, ModelCard
 from schemas.topics import tray_key
 from tests.support.replay_data import START_NS, STEP_NS, raw_of
@@ -78,3 +80,23 @@ def test_a_file_that_is_no_recording_is_refused(tmp_path):
     (tmp_path / "text").write_text("no recording")
     with pytest.raises(RecordingError, match="not a recording"):
         rare_messages(tmp_path / "text", "twin")
+
+
+def test_the_last_one_of_each_key_is_found_from_the_end(recording, monkeypatch):
+    read: list[int] = []
+
+    def chunk_at(file, offset: int, length: int) -> bytes:
+        read.append(offset)
+        return whole(file, offset, length)
+
+    whole = rare.chunk_at
+    monkeypatch.setattr(rare, "chunk_at", chunk_at)
+    (payload,) = last_messages(recording, "twin").values()
+    assert decode(ModelCard, payload).header.sequence == AT[-1]
+    assert len(read) == 1
+    assert last_messages(recording, "grid") == {}
+
+
+def test_of_a_file_without_an_index_no_last_message_is_found(tmp_path):
+    (tmp_path / "r.mcap").write_bytes(b"no recording")
+    assert last_messages(tmp_path / "r.mcap", "twin") == {}

@@ -22,7 +22,8 @@ PREDICTION = tray_key("s", "a", "prediction")
 
 
 def there(*labels: str) -> list[Present]:
-    return [Present(load_stage(name), instance or "all") for name, _, instance in (x.partition("/") for x in labels)]
+    parts = (label.partition("/") for label in labels)
+    return [Present(load_stage(name), tray or "all", (tray,) if tray else ()) for name, _, tray in parts]
 
 
 @pytest.mark.parametrize(

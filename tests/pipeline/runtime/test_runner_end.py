@@ -14,6 +14,7 @@ import pytest
 from pipeline.bus.recovery import recovery_key
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig, LauncherConfig
+from pipeline.config.shards import chosen_shard
 from pipeline.errors import UserError
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Context, Stage
@@ -35,7 +36,7 @@ class Ended:
         self.has_left_the_bus = False
         with Bus(config.bus) as watching:
             watching.subscribe(health_key("s", "*", "*"), self._keep)
-            self.runner = Runner(stage, config, tray, self.stop)
+            self.runner = Runner(stage, config, chosen_shard(stage.name, config, tray), self.stop)
             close = self.runner._bus.close
 
             def close_and_say() -> None:

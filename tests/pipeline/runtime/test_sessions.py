@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.bus.session import Bus
+from pipeline.config.shards import Shard
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
@@ -19,10 +20,11 @@ from schemas.codec import encode, type_name
 from schemas.messages import Alarm, Grid, Header, Raw, Severity
 from schemas.topics import BY_NAME, alive_key, sessions_key, tray_key
 from tests.support.running_chain import eventually
-from tests.support.toy_stage import TRAY_A, Bench, Passer, raw, toy
+from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, raw, toy
 
-FIRST = Session("acquisition", TRAY_A, 100, "acquisition-a-1111", "board", 4711)
-SECOND = Session("acquisition", TRAY_A, 200, "acquisition-a-2222", "rack", 4712)
+FIRST = Session("acquisition", TRAY_A, 100, "acquisition-a-1111", "board", 4711, (TRAY_A,))
+SECOND = Session("acquisition", TRAY_A, 200, "acquisition-a-2222", "rack", 4712, (TRAY_A,))
+SHARD_A = Shard(TRAY_A, (TRAY_A,), ("--trays", TRAY_A))
 ONE_LINE = (
     "acquisition/a runs twice: process 4711 on board is ignored, because process 4712 on rack started later; "
     "stop one of them"
@@ -40,19 +42,78 @@ def test_row_07_of_two_sessions_the_later_owns_the_stage_until_it_ends(order):
     sessions = Sessions()
     for session in order:
         sessions.update(session.key("s"), alive=True)
-    assert sessions.is_ignored(FIRST.producer)
-    assert not sessions.is_ignored(SECOND.producer)
+    assert sessions.is_ignored(FIRST.producer, TRAY_A)
+    assert not sessions.is_ignored(SECOND.producer, TRAY_A)
     assert sessions.problem() == ONE_LINE
     sessions.update(SECOND.key("s"), alive=False)
-    assert not sessions.is_ignored(FIRST.producer)
+    assert not sessions.is_ignored(FIRST.producer, TRAY_A)
     assert not sessions.problem()
 
 
 def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict():
     sessions = Sessions()
-    for session in (FIRST, replace(SECOND, instance="b"), replace(SECOND, stage="scorer")):
+    for session in (FIRST, replace(SECOND, instance="b", trays=("b",)), replace(SECOND, stage="scorer")):
         sessions.update(session.key("s"), alive=True)
     assert not sessions.problem()
+
+
+def shard(name: str, started_t_ns: int, *trays: str) -> Session:
+    return Session("scorer", name, started_t_ns, f"scorer-{name}-{started_t_ns}", "board", started_t_ns, trays)
+
+
+def known(*sessions: Session) -> Sessions:
+    found = Sessions()
+    for session in sessions:
+        found.update(session.key("s"), alive=True)
+    return found
+
+
+@pytest.mark.parametrize(
+    "session", [shard("all", 1), shard("a", 2, "a"), shard("2-of-4", 3, "b", "c-d"), shard("all", 4, "all")]
+)
+def test_row_07_a_token_says_the_trays_of_its_session(session):
+    assert Session.of_key(session.key("s")) == session
+
+
+def test_row_07_only_the_trays_that_two_sessions_have_change_their_owner():
+    one, other = shard("1-of-2", 1, "a", "c"), shard("c+d", 2, "c", "d")
+    sessions = known(other, one, shard("2-of-2", 1, "b"))
+    assert [sessions.is_ignored(one.producer, tray) for tray in "ac"] == [False, True]
+    assert not any(sessions.is_ignored(other.producer, tray) for tray in "cd")
+    assert sessions.owner("scorer", "c") == other
+    assert sessions.owner("scorer", "x") is None
+    assert sessions.problem() == (
+        "two owners of tray c in scorer: scorer/1-of-2, process 1 on board, is ignored, because scorer/c+d, "
+        "process 2 on board, started later; stop one of them, or give it other trays"
+    )
+    sessions.update(other.key("s"), alive=False)
+    assert not sessions.is_ignored(one.producer, "c"), "it takes over at once"
+    assert not sessions.problem()
+
+
+@pytest.mark.parametrize(("whole_started", "is_whole_ignored"), [(1, True), (9, False)])
+def test_row_07_a_session_of_all_trays_and_one_of_some(whole_started, is_whole_ignored):
+    whole, some = shard("all", whole_started), shard("a+b", 5, "a", "b")
+    sessions = known(whole, some)
+    for tray, is_shared in (("a", True), ("b", True), ("c", False)):
+        assert sessions.is_ignored(whole.producer, tray) == (is_whole_ignored and is_shared)
+        assert sessions.is_ignored(some.producer, tray) == (not is_whole_ignored or not is_shared)
+    assert "two owners of trays a, b in scorer" in sessions.problem()
+
+
+def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(config, monkeypatch):
+    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
+    stop = threading.Event()
+    stop.set()
+    with Bus(config.bus) as bus:
+        bus.declare_alive(replace(shard("a+x", 1, "a", "x"), stage="resampler").key("s"))
+        with pytest.raises(StageError) as refused:
+            Runner(toy(), config, Shard("all", (TRAY_A, TRAY_B)), stop)
+        assert str(refused.value) == (
+            "resampler of site 's' cannot start: resampler/a+x already has trays a, x: process 1 on board; stop that, "
+            "or give this one other trays"
+        )
+        Runner(toy(), config, Shard(TRAY_B, (TRAY_B,), ("--trays", TRAY_B)), stop).run()
 
 
 def test_row_07_the_sessions_remembered_are_bounded():
@@ -64,7 +125,7 @@ def test_row_07_the_sessions_remembered_are_bounded():
 
 
 def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_the_first(config, monkeypatch):
-    monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     aborted: list[bool] = []
 
     class Aborts(Passer):
@@ -87,11 +148,11 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
 def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_site_and_others_are_not(
     config, monkeypatch
 ):
-    monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     with Bus(config.bus) as replay:
         replay.declare_alive(alive_key("s", "replay", "all"))
         with pytest.raises(StageError) as refused:
-            Runner(toy(name="acquisition", reads=(), writes=("raw",)), config, TRAY_A, threading.Event())
+            Runner(toy(name="acquisition", reads=(), writes=("raw",)), config, SHARD_A, threading.Event())
         assert str(refused.value) == (
             "a replay presents site 's': stop it, or give acquisition/a another site or bus.endpoint"
         )
@@ -102,8 +163,8 @@ def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_sit
 
 @pytest.mark.parametrize("process_id", [2**22 + 1, os.getpid()], ids=["ended", "our number, as in a container"])
 def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(config, monkeypatch, process_id):
-    monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
-    ours = Session.of_this_process("resampler", "all", 1, "p")
+    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
+    ours = Session.of_this_process("resampler", Shard("all", (TRAY_A, TRAY_B)), 1, "p")
     with Bus(config.bus) as bus:
         bus.declare_alive(replace(ours, process_id=process_id).key("s"))
         stop = threading.Event()
@@ -137,7 +198,7 @@ def test_row_07_where_two_run_the_samples_of_one_are_ignored_and_both_are_named(
 
 
 def test_row_07_alarms_of_a_second_scorer_are_not_shown(config):
-    first, second = (replace(s, stage="scorer", instance="all") for s in (FIRST, SECOND))
+    first, second = (replace(s, stage="scorer", instance="all", trays=()) for s in (FIRST, SECOND))
     with Bus(config.bus) as site, Bus(config.bus) as ours:
         watcher = SiteWatcher(ours, "s")
         for session in (first, second):

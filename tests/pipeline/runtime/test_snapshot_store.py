@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.runtime.snapshot_store import SnapshotStore
+from pipeline.runtime.snapshot_store import AHEAD_NS, RECENT_NS, SnapshotStore
 from pipeline.runtime.stage import StageError
 from schemas.codec import encode
 from schemas.messages import ScorerSnapshot
 
 
 def snapshot(number: int) -> ScorerSnapshot:
-    return ScorerSnapshot(t_ns=number, twin_sha256="twin", state_json="{}" * number)
+    return ScorerSnapshot(t_ns=number, twin_sha256="twin", state_json="{}" * min(number, 1000))
 
 
 def saved(path: Path) -> int:
@@ -94,6 +94,8 @@ def test_half_a_snapshot_is_refused(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(StageError, match="remove it to start without"):
         SnapshotStore(path).load()
+    with pytest.raises(StageError, match="remove it to continue from the one that the recorder keeps, or without"):
+        SnapshotStore(path, lambda _is_patient: ((), "")).load()
 
 
 def test_a_file_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -116,3 +118,41 @@ def test_a_removed_snapshot_does_not_bring_back_the_one_of_an_earlier_version(tm
     store.save(snapshot(2))
     store.path.unlink()
     assert store.load() is None
+
+
+def test_of_a_file_and_what_others_keep_the_newest_counts(tmp_path: Path) -> None:
+    store = SnapshotStore(tmp_path / "m.snapshot", lambda _is_patient: ([snapshot(5), snapshot(9)], ""))
+    store.save(snapshot(7))
+    found = store.load()
+    assert found and found.t_ns == 9
+    assert store.note == "continued from the snapshot that the recorder keeps; the file here is 0 s older"
+    store.save(snapshot(11))
+    found = store.load()
+    assert found and found.t_ns == 11
+
+
+def test_a_snapshot_of_a_clock_that_was_ahead_does_not_hide_the_last_one(tmp_path: Path) -> None:
+    SnapshotStore(tmp_path / "m.snapshot").save(snapshot(3 * AHEAD_NS))
+    store = SnapshotStore(tmp_path / "m.snapshot", lambda _is_patient: ([snapshot(AHEAD_NS)], ""), now_ns=AHEAD_NS)
+    found = store.load()
+    assert found and found.t_ns == AHEAD_NS
+
+
+@pytest.mark.parametrize(("t_ns", "is_patient"), [(None, True), (1, True), (2 * RECENT_NS, False)])
+def test_others_are_waited_for_where_there_is_no_recent_file_and_are_asked_once(
+    tmp_path: Path, t_ns: int | None, is_patient: bool
+) -> None:
+    asked: list[bool] = []
+
+    def elsewhere(is_patient: bool) -> tuple[list[ScorerSnapshot], str]:
+        asked.append(is_patient)
+        return [], "no recorder was there"
+
+    store = SnapshotStore(tmp_path / "m.snapshot", elsewhere, now_ns=2 * RECENT_NS + 1)
+    if t_ns is not None:
+        store.save(ScorerSnapshot(t_ns=t_ns, twin_sha256="", state_json=""))
+    store.load()
+    store.load()
+    assert asked == [is_patient]
+    from_what = "without a snapshot" if t_ns is None else "from the file here"
+    assert store.note == f"continued {from_what}: no recorder was there", "nothing is forgotten without a word"

@@ -1,0 +1,93 @@
+"""Builds what a process of a stage consists of, a core for each of its trays or one for all, and joins the bus."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import Config
+from pipeline.config.shards import Shard
+from pipeline.runtime.kept_snapshots import KeptSnapshots, keeps_snapshots
+from pipeline.runtime.second_owner import refuse_second
+from pipeline.runtime.sessions import Session
+from pipeline.runtime.stage import BuiltStage, Context, Kept, Stage
+
+
+def build_and_join(
+    stage: Stage, config: Config, shard: Shard, session: Session, stop: threading.Event
+) -> tuple[Bus, dict[str, BuiltStage]]:
+    """Build a process of a stage and join the bus: afterwards, so that what cannot be built says so even where the bus
+    cannot be joined; earlier if a core continues from what others keep. If it fails, nothing is left.
+
+    Raises:
+        StageError: it cannot be built, or another process has one of its trays.
+        BusError: the bus cannot be joined.
+    """
+    joined: list[Bus] = []
+
+    def bus() -> Bus:
+        if not joined:
+            joined.append(Bus(config.bus, stop))
+        return joined[0]
+
+    def refuse_others() -> None:
+        refuse_second(bus(), config.site, session, stop)
+
+    is_one_expected = any(map(keeps_snapshots, config.stages))
+    timeout_s = config.bus.recovery_timeout_s
+    kept = KeptSnapshots(bus, config.site, stop, refuse_others, timeout_s, is_one_expected=is_one_expected)
+    parts: dict[str, BuiltStage] = {}
+    try:
+        parts = build_parts(stage, _context_of(stage, config, shard, session.started_t_ns, kept))
+        refuse_others()
+        return bus(), parts
+    except BaseException:
+        abort(parts)
+        for each in joined:
+            each.close()
+        raise
+
+
+def build_parts(stage: Stage, context: Context) -> dict[str, BuiltStage]:
+    """The cores, with their sources, by the tray that each serves; an empty name: all. If one cannot be built, those
+    before it are aborted.
+
+    Raises:
+        StageError: it cannot be built.
+    """
+    groups = {tray.name: (tray,) for tray in context.trays} if stage.core_per_tray else {"": context.trays}
+    parts: dict[str, BuiltStage] = {}
+    try:
+        for name, trays in groups.items():
+            parts[name] = stage.build(replace(context, trays=trays))
+    except BaseException:
+        abort(parts)
+        raise
+    return parts
+
+
+def abort(parts: dict[str, BuiltStage]) -> None:
+    """Release what the cores hold; nothing is saved."""
+    for each in parts.values():
+        each.core.abort()
+
+
+def _context_of(stage: Stage, config: Config, shard: Shard, started_t_ns: int, kept: Kept) -> Context:
+    """What a process of a stage is built from. kept: what others keep of its state."""
+    return Context(
+        site=config.site,
+        trays=tuple(map(config.tray, shard.trays)),
+        config=config.sections[stage.name],
+        folder=config.folder,
+        run_folder=config.run_folder,
+        started_t_ns=started_t_ns,
+        instance=shard.name,
+        shard_number=shard.number,
+        snapshot_folder=config.run_folder,
+        kept=kept,
+        configuration_path=config.path,
+        configuration_text=config.text,
+        overrides=config.overrides,
+        reads=stage.reads_as_configured(config),
+    )

@@ -1,0 +1,133 @@
+"""The last message about each tray that a stage keeps for others: what a stage continues from where its own file is
+missing or old.
+
+The recorder keeps the last snapshot of each of its trays. So a scorer that is killed with its host goes on elsewhere.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from pipeline.bus.kept_messages import KeptQuery
+from pipeline.bus.session import Bus
+from pipeline.config.registry import STAGES
+from pipeline.runtime.second_owner import GOSSIP_S
+from pipeline.runtime.sessions import Session
+from schemas.codec import CodecError, decode
+from schemas.envelope import Envelope
+from schemas.messages import ScorerSnapshot
+from schemas.topics import sessions_key, topic_of, tray_key
+
+SNAPSHOT = "snapshot"
+KEEPER_LIMIT_S = 60.0
+"""how long a stage without a recent file waits for one that keeps snapshots; what it misses meanwhile, others keep"""
+IMPATIENT_S = 0.5
+"""how long further answers are waited for, once one has not come in time"""
+_POLL_S = 0.05
+
+
+class KeptForOthers:
+    """The last messages that this process keeps."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        site: str,
+        topics: Iterable[str],
+        producer: str,
+        before: Mapping[str, bytes],
+        on_query: Callable[[KeptQuery], object],
+    ) -> None:
+        """topics: those that are kept; producer: of this process; before: messages from before its start, by key.
+
+        on_query: called from a thread of the bus. `answer` must be called after what had arrived before the query has
+        been added: whoever asks has seen the end of a process, whose last message may still be on the way.
+        """
+        self._topics = frozenset(topics)
+        self._last = dict(before)
+        for topic in self._topics:
+            bus.answer_for_kept(tray_key(site, "*", topic), producer, on_query)
+
+    def add(self, envelope: Envelope) -> None:
+        """Keep a message if it is of such a topic."""
+        if envelope.topic in self._topics:
+            self._last[envelope.key] = envelope.payload
+
+    def answer(self, query: KeptQuery) -> None:
+        """Give the last message to whoever asks for it."""
+        is_kept = topic_of(query.key).name in self._topics
+        query.answer(self._last.get(query.key) if is_kept else None)
+
+
+class KeptSnapshots:
+    """Asks the stages of a site for the snapshots that they keep."""
+
+    def __init__(
+        self,
+        bus: Callable[[], Bus],
+        site: str,
+        stop: threading.Event,
+        wait_for_predecessor: Callable[[], None],
+        answer_limit_s: float,
+        *,
+        is_one_expected: bool,
+        keeper_limit_s: float = KEEPER_LIMIT_S,
+    ) -> None:
+        """bus: joins it, if it is not joined yet. wait_for_predecessor: returns when no other process has these trays,
+        so that no snapshot is still to come. answer_limit_s: how long to wait for an answer. is_one_expected: whether
+        the configuration has a stage that keeps snapshots; if so, it is waited for up to keeper_limit_s."""
+        self._bus = bus
+        self._site = site
+        self._stop = stop
+        self._wait_for_predecessor = wait_for_predecessor
+        self._answer_limit_s = answer_limit_s
+        self._is_one_expected = is_one_expected
+        self._keeper_limit_s = keeper_limit_s
+        self._began_s: float | None = None
+
+    def of(self, tray: str, *, is_patient: bool) -> tuple[Sequence[ScorerSnapshot], str]:
+        """The last snapshot of a tray that each stage keeps, and why there may be others, for people. is_patient: wait
+        for a stage that is not there yet.
+
+        Raises:
+            StageError: another process has the tray.
+        """
+        if self._began_s is None:
+            self._wait_for_predecessor()
+            self._began_s = time.monotonic()
+        is_patient = is_patient and self._is_one_expected
+        bus = self._bus()
+        limit_s = self._keeper_limit_s if is_patient else GOSSIP_S if bus.came_second else 0.0
+        is_kept = self._wait_for_keeper(bus, tray, self._began_s + limit_s)
+        payloads, have_answered = bus.ask_for_kept(tray_key(self._site, tray, SNAPSHOT), self._answer_limit_s)
+        why = f"no recorder of this tray was there within {limit_s:g} s" if is_patient and not is_kept else ""
+        if not have_answered:
+            why = f"a recorder did not answer within {self._answer_limit_s:g} s"
+            self._answer_limit_s = min(self._answer_limit_s, IMPATIENT_S)
+        return [snapshot for snapshot in map(_decoded, payloads) if snapshot is not None], why
+
+    def _wait_for_keeper(self, bus: Bus, tray: str, until_s: float) -> bool:
+        """Whether a stage that keeps the snapshots of a tray is there in time."""
+        while not (is_there := self._has_keeper(bus, tray)) and time.monotonic() < until_s:
+            if self._stop.wait(_POLL_S):
+                break
+        return is_there
+
+    def _has_keeper(self, bus: Bus, tray: str) -> bool:
+        keepers = filter(keeps_snapshots, STAGES)
+        tokens = (token for stage in keepers for token in bus.alive(sessions_key(self._site, stage)))
+        return any(each is not None and each.has(tray) for each in map(Session.of_key, tokens))
+
+
+def keeps_snapshots(stage: str) -> bool:
+    """Whether a stage keeps the snapshots of others."""
+    return stage in STAGES and SNAPSHOT in STAGES[stage].keeps
+
+
+def _decoded(payload: bytes) -> ScorerSnapshot | None:
+    try:
+        return decode(ScorerSnapshot, payload)
+    except CodecError:
+        return None

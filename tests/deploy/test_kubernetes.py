@@ -1,0 +1,182 @@
+"""The chart, rendered by Helm's own library and checked against the schemas of Kubernetes; nothing is installed."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.config.registry import STAGES
+from tests.support.fantwin_words import parsed
+
+why = "the chart is not checked: pip install helm-python-sdk kubernetes-validate"
+helm: Any = pytest.importorskip("helm_python", reason=why)
+schemas: Any = pytest.importorskip("kubernetes_validate", reason=why)
+yaml: Any = pytest.importorskip("yaml", reason=why)
+
+CHART = Path(__file__).parents[2] / "deploy" / "kubernetes" / "fantwin"
+CONFIGURATION = 'site = "plant"\n[[tray]]\nname = "a"\nfans = 8\n'
+OLDEST, NEWEST = "1.28", "1.37"
+"""versions of Kubernetes: the first of which schemas have the fields that the chart needs, and the newest known"""
+MANY = {stage: {"shards": 3, "storage": "1Gi" if stage in ("recorder", "learner") else ""} for stage in STAGES}
+
+
+def rendered(**values: Any) -> list[dict[str, Any]]:
+    with helm.Chart.load(str(CHART)) as chart:
+        files = chart.render({"config": CONFIGURATION, **values}, name="plant", namespace="fans")
+    return [document for text in files.values() for document in yaml.safe_load_all(text) if document]
+
+
+def of_kind(kind: str, documents: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {each["metadata"]["name"]: each for each in documents if each["kind"] == kind}
+
+
+@pytest.fixture(scope="module")
+def stages() -> dict[str, dict[str, Any]]:
+    """The stateful sets of a site where every stage has three shards, by stage."""
+    sets = of_kind("StatefulSet", rendered(stages=MANY))
+    return {each["spec"]["selector"]["matchLabels"]["app.kubernetes.io/component"]: each for each in sets.values()}
+
+
+def container(stateful_set: dict[str, Any]) -> dict[str, Any]:
+    (found,) = stateful_set["spec"]["template"]["spec"]["containers"]
+    return found
+
+
+@pytest.mark.parametrize("version", [OLDEST, NEWEST])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"stages": MANY, "files": {"configMap": {"name": "twins"}}, "image": {"pullSecrets": [{"name": "registry"}]}},
+        {"router": {"enabled": False}},
+    ],
+    ids=str,
+)
+def test_what_is_rendered_fits_the_schemas_of_kubernetes(values, version):
+    documents = rendered(**values)
+    assert {"ConfigMap", "Service", "StatefulSet"} <= {each["kind"] for each in documents}
+    for document in documents:
+        schemas.validate(document, version, strict=True)
+
+
+def test_the_schemas_see_what_is_wrong(stages):
+    broken = {**stages["scorer"], "spec": {**stages["scorer"]["spec"], "replica": 3}}
+    with pytest.raises(schemas.ValidationError, match="replica"):
+        schemas.validate(broken, NEWEST, strict=True)
+
+
+def test_helm_finds_nothing_to_complain_about():
+    found = helm.lint(str(CHART), values={"config": CONFIGURATION})
+    assert found["errors"] == [] or found["errors"] is None
+    severe = [each for each in found["messages"] or [] if "icon" not in str(each)]
+    assert severe == []
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"stages": {"scorer": {"shards": -1}}},
+        {"stages": {"scorer": {"shards": 1, "storage": "much"}}},
+        {"image": {"pullSecrets": ["registry"]}},
+        {"stage": {}},
+        {"config": ""},
+    ],
+    ids=str,
+)
+def test_wrong_values_are_refused(values):
+    with pytest.raises(helm.HelmError):
+        rendered(**values)
+
+
+def test_the_values_name_every_stage_in_the_order_of_the_data_flow():
+    assert list(yaml.safe_load((CHART / "values.yaml").read_text())["stages"]) == list(STAGES)
+
+
+def test_a_stage_without_shards_has_no_pods():
+    assert set(of_kind("StatefulSet", rendered(stages={"scorer": {"shards": 0}}))) == {
+        f"plant-{stage}-of-1" for stage in ("resampler", "twin-integrator", "recorder")
+    }
+
+
+def test_another_number_of_shards_is_another_set_with_pods_and_a_service_of_its_own():
+    for shards in (2, 3):
+        (of_scorer,) = (
+            each
+            for name, each in of_kind("StatefulSet", rendered(stages={"scorer": {"shards": shards}})).items()
+            if "scorer" in name
+        )
+        assert of_scorer["metadata"]["name"] == of_scorer["spec"]["serviceName"] == f"plant-scorer-of-{shards}"
+    long = "a-release-whose-name-is-as-long-as-helm-allows-53-cha"
+    with helm.Chart.load(str(CHART)) as chart:
+        files = chart.render(
+            {"config": CONFIGURATION, "stages": {"scorer": {"shards": 4096}}}, name=long, namespace="f"
+        )
+    names = of_kind("StatefulSet", [each for text in files.values() for each in yaml.safe_load_all(text) if each])
+    assert all(re.fullmatch(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?", name) for name in names)
+    assert max(map(len, names)) <= 52, "the hash of the revision is appended to it in a label of 63 characters"
+
+
+def test_the_pods_of_the_scorer_ask_for_the_snapshots_of_those_before_them(stages):
+    for stage, stateful_set in stages.items():
+        words = container(stateful_set)["args"]
+        assert ("--set=scorer.asks_for_snapshots=true" in words) == (stage == "scorer")
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_pods_of_a_stage_share_the_trays_by_their_ordinals(stages, stage):
+    spec = stages[stage]["spec"]
+    assert (spec["replicas"], spec["ordinals"]) == (3, {"start": 1})
+    (ordinal,) = (each for each in container(stages[stage])["env"] if each["name"] == "SHARD")
+    assert ordinal["valueFrom"]["fieldRef"]["fieldPath"] == "metadata.labels['apps.kubernetes.io/pod-index']"
+    for number in (1, 2, 3):
+        words = [word.replace("$(SHARD)", str(number)) for word in container(stages[stage])["args"]]
+        found = parsed(words)
+        assert (found["stage"], found["shard"]) == (stage, f"{number}/3")
+        assert {"bus.mode=client", "bus.endpoint=tcp/plant-router:7447"} <= set(found["overrides"])
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_pod_is_ready_when_its_own_process_is_at_work(stages, stage, tmp_path):
+    program = tmp_path / "fantwin"
+    program.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    program.chmod(0o755)
+    command = container(stages[stage])["readinessProbe"]["exec"]["command"]
+    environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "SHARD": "2"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    found = parsed(done.stdout.splitlines())
+    assert (found["stage"], found["shard"]) == (stage, "2/3")
+
+
+def test_a_pod_is_alive_while_its_main_loop_renews_its_file(stages, tmp_path):
+    file = tmp_path / "alive"
+    env = {each["name"]: each.get("value") for each in container(stages["scorer"])["env"]}
+    assert env["FANTWIN_ALIVE_FILE"] == "/tmp/alive"
+    *shell, script = container(stages["scorer"])["livenessProbe"]["exec"]["command"]
+
+    def is_alive() -> bool:
+        return not subprocess.run([*shell, script.replace("/tmp/alive", str(file))], check=False).returncode
+
+    assert not is_alive()
+    file.touch()
+    assert is_alive()
+    os.utime(file, (0, 0))
+    assert not is_alive()
+
+
+def test_only_what_must_survive_a_pod_has_a_claim(stages):
+    for stage, stateful_set in stages.items():
+        claims = [each["metadata"]["name"] for each in stateful_set["spec"].get("volumeClaimTemplates", ())]
+        volumes = [each["name"] for each in stateful_set["spec"]["template"]["spec"]["volumes"]]
+        is_kept = bool(MANY[stage]["storage"])
+        assert (claims, "run" in volumes) == ((["run"], False) if is_kept else ([], True)), stage
+
+
+def test_only_pods_of_the_site_reach_its_router():
+    (policy,) = of_kind("NetworkPolicy", rendered()).values()
+    (peer,) = policy["spec"]["ingress"][0]["from"]
+    assert peer["podSelector"]["matchLabels"]["app.kubernetes.io/instance"] == "plant"

@@ -1,0 +1,129 @@
+"""The recordings of the shards of a recorder, read as those of one run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.cli.recordings import info
+from pipeline.recordings.contents import contents_of
+from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from pipeline.recordings.run_recordings import recorded_files, run_metadata
+from pipeline.recordings.writing import RecordingWriter
+from pipeline.replay.live.recording_playback import RecordingPlayback
+from schemas.messages import Counter, Header, Health, StageStatus
+from schemas.topics import health_key, tray_key
+from tests.support.fantwin_command import error_of, fantwin
+from tests.support.killed_site import CONFIGURATION, SITE, TRAY, Site
+
+TRAYS = (TRAY, "tray2")
+_TRAY_TABLE = CONFIGURATION[CONFIGURATION.index("[[tray]]") : CONFIGURATION.index("[twin_integrator]")]
+OF_BOTH = CONFIGURATION.replace(_TRAY_TABLE, _TRAY_TABLE + _TRAY_TABLE.replace(TRAY, TRAYS[1]))
+HEALTH = Health(
+    header=Header("resampler-all-1", 0, ""),
+    stage="resampler",
+    instance="all",
+    status=StageStatus.OK,
+    t_ns=1,
+    uptime_s=1,
+)
+
+
+def shard(folder: Path, number: int, configuration: str = OF_BOTH, overrides: str = "[]") -> Path:
+    """The recording of one of two shards: a whole site of one tray, under the name of its tray."""
+    tray = TRAYS[number - 1]
+    made = folder / f"site-{number}"
+    made.mkdir()
+    site = Site(made, seed=number)
+    site.run(500)
+    site.kill("scorer")
+    site.run(100)
+    path = site.finished()
+    head = read_metadata(path)
+    metadata = {name.replace(TRAY, tray): value.replace(TRAY, tray) for name, value in head.metadata.items()}
+    metadata |= {"recording": f"{number}-of-2.recording.mcap", "overrides": overrides}
+    attachments = {"configuration.toml": configuration.encode(), f"{tray}.onnx": head.attachments[f"{TRAY}.onnx"]}
+    with RecordingWriter(folder / f"{number}-of-2.recording.mcap", metadata, attachments) as writer:
+        entries = list(read_recording(path))
+        for entry in entries:
+            header = replace(entry.message.header, tray=tray)
+            message = replace(entry.message, header=header)
+            writer.add_message(tray_key(SITE, tray, entry.topic), message, entry.received_t_ns)
+        for sequence in range(number):  # the second one has heard the stage of both for longer
+            health = replace(
+                HEALTH,
+                header=Header("resampler-all-1", sequence, ""),
+                counters=(Counter(name="lost_late", value=sequence),),
+                lost=sequence,
+            )
+            writer.add_message(health_key(SITE, "resampler", "all"), health, entries[-1].received_t_ns)
+    return writer.path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with the recordings of two shards, and a table that somebody has imported there."""
+    found = tmp_path_factory.mktemp("runs")
+    for number in (1, 2):
+        shard(found, number)
+    with RecordingWriter(found / "imported.mcap", {"trays": "other", "source": "table.csv"}):
+        pass
+    return found
+
+
+def test_a_folder_stands_for_what_recorders_have_recorded_there(folder, tmp_path):
+    both = [folder / f"{number}-of-2.recording.mcap" for number in (1, 2)]
+    assert recorded_files([folder, both[0]]) == both
+    with pytest.raises(RecordingError, match="no recording that a recorder has finished in this folder"):
+        recorded_files([tmp_path])
+
+
+def test_the_shards_together_know_what_each_knows_about_its_trays(folder):
+    found = run_metadata(recorded_files([folder]))
+    assert found.trays == TRAYS
+    assert {f"{tray}.onnx" for tray in TRAYS} < set(found.attachments)
+    assert [found.speed_unit(tray) for tray in TRAYS] == ["rad/s", "rad/s"]
+
+
+def test_a_replay_of_the_folder_decides_for_all_trays_as_it_was_decided(folder):
+    done = fantwin("replay", "--offline", "--verify", "--json", folder)
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert found["verified"]["equal"]
+    assert set(found["counts"]) == set(TRAYS)
+    assert found["restarts"] == 2
+    alone = json.loads(fantwin("replay", "--offline", "--json", folder / "2-of-2.recording.mcap").stdout)
+    assert set(alone["counts"]) == {TRAYS[1]}
+    assert alone["counts"][TRAYS[1]] == found["counts"][TRAYS[1]]
+    assert found["verified"]["samples_equal"] > 900
+
+
+def test_shards_of_hosts_that_run_at_different_places_are_one_run_and_those_that_decide_otherwise_are_not(tmp_path):
+    here = shard(tmp_path, 1, overrides='["run_folder=\\"/a\\"", "bus.endpoint=\\"x\\""]')
+    there = shard(tmp_path, 2, overrides='["run_folder=\\"/b\\""]')
+    assert fantwin("replay", "--offline", "--verify", here, there).exit_code == 0
+    other = tmp_path / "other"
+    other.mkdir()
+    strict = shard(other, 2, overrides='["scorer.alarm_sigmas=9.0"]')
+    assert "they differ in keys set on the command line" in error_of("replay", "--offline", here, strict)
+
+
+def test_the_messages_of_all_shards_are_played_in_the_order_of_their_times(folder):
+    played = list(RecordingPlayback([folder], ("raw",)))
+    times = [entry.received_t_ns for entry in played]
+    assert times == sorted(times)
+    assert {entry.message.header.tray for entry in played[:20]} == set(TRAYS), "side by side, not one after the other"
+    assert len(played) == sum(len(list(RecordingPlayback([path], ("raw",)))) for path in recorded_files([folder]))
+
+
+def test_what_two_shards_have_both_recorded_counts_once_and_the_newest_health_counts(folder):
+    found = json.loads(fantwin("info", folder, "--json").stdout)
+    assert found["continuity"] == []
+    assert {key.split("/")[2] for key in found["topics"]} == {*TRAYS, "health"}
+    assert found["topics"][health_key(SITE, "resampler", "all")]["messages"] == 2
+    parts = list(map(contents_of, recorded_files([folder])))
+    for ordered in (parts, parts[::-1]):
+        assert [health.lost for health in info._sessions(ordered)] == [1]

@@ -1,0 +1,149 @@
+"""What one stage keeps for others, and what a stage that starts is given of it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+
+import pytest
+
+from pipeline.bus.kept_messages import KeptQuery
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from pipeline.runtime.kept_snapshots import KeptForOthers, KeptSnapshots
+from pipeline.runtime.sessions import Session
+from schemas.codec import encode
+from schemas.envelope import Envelope
+from schemas.messages import Header, ScorerSnapshot
+from schemas.topics import tray_key
+from tests.support.running_chain import eventually
+from tests.support.written_recordings import alarm
+
+LONG_S = 60.0
+RECORDER = Session("recorder", "1-of-2", 1, "recorder-1-of-2-1", "board", 1, ("a", "b"))
+
+
+def snapshot(tray: str, t_ns: int) -> Envelope:
+    header = Header("scorer-all-1", t_ns, tray)
+    message = ScorerSnapshot(header=header, t_ns=t_ns, twin_sha256="x", state_json="{}")
+    return Envelope.of(tray_key("s", tray, "snapshot"), message, t_ns)
+
+
+@pytest.fixture
+def buses(endpoint: str) -> Iterator[tuple[Bus, Bus]]:
+    with Bus(BusConfig(endpoint=endpoint)) as one, Bus(BusConfig(endpoint=endpoint)) as other:
+        other.wait_for_others(threading.Event())
+        yield one, other
+
+
+def asking(
+    bus: Bus,
+    *,
+    is_one_expected: bool = True,
+    keeper_limit_s: float = LONG_S,
+    answer_limit_s: float = LONG_S,
+    wait_for_predecessor: Callable[[], None] = lambda: None,
+) -> KeptSnapshots:
+    return KeptSnapshots(
+        lambda: bus,
+        "s",
+        threading.Event(),
+        wait_for_predecessor,
+        answer_limit_s,
+        is_one_expected=is_one_expected,
+        keeper_limit_s=keeper_limit_s,
+    )
+
+
+def keeping(bus: Bus, before: Mapping[str, bytes], producer: str = RECORDER.producer) -> KeptForOthers:
+    """What a recorder keeps that answers at once."""
+
+    def answer(query: KeptQuery) -> None:
+        kept.answer(query)
+
+    kept = KeptForOthers(bus, "s", ("snapshot",), producer, before, answer)
+    return kept
+
+
+def by_key(*snapshots: Envelope) -> dict[str, bytes]:
+    return {each.key: each.payload for each in snapshots}
+
+
+def times(kept: KeptSnapshots, tray: str, *, is_patient: bool = True) -> list[int]:
+    return [each.t_ns for each in kept.of(tray, is_patient=is_patient)[0]]
+
+
+def test_the_last_snapshot_of_a_tray_is_given_to_whoever_asks_for_that_tray(buses):
+    recorder, scorer = buses
+    kept = keeping(recorder, by_key(snapshot("b", 1), snapshot("a", 1)))
+    recorder.declare_alive(RECORDER.key("s"))
+    for t_ns in (5, 7):
+        kept.add(snapshot("a", t_ns))
+    kept.add(Envelope.of(tray_key("s", "a", "alarm"), alarm(0), 9))
+    found = asking(scorer)
+    assert [times(found, tray) for tray in ("a", "b")] == [[7], [1]]
+    (given,), _ = found.of("a", is_patient=True)
+    assert given.header == Header("scorer-all-1", 7, "a"), "as it was published"
+
+
+def test_each_stage_that_keeps_one_answers_and_what_cannot_be_read_is_left_out(buses):
+    one, scorer = buses
+    for number, payload in enumerate((encode(snapshot("a", 3).message), b"\xff\xff")):
+        keeping(one, {tray_key("s", "a", "snapshot"): payload}, f"recorder-{number}")
+    one.declare_alive(RECORDER.key("s"))
+    assert times(asking(scorer), "a") == [3]
+
+
+def test_nobody_waits_for_a_recorder_that_the_configuration_does_not_have_or_where_the_own_file_is_recent(buses):
+    _, scorer = buses
+    assert asking(scorer, is_one_expected=False).of("a", is_patient=True) == ([], "")
+    assert asking(scorer).of("a", is_patient=False) == ([], "")
+
+
+def test_a_recorder_of_other_trays_is_not_the_one_that_is_waited_for(buses):
+    recorder, scorer = buses
+    keeping(recorder, {})
+    recorder.declare_alive(RECORDER.key("s"))
+    found = asking(scorer, keeper_limit_s=0.3)
+    looked: list[str] = []
+    alive = scorer.alive
+
+    def look(key: str) -> set[str]:
+        looked.append(key)
+        return alive(key)
+
+    eventually(lambda: scorer.alive(RECORDER.key("s")), "the recorder is known")
+    scorer.alive = look
+    assert found.of("a", is_patient=True) == ([], "")
+    assert len(looked) == 1, "the recorder of this tray is there"
+    assert found.of("c", is_patient=True) == ([], "no recorder of this tray was there within 0.3 s")
+    assert len(looked) > 2, "no recorder has this tray: it may still start"
+
+
+def test_a_recorder_that_starts_meanwhile_is_waited_for(buses):
+    recorder, scorer = buses
+    given: list[int] = []
+    thread = threading.Thread(target=lambda: given.extend(times(asking(scorer), "a")))
+    thread.start()
+    keeping(recorder, by_key(snapshot("a", 4)))
+    recorder.declare_alive(RECORDER.key("s"))
+    thread.join(LONG_S)
+    assert given == [4]
+
+
+def test_whoever_takes_over_asks_when_the_one_before_has_published_its_last_snapshot(buses):
+    recorder, scorer = buses
+    kept = keeping(recorder, by_key(snapshot("a", 1)))
+    recorder.declare_alive(RECORDER.key("s"))
+    assert times(asking(scorer, wait_for_predecessor=lambda: kept.add(snapshot("a", 2))), "a") == [2]
+
+
+def test_a_recorder_that_hangs_is_not_waited_for_twice_and_is_told_of(buses):
+    recorder, scorer = buses
+    queries: list[KeptQuery] = []
+    KeptForOthers(recorder, "s", ("snapshot",), RECORDER.producer, {}, queries.append)
+    recorder.declare_alive(RECORDER.key("s"))
+    found = asking(scorer, answer_limit_s=0.6)
+    assert found.of("a", is_patient=True) == ([], "a recorder did not answer within 0.6 s")
+    assert found.of("b", is_patient=True) == ([], "a recorder did not answer within 0.5 s")
+    assert [query.key for query in queries] == [tray_key("s", tray, "snapshot") for tray in ("a", "b")]
