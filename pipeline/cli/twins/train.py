@@ -30,7 +30,7 @@ from pipeline.cli.twins.training_data import (
 )
 
 if TYPE_CHECKING:
-    from twin.build import TrainedTwin
+    from twin.finishing import TrainedTwin
     from twin.progress import Progress
 
 
