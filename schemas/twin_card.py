@@ -99,7 +99,8 @@ class TrainingCard:
 
     physics: whether they were refined together with the network. duration_s: duration of the training. fans: the fan
     numbers in the recordings, in the order of the card's lists; empty in early cards. networks: how many were trained;
-    the twin is the mean of those that ended about as well as the best. iterations: of all of them.
+    the twin is the mean of those that ended about as well as the best. iterations: of all of them. of_type: name of the
+    twin of the type whose network it has, if only its physics are of these fans; else empty.
     """
 
     trainer: str
@@ -110,6 +111,7 @@ class TrainingCard:
     data: tuple[DataCard, ...]
     fans: tuple[int, ...] = ()
     networks: Count = 1
+    of_type: str = ""
 
 
 @dataclass(frozen=True, config=_CONFIG)

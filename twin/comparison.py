@@ -7,10 +7,11 @@ from typing import Literal
 import numpy as np
 
 from schemas.twin_card import DataCard
-from twin.build import TrainedTwin, evaluate, train_twin
+from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.evaluation.accuracy import Evaluation, evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
 from twin.export.fan_rows import measured_as_in_card
+from twin.finishing import TrainedTwin
 from twin.kinds import KINDS, Variant
 from twin.models.physics import LAG, PARAMETER_NAMES
 from twin.progress import Progress, unreported

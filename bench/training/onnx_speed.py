@@ -29,8 +29,9 @@ from scipy.integrate import solve_ivp
 from bench.printing import JsonOption, progress, show
 from bench.training import race_diffrax, race_torchdiffeq
 from simulation.published_fan import RATE_HZ, ROUGH_RANGE, random_stairs, rough_run
-from twin.build import TrainedTwin, train_twin
+from twin.build import train_twin
 from twin.export.onnx_twin import OnnxTwin
+from twin.finishing import TrainedTwin
 from twin.fitting.torch_reference import torch_free_run
 from twin.models.hybrid import Hybrid
 from twin.models.physics import LAG

@@ -40,6 +40,7 @@ COMMANDS = {
     "picture": "recordings.picture",
     "identify": "twins.identify",
     "train": "twins.train",
+    "place": "twins.place",
     "calibrate": "twins.calibrate",
     "evaluate": "twins.evaluate",
     "compare": "twins.compare",
@@ -51,6 +52,7 @@ COMMANDS = {
 """command -> its module in this folder; the module's function of the same name is the command"""
 VARIADIC: dict[str, tuple[str, ...]] = {
     "train": ("--validate",),
+    "place": ("--validate",),
     "compare": ("--validate", "--test"),
     "calibrate": ("--verify",),
 }

@@ -7,8 +7,9 @@ import pytest
 
 from schemas.tacho import INSTANTANEOUS, Tacho
 from tests.support.fan_data import PUBLISHED_PARAMETERS, counted_run, published_run
-from twin.build import TrainedTwin, evaluate, train_twin
+from twin.build import evaluate, train_twin
 from twin.errors import TwinError
+from twin.finishing import TrainedTwin
 from twin.fitting.identification import identify
 from twin.fitting.trajectories import cut_into_trajectories
 from twin.kinds import find_kind

@@ -71,17 +71,19 @@ def model_uncertainty(
     )
     commands = _commands(evidence, scale)
     offsets_rad_s = scale.speed_scale_rad_s * np.array((*(-each for each in reversed(OFFSETS)), 0.0, *OFFSETS))
+    reach = np.linspace(-2.0 * REACH, 2.0 * REACH, SETTLING_SPEEDS)
+    reach_rad_s = scale.speed_offset_rad_s + scale.speed_scale_rad_s * reach
     settled_rad_s, std_rad_s = [], []
     for own, its, root in zip(parameters, evidence, _roots([each.squares for each in evidence]), strict=True):
-        settled_rad_s.append(_settled_speed_rad_s(model, own, commands - its.friction, scale))
+        settled_rad_s.append(settled_speed_rad_s(model, own, commands - its.friction, reach_rad_s))
         speeds_rad_s = settled_rad_s[-1][:, np.newaxis] + offsets_rad_s
         held_s = _held_s(own, speeds_rad_s, SLOWEST * typical_s)
         std_rad_s.append(_left_rad_s2(root, basis, speeds_rad_s, commands) * held_s)
     table = ModelUncertainty(
-        tuple(_digits(offsets_rad_s)),
-        tuple(_digits(commands)),
-        tuple(tuple(tuple(_digits(row, 4)) for row in each) for each in std_rad_s),
-        settled_speed_rad_s=tuple(tuple(_digits(each)) for each in settled_rad_s),
+        tuple(significant(offsets_rad_s)),
+        tuple(significant(commands)),
+        tuple(tuple(tuple(significant(row, 4)) for row in each) for each in std_rad_s),
+        settled_speed_rad_s=tuple(tuple(significant(each)) for each in settled_rad_s),
     )
     seen_rad_s = [
         _seen_std_rad_s(table.of_fans([fan]), its.held_command, settled, stands_below_rad_s)
@@ -91,8 +93,8 @@ def model_uncertainty(
     return replace(table, seen_std_rad_s=tuple(of_others if each is None else each for each in seen_rad_s))
 
 
-def _digits(values: Array, digits: int = 7) -> list[float]:
-    """Significant ones: commands and speeds may be of any size."""
+def significant(values: Array, digits: int = 7) -> list[float]:
+    """Values with so many significant digits: commands and speeds may be of any size."""
     return [float(f"{value:.{digits}g}") for value in values.tolist()]
 
 
@@ -124,10 +126,11 @@ def _seen_std_rad_s(
     return float(f"{np.quantile(std_rad_s, SEEN_QUANTILE):.4g}")
 
 
-def _settled_speed_rad_s(model: OdeModel, own: Array, commands: Array, scale: Scaling) -> Array:
-    """(n,) the speeds at which a fan settles under acting commands, limited to twice the reach of the table."""
-    reach = np.linspace(-2.0 * REACH, 2.0 * REACH, SETTLING_SPEEDS)
-    speeds_rad_s = scale.speed_offset_rad_s + scale.speed_scale_rad_s * reach
+def settled_speed_rad_s(model: OdeModel, own: Array, commands: Array, speeds_rad_s: Array) -> Array:
+    """(commands,) the speeds at which a fan settles under acting commands, between the given ones, which rise.
+
+    own: (4,) its physics.
+    """
     command, speed_rad_s = (values.ravel() for values in np.meshgrid(commands, speeds_rad_s, indexing="ij"))
     acceleration = acceleration_of(model, own)(speed_rad_s, command).reshape(len(commands), -1)
     braking = -np.minimum.accumulate(acceleration, axis=1)

@@ -106,21 +106,32 @@ class TanhNetwork:
 
     def linearise(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array, Array]:
         """The acceleration and its derivatives by speed and by command (..., batch), and by theta (..., batch, P)."""
-        input_weights, _, output_weights, output_bias = self.weights()
+        value, by_speed, by_command, hidden, by_bias = self._by_inputs(speed_rad_s, command)
         rate = self.scaling.acceleration_scale_rad_s2
-        hidden = self.hidden(speed_rad_s, command)
-        by_bias = rate * output_weights * (1.0 - hidden * hidden)
         by_theta = np.empty((*speed_rad_s.shape, self.parameter_count))
         for index, scaled in enumerate(self._scaled_inputs(speed_rad_s, command)):
             by_theta[..., index * self.units : (index + 1) * self.units] = by_bias * scaled[..., np.newaxis]
         by_theta[..., -2 * self.units - 1 : -self.units - 1] = by_bias
         by_theta[..., -self.units - 1 : -1] = rate * hidden
         by_theta[..., -1] = rate
+        return value, by_speed, by_command, by_theta
+
+    def linearise_inputs(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array]:
+        """`linearise` without the derivatives by theta."""
+        value, by_speed, by_command, _, _ = self._by_inputs(speed_rad_s, command)
+        return value, by_speed, by_command
+
+    def _by_inputs(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """`linearise_inputs`, and (..., batch, units) the hidden layer and the derivatives by its biases."""
+        input_weights, _, output_weights, output_bias = self.weights()
+        rate = self.scaling.acceleration_scale_rad_s2
+        hidden = self.hidden(speed_rad_s, command)
+        by_bias = rate * output_weights * (1.0 - hidden * hidden)
         by_speed = by_bias @ (input_weights[0] / self.scaling.speed_scale_rad_s)
         by_command = np.zeros_like(by_speed)
         if len(self.inputs) > 1:
             by_command = by_bias @ (input_weights[1] / self.scaling.command_scale)
-        return rate * (hidden @ output_weights + output_bias), by_speed, by_command, by_theta
+        return rate * (hidden @ output_weights + output_bias), by_speed, by_command, hidden, by_bias
 
     def _scaled_inputs(self, speed_rad_s: Array, command: Array) -> tuple[Array, ...]:
         scale = self.scaling

@@ -23,11 +23,13 @@ ODE_LAYOUT = StateLayout(speed=1, command=1)
 class FanEquation:
     """The right-hand side of a batch of fans. parameters: (batch, 4) or more, or None without physics.
 
-    linearise gives the derivatives by the network's weights and then by J, alpha and C_D, as far as there are any.
+    linearise gives the derivatives by the network's weights, if these are free, and then by J, alpha and C_D, as far as
+    there are any.
     """
 
     parameters: Array | None
     network: TanhNetwork | None
+    has_free_weights: bool = True
 
     def acceleration(self, speed_rad_s: Array, command: Array) -> Array:
         """(..., batch) in rad/s^2."""
@@ -55,9 +57,11 @@ class FanEquation:
         """See integration.Linearised."""
         value = by_speed = by_command = np.zeros_like(speed_rad_s)
         by_theta = []
-        if self.network is not None:
+        if self.network is not None and self.has_free_weights:
             value, by_speed, by_command, by_weights = self.network.linearise(speed_rad_s, command)
             by_theta.append(by_weights)
+        elif self.network is not None:
+            value, by_speed, by_command = self.network.linearise_inputs(speed_rad_s, command)
         if self.parameters is not None:
             value = value + physics.acceleration(speed_rad_s, command, self.parameters)
             by_speed = by_speed + physics.acceleration_by_speed(speed_rad_s, self.parameters)

@@ -33,7 +33,7 @@ from pipeline.cli.twins.training_data import (
 from pipeline.recordings.remote import matching, recording_path
 
 if TYPE_CHECKING:
-    from twin.build import TrainedTwin
+    from twin.finishing import TrainedTwin
     from twin.progress import Progress
 
 

@@ -15,10 +15,11 @@ from onnx import helper
 from schemas.twin_card import CARD_PROPERTY, GRAPH_INPUTS, GRAPH_OUTPUTS, CardError, DataCard, TwinCard
 from tests.support import fan_data
 from tests.twin.models.test_models import ALL_MODELS, random_network
-from twin.build import TrainedTwin, evaluate, train_twin
+from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.export.onnx_export import export_onnx
 from twin.export.onnx_twin import OnnxTwin
+from twin.finishing import TrainedTwin
 from twin.fitting.torch_reference import torch_free_run
 from twin.models.hybrid import Hybrid
 from twin.models.lag import effective_command

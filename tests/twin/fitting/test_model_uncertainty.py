@@ -6,8 +6,9 @@ import pytest
 from schemas.model_uncertainty import ModelUncertainty
 from tests.support import fan_data
 from tests.twin.fitting.test_drive_fit import DRIVE, run_of
-from twin.build import TrainedTwin, train_twin
+from twin.build import train_twin
 from twin.evaluation.accuracy import compared_readings, free_run_readings
+from twin.finishing import TrainedTwin
 from twin.fitting.fan_evidence import variance_of_independent
 from twin.fitting.identification import identify
 from twin.fitting.model_uncertainty import model_uncertainty

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from tests.support import fan_data
-from twin.build import TrainedTwin, evaluate, train_twin
+from twin.build import evaluate, train_twin
 from twin.errors import TwinError
+from twin.finishing import TrainedTwin
 from twin.fitting import training
 from twin.fitting.identification import identify
 from twin.fitting.outliers import without_outliers

@@ -17,9 +17,10 @@ from schemas.twin_card import NetworkCard, StateLayout
 from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from tests.support import fan_data
 from twin import kinds
-from twin.build import TrainedTwin, evaluate, train_twin
+from twin.build import evaluate, train_twin
 from twin.comparison import all_candidates
 from twin.export.onnx_twin import OnnxTwin
+from twin.finishing import TrainedTwin
 from twin.fitting.model_fits import FitRequest, FittedModel
 from twin.models.onnx_nodes import Nodes, double
 from twin.report.content import SpeedUnit, report_content

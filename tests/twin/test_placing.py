@@ -1,0 +1,96 @@
+"""Fans of a known type get a twin from little of their own running, and one that is not of the type is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from simulation import published_fan
+from tests.support import fan_data
+from tests.support.fantwin_command import error_of
+from twin.build import evaluate, train_twin
+from twin.errors import TwinError
+from twin.export.onnx_twin import OnnxTwin
+from twin.export.stored_model import stored_hybrid
+from twin.placing import place_twin
+from twin.runs import Run
+
+OWN_S, TEST_S = 20.0, 40.0
+
+
+@pytest.fixture(scope="module")
+def type_twin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five rough fans, whose physics differ by up to 10 %."""
+    run = fan_data.rough_run(1, 60.0, 5)
+    twin = train_twin([run], [], "hybrid", name="type", max_iterations=25)
+    return twin.save(tmp_path_factory.mktemp("type") / "type.onnx")
+
+
+@pytest.fixture(scope="module")
+def others() -> tuple[Run, Run]:
+    """What four other fans of the type show of themselves, and what they do then."""
+    whole = fan_data.rough_run(7, OWN_S + TEST_S, 4)
+    return whole.between(0.0, OWN_S), whole.between(OWN_S, OWN_S + TEST_S)
+
+
+def test_fans_that_were_never_trained_on_are_predicted_to_the_noise(
+    type_twin: Path, others: tuple[Run, Run], tmp_path: Path
+) -> None:
+    own, then = others
+    placed = place_twin(type_twin, [own], [], name="placed")
+    alone = train_twin([own], [], "physical", name="physical")
+    error = evaluate(placed, [then]).pooled
+    assert error.rmse_rad_s < 1.08 * fan_data.NOISE_RAD_S
+    assert evaluate(alone, [then]).pooled.rmse_rad_s > 1.3 * error.rmse_rad_s
+    assert error.coverage_2_sigma > 0.93
+    assert placed.card.training.of_type == "type"
+    assert placed.card.network == OnnxTwin(type_twin).card.network
+    stored = OnnxTwin(placed.save(tmp_path / "placed.onnx"))
+    assert evaluate(stored, [then]).pooled.rmse_rad_s == pytest.approx(error.rmse_rad_s, rel=1e-9)
+
+
+def test_what_fans_did_not_show_is_typical_and_widens_the_band(type_twin: Path, others: tuple[Run, Run]) -> None:
+    own, then = others
+    slow = published_fan.rough_run(8, OWN_S, 4, low=20.0, high=60.0).run
+    little, much = (place_twin(type_twin, [run], [], name="placed") for run in (slow, own))
+    few, many = little.identification.standard_errors, much.identification.standard_errors
+    assert np.all(few[:, 2] > 2.0 * many[:, 2]), "of the drag, which shows at speed"
+    fast = np.full((1, 4), float(np.nanmax(then.speed_rad_s)))
+    command = np.full((1, 4), float(then.command.max()))
+    assert little.card.model_uncertainty and much.card.model_uncertainty
+    wide, narrow = (twin.card.model_uncertainty.std_at(fast, command) for twin in (little, much))
+    assert np.all(wide > narrow)
+    assert evaluate(little, [then]).pooled.coverage_2_sigma > 0.9
+
+
+def test_a_fan_of_another_type_is_named(type_twin: Path, others: tuple[Run, Run]) -> None:
+    own, _ = others
+    heavy = published_fan.published_fan(2.0 * own.command[:, :1], 3, "other").run
+    other = Run("mixed", own.t_s, own.command[:, :1], heavy.speed_rad_s)
+    (warning,) = place_twin(type_twin, [other], [], name="placed").identification.warnings
+    assert warning.startswith("fan 0: its ")
+    assert "standard deviations from that of its type: it is another type of fan, or faulty" in warning
+    assert not place_twin(type_twin, [own], [], name="placed").identification.warnings
+
+
+def test_the_model_in_a_file_is_the_one_that_was_written(type_twin: Path, others: tuple[Run, Run]) -> None:
+    own, _ = others
+    twin = OnnxTwin(type_twin)
+    state = twin.state_layout.initial_state(np.full(4, 100.0), own.command[0])
+    arguments = state, own.command, own.step_s, twin.parameters[:4]
+    stored = stored_hybrid(type_twin, twin.card)
+    for ours, theirs in zip(stored.advance(*arguments), twin.advance(*arguments), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-7)
+
+
+def test_what_cannot_be_placed_is_refused_in_one_line(type_twin: Path, others: tuple[Run, Run], tmp_path: Path) -> None:
+    own, _ = others
+    physical = train_twin([own], [], "physical", name="physical").save(tmp_path / "physical.onnx")
+    with pytest.raises(TwinError, match="a physical twin has no physics beside a network; give a hybrid"):
+        place_twin(physical, [own], [], name="x")
+    silent = Run("silent", own.t_s, own.command, np.where(np.arange(4) == 2, np.nan, own.speed_rad_s))
+    with pytest.raises(TwinError, match="fan 2: fewer than 100 measured speeds"):
+        place_twin(type_twin, [silent], [], name="x")
+    assert "no such file" in error_of("place", tmp_path / "none.onnx", tmp_path / "a.mcap", "-o", tmp_path / "b.onnx")

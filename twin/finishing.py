@@ -1,0 +1,239 @@
+"""From a fitted model to a twin with its card: band, uncertainty, torque balance, and figures on healthy runs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from schemas.model_uncertainty import ModelUncertainty
+from schemas.standstill import Standstill
+from schemas.tacho import Tacho
+from schemas.twin_card import (
+    BalanceCard,
+    DataCard,
+    DriveCard,
+    Four,
+    HealthyCard,
+    TrainingCard,
+    TwinCard,
+    ValidationCard,
+)
+from twin.errors import TwinError
+from twin.evaluation.accuracy import (
+    Evaluation,
+    Figures,
+    UnseenStd,
+    evaluate_model,
+    evaluation_pieces,
+    free_run_residuals,
+)
+from twin.evaluation.reading_range import reading_sigma_rad_s
+from twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
+from twin.export.onnx_export import export_onnx
+from twin.fitting.balance import FILTER_RATE_PER_S
+from twin.fitting.balance_fit import BalanceFit, fit_balance
+from twin.fitting.drive_fit import FoundDrive
+from twin.fitting.identification import Identification
+from twin.models.drive import DRIVE_PARAMETERS
+from twin.models.model import Model
+from twin.models.physics import PARAMETER_NAMES
+from twin.progress import Progress
+from twin.runs import Array, Run
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedTwin:
+    """A trained model with its identification and validation. parameters: (fans, 4), behind a drive (fans, 7)."""
+
+    model: Model
+    parameters: Array
+    card: TwinCard
+    identification: Identification
+    validation: Evaluation
+
+    def save(self, path: str | Path) -> Path:
+        """Write the ONNX file; returns its path. Raises TwinError when it cannot be written."""
+        target = Path(path)
+        try:
+            target.write_bytes(export_onnx(self.model, self.card))
+        except OSError as error:
+            raise TwinError(f"{target}: cannot be written ({error.strerror}); choose another path") from error
+        return target
+
+
+def finish_twin(
+    model: Model,
+    parameters: Array,
+    identification: Identification,
+    runs: Sequence[Run],
+    validation_runs: Sequence[Run],
+    *,
+    name: str,
+    training: TrainingCard,
+    drive: FoundDrive | None,
+    uncertainty: ModelUncertainty | None,
+    standstill: Standstill | None,
+    tacho: tuple[Tacho, ...],
+    validation_data: Sequence[DataCard],
+    command_unit: str,
+    created: datetime | None,
+    progress: Progress,
+) -> TrainedTwin:
+    """The twin of a fitted model. parameters: (fans, 4), behind a drive (fans, 7). runs: healthy ones that it was
+    fitted to. The other arguments are those of build.train_twin.
+
+    Raises TwinError when a fan was never measured, the free run diverges, or a balance never moves.
+    """
+    judged = validation_runs or runs
+    progress("evaluation", 0, 0, np.nan)
+    pieces = evaluation_pieces(judged)
+    healthy = healthy_residual(free_run_residuals(model, parameters, pieces), pieces)
+    sigma_rad_s = np.array(healthy.sigma_rad_s)
+    unmeasured = np.flatnonzero(sigma_rad_s == 0.0)
+    if unmeasured.size:
+        where = "held-out" if validation_runs else "training"
+        raise TwinError(
+            f"fan {unmeasured[0]}: no measured speed in the {where} runs, so no band; give runs in which it was "
+            "measured, or leave it out"
+        )
+    if not np.all(np.isfinite(sigma_rad_s)):
+        raise TwinError(
+            f"the {model.kind} model of {name!r} diverges when run freely; record more levels, or try another kind"
+        )
+    unseen_std = unseen_std_of(uncertainty, drive.card if drive else None)
+    validation = evaluate_model(model, parameters, sigma_rad_s, judged, unseen_std)
+    progress("torque balance", 0, 0, np.nan)
+    if drive is None:
+        balance = fit_balance(runs, validation_runs, identification)
+    else:
+        balance = fit_balance(drive.raised(runs), drive.raised(validation_runs), identification)
+    settings = drive.settings if drive else np.zeros((len(parameters), 0))
+    speeds = np.concatenate([run.speed_rad_s.ravel() for run in runs])
+    commands = np.concatenate([run.command.ravel() for run in runs])
+    card = TwinCard(
+        kind=model.kind,
+        name=name,
+        created=(created or datetime.now(UTC)).isoformat(timespec="seconds"),
+        fans=len(parameters),
+        n_state=model.state_layout.size,
+        state_layout=model.state_layout,
+        fixed_rate=model.fixed_rate,
+        parameter_names=(*PARAMETER_NAMES, *(DRIVE_PARAMETERS if drive else ())),
+        used_parameters=(*model.used_parameters, *(DRIVE_PARAMETERS if drive else ())),
+        parameters=_rows(parameters),
+        identified_parameters=_rows(np.hstack((identification.parameters, settings))),
+        parameter_std_errors=_rows(np.hstack((identification.standard_errors, np.zeros_like(settings)))),
+        parameter_interval_95=tuple(
+            tuple((float(low), float(high)) for low, high in fan)
+            for fan in np.concatenate((identification.interval_95, np.stack((settings, settings), axis=-1)), axis=1)
+        ),
+        sigma_rad_s=healthy.sigma_rad_s,
+        healthy=_healthy_card(healthy),
+        balance=_balance_card(balance),
+        speed_range_rad_s=(float(np.nanmin(speeds)), float(np.nanmax(speeds))),
+        command_range=(float(commands.min()), float(commands.max())),
+        rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
+        network=model.network_card,
+        training=training,
+        validation=_validation_card(
+            validation.pooled, "held-out" if validation_runs else "training", tuple(validation_data)
+        ),
+        versions=_versions(),
+        command_unit=command_unit,
+        tacho=tacho[:1] if len(set(tacho)) == 1 else tacho,
+        standstill=standstill,
+        drive=drive.card if drive else None,
+        reading_sigma_rad_s=_reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces),
+        model_uncertainty=uncertainty,
+    )
+    return TrainedTwin(model, parameters, card, identification, validation)
+
+
+def unseen_std_of(table: ModelUncertainty | None, drive: DriveCard | None) -> UnseenStd | None:
+    """The standard deviation of the unseen error by speed and command; None without a table."""
+    if table is None:
+        return None
+    return lambda speed_rad_s, command: table.unseen_std_at(speed_rad_s, drive.raised(command) if drive else command)
+
+
+def _reading_sigma_rad_s(
+    model: Model, parameters: Array, sigma_rad_s: Array, standstill: Standstill | None, pieces: Sequence[Run]
+) -> tuple[float, ...]:
+    if all(tacho.window_s == 0.0 for tacho in pieces[0].tacho):
+        return ()
+    return tuple(reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces).tolist())
+
+
+def _healthy_card(healthy: HealthyResidual) -> HealthyCard:
+    return HealthyCard(
+        autocorrelation_time_s=tuple(map(_finite, healthy.autocorrelation_time_s)),
+        independent_samples=tuple(map(_finite, healthy.independent_samples)),
+        probabilities=QUANTILES,
+        quantiles_sigma=tuple(tuple(map(_finite, fan)) for fan in healthy.quantiles_sigma),
+        max_sigma=tuple(map(_finite, healthy.max_sigma)),
+    )
+
+
+def _balance_card(balance: BalanceFit) -> BalanceCard:
+    inertia, viscous, drag, friction = (tuple(column) for column in balance.coefficients.T.tolist())
+    return BalanceCard(
+        inertia=inertia,
+        viscous=viscous,
+        drag=drag,
+        friction=friction,
+        covariance=tuple(map(_square, balance.covariance)),
+        lag_s=tuple(balance.lag_s.tolist()),
+        source=balance.sources,
+        sigma_command=tuple(balance.sigma_command.tolist()),
+        autocorrelation_time_s=tuple(balance.autocorrelation_time_s.tolist()),
+        lowest_speed_rad_s=tuple(balance.lowest_speed_rad_s.tolist()),
+        filter_rate_per_s=FILTER_RATE_PER_S,
+    )
+
+
+def _square(matrix: Array) -> tuple[Four, Four, Four, Four]:
+    first, second, third, fourth = _fours(matrix)
+    return first, second, third, fourth
+
+
+def _fours(rows: Array) -> tuple[tuple[float, float, float, float], ...]:
+    return tuple((row[0], row[1], row[2], row[3]) for row in rows.tolist())
+
+
+def _validation_card(
+    figures: Figures, source: Literal["held-out", "training"], data: tuple[DataCard, ...]
+) -> ValidationCard:
+    return ValidationCard(
+        source=source,
+        data=data,
+        samples=figures.samples,
+        rmse=_finite(figures.rmse_rad_s),
+        max_error=_finite(figures.max_error_rad_s),
+        r2=_finite(figures.r2),
+        one_step_rmse=_finite(figures.one_step_rmse_rad_s),
+        coverage_2_sigma=_finite(figures.coverage_2_sigma),
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _versions() -> dict[str, str]:
+    return {package: _version(package) for package in ("fantwin", "numpy", "onnx")}
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        # Run from a checkout that was never installed.
+        return "unknown"
+
+
+def _rows(values: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in values.tolist())
