@@ -28,6 +28,7 @@ from tests.support.written_recordings import write_run
 
 FANS = 2
 MODEL = ("--model", "physical")
+TWO_WORKERS: dict[str, Any] = {"n_workers": 2, "threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None}
 
 
 def main(
@@ -39,8 +40,9 @@ def main(
     rows: list[dict[str, Any]] = []
     with (
         tempfile.TemporaryDirectory() as place,
-        LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster,
+        LocalCluster(**TWO_WORKERS) as local,
     ):
+        cluster: Any = local  # its types are those of asynchronous use
         folder = Path(place)
         progress(f"simulating {recordings} recordings of {FANS} fans")
         paths = [

@@ -59,9 +59,9 @@ def test_what_fans_did_not_show_is_typical_and_widens_the_band(type_twin: Path, 
     assert np.all(few[:, 2] > 2.0 * many[:, 2]), "of the drag, which shows at speed"
     fast = np.full((1, 4), float(np.nanmax(then.speed_rad_s)))
     command = np.full((1, 4), float(then.command.max()))
-    assert little.card.model_uncertainty and much.card.model_uncertainty
-    wide, narrow = (twin.card.model_uncertainty.std_at(fast, command) for twin in (little, much))
-    assert np.all(wide > narrow)
+    wide, narrow = little.card.model_uncertainty, much.card.model_uncertainty
+    assert wide and narrow
+    assert np.all(wide.std_at(fast, command) > narrow.std_at(fast, command))
     assert evaluate(little, [then]).pooled.coverage_2_sigma > 0.9
 
 

@@ -160,7 +160,7 @@ def figure_sums(
         spread=np.sum(deviation**2, axis=0),
         squares=squares,
         largest=np.abs(errors).max(axis=0),
-        within=np.sum(measured & (np.abs(errors) <= 2.0 * std), axis=0, dtype=np.float64),
+        within=(measured & (np.abs(errors) <= 2.0 * std)).sum(axis=0, dtype=np.float64),
         steps=is_step.sum(axis=0, dtype=np.float64),
         step_squares=np.sum(np.where(is_step, steps, 0.0) ** 2, axis=0),
         noise=np.sum(np.where(measured, np.broadcast_to(noise, speed.shape), 0.0) ** 2, axis=0),

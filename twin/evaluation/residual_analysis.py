@@ -171,9 +171,9 @@ def _sums_of_piece(settled: Array, piece: Run, grid: ResidualGrid) -> ResidualSu
     within, around = np.arange(grid.window + 1), np.arange(-grid.lags, grid.lags + 1)
 
     def transform(values: Array) -> Spectrum:
-        laid = np.zeros(size)
+        laid = np.zeros(int(slots[-1]) + 1)
         laid[slots] = values
-        return np.fft.rfft(laid)
+        return np.fft.rfft(laid, size)
 
     def lagged(left: Spectrum, right: Spectrum) -> Array:
         """(size,) sums over t of left(t) right(t - lag), of negative lags at the end."""

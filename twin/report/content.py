@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -184,7 +185,8 @@ def report_content(
         )
         for column, fan in enumerate(summary.fans)
     )
-    return Content(**vars(summary) | {"fans": fans}, pieces=pieces, timeline=timeline(pieces))
+    fields: dict[str, Any] = vars(summary) | {"fans": fans}
+    return Content(**fields, pieces=pieces, timeline=timeline(pieces))
 
 
 def _parameters(twin: OnnxTwin, row: int) -> tuple[Parameter, ...]:

@@ -5,13 +5,21 @@ All sums have the extent of the runs in common, which must be known before.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from schemas.twin_card import TwinCard
 from twin.build import RunsOfTwin
 from twin.errors import TwinError
-from twin.evaluation.accuracy import FigureSums, compared_readings, evaluation_pieces, figure_sums, free_run_readings
+from twin.evaluation.accuracy import (
+    FigureSums,
+    Flags,
+    compared_readings,
+    evaluation_pieces,
+    figure_sums,
+    free_run_readings,
+)
 from twin.evaluation.residual_analysis import ResidualGrid, ResidualSums, residual_grid, residual_sums
 from twin.report.speed_bins import SpeedSums, speed_sums
 from twin.runs import Array, Run
@@ -83,8 +91,9 @@ class RecordingSums:
     outside: Array
 
     def __add__(self, other: "RecordingSums") -> "RecordingSums":
-        sums = {name: value + getattr(other, name) for name, value in vars(self).items()}
-        return RecordingSums(**sums | {"fastest_rad_s": np.fmax(self.fastest_rad_s, other.fastest_rad_s)})
+        sums: dict[str, Any] = {name: value + getattr(other, name) for name, value in vars(self).items()}
+        sums["fastest_rad_s"] = np.fmax(self.fastest_rad_s, other.fastest_rad_s)
+        return RecordingSums(**sums)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +131,7 @@ def recording_sums(of: RunsOfTwin, extent: Extent) -> RecordingSums:
     return sum(others, first)
 
 
-def _is_outside(card: TwinCard, command: Array) -> Array:
+def _is_outside(card: TwinCard, command: Array) -> Flags:
     low, high = card.command_range
     reach = RANGE_TOLERANCE * (high - low)
     return (command < low - reach) | (command > high + reach)

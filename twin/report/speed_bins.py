@@ -64,4 +64,5 @@ def speed_sums(predicted_rad_s: Array, error_rad_s: Array, range_rad_s: Array) -
     column = np.clip(place, 0, BINS - 1).astype(int) + BINS * np.arange(fans)
     error = error_rad_s[seen]
     sums = (np.bincount(column[seen], weights, fans * BINS) for weights in (np.ones(len(error)), error, error**2))
-    return SpeedSums(*(of.reshape(fans, BINS) for of in sums))
+    count, total, square = (of.reshape(fans, BINS).astype(np.float64) for of in sums)
+    return SpeedSums(count, total, square)

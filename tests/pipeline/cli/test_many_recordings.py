@@ -41,7 +41,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def words_of(command: str, folder: Path, recordings: Sequence[Path | str], output: Path) -> list[object]:
+def words_of(
+    command: str, folder: Path, recordings: Sequence[Path | str], output: Path
+) -> tuple[str, *tuple[object, ...]]:
     """The words of each command, which writes into the folder `output` if it writes anything."""
     twin = folder / "twin.onnx"
     words: dict[str, list[object]] = {
@@ -60,7 +62,7 @@ def words_of(command: str, folder: Path, recordings: Sequence[Path | str], outpu
         ],
         "replay": ["--offline", *recordings, "--twin", twin, "-o", output],
     }
-    return [command, *words[command], "--json"]
+    return command, *words[command], "--json"
 
 
 COMMANDS = ("identify", "train", "compare", "evaluate", "calibrate", "replay")
@@ -230,7 +232,7 @@ def test_a_command_that_is_ended_while_it_fetches_a_recording_leaves_no_copy(tmp
             begun.release()
             ended.wait()
 
-        def log_message(self, *_args: object) -> None:
+        def log_message(self, format: str, *args: object) -> None:
             """Nothing."""
 
     temporary = tmp_path / "temporary"

@@ -122,7 +122,7 @@ def test_a_pass_that_ends_early_is_not_taken_for_a_whole_recording(part: Healthy
 
 def test_many_recordings_take_no_more_memory_than_one(part: HealthyPart, tmp_path: Path) -> None:
     limits = Limits.model_validate(load_tray_twin(part.twin).card.calibration)
-    copies = [shutil.copy(GOLDEN, tmp_path / f"{number}.mcap") for number in range(4)]
+    copies = [Path(shutil.copy(GOLDEN, tmp_path / f"{number}.mcap")) for number in range(4)]
 
     def peak_of(recordings: list[Path]) -> int:
         score: Callable[[HealthyRun], Any] = partial(statistics_of_run, limits=limits, top_speed_rad_s=200.0)
