@@ -28,7 +28,7 @@ from twin.runs import Array, Run, common_fans
 
 STRETCH_TIME_CONSTANTS = 10.0
 MAX_ITERATIONS = 60
-USUAL_SPREAD, USUAL_FANS = 0.1, 2.0
+ASSUMED_SPREAD, ASSUMED_FANS = 0.1, 2.0
 """how far fans of a type are taken to be apart before any is known, relative, and the number of fans that this counts
 as: two or three fans of a type may be alike by chance"""
 NOT_OF_TYPE = 5.0
@@ -62,10 +62,10 @@ class TypeOfFans:
         top_speed_rad_s = card.top_speed_rad_s
         unknowns = fitted_unknowns(parameters, np.full(len(parameters), top_speed_rad_s))
         mean = unknowns.mean(axis=0)
-        usual = np.full(len(PARAMETER_NAMES), USUAL_SPREAD)
-        usual[LAG] *= mean[LAG]
-        squares = np.sum((unknowns - mean) ** 2, axis=0) + USUAL_FANS * usual**2
-        return cls(mean, np.sqrt(squares / (len(unknowns) - 1 + USUAL_FANS)), top_speed_rad_s)
+        assumed_std = np.full(len(PARAMETER_NAMES), ASSUMED_SPREAD)
+        assumed_std[LAG] *= mean[LAG]
+        squares = np.sum((unknowns - mean) ** 2, axis=0) + ASSUMED_FANS * assumed_std**2
+        return cls(mean, np.sqrt(squares / (len(unknowns) - 1 + ASSUMED_FANS)), top_speed_rad_s)
 
 
 def place_fans(

@@ -69,8 +69,11 @@ def place(
     """
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible("no twin was written"), twin_errors():
-        from twin.placing import place_twin  # noqa: PLC0415  the command line loads twin only when it is needed
+        # The command line loads twin only when it is needed.
+        from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
+        from twin.placing import place_twin  # noqa: PLC0415
 
+        OnnxTwin(type_twin)  # what is no twin is said before recordings are read
         check_writable(output, ".onnx")
         part = Part(tray, fans, from_s, to_s)
         validation_part = replace(part, from_s=validate_from_s, to_s=validate_to_s)
