@@ -132,10 +132,8 @@ class LearningSchedule:
     def _is_check_due(self, listed: VersionList) -> bool:
         if not listed.versions:
             return False
-        made_t_ns, commissioned_t_ns = listed.versions[-1].made_t_ns, listed.commissioned_t_ns
-        checked_t_ns, looked_t_ns = (listed.check.t_ns, listed.check.near_t_ns) if listed.check else (0, 0)
-        newest_t_ns = max(made_t_ns, commissioned_t_ns, checked_t_ns)
-        near_t_ns = max(newest_t_ns, looked_t_ns)
+        newest_t_ns, commissioned_t_ns = listed.newest_t_ns, listed.commissioned_t_ns
+        near_t_ns = max(newest_t_ns, listed.check.near_t_ns if listed.check else 0)
         near_s = self._history.seconds_near_alarms_since(near_t_ns)
         is_near_due = near_s >= COMMISSIONED_CHECK_S and (
             near_t_ns == commissioned_t_ns or self._running_s("check", near_t_ns) >= CHECK_AFTER_S

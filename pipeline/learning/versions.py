@@ -140,6 +140,12 @@ class VersionList(_Record):
         return self.model_copy(update={"check": check, "changed": changed})
 
     @property
+    def newest_t_ns(self) -> int:
+        """When fans were last checked or commissioned, or a version was made."""
+        made_t_ns = self.versions[-1].made_t_ns if self.versions else 0
+        return max(made_t_ns, self.commissioned_t_ns, self.check.t_ns if self.check else 0)
+
+    @property
     def is_tainted(self) -> bool:
         """Whether the version in force was learned from a time that was marked as faulty."""
         return self.current is not None and overlap(self.current.learned_spans, self.faulty)

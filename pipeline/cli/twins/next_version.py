@@ -120,10 +120,8 @@ def _is_too_little_new(healthy: Sequence[HistoryRecording], listed: VersionList)
     """Whether the newest hours of healthy running are partly from before the last check or version: a change since then
     would be diluted, and the time since then be taken as unchanged. (What is from before a commissioning is left out.)
     """
-    checked_t_ns = listed.check.t_ns if listed.check else 0
-    since_t_ns = max(checked_t_ns, listed.commissioned_t_ns, *(each.made_t_ns for each in listed.versions), 0)
-    needed_s = LEAST_CHECKED_S if since_t_ns == listed.commissioned_t_ns else CHECKED_S
-    return sum(each.seconds for each in healthy if each.span[0] >= since_t_ns) < needed_s
+    needed_s = LEAST_CHECKED_S if listed.newest_t_ns == listed.commissioned_t_ns else CHECKED_S
+    return sum(each.seconds for each in healthy if each.span[0] >= listed.newest_t_ns) < needed_s
 
 
 def _write(path: Path, content: bytes) -> None:
