@@ -14,8 +14,9 @@ from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.export.onnx_twin import OnnxTwin
 from twin.export.stored_model import stored_hybrid
+from twin.finishing import TrainedTwin
 from twin.placing import place_twin
-from twin.runs import Run
+from twin.runs import Array, Run
 
 OWN_S, TEST_S = 20.0, 40.0
 
@@ -57,12 +58,16 @@ def test_what_fans_did_not_show_is_typical_and_widens_the_band(type_twin: Path, 
     little, much = (place_twin(type_twin, [run], [], name="placed") for run in (slow, own))
     few, many = little.identification.standard_errors, much.identification.standard_errors
     assert np.all(few[:, 2] > 1.2 * many[:, 2]), "of the drag, which shows at speed"
-    fast = np.full((1, 4), float(np.nanmax(then.speed_rad_s)))
-    command = np.full((1, 4), float(then.command.max()))
-    wide, narrow = little.card.model_uncertainty, much.card.model_uncertainty
-    assert wide and narrow
-    assert np.all(wide.std_at(fast, command) > narrow.std_at(fast, command))
+    assert np.all(_std_where_it_settles(little, 85.0) > 1.2 * _std_where_it_settles(much, 85.0))
     assert evaluate(little, [then]).pooled.coverage_2_sigma > 0.9
+
+
+def _std_where_it_settles(twin: TrainedTwin, command: float) -> Array:
+    """(fans,) of the twin's own error, rad/s, for each fan at its steady speed under a command."""
+    uncertainty = twin.card.model_uncertainty
+    assert uncertainty
+    settled = [np.interp(command, uncertainty.commands, each) for each in uncertainty.settled_speed_rad_s]
+    return uncertainty.std_at(np.array([settled]), np.full((1, len(settled)), command))[0]
 
 
 def test_a_fan_of_another_type_is_named(type_twin: Path, others: tuple[Run, Run]) -> None:
