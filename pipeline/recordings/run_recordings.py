@@ -27,19 +27,6 @@ def recorded_files(paths: Iterable[Path], *, with_unfinished: bool = False) -> l
     return list(dict.fromkeys(found))
 
 
-def recordings_of(parts: Sequence[Path]) -> list[list[Path]]:
-    """The parts of each recording, in the order given.
-
-    Raises:
-        RecordingError: one cannot be read.
-    """
-    found: dict[tuple[Path, str], list[Path]] = {}
-    for path in parts:
-        name = read_metadata(path).metadata.get(RECORDING_KEY, "")
-        found.setdefault((path.parent, name), []).append(path)
-    return list(found.values())
-
-
 def run_metadata(parts: Sequence[Path]) -> RecordingMetadata:
     """The metadata of the first part, with what others say about further trays, and their twins.
 

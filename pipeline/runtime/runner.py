@@ -22,28 +22,24 @@ from pipeline.config.registry import STAGES
 from pipeline.config.shards import Shard, chosen_shard
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.runtime.building import build_and_join
-from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
+from pipeline.runtime.clock import StageClock, is_of_replay
 from pipeline.runtime.due_messages import DueMessages
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
-from pipeline.runtime.inbox import INBOX_SIZE, FromBus, FromSource, Inbox, Item, Liveness, Newest, Recovered
+from pipeline.runtime.inbox import INBOX_SIZE, FromBus, FromSource, Inbox, Item
 from pipeline.runtime.kept_snapshots import KeptForOthers
-from pipeline.runtime.newest_messages import NewestMessages
 from pipeline.runtime.notifier import Notifier
 from pipeline.runtime.outputs import Outputs
-from pipeline.runtime.peers import Peers
-from pipeline.runtime.recovery import Recovery
-from pipeline.runtime.sequence_tracker import Found, SequenceTracker
+from pipeline.runtime.receiving import Receiver
 from pipeline.runtime.sessions import Session, Sessions
 from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Core, Stage
-from pipeline.runtime.subscriptions import Subscriptions
 from schemas.blocks import join
-from schemas.codec import CodecError, encode, type_name
+from schemas.codec import encode, type_name
 from schemas.envelope import Envelope
-from schemas.messages import Clock, Header, Health, Message, Note, StageStatus, newest_t_ns
+from schemas.messages import Header, Health, Message, Note, StageStatus, newest_t_ns
 from schemas.streams import stage_losses
-from schemas.topics import ALL_TRAYS, BY_NAME, alive_key, health_key, sessions_key, topic_of, tray_key
+from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 TICK_S = 0.05
 HEALTH_PERIOD_S = 1.0
@@ -81,7 +77,6 @@ class Runner:
         """Set when the process that started this stage has gone: it ends as soon as its producers have ended."""
         self._site = config.site
         self._shard = shard
-        self._trays = frozenset(shard.trays)
         self.producer = f"{stage.name}-{self._shard.name}-{secrets.token_hex(4)}"
         self._inbox = Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
@@ -96,38 +91,41 @@ class Runner:
             self._bus, config.site, STAGES[stage.name].keeps, self.producer, before, self._inbox.put
         )
         self._has_source = any(parts.source for parts in self._parts.values())
-        joins = stage.core_per_tray and not stage.wants_envelopes and not self._has_source
+        takes_messages = not (stage.wants_envelopes or stage.undecoded)
+        joins = stage.core_per_tray and takes_messages and not self._has_source
         self._due = DueMessages(self._parts, joins=joins)
         """to be processed before anything else"""
-        self._recovery = Recovery(self._bus, self._inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
-        self._tracker = SequenceTracker(self._recovery.ask, sessions=self._sessions)
         self._outputs = Outputs(self._bus, config.site, stage, list(shard.trays), self.producer)
         self._health_publisher = self._bus.publisher(
             health_key(config.site, stage.name, self._shard.name), BY_NAME["health"], type_name(Health), self.producer
         )
-        self._subscriptions = Subscriptions(
-            self._bus,
-            config.site,
-            stage.reads_as_configured(config),
-            stage.undecoded,
-            shard.trays,
-            self._on_bus,
-            self._tracker.forget,
-        )
-        self._newest = NewestMessages(self._bus, self._inbox)
-        self._read_keys = self._subscriptions.keys
-        self._peers = Peers(self._read_keys)
-        main = (
-            stage.reads[0] if stage.reads and not self._has_source else ""
-        )  # the core of a source reports its silence
+        main = stage.reads[:1] if not self._has_source else ()  # the core of a source reports its silence
         self._health = HealthBuilder(
             stage.name,
             self._shard.name,
             started_t_ns,
             may_drop=stage.may_drop,
-            main_keys=self._read_keys & {tray_key(config.site, tray, main) for tray in shard.trays},
+            main_keys={
+                tray_key(config.site, tray, topic)
+                for topic in main
+                if topic in stage.reads_as_configured(config)
+                for tray in shard.trays
+            },
             trays=() if shard.is_whole else shard.trays,
         )
+        self._receiver = Receiver(
+            stage,
+            config,
+            shard,
+            self._bus,
+            self._inbox,
+            producer=self.producer,
+            sessions=self._sessions,
+            clock=self._clock,
+            health=self._health,
+            due=self._due,
+        )
+        self._tracker = self._receiver.tracker
         self._notifier = Notifier.from_environment()
         self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
         self._owes_answer = False
@@ -188,17 +186,13 @@ class Runner:
 
     def _start(self) -> None:
         self._follow()
-        if self.stage.core_per_tray and not self._has_source:  # others use the host's time, also during a replay
-            for tray in self._parts:
-                self._bus.subscribe(tray_key(self._site, tray, "clock"), self._on_bus)
-        self._bus.subscribe(health_key(self._site, "*", "*"), self._on_bus)
-        self._bus.watch_alive(alive_key(self._site, "*", "*"), self._on_liveness)
-        self._bus.watch_alive(sessions_key(self._site), self._on_liveness)
+        # sources use the host's time, also during a replay, and so do stages that have all trays in one core
+        self._receiver.start(follows_clock=self.stage.core_per_tray and not self._has_source)
         self._bus.declare_alive(self._session.key(self._site))  # before the first message
         self._sessions.update(self._session.key(self._site), alive=True)
         self._publish_health(StageStatus.STARTING)
         if not self.stage.may_drop:
-            self._catch_up()
+            self._receiver.catch_up()
             self._loop(self._has_caught_up, StageStatus.STARTING)
             self._health.has_caught_up()
         self._bus.declare_alive(alive_key(self._site, self.stage.name, self._shard.name))
@@ -208,14 +202,7 @@ class Runner:
     def _follow(self) -> None:
         """Read what the core follows message by message, and ask for the newest of the rest."""
         serves_all = self._parts.get("")
-        followed = serves_all.core.followed() if serves_all and self.stage.undecoded else None
-        self._newest.watch(self._subscriptions.follow(followed))
-
-    def _on_bus(self, key: str, payload: bytes) -> None:
-        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()))
-
-    def _on_liveness(self, key: str, alive: bool) -> None:
-        self._inbox.put(Liveness(key, alive))
+        self._receiver.follow(serves_all.core.followed() if serves_all and self.stage.undecoded else None)
 
     def _loop(self, until: Callable[[], bool], status: StageStatus) -> None:
         next_tick = next_health = next_loss = time.monotonic()
@@ -235,7 +222,6 @@ class Runner:
                     self._call(name, lambda core=parts.core, now_ns=now_ns: core.tick(now_ns), from_timer=True)
                 if self.stage.undecoded:
                     self._follow()
-                    self._newest.ask()
                 news = self._owes_answer or self._lost() > reported_lost
                 if now >= next_health or (now >= next_loss and news):
                     self._owes_answer = False
@@ -244,7 +230,7 @@ class Runner:
                 self._notifier.at_work(self._health.summary)
 
     def _should_end(self) -> bool:
-        return self.stop.is_set() or (self.launcher_gone.is_set() and not self._peers.has_producer())
+        return self.stop.is_set() or (self.launcher_gone.is_set() and not self._receiver.peers.has_producer())
 
     def _drain(self) -> None:
         """Process what was sent to this stage before it was asked to stop, however much more is being sent.
@@ -260,8 +246,7 @@ class Runner:
             if self._due:
                 self._step(self._due.pop())
                 continue
-            awaits_more = self._peers.awaits_last_health() or self._tracker.is_waiting
-            if left is None and sources.wait(0) and not awaits_more:
+            if left is None and sources.wait(0) and not self._receiver.awaits_more:
                 left = self._inbox.waiting()
                 continue
             item = self._inbox.get(TICK_S)
@@ -276,7 +261,7 @@ class Runner:
         while (item := self._inbox.get(0)) is not None:
             if isinstance(item, FromSource):
                 self._sources.discard(item)
-            elif isinstance(item, FromBus) and item.key in self._read_keys and not self.stage.may_drop:
+            elif isinstance(item, FromBus) and self._receiver.reads(item.key) and not self.stage.may_drop:
                 self._counts["lost_at_stop"] += 1
 
     def _close_core(self, name: str, parts: BuiltStage, failed: str | None) -> None:
@@ -318,96 +303,10 @@ class Runner:
             self._health.add_input("", now_ns, now_ns)
             core = self._parts[item.core].core
             self._call(item.core, lambda: core.step(item.item))
-        elif isinstance(item, Recovered):
-            self._handle_recovered(item)
-        elif isinstance(item, Newest):
-            self._handle_newest(item)
         elif isinstance(item, KeptQuery):
             self._kept.answer(item)
-        elif isinstance(item, Liveness):
-            self._peers.update(item)
-            self._sessions.update(item.key, item.alive)
-            if item.key == alive_key(self._site, REPLAY, ALL_TRAYS):
-                self._clock.set_replay_alive(item.alive)
         else:
-            self._handle_from_bus(item)
-
-    def _handle_from_bus(self, item: FromBus) -> None:
-        envelope = self._decode(item.key, item.payload, item.received_t_ns)
-        if envelope is None:
-            return
-        is_undecoded = self._is_undecoded(envelope)
-        if is_undecoded and envelope.key not in self._subscriptions.current:
-            return  # it was on its way when the core ceased to follow its tray
-        message = None if is_undecoded else envelope.message
-        if isinstance(message, Health):
-            self._handle_health(envelope, message)
-        elif isinstance(message, Clock):
-            if not self._clock.update(message):
-                self._counts["refused_clocks"] += 1
-        else:
-            self._health.add_input(envelope.key, envelope.received_t_ns, HOST_CLOCK.now_ns())
-            self._due.add(self._tracker.accept(envelope))
-
-    def _handle_recovered(self, item: Recovered) -> None:
-        now_ns = HOST_CLOCK.now_ns()
-        decoded = (self._decode(key, payload, now_ns) for key, payload in item.answer.messages)
-        envelopes = [e for e in decoded if e and e.header.producer != self.producer and self._concerns(e)]
-        if self._recovery.is_catch_up(item.request):
-            due = self._tracker.accept_kept(envelopes)
-        else:
-            due = self._tracker.answer(item.request, Found(envelopes, item.answer.published))
-        for key in dict.fromkeys(envelope.key for envelope in due if envelope.topic != "health"):
-            self._health.add_input(key, now_ns, now_ns)
-        self._due.add(due)
-        self._recovery.finish(item)
-
-    def _handle_newest(self, item: Newest) -> None:
-        now_ns = HOST_CLOCK.now_ns()
-        decoded = (self._decode(key, payload, now_ns) for key, payload in item.answer.messages)
-        newest = self._newest.finish(item, [e for e in decoded if e and self._counts_on_its_key(e)])
-        if newest is not None:
-            self._health.add_input(newest.key, now_ns, now_ns)
-            self._step([newest])
-        self._newest.ask()
-
-    def _counts_on_its_key(self, envelope: Envelope) -> bool:
-        producer = envelope.header.producer
-        is_ignored = self._sessions.is_ignored(producer, envelope.header.tray)
-        return not (is_ignored or self._sessions.is_stranger(envelope.key, producer))
-
-    def _handle_health(self, envelope: Envelope, health: Health) -> None:
-        if not self._tracker.believes(health):
-            return
-        self._peers.add_health(alive_key(self._site, health.stage, health.instance), health)
-        if health.stage == REPLAY:
-            self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
-        self._sessions.add_health(health, self._read_keys)
-        self._due.add(self._tracker.reconcile(health, self._subscriptions.current))
-        if "health" in self.stage.reads and self._concerns(envelope):
-            self._due.add(self._tracker.accept(envelope))
-
-    def _concerns(self, envelope: Envelope) -> bool:
-        """Whether a message is of a tray of this process. Health is of all trays of its process: so each recorder has
-        the health of all processes that work on its trays, whatever becomes of the others."""
-        if envelope.topic != "health" or self._shard.is_whole:
-            return True
-        message = envelope.message
-        if not isinstance(message, Health) or not message.trays:
-            return True
-        return not self._trays.isdisjoint(message.trays.split(","))
-
-    def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
-        try:
-            envelope = Envelope(key, topic_of(key).name, payload, received_t_ns)
-            _ = envelope.header if self._is_undecoded(envelope) else envelope.message
-        except (KeyError, CodecError):
-            self._counts["undecodable"] += 1
-            return None
-        return envelope
-
-    def _is_undecoded(self, envelope: Envelope) -> bool:
-        return envelope.topic in self.stage.undecoded
+            self._receiver.take(item)
 
     def _step(self, envelopes: Sequence[Envelope]) -> None:
         """Process one message, or several of a tray that differ only in their samples."""
@@ -432,7 +331,7 @@ class Runner:
                 self._outputs.advance(header.tray, first.topic, envelope.header)
         self._owes_answer |= self._has_source
         core = self._parts[name].core
-        as_it_is = self.stage.wants_envelopes or self._is_undecoded(first)
+        as_it_is = self.stage.wants_envelopes or self._receiver.is_undecoded(first)
         item = first if as_it_is else join([envelope.message for envelope in envelopes])
         self._call(name, lambda: core.step(item), input_tray=header.tray)
 
@@ -451,18 +350,16 @@ class Runner:
             self._health.add_output(t_ns, HOST_CLOCK.now_ns(), self._clock.now_ns(tray, t_ns))
         self._active_core = None
 
-    def _catch_up(self) -> None:
-        """Request what producers still keep from before this stage started: only then is it ready."""
-        keys = sorted(self._read_keys, key=lambda key: (not topic_of(key).is_needed_first, key))
-        if "health" in self.stage.reads:
-            keys.append(health_key(self._site, "*", "*"))
-        self._recovery.catch_up(keys)
-
     def _has_caught_up(self) -> bool:
-        return not (self._recovery.is_catching_up or self._due) or self._ending.left_s(CAUGHT_UP) < 0
+        return not (self._receiver.is_catching_up or self._due) or self._ending.left_s(CAUGHT_UP) < 0
 
     def _counters(self) -> Counter[str]:
-        counters = self._counts + Counter(self._tracker.counters()) + Counter(lost_at_stop=self._sources.lost)
+        counters = (
+            self._counts
+            + self._receiver.counts
+            + Counter(self._tracker.counters())
+            + Counter(lost_at_stop=self._sources.lost)
+        )
         if self._bus.refused_too_large:
             counters["refused_too_large"] = self._bus.refused_too_large
         for parts in self._parts.values():

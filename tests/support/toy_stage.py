@@ -112,8 +112,11 @@ class Bench:
         return lambda key, payload: self.heard.put((key, decode(kind, payload)))
 
     def feed(self, tray: str, t_ns: int) -> None:
+        """Publish one sample. Neighbours differ in their columns, so that a stage takes each by itself."""
         publisher = self.publisher[tray]
-        publisher.put(encode(replace(raw(t_ns), header=Header("feeder", publisher.published, tray))))
+        sequence = np.array([t_ns]) if publisher.published % 2 else None
+        sample = replace(raw(t_ns), header=Header("feeder", publisher.published, tray))
+        publisher.put(encode(sample if sequence is None else replace(sample, device_sequence=sequence)))
 
     def next(self, kind: type[Message]) -> Any:
         while True:

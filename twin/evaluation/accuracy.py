@@ -149,22 +149,28 @@ def figure_sums(
     with np.errstate(invalid="ignore", over="ignore"):
         noise = measurement_of(piece).noise_rad_s(expected)
         std = np.hypot(sigma_rad_s, np.nan_to_num(unseen_std(expected, piece.command))) if unseen_std else sigma_rad_s
-        squares = np.sum(errors**2, axis=0)
+        squares = sums_by_fan(errors**2)
     steps = _one_step_residual(model, parameters, piece)
     is_step = np.isfinite(steps)
-    total = np.where(measured, speed, 0.0).sum(axis=0)
+    total = sums_by_fan(np.where(measured, speed, 0.0))
     deviation = np.where(measured, speed - total / np.maximum(count, 1.0), 0.0)
     return FigureSums(
         measured=count,
         speed=total,
-        spread=np.sum(deviation**2, axis=0),
+        spread=sums_by_fan(deviation**2),
         squares=squares,
         largest=np.abs(errors).max(axis=0),
         within=(measured & (np.abs(errors) <= 2.0 * std)).sum(axis=0, dtype=np.float64),
         steps=is_step.sum(axis=0, dtype=np.float64),
-        step_squares=np.sum(np.where(is_step, steps, 0.0) ** 2, axis=0),
-        noise=np.sum(np.where(measured, np.broadcast_to(noise, speed.shape), 0.0) ** 2, axis=0),
+        step_squares=sums_by_fan(np.where(is_step, steps, 0.0) ** 2),
+        noise=sums_by_fan(np.where(measured, np.broadcast_to(noise, speed.shape), 0.0) ** 2),
     )
+
+
+def sums_by_fan(values: Array) -> Array:
+    """(fans,) the sums over the samples of (n, fans), to the bit as for each fan by itself: numpy adds rows that lie
+    side by side in another order."""
+    return np.ascontiguousarray(values.T).sum(axis=1)
 
 
 def evaluation_pieces(runs: Sequence[Run]) -> list[Run]:

@@ -20,7 +20,7 @@ from scipy.fft import next_fast_len
 from scipy.special import chdtrc
 
 from twin.errors import TwinError
-from twin.evaluation.accuracy import healthy_sigma_rad_s
+from twin.evaluation.accuracy import healthy_sigma_rad_s, sums_by_fan
 from twin.runs import Array, Run
 
 Spectrum = NDArray[np.complex128]
@@ -196,9 +196,9 @@ def _sums_of_piece(settled: Array, piece: Run, grid: ResidualGrid) -> ResidualSu
         crosses.append(np.stack([lagged(one, of)[around] for one in (error, known) for of in (command, driven)]))
     return ResidualSums(
         count=measured.sum(axis=0, dtype=np.float64),
-        error=np.where(measured, settled, 0.0).sum(axis=0),
+        error=sums_by_fan(np.where(measured, settled, 0.0)),
         commands=np.full(piece.fans, float(piece.samples)),
-        command=piece.command.sum(axis=0),
+        command=sums_by_fan(piece.command),
         auto=np.stack(autos, axis=1),
         drive=np.stack(drives, axis=1),
         cross=np.stack(crosses, axis=1),

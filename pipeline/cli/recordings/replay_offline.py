@@ -25,6 +25,7 @@ from pipeline.errors import UsageError, UserError
 from pipeline.recordings.dates import format_utc, has_date
 from pipeline.recordings.grouping import describe, recordings_of
 from pipeline.recordings.records import active_path
+from pipeline.recordings.run_recordings import recorded_files
 from schemas.messages import Diagnosis
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import most_probable
@@ -42,7 +43,7 @@ def run_offline(
     """Score, print, and exit with 0: success, 1: failed, 3: data were lost. With `verify`: 0 equal, 1 different,
     2 nothing is comparable, 3 equal as far as it is comparable. With 4: recordings were skipped.
 
-    files: of one or many recordings. output: a recording to write; a folder for those of many.
+    files: of one or many recordings; a folder stands for those in it. output: a recording to write; of many, a folder.
 
     Raises:
         UserError: it failed.
@@ -50,7 +51,7 @@ def run_offline(
     began_s = time.monotonic()
     try:
         with interruptible("nothing was written"), pool:
-            recordings = recordings_of(pool.map(describe, list(dict.fromkeys(files)), "opening recordings"))
+            recordings = recordings_of(pool.map(describe, recorded_files(files), "opening recordings"))
             with written_at_the_end(output, recordings) as folder:
                 scored = list(pool.map(partial(score_again, again=again, folder=folder), recordings, "scoring"))
     except UserError as error:

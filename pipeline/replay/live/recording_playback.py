@@ -11,10 +11,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from pipeline.recordings.grouping import describe, recordings_of
 from pipeline.recordings.order import Seen, in_order
 from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
-from pipeline.recordings.run_recordings import recordings_of
 from pipeline.replay.live.recorded_versions import NEW_TWIN, TWIN, ComingVersions, read_versions
 from pipeline.replay.live.sample_times import sample_times
 from schemas.envelope import Envelope
@@ -45,7 +45,7 @@ class RecordingPlayback:
         if not firsts:
             raise RecordingError(f"{files[0]}: there is no message in it")
         self.files = list(firsts)
-        self._recordings = recordings_of(self.files)
+        self._recordings = recordings_of(map(describe, self.files))
         first = self.first = firsts[self.files[0]]
         # with start_s = 0 everything is played, also messages that were recorded out of order
         self._start_ns = first.received_t_ns + round(start_s * NS_PER_S) if start_s else 0

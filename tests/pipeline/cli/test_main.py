@@ -144,7 +144,6 @@ def test_a_mistake_is_one_line_with_what_to_do(command, words, tmp_path, monkeyp
         ("replay RECORDING --rate quick", "--rate quick: give a number above 0"),
         ("run scorr CONFIG", "no stage called 'scorr'; known: acquisition"),
         ("run acquisition CONFIG --tray nobody", "no tray called 'nobody'"),
-        ("run acquisition TRAYS", "say which with --tray (one of a, b)"),
         ("selftest kil", "no scenario 'kil'"),
         ("simulate --fans 99", "fans = 99; give one from 1 to 64"),
         ("simulate --fault melt:fan=1", "melt"),

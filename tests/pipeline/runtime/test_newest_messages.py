@@ -179,7 +179,7 @@ def test_a_tray_is_followed_from_when_the_core_says_so_and_what_it_did_not_read_
         eventually(lambda: got and got[-1] == feeder.published - 1, "the newest arrives")
         before = len(got)
         follower.trays = {TRAY_B}
-        eventually(lambda: key in bench.runner._subscriptions.current, "it has subscribed")
+        eventually(lambda: key in bench.runner._receiver.current_keys, "it has subscribed")
 
         def arrives(before: int = before) -> bool:
             bench.feed(TRAY_B, 0)
@@ -192,8 +192,8 @@ def test_a_tray_is_followed_from_when_the_core_says_so_and_what_it_did_not_read_
         assert got[before:] == list(range(got[before], feeder.published))
         received += feeder.published - got[before]
         follower.trays = set()
-        eventually(lambda: not bench.runner._subscriptions.current, "it has unsubscribed")
-        bench.runner._on_bus(key, sent(key, feeder.published - 1, "feeder").payload)  # came late
+        eventually(lambda: not bench.runner._receiver.current_keys, "it has unsubscribed")
+        bench.runner._receiver.on_message(key, sent(key, feeder.published - 1, "feeder").payload)  # came late
     lines = bench.end().inputs
     assert [(line.key, line.producer) for line in lines] == [(key, "")], "nobody waits for it to receive more"
     assert (lines[0].received, lines[0].missing, lines[0].duplicated) == (received, 0, 0)

@@ -49,6 +49,30 @@ def test_an_output_carries_the_position_of_its_main_input(config):
     ]
 
 
+def test_what_waits_for_a_busy_core_comes_to_it_as_one_message(config):
+    is_busy, may_go_on = threading.Event(), threading.Event()
+
+    class Busy(Passer):
+        def step(self, item: Any) -> Sequence[Message]:
+            is_busy.set()
+            assert may_go_on.wait(20)
+            return super().step(item)
+
+    bench = Bench(toy(lambda _context: BuiltStage(Busy())), config)
+    bench.feed(TRAY_A, 9)
+    assert is_busy.wait(20)
+    publisher = bench.publisher[TRAY_A]
+    for t_ns in (10, 11, 12):
+        publisher.put(encode(replace(raw(t_ns), header=Header("feeder", publisher.published, TRAY_A))))
+    eventually(lambda: bench.runner._inbox.waiting() >= 3, "they wait")
+    may_go_on.set()
+    grids = [bench.next(Grid) for _ in range(2)]
+    last = bench.end()
+    assert [grid.t_ns.tolist() for grid in grids] == [[9], [10, 11, 12]]
+    assert grids[1].header.input_position == InputPosition("raw", "feeder", 3, 4, 0)
+    assert [(line.received, line.missing) for line in last.inputs] == [(4, 0)]
+
+
 def test_an_output_made_because_time_passed_says_so(config):
     class Waits(Core):
         def __init__(self) -> None:
@@ -310,7 +334,7 @@ def test_a_stage_whose_launcher_has_gone_runs_until_its_producers_have_ended(con
         )
         feeder.declare_alive(alive_key("s", *stage))
         publisher = feeder.publisher(key, BY_NAME["health"], type_name(Health), "feeder")
-        while not bench.runner._peers.has_producer():  # until they have discovered each other
+        while not bench.runner._receiver.peers.has_producer():  # until they have discovered each other
             publisher.put(encode(health))
             bench.next(Health)
         bench.runner.launcher_gone.set()

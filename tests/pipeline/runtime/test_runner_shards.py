@@ -77,7 +77,13 @@ def test_a_recorder_that_is_behind_gives_the_last_snapshot_that_had_arrived(conf
             return []
 
     config = replace(config, sections={"recorder": ToyConfig()})
-    stage = toy(lambda _context: BuiltStage(Behind()), name="recorder", reads=("raw", "snapshot"), writes=())
+    stage = toy(
+        lambda _context: BuiltStage(Behind()),
+        name="recorder",
+        reads=("raw", "snapshot"),
+        writes=(),
+        core_per_tray=False,
+    )
     bench = Bench(stage, config)
     key = tray_key("s", TRAY_A, "snapshot")
     scorer = bench.bus.publisher(key, BY_NAME["snapshot"], type_name(ScorerSnapshot), "scorer-all-1")

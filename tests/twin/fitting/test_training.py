@@ -174,6 +174,7 @@ def test_progress_is_reported_of_each_part_of_the_work(rough) -> None:
         "identification: checks",
         "starting weights",
         *trainings,
+        "uncertainty",
         "evaluation",
         "torque balance",
     ]

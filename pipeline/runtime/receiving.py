@@ -1,0 +1,220 @@
+"""What comes from the bus to a stage: decoded, with nothing missing, and in the order in which it is processed.
+
+Missing messages are asked of their producers; what nobody has any more is counted as lost. Health of other stages says
+how much of each sequence there should be, and which producers there are.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence, Set
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import Config
+from pipeline.config.shards import Shard
+from pipeline.devices.host_clock import HOST_CLOCK
+from pipeline.runtime.clock import REPLAY, StageClock
+from pipeline.runtime.due_messages import DueMessages
+from pipeline.runtime.health import HealthBuilder
+from pipeline.runtime.inbox import FromBus, Inbox, Liveness, Newest, Recovered
+from pipeline.runtime.newest_messages import NewestMessages
+from pipeline.runtime.peers import Peers
+from pipeline.runtime.recovery import Recovery
+from pipeline.runtime.sequence_tracker import Found, SequenceTracker
+from pipeline.runtime.sessions import Sessions
+from pipeline.runtime.stage import Stage
+from pipeline.runtime.subscriptions import Subscriptions
+from schemas.codec import CodecError
+from schemas.envelope import Envelope
+from schemas.messages import Clock, Health, StageStatus
+from schemas.topics import ALL_TRAYS, alive_key, health_key, sessions_key, topic_of, tray_key
+
+
+class Receiver:
+    """Takes items of the inbox that came from the bus, and puts the messages that are due into `due`."""
+
+    def __init__(
+        self,
+        stage: Stage,
+        config: Config,
+        shard: Shard,
+        bus: Bus,
+        inbox: Inbox,
+        *,
+        producer: str,
+        sessions: Sessions,
+        clock: StageClock,
+        health: HealthBuilder,
+        due: DueMessages,
+    ) -> None:
+        """shard: the trays of the process. producer: its name; its own messages are not taken. sessions, clock, health:
+        what is received changes them."""
+        self._stage = stage
+        self._site = config.site
+        self._shard = shard
+        self._trays = frozenset(shard.trays)
+        self._producer = producer
+        self._bus = bus
+        self._inbox = inbox
+        self._sessions = sessions
+        self._clock = clock
+        self._health = health
+        self._due = due
+        self.counts: Counter[str] = Counter()
+        """of messages that could not be taken"""
+        self._recovery = Recovery(bus, inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
+        self.tracker = SequenceTracker(self._recovery.ask, sessions=sessions)
+        reads = stage.reads_as_configured(config)
+        self._subscriptions = Subscriptions(
+            bus, config.site, reads, stage.undecoded, shard.trays, self.on_message, self.tracker.forget
+        )
+        self._newest = NewestMessages(bus, inbox)
+        self.peers = Peers(self._subscriptions.keys)
+
+    def start(self, *, follows_clock: bool) -> None:
+        """Subscribe to health, to who is there and, if it follows them, to the clocks of the trays."""
+        if follows_clock:
+            for tray in self._shard.trays:
+                self._bus.subscribe(tray_key(self._site, tray, "clock"), self.on_message)
+        self._bus.subscribe(health_key(self._site, "*", "*"), self.on_message)
+        self._bus.watch_alive(alive_key(self._site, "*", "*"), self._on_liveness)
+        self._bus.watch_alive(sessions_key(self._site), self._on_liveness)
+
+    def on_message(self, key: str, payload: bytes) -> None:
+        """A message has come, in a thread of the bus: put it into the inbox."""
+        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()))
+
+    def _on_liveness(self, key: str, alive: bool) -> None:
+        self._inbox.put(Liveness(key, alive))
+
+    @property
+    def current_keys(self) -> Set[str]:
+        """The keys that are read message by message now."""
+        return self._subscriptions.current
+
+    def reads(self, key: str) -> bool:
+        """Whether the stage reads a key, message by message or not; health apart."""
+        return key in self._subscriptions.keys
+
+    def follow(self, trays: Set[str] | None) -> None:
+        """Read the stage's undecoded topics of these trays message by message, None: of all; of the others only the
+        newest message, once a second."""
+        self._newest.watch(self._subscriptions.follow(trays))
+        self._newest.ask()
+
+    def catch_up(self) -> None:
+        """Request what producers still keep from before this stage started: only then is it ready."""
+        keys = sorted(self._subscriptions.keys, key=lambda key: (not topic_of(key).is_needed_first, key))
+        if "health" in self._stage.reads:
+            keys.append(health_key(self._site, "*", "*"))
+        self._recovery.catch_up(keys)
+
+    @property
+    def is_catching_up(self) -> bool:
+        """Whether an answer to `catch_up` is still to come."""
+        return self._recovery.is_catching_up
+
+    @property
+    def awaits_more(self) -> bool:
+        """Whether something that other stages have sent, or say at their end, is still to come."""
+        return self.peers.awaits_last_health() or self.tracker.is_waiting
+
+    def take(self, item: FromBus | Recovered | Newest | Liveness) -> None:
+        """Take an item of the inbox."""
+        match item:
+            case FromBus():
+                self._take_message(item)
+            case Recovered():
+                self._take_recovered(item)
+            case Newest():
+                self._take_newest(item)
+            case Liveness():
+                self.peers.update(item)
+                self._sessions.update(item.key, item.alive)
+                if item.key == alive_key(self._site, REPLAY, ALL_TRAYS):
+                    self._clock.set_replay_alive(item.alive)
+
+    def _take_message(self, item: FromBus) -> None:
+        envelope = self._decode(item.key, item.payload, item.received_t_ns)
+        if envelope is None:
+            return
+        is_undecoded = self.is_undecoded(envelope)
+        if is_undecoded and envelope.key not in self.current_keys:
+            return  # it was on its way when the core ceased to follow its tray
+        message = None if is_undecoded else envelope.message
+        if isinstance(message, Health):
+            self._take_health(envelope, message)
+        elif isinstance(message, Clock):
+            if not self._clock.update(message):
+                self.counts["refused_clocks"] += 1
+        else:
+            self._health.add_input(envelope.key, envelope.received_t_ns, HOST_CLOCK.now_ns())
+            self._due.add(self.tracker.accept(envelope))
+
+    def _take_recovered(self, item: Recovered) -> None:
+        now_ns = HOST_CLOCK.now_ns()
+        envelopes = [
+            each
+            for each in self._decoded(item.answer.messages, now_ns)
+            if each.header.producer != self._producer and self._concerns(each)
+        ]
+        if self._recovery.is_catch_up(item.request):
+            due = self.tracker.accept_kept(envelopes)
+        else:
+            due = self.tracker.answer(item.request, Found(envelopes, item.answer.published))
+        for key in dict.fromkeys(envelope.key for envelope in due if envelope.topic != "health"):
+            self._health.add_input(key, now_ns, now_ns)
+        self._due.add(due)
+        self._recovery.finish(item)
+
+    def _take_newest(self, item: Newest) -> None:
+        now_ns = HOST_CLOCK.now_ns()
+        believed = [each for each in self._decoded(item.answer.messages, now_ns) if self._counts_on_its_key(each)]
+        newest = self._newest.finish(item, believed)
+        if newest is not None:
+            self._health.add_input(newest.key, now_ns, now_ns)
+            self._due.add([newest])
+        self._newest.ask()
+
+    def _counts_on_its_key(self, envelope: Envelope) -> bool:
+        producer = envelope.header.producer
+        is_ignored = self._sessions.is_ignored(producer, envelope.header.tray)
+        return not (is_ignored or self._sessions.is_stranger(envelope.key, producer))
+
+    def _take_health(self, envelope: Envelope, health: Health) -> None:
+        if not self.tracker.believes(health):
+            return
+        self.peers.add_health(alive_key(self._site, health.stage, health.instance), health)
+        if health.stage == REPLAY:
+            self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
+        self._sessions.add_health(health, self._subscriptions.keys)
+        self._due.add(self.tracker.reconcile(health, self.current_keys))
+        if "health" in self._stage.reads and self._concerns(envelope):
+            self._due.add(self.tracker.accept(envelope))
+
+    def _concerns(self, envelope: Envelope) -> bool:
+        """Whether a message is of a tray of this process. Health is of all trays of its process: so each recorder has
+        the health of all processes that work on its trays, whatever becomes of the others."""
+        if envelope.topic != "health" or self._shard.is_whole:
+            return True
+        message = envelope.message
+        if not isinstance(message, Health) or not message.trays:
+            return True
+        return not self._trays.isdisjoint(message.trays.split(","))
+
+    def _decoded(self, messages: Sequence[tuple[str, bytes]], received_t_ns: int) -> list[Envelope]:
+        decoded = (self._decode(key, payload, received_t_ns) for key, payload in messages)
+        return [envelope for envelope in decoded if envelope]
+
+    def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
+        try:
+            envelope = Envelope(key, topic_of(key).name, payload, received_t_ns)
+            _ = envelope.header if self.is_undecoded(envelope) else envelope.message
+        except (KeyError, CodecError):
+            self.counts["undecodable"] += 1
+            return None
+        return envelope
+
+    def is_undecoded(self, envelope: Envelope) -> bool:
+        """Whether the core takes a message as it came."""
+        return envelope.topic in self._stage.undecoded
