@@ -87,6 +87,11 @@ def rough_run(
     return _measured(random_stairs(seed, duration_s, fans, low, high), parts, lag_s, seed, f"rough {seed}")
 
 
+def rough_fans(command: Array) -> Array:
+    """(n, fans) speeds without noise of identical rough fans under commands (n, fans) at 100 Hz, from standstill."""
+    return np.column_stack([_simulate(each.tolist(), _rough_torque, INERTIA, VISCOUS, DRAG, 0.0) for each in command.T])
+
+
 def random_stairs(seed: int, duration_s: float, fans: int, low: float, high: float) -> Array:
     """(n, fans) commands at 100 Hz that jump to a random level every 0.5 to 2 s, independently for each fan."""
     return stairs(np.random.default_rng([seed, 0]), round(duration_s * RATE_HZ), fans, low, high)
