@@ -66,7 +66,7 @@ def evaluate(
     skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Run a twin freely over recordings and compare it with the measured speeds, in the recording's own units.
+    """Compare the free run of a twin with the measured speeds of recordings, in the recordings' own units.
 
     The free run gets one initial speed and then only the commands. The one-step error is shown for comparison: it is
     corrected at every sample, so it is small even for a poor twin. The residual is tested: that of a good twin is

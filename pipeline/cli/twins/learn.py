@@ -33,7 +33,7 @@ def learn(
     tray: Annotated[str | None, typer.Option(help="Which tray, where several learn their twins.")] = None,
     check: Annotated[
         bool,
-        typer.Option("--check", help="Only compare the fans with the reference, and make a version if they changed."),
+        typer.Option("--check", help="Compare the fans with the reference; make a version only if they have changed."),
     ] = False,
     overrides: SetOption = None,
     json_output: JsonOption = False,
@@ -44,7 +44,7 @@ def learn(
     The new version takes over within seconds, also on a running site, unless it is only offered. `fantwin twins` lists
     the versions.
 
-    Exit codes: 0 a version was made, or --check found no change; 1 error, such as too little history; 130 Ctrl-C.
+    Exit codes: 0 a version was made, or --check found no new change; 1 error, such as too little history; 130 Ctrl-C.
 
     Example: fantwin learn -c fantwin.toml
 

@@ -41,11 +41,11 @@ def report(
     fans: FansOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Run a twin freely over recordings and write the result as one self-contained HTML page.
+    """Compare the free run of a twin with recordings, and write the result as one self-contained HTML page.
 
-    It holds the figures of `fantwin evaluate`, an assessment in words, what raises an alarm, fit and error over time,
-    histogram, whiteness, cross-correlation with the command, static curve, parameters with 95 % intervals and the model
-    card.
+    The page contains the figures of `fantwin evaluate`, an assessment in words, what raises an alarm, fit and error
+    over time, histogram and whiteness of the residual, its cross-correlation with the command, static curve, parameters
+    with 95 % intervals and the model card.
 
     Example: fantwin report TWIN.onnx held-out.mcap -o report.html
     """

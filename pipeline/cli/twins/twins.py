@@ -40,12 +40,11 @@ def twins(
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """List the versions of a learned twin, put one in force, or mark a time span as faulty: it is never learned
-    from.
+    """List the versions of a learned twin, put one in force, or mark a time span as faulty (not used for learning).
 
     A running site changes to the version in force within seconds. If the version in force was learned from a faulty
-    time span, the newest version that was not takes its place. With another twin, alarms are discarded and baselines
-    start again.
+    time span, the newest version that was not learned from it takes its place. Unless only the limits differ, alarms
+    are discarded and baselines start again.
 
     Example: fantwin twins -c fantwin.toml
 

@@ -43,7 +43,7 @@ def commission(
     ] = None,
     sweep: Annotated[
         bool,
-        typer.Option("--sweep", help="Move the fans, as `fantwin sweep` does; otherwise the plant must move them."),
+        typer.Option("--sweep", help="Move the commands, as `fantwin sweep` does; otherwise the plant must."),
     ] = False,
     low: Annotated[float | None, typer.Option(help="With --sweep: lowest command.")] = None,
     high: Annotated[float | None, typer.Option(help="With --sweep: highest command.")] = None,
@@ -53,7 +53,7 @@ def commission(
         typer.Option(
             min=1,
             max=100,
-            help="With --sweep: how often the first sweep passes all levels; the second passes them once.",
+            help="With --sweep: times that the first sweep runs through all levels; the second does so once.",
         ),
     ] = 2,
     minutes: Annotated[
@@ -61,32 +61,32 @@ def commission(
     ] = 10.0,
     at_most_hours: Annotated[
         float,
-        typer.Option(min=0.01, max=1000, help="Without --sweep: the longest wait for the plant to move the fans."),
+        typer.Option(min=0.01, max=1000, help="Without --sweep: the longest wait for the plant to move the commands."),
     ] = 24.0,
     false_alarms_per_day: Annotated[
         float, typer.Option(min=1e-6, max=8640, help="The rate to declare: false alarms per fan and day.")
     ] = 1.0,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="TWIN.onnx", help="Twin to write, of one tray. Default: TRAY.onnx."),
+        typer.Option("-o", "--output", metavar="TWIN.onnx", help="Twin to write, for one tray. Default: TRAY.onnx."),
     ] = None,
     watch: Annotated[bool, typer.Option(help="Start `fantwin up` at the end.")] = True,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Record healthy fans, train their twins, set the alarm limits, write the twins into the configuration, watch.
+    """Record healthy fans, train their twins, set alarm limits, add the twins to the configuration, start `fantwin up`.
 
     Each tray that names no twin gets one; the others stay as they are. The steps are commands of
     docs/tutorial/own-fan.md; each is shown before it runs, except the `up` that records. The fans must be healthy. With
-    --sweep one tray after the other is moved. Without --sweep no fan is moved: the first recording lasts until the
-    plant has moved every fan through enough commands, and what is missing is shown. The limits come from little data:
+    --sweep, the trays are swept one after another. Without --sweep, no command is sent: the first recording lasts until
+    the plant has moved the command of every fan enough, and what is missing is shown. The limits come from little data:
     calibrate again after a few days.
 
-    A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends it without
-    further twins. Recordings stay. With --json it does not start `fantwin up`.
+    A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends `commission`
+    without further twins. Recordings stay. With --json, `fantwin up` is not started.
 
-    Exit codes: 0 success; 1 a tray or all failed, and one line says why; 3 success, but data were lost while recording;
-    130 Ctrl-C. Once `fantwin up` is started, the exit code is that of `up`.
+    Exit codes: 0 success; 1 at least one tray failed, and one line says why; 3 success, but data were lost while
+    recording; 130 Ctrl-C. Once `fantwin up` is started, the exit code is that of `up`.
 
     Example: fantwin commission -c fantwin.toml --sweep --low 0.2
     """
