@@ -2,6 +2,7 @@
 
 import math
 import signal
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
@@ -45,6 +46,16 @@ def test_without_a_terminal_work_is_reported_once(capsys: pytest.CaptureFixture[
     assert capsys.readouterr().err == "drawing page.html\n"
 
 
+@pytest.fixture
+def _signals_of_a_new_process() -> Iterator[None]:
+    """Commands that tests have run in this process may have left handlers behind."""
+    wakeup, before = signal.set_wakeup_fd(-1), signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+    signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
+
+
+@pytest.mark.usefixtures("_signals_of_a_new_process")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_and_sigterm_end_with_one_line_and_their_own_exit_code(
     capsys: pytest.CaptureFixture[str], number: signal.Signals
