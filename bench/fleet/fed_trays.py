@@ -7,6 +7,7 @@ later than the one before.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +18,8 @@ import numpy as np
 from pipeline.bus.publisher import Publisher
 from pipeline.bus.session import Bus
 from schemas.codec import decode, encode, type_name
-from schemas.messages import Header, Raw, Score
-from schemas.topics import BY_NAME, CATCH_UP_MESSAGES, tray_key
+from schemas.messages import Header, Health, Output, Raw, Score, StageStatus
+from schemas.topics import ALL_TRAYS, BY_NAME, CATCH_UP_MESSAGES, health_key, tray_key
 from schemas.units import NS_PER_S
 from simulation.faults import Fault
 from simulation.tray import SimulatedTray, TraySample, TraySettings
@@ -92,7 +93,8 @@ def longer_than_kept_s(block: int) -> float:
 
 
 class Feed:
-    """Publishes what was made beforehand."""
+    """Publishes what was made beforehand, and inside `with` once a second, as a stage does, how much that is: so that
+    what is lost with a connection is asked for."""
 
     def __init__(self, bus: Bus, load: Load, messages: Mapping[str, Sequence[Raw]]) -> None:
         topic = BY_NAME["raw"]
@@ -102,6 +104,18 @@ class Feed:
         self._messages = list(zip(*messages.values(), strict=True))
         self._block_s = load.block / RATE_HZ
         self._beginning = round(load.beginning_s / self._block_s)
+        key = health_key(SITE, "feed", ALL_TRAYS)
+        self._health = bus.publisher(key, BY_NAME["health"], type_name(Health), PRODUCER)
+        self._has_ended = threading.Event()
+        self._reporting = threading.Thread(target=self._report)
+
+    def __enter__(self) -> Feed:
+        self._reporting.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._has_ended.set()
+        self._reporting.join()
 
     def begin(self) -> None:
         """Publish the beginning; waits while a consumer is behind."""
@@ -114,6 +128,20 @@ class Feed:
         for number, together in enumerate(self._messages[self._beginning :]):
             time.sleep(max(0.0, began_s + number * self._block_s - time.monotonic()))
             self._publish(together)
+
+    def _report(self) -> None:
+        began_s = time.monotonic()
+        while not self._has_ended.wait(1.0):
+            health = Health(
+                header=Header(PRODUCER, self._health.published, ""),
+                stage="feed",
+                instance=ALL_TRAYS,
+                status=StageStatus.OK,
+                t_ns=time.time_ns(),
+                uptime_s=time.monotonic() - began_s,
+                outputs=tuple(Output(key=each.key, published=each.published) for each in self._publishers.values()),
+            )
+            self._health.put(encode(health))
 
     def _publish(self, together: Sequence[Raw]) -> None:
         for publisher, raw in zip(self._publishers.values(), together, strict=True):

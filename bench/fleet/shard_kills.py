@@ -92,19 +92,19 @@ def run(
     )
     with Bus(BusConfig(endpoint=endpoint)) as bus:
         watcher, ends = SiteWatcher(bus, SITE), NewestScores(bus)
-        feed = Feed(bus, load, sent)
         up = RunningCommand(["up", "-c", configuration, "--json"])
         try:
             processes = kills.shards * len(STAGES)
-            eventually(lambda: len(_at_work(watcher)) == processes, "all are at work", DEADLINE_S)
-            say("feeding the beginning")
-            feed.begin()
-            eventually(lambda: ends.have_reached(load, sent, load.beginning_s), "that is scored", DEADLINE_S)
-            killed = _feed_and_kill(load, kills, feed, watcher, say)
-            say("waiting until all is scored")
-            eventually(lambda: len(_at_work(watcher)) == processes, "all are back", DEADLINE_S)
-            end_s = load.beginning_s + load.seconds
-            eventually(lambda: ends.have_reached(load, sent, end_s), "the last samples are scored", DEADLINE_S)
+            with Feed(bus, load, sent) as feed:
+                eventually(lambda: len(_at_work(watcher)) == processes, "all are at work", DEADLINE_S)
+                say("feeding the beginning")
+                feed.begin()
+                eventually(lambda: ends.have_reached(load, sent, load.beginning_s), "that is scored", DEADLINE_S)
+                killed = _feed_and_kill(load, kills, feed, watcher, say)
+                say("waiting until all is scored")
+                eventually(lambda: len(_at_work(watcher)) == processes, "all are back", DEADLINE_S)
+                end_s = load.beginning_s + load.seconds
+                eventually(lambda: ends.have_reached(load, sent, end_s), "the last samples are scored", DEADLINE_S)
             status = up.end()
             assert status in (0, 3), (status, up.lines[-20:])
             lost = up.output()["lost"]

@@ -96,8 +96,14 @@ class _Site:
 
     def feed(self, load: Load, sent: dict[str, list[Raw]], say: Callable[[str], None]) -> None:
         """Feed it, and let things happen meanwhile; wait until everything is scored."""
+        with Feed(self._bus, load, sent) as feed:
+            self._let_things_happen(load, sent, feed, say)
+
+    def _let_things_happen(
+        self, load: Load, sent: dict[str, list[Raw]], feed: Feed, say: Callable[[str], None]
+    ) -> None:
         one, two = self._hosts
-        ends, feed = NewestScores(self._bus), Feed(self._bus, load, sent)
+        ends = NewestScores(self._bus)
         self._wait_for_all()
         say("feeding the beginning")
         feed.begin()

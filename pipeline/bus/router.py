@@ -11,6 +11,14 @@ import zenoh
 from pipeline.bus.errors import BusError, reason
 from pipeline.bus.link import LEASE_MS
 
+QUEUE_BATCHES = "16"
+"""of 64 KiB for each client, the most that Zenoh allows: for what is sent to a client that has vanished"""
+LONGEST_WAIT_US = "1000000"
+"""a client that takes nothing for so long while its queue is full is cut off, and connects again. Until then the router
+does not read from whoever sends to it. That must be well below the lease: after it, the router would take the senders
+for gone as well, and Zenoh does not give back its subscriptions to a client that comes back meanwhile (zenoh #2806).
+"""
+
 
 @contextmanager
 def open_router(endpoint: str) -> Iterator[None]:
@@ -24,6 +32,8 @@ def open_router(endpoint: str) -> Iterator[None]:
         conf.insert_json5("mode", '"router"')
         conf.insert_json5("listen/endpoints", json.dumps([endpoint]))
         conf.insert_json5("transport/link/tx/lease", LEASE_MS)
+        conf.insert_json5("transport/link/tx/queue/size/data", QUEUE_BATCHES)
+        conf.insert_json5("transport/link/tx/queue/congestion_control/block/wait_before_close", LONGEST_WAIT_US)
         conf.insert_json5("scouting/multicast/enabled", "false")
         session = zenoh.open(conf)
     except zenoh.ZError as error:

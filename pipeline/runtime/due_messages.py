@@ -27,6 +27,8 @@ class DueMessages:
         self.joins = joins
         self._waiting: dict[str, deque[Envelope]] = {}
         """by tray, the next one to take its turn first; none is empty"""
+        self._begun: set[str] = set()
+        """the keys of which a message has been taken"""
 
     def __len__(self) -> int:
         return sum(map(len, self._waiting.values()))
@@ -47,13 +49,18 @@ class DueMessages:
     def pop(self) -> list[Envelope]:
         """The next message; or several of one tray, topic and producer that differ only in their samples.
 
+        The first of a key comes alone: so the position of the first output that is made of it shows whether a session
+        had consumed anything before.
+
         Raises:
             StopIteration: none is left.
         """
         tray = next(iter(self._waiting))
         waiting = self._waiting.pop(tray)
         taken = [waiting.popleft()]
-        if self.joins and tray:
+        is_first = taken[0].key not in self._begun
+        self._begun.add(taken[0].key)
+        if self.joins and tray and not is_first:
             left = MOST_JOINED_VALUES - _values(taken[0])
             while waiting and _differ_in_samples(taken[0], waiting[0]) and (left := left - _values(waiting[0])) >= 0:
                 taken.append(waiting.popleft())

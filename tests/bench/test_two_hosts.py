@@ -22,5 +22,5 @@ def test_the_shards_of_a_host_that_vanishes_go_on_on_the_other_one():
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     (found,) = json.loads(done.stdout)["two hosts"]
-    assert found["alarms"] == 12
+    assert found["alarms"] == 16
     assert [found[name] for name in ("not recorded", "not scored", "forgotten", "too many", "raised again")] == [0] * 5

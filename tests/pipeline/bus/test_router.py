@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import queue
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -87,6 +89,44 @@ def catches_interrupts(process_id: int) -> bool:
     status = Path(f"/proc/{process_id}/status").read_text()
     caught = int(status.split("SigCgt:")[1].split()[0], 16)
     return bool(caught >> (signal.SIGTERM - 1) & 1)  # Python itself catches SIGINT from the first
+
+
+LISTENS = """
+import sys, threading
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+bus = Bus(BusConfig(mode="client", endpoint=sys.argv[1]), threading.Event())
+bus.subscribe(sys.argv[2], lambda _key, payload: print("heard", flush=True))
+sys.stdin.read()
+"""
+
+
+def test_a_client_that_takes_nothing_any_more_does_not_cut_the_others_off(endpoint, started):
+    """The router waits for it at most a second, well below the lease of the client that sends."""
+    started.append(RunningCommand(["router", "--listen", endpoint]))
+    heard: queue.Queue[bytes] = queue.Queue()
+    with client(endpoint, threading.Event()) as one, client(endpoint) as other:
+        exchange(one, other)
+        words = [sys.executable, "-c", LISTENS, endpoint, KEY]
+        with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as silent:
+            assert silent.stdout
+            publisher = other.publisher(KEY, BY_NAME["alarm"], "x", "speaker-2")
+            heard_there = threading.Thread(target=silent.stdout.readline)
+            heard_there.start()
+
+            def has_heard() -> bool:
+                publisher.put(b"hello")
+                return not heard_there.is_alive()
+
+            eventually(has_heard, "it hears")
+            silent.send_signal(signal.SIGSTOP)
+            one.subscribe(KEY, lambda _key, payload: None if payload == b"hello" else heard.put(payload))
+            numbers = [f"{number}".encode().ljust(50_000) for number in range(600)]
+            for number in numbers:
+                publisher.put(number)
+            taken = [heard.get(timeout=20) for _ in numbers]
+            silent.kill()
+    assert taken == numbers
 
 
 def test_a_second_router_at_the_same_place_is_refused_in_one_line(endpoint, started):

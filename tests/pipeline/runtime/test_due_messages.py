@@ -45,8 +45,23 @@ def popped(due: DueMessages) -> list[list[Envelope]]:
     return found
 
 
-def test_messages_of_a_tray_come_together_and_trays_take_turns():
+def begun() -> DueMessages:
+    """The first message of each tray has been taken."""
     due = DueMessages(TRAYS, joins=True)
+    due.add([raw("a", 0), raw("b", 0)])
+    popped(due)
+    return due
+
+
+def test_the_first_message_of_a_key_comes_alone():
+    due = DueMessages(TRAYS, joins=True)
+    a = [raw("a", k) for k in range(3)]
+    due.add(a)
+    assert popped(due) == [a[:1], a[1:]]
+
+
+def test_messages_of_a_tray_come_together_and_trays_take_turns():
+    due = begun()
     a, b = [raw("a", k) for k in range(3)], [raw("b", k) for k in range(2)]
     between = request("a", 0)
     due.add([a[0], b[0], a[1], between, a[2], b[1]])
@@ -55,14 +70,14 @@ def test_messages_of_a_tray_come_together_and_trays_take_turns():
 
 
 def test_another_producer_or_number_of_fans_is_not_joined():
-    due = DueMessages(TRAYS, joins=True)
+    due = begun()
     mixed = [raw("a", 0), raw("a", 0, producer="acquisition-2"), raw("a", 1, fans=3)]
     due.add(mixed)
     assert popped(due) == [[each] for each in mixed]
 
 
 def test_so_many_values_come_together_at_most():
-    due = DueMessages(TRAYS, joins=True)
+    due = begun()
     half = [raw("a", k, samples=MOST_JOINED_VALUES // 4, fans=2) for k in range(3)]
     larger = raw("a", 3, samples=MOST_JOINED_VALUES, fans=2)
     due.add([*half, larger])
