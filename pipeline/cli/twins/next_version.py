@@ -331,6 +331,12 @@ class _Work:
         twin = self._place / f"{self._name}.onnx"
         self._say(f"{self._name}: training")
         training, validation = read_excerpts(parts.training), read_excerpts(parts.validation)
+        if self._before is None and (hints := training.tacho_hints()):
+            place = self._recordings[0].path.parent
+            raise UserError(
+                f"{hints[0]}: declare the tacho that was found, delete {place}, whose recordings say otherwise, and "
+                "start the site again"
+            )
         with twin_errors():
             fit_twin(training, validation, self._name).save(twin)
         return twin

@@ -227,4 +227,4 @@ class Commissioning:
 def _check_tachos(work: TrayWork) -> None:
     """Raises UserError if the readings for training are not those of the declared tachos."""
     if hints := read_training_data(work.training, work.name, None, 0.0, float("inf")).tacho_hints():
-        raise UserError(f"{hints[0]}: declare the tacho that was found as `tacho` in [[tray]], then start again")
+        raise UserError(f"{hints[0]}: declare the tacho that was found, then start again")

@@ -11,6 +11,7 @@ import pytest
 
 from pipeline.cli.twins import next_version
 from pipeline.cli.twins.next_version import make_next_version
+from pipeline.cli.twins.training_data import TrainingData
 from pipeline.cli.twins.version_data import newest_recordings
 from pipeline.errors import UserError
 from pipeline.learning.healthy_history import healthy_recordings
@@ -90,6 +91,17 @@ def test_the_first_version_has_a_twin_with_limits_and_is_a_target_only(site: Pat
     assert twin.sha256 == first.sha256
     assert twin.card.calibration
     assert first.error < 10.0, "rad/s; the noise is sqrt(10)"
+
+
+def test_no_first_twin_is_learned_of_tachos_that_are_not_declared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its fans would seem to be slow, and no alarm would come where they turn slowly."""
+    add_recording(tmp_path, 0, 120.0, 1)
+    monkeypatch.setattr(TrainingData, "tacho_hints", lambda _self: ["fan 0: a count over 1 s"])
+    with pytest.raises(UserError, match="fan 0: a count over 1 s: declare the tacho .* delete .*healthy, whose"):
+        made(tmp_path)
+    assert not TwinVersions(tmp_path, "tray1").all()
 
 
 def test_more_healthy_running_tightens_the_limits(site: Path) -> None:
