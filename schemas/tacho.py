@@ -58,6 +58,15 @@ class Tacho(BaseModel):
         return f"count over {self.window_s:g} s, {self.pulses} pulses a revolution{update}{delay}"
 
     @property
+    def as_toml(self) -> str:
+        """The value of `tacho` in a configuration, without what is as by default."""
+        values = self.model_dump(exclude_defaults=True) | {"kind": self.kind}
+        if self.kind == "count":
+            values["pulses"] = self.pulses
+        names = (name for name in type(self).model_fields if name in values)
+        return f"{{ {', '.join(f'{name} = {json.dumps(values[name])}' for name in names)} }}"
+
+    @property
     def held_s(self) -> float:
         """For how long one reading is shown, s; 0 where each sample is a reading of its own."""
         return (self.update_s or self.window_s) if self.kind == "count" else 0.0

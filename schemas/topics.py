@@ -161,6 +161,11 @@ def sessions_key(site: str, stage: str = "*", instance: str = "*") -> str:
     return f"{ROOT}/{site}/{SESSION_CHUNK}/{stage}/{instance}/**"
 
 
+def sweep_key(site: str, tray: str) -> str:
+    """Key of the liveliness token of a sweep that moves a tray's commands."""
+    return f"{ROOT}/{site}/{tray}/sweep"
+
+
 def key_in_words(key: str) -> str:
     """A tray's topic for people: `grid of tray1`. What is no key, as another program may send it, stays as it is."""
     *_, tray, topic = ["", *key.split("/")]

@@ -51,7 +51,7 @@ class TachoEvidence:
     def __str__(self) -> str:
         graded = f"readings are multiples of {self.resolution_rad_s / RAD_S_PER_RPM:.3g} rpm"
         changing = f" and change every {self.change_s:.2f} s" if self.change_s else ""
-        return f"{graded}{changing}: a {self.tacho}"
+        return f"{graded}{changing}: a {self.tacho} (`tacho = {self.tacho.as_toml}` in [[tray]])"
 
 
 def find_tacho(t_s: Array, speed_rad_s: Array) -> TachoEvidence | None:

@@ -203,8 +203,9 @@ class TwinVersions:
         except FileNotFoundError:
             return VersionList()
         except (OSError, ValidationError) as error:
-            why = error.strerror if isinstance(error, OSError) else f"{error.errors()[0]['msg']}"
-            raise UserError(f"{self._path}: cannot read the versions of the twin: {why}; move it away") from error
+            is_bad = isinstance(error, ValidationError)
+            why = f"{error.errors()[0]['msg']}; move it away" if is_bad else f"{error.strerror}; see `run_folder`"
+            raise UserError(f"{self._path}: cannot read the versions of the twin: {why}") from error
 
     def all(self) -> tuple[Version, ...]:
         """All versions, in the order they were made. Raises as `read`."""

@@ -37,6 +37,7 @@ from pipeline.cli.twins.fan_changes import (
 from pipeline.cli.twins.train import fit_twin
 from pipeline.cli.twins.training_data import TrainingData, twin_errors
 from pipeline.cli.twins.version_data import Split, newest_long, newest_recordings, split, spread_parts
+from pipeline.devices.tacho_evidence import tacho_hints
 from pipeline.errors import UserError
 from pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
 from pipeline.learning.history_recordings import HistoryRecording
@@ -331,6 +332,14 @@ class _Work:
         twin = self._place / f"{self._name}.onnx"
         self._say(f"{self._name}: training")
         training, validation = read_excerpts(parts.training), read_excerpts(parts.validation)
+        longest = max(training.runs, key=lambda run: len(run.t_s))
+        hints = tacho_hints(longest.t_s, longest.speed_rad_s, longest.tacho, training.fans)
+        if self._before is None and hints:
+            place = self._recordings[0].path.parent
+            raise UserError(
+                f"{hints[0]}: declare the tacho that was found, delete {place}, whose recordings say otherwise, and "
+                "start the site again"
+            )
         with twin_errors():
             fit_twin(training, validation, self._name).save(twin)
         return twin

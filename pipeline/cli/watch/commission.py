@@ -45,7 +45,7 @@ def commission(
         bool,
         typer.Option("--sweep", help="Move the commands, as `fantwin sweep` does; otherwise the plant must."),
     ] = False,
-    low: Annotated[float | None, typer.Option(help="With --sweep: lowest command.")] = None,
+    low: Annotated[float | None, typer.Option(help="With --sweep: lowest command, in the unit of the line.")] = None,
     high: Annotated[float | None, typer.Option(help="With --sweep: highest command.")] = None,
     safe: Annotated[float | None, typer.Option(help="With --sweep: the command at the end.")] = None,
     rounds: Annotated[

@@ -228,4 +228,4 @@ class Commissioning:
 def _check_tachos(work: TrayWork) -> None:
     """Raises UserError if the readings for training are not those of the declared tachos."""
     if hints := read_training_data(work.training, Part(work.name), RecordingsInParallel(jobs=1)).hints:
-        raise UserError(f"{hints[0]}: declare the tacho that was found as `tacho` in [[tray]], then start again")
+        raise UserError(f"{hints[0]}: declare the tacho that was found, then start again")

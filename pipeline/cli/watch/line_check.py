@@ -200,7 +200,7 @@ def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Findin
     """Whether the readings are those of the declared tachos. t_s: (n,). speed_rad_s: (n, fans)."""
     hints = tacho_hints(t_s, speed_rad_s, tray.tacho, range(tray.fans))
     for hint in hints:
-        yield False, f"{hint}: see `tacho` in [[tray]]"
+        yield False, hint
     seen = [find_tacho(t_s, readings) is not None for readings in speed_rad_s.T]
     if any(seen) and not hints:
         yield True, f"tachos of {_fans(seen)}: they read as declared"

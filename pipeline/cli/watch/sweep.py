@@ -23,7 +23,7 @@ from pipeline.errors import UsageError, UserError
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
 from schemas.messages import Raw
-from schemas.topics import tray_key
+from schemas.topics import sweep_key, tray_key
 from schemas.units import NS_PER_S
 
 _FIRST_SAMPLE_S = 5.0
@@ -68,8 +68,13 @@ def sweep(
     with Bus(settings.bus, stop, listens=False) as bus:
         line = _BusLine(bus, settings.site, chosen, stop)
         before = line.connect()
+        key = sweep_key(settings.site, chosen.name)
+        if bus.alive(key):
+            raise UserError(f"another sweep moves the fans of tray {chosen.name}: wait until it has ended")
+        bus.declare_alive(key)
         at_end = {fan: float(before[fan]) if safe is None else safe for fan in numbers}
         left_at = ", ".join(f"fan {fan} {value:g}" for fan, value in at_end.items())
+        progress(_range_in_words(chosen, lowest, highest))
         progress(f"at the end and after Ctrl-C the fans get these commands: {left_at}")
         is_stopped, constants_s = False, dict[int, float]()
         try:
@@ -108,6 +113,12 @@ def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: 
     if safe is not None:
         require_within_limits(tray, safe, "--safe")
     return lowest, highest
+
+
+def _range_in_words(tray: TrayConfig, lowest: float, highest: float) -> str:
+    """With the shares of the tray's range: a --low of 0.2 is next to nothing where commands go to 255."""
+    low, high = ((each - tray.command_min) / (tray.command_max - tray.command_min) for each in (lowest, highest))
+    return f"tray {tray.name}: commands from {lowest:g} to {highest:g}, {low:.0%} to {high:.0%} of its range"
 
 
 def _leave(line: _BusLine, at_end: Mapping[int, float], left_at: str) -> None:

@@ -254,7 +254,7 @@ def test_a_wrong_tacho_of_a_tray_is_found_before_it_is_swept_again(
 
     monkeypatch.setattr(commissioning, "read_training_data", read)
     result = played.commission("--sweep")
-    failed = "tray a failed: fan 0: counts over 0.5 s: declare the tacho that was found as `tacho` in [[tray]]"
+    failed = "tray a failed: fan 0: counts over 0.5 s: declare the tacho that was found, then start again"
     assert str(result.exception).startswith(failed)
     assert [line.split()[1] for line in played.of("sweep")] == ["a", "b", "b"]
     assert (played.folder / "b.onnx").exists()

@@ -71,7 +71,10 @@ def test_speeds_in_rad_s_are_also_shown_in_rpm() -> None:
     [
         (
             None,
-            (False, "every 1.00 s: a count over 1 s, 2 pulses a revolution; declared is instantaneous: see `tacho`"),
+            (
+                False,
+                '(`tacho = { kind = "count", pulses = 2, window_s = 1.0 }` in [[tray]]); declared is instantaneous',
+            ),
         ),
         ('{kind="count", window_s=1.0}', (True, "tachos of fans 0, 1: they read as declared")),
     ],

@@ -92,6 +92,17 @@ def test_the_first_version_has_a_twin_with_limits_and_is_a_target_only(site: Pat
     assert first.error < 10.0, "rad/s; the noise is sqrt(10)"
 
 
+def test_no_first_twin_is_learned_of_tachos_that_are_not_declared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its fans would seem to be slow, and no alarm would come where they turn slowly."""
+    add_recording(tmp_path, 0, 120.0, 1)
+    monkeypatch.setattr(next_version, "tacho_hints", lambda *_arguments: ["fan 0: a count over 1 s"])
+    with pytest.raises(UserError, match="fan 0: a count over 1 s: declare the tacho .* delete .*healthy, whose"):
+        made(tmp_path)
+    assert not TwinVersions(tmp_path, "tray1").all()
+
+
 def test_more_healthy_running_tightens_the_limits(site: Path) -> None:
     first, second = TwinVersions(site, "tray1").all()[:2]
     assert second.outcome == "taken"

@@ -71,10 +71,10 @@ def test_a_hint_names_the_fans_the_evidence_in_numbers_and_what_is_declared() ->
     _, fast = readings(Tacho(kind="count", window_s=0.5), 10.0)
     speeds = np.column_stack([slow, slow, fast])
     assert tacho_hints(t_s, speeds, INSTANTANEOUS, [0, 1, 4]) == [
-        "fans 0, 1: readings are multiples of 30 rpm and change every 1.00 s: a count over 1 s, 2 pulses a revolution; "
-        "declared is instantaneous",
-        "fan 4: readings are multiples of 60 rpm and change every 0.50 s: a count over 0.5 s, 2 pulses a revolution; "
-        "declared is instantaneous",
+        "fans 0, 1: readings are multiples of 30 rpm and change every 1.00 s: a count over 1 s, 2 pulses a revolution "
+        '(`tacho = { kind = "count", pulses = 2, window_s = 1.0 }` in [[tray]]); declared is instantaneous',
+        "fan 4: readings are multiples of 60 rpm and change every 0.50 s: a count over 0.5 s, 2 pulses a revolution "
+        '(`tacho = { kind = "count", pulses = 2, window_s = 0.5 }` in [[tray]]); declared is instantaneous',
     ]
     declared = tuple(Tacho(kind="count", window_s=window_s) for window_s in (1.0, 1.0, 0.5))
     assert tacho_hints(t_s, speeds, declared, range(3)) == []

@@ -30,7 +30,7 @@ def test_row_07_what_sessions_have_refused_is_added_up():
 def test_noise_on_a_line_is_listed_with_its_kinds():
     found = refused([health(samples=9, garbage=3, truncated=1, resync=1, refused_input=4)])
     assert found == {"acquisition/bench": {"garbage": 3, "truncated": 1, "refused_input": 4}}
-    words = "4 pieces of input that are no usable sample (garbage 3, truncated 1)"
+    words = "4 lines or frames that are no usable sample (garbage 3, truncated 1)"
     assert refused_lines(found) == [f"acquisition/bench: refused: {words}"]
 
 
