@@ -27,6 +27,8 @@ class DueMessages:
         self.joins = joins
         self._waiting: dict[str, deque[Envelope]] = {}
         """by tray, the next one to take its turn first; none is empty"""
+        self.bytes = 0
+        """of the payloads of all"""
         self._begun: set[str] = set()
         """the keys of which a message has been taken"""
 
@@ -44,6 +46,7 @@ class DueMessages:
         """Messages that are in sequence now."""
         for envelope in envelopes:
             tray = envelope.header.tray
+            self.bytes += len(envelope.payload)
             self._waiting.setdefault(tray if tray in self._trays else "", deque()).append(envelope)
 
     def pop(self) -> list[Envelope]:
@@ -66,6 +69,7 @@ class DueMessages:
                 taken.append(waiting.popleft())
         if waiting:
             self._waiting[tray] = waiting
+        self.bytes -= sum(len(each.payload) for each in taken)
         return taken
 
 

@@ -46,6 +46,8 @@ HEALTH_PERIOD_S = 1.0
 LOSS_REPORT_S = (
     0.2  # losses, and that a command has arrived, are reported this soon: a killed stage leaves few unreported
 )
+MOST_DUE_BYTES = 8 << 20
+"""of messages that are taken from the inbox to be joined: more than ever come together"""
 PRODUCERS_END_LIMIT_S = 10.0  # how long a stage whose launcher has gone waits for its producers to end
 # When each part of the end must be over, as shares of launcher.stop_timeout_s: the rest is for the process itself.
 CAUGHT_UP, DRAINED, WORK_ENDED = 0.4, 0.7, 0.75
@@ -292,10 +294,12 @@ class Runner:
         return reported[0] if reported else self._build_health(StageStatus.DEGRADED, with_counts=False)
 
     def _handle_what_waits(self) -> None:
-        """Take what else is in the inbox now, up to as much as it holds: messages of a tray are then joined."""
+        """Take what else is in the inbox now, so that messages of a tray are joined. Not so much that what the inbox
+        holds back would be in memory here."""
         for _ in range(min(self._inbox.waiting(), INBOX_SIZE - len(self._due))):
-            if (item := self._inbox.get(0)) is not None:
-                self._handle(item)
+            if self._due.bytes >= MOST_DUE_BYTES or (item := self._inbox.get(0)) is None:
+                return
+            self._handle(item)
 
     def _handle(self, item: Item) -> None:
         if isinstance(item, FromSource):

@@ -66,7 +66,9 @@ def test_messages_of_a_tray_come_together_and_trays_take_turns():
     between = request("a", 0)
     due.add([a[0], b[0], a[1], between, a[2], b[1]])
     assert len(due) == 6
+    assert due.bytes == sum(len(each.payload) for each in (*a, *b, between))
     assert popped(due) == [a[:2], b, [between], [a[2]]]
+    assert due.bytes == 0
 
 
 def test_another_producer_or_number_of_fans_is_not_joined():
