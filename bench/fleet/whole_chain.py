@@ -16,13 +16,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import typer
 
-from bench.fleet.hall import FAULT_S, SITE, Hall, HallFault
+from bench.fleet.hall import FAULT_S, PRODUCER, SITE, Hall, HallFault
 from bench.fleet.stage_cost import calibrated_twin
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint, memory_mb
@@ -59,12 +59,8 @@ class Measured:
     memory_mb: float
 
 
-@dataclass
-class Found:
-    """The alarms of the site."""
-
-    raised: list[tuple[str, int, float]] = field(default_factory=list[tuple[str, int, float]])
-    """tray, fan and time since the first sample of each alarm"""
+Raised: TypeAlias = list[tuple[str, int, float]]
+"""tray, fan and time since the first sample of each alarm"""
 
 
 def main(
@@ -101,9 +97,10 @@ def run(
         f'[bus]\nendpoint = "{endpoint}"\n[resampler]\nrate_hz = {RATE_HZ:g}\nwatermark_s = 600\nstale_for_s = 1200\n'
         + "".join(tables.format(name) for name in hall.names)
     )
-    found, epoch_ns, waits_s = Found(), time.time_ns(), 3 * hall.block / RATE_HZ
+    raised: Raised = []
+    epoch_ns, waits_s = time.time_ns(), 3 * hall.block / RATE_HZ
     with Bus(BusConfig(endpoint=endpoint)) as bus:
-        _listen(bus, found, epoch_ns)
+        _listen(bus, raised, epoch_ns)
         watcher, scores = SiteWatcher(bus, SITE), NewestScores(bus, hall, epoch_ns)
         up = RunningCommand(["up", "-c", configuration, "--json"])
         try:
@@ -135,7 +132,7 @@ def run(
         "cores": sum(row["cpu s"] for row in rows[:-1]) / took_s,
         "lost": lost,
         "faults": len(faults),
-        **_alarms(hall, faults, found),
+        **_alarms(hall, faults, raised),
         "bytes recorded": recorded / (hall.fans * (BEGINNING_S + seconds) * RATE_HZ),
     }
 
@@ -143,7 +140,7 @@ def run(
 def _sender(bus: Bus, hall: Hall, epoch_ns: int, faults: list[HallFault]) -> Callable[[float], None]:
     """Sends the next so many seconds, in real time, or as fast as they are taken."""
     topic = BY_NAME["raw"]
-    publishers = [bus.publisher(tray_key(SITE, name, "raw"), topic, type_name(Raw), "feed-1") for name in hall.names]
+    publishers = [bus.publisher(tray_key(SITE, name, "raw"), topic, type_name(Raw), PRODUCER) for name in hall.names]
     messages = hall.messages(epoch_ns, faults)
     block_s = hall.block / RATE_HZ
 
@@ -157,11 +154,11 @@ def _sender(bus: Bus, hall: Hall, epoch_ns: int, faults: list[HallFault]) -> Cal
     return send
 
 
-def _listen(bus: Bus, found: Found, epoch_ns: int) -> None:
+def _listen(bus: Bus, raised: Raised, epoch_ns: int) -> None:
     def on_alarm(key: str, payload: bytes) -> None:
         alarm = decode(Alarm, payload)
         if alarm.transition == Transition.RAISED:
-            found.raised.append((key.split("/")[2], alarm.fan, (alarm.t_ns - epoch_ns) / NS_PER_S))
+            raised.append((key.split("/")[2], alarm.fan, (alarm.t_ns - epoch_ns) / NS_PER_S))
 
     bus.subscribe(tray_key(SITE, "*", "alarm"), on_alarm)
 
@@ -219,11 +216,11 @@ def _cost(cpu_s: float, fan_samples: float) -> dict[str, Any]:
     return {"cpu s": cpu_s, "us a fan-sample": us, "fans at 100 Hz a core": round(1e6 / (us * RATE_HZ)) if us else None}
 
 
-def _alarms(hall: Hall, faults: list[HallFault], found: Found) -> dict[str, Any]:
+def _alarms(hall: Hall, faults: list[HallFault], raised: Raised) -> dict[str, Any]:
     """How many faults were found, and how many alarms are of none."""
     delays_s: dict[HallFault, float] = {}
     false = 0
-    for tray, fan, t_s in found.raised:
+    for tray, fan, t_s in raised:
         of = [
             fault
             for fault in faults

@@ -22,13 +22,15 @@ from pipeline.cli.twins.training_data import (
     RecordingsArgument,
     ToOption,
     TrayOption,
+    ValidateFromOption,
+    ValidateOption,
+    ValidateToOption,
     check_writable,
     data_cards,
     read_held_out,
     read_training_data,
     twin_errors,
 )
-from pipeline.recordings.remote import matching, recording_path
 
 
 def place(
@@ -37,19 +39,11 @@ def place(
     ],
     recordings: RecordingsArgument,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="TWIN.onnx", help="Twin to write.")],
-    validate: Annotated[
-        list[Path] | None,
-        typer.Option(
-            parser=recording_path,
-            callback=matching,
-            metavar="REC.mcap",
-            help="Held-out healthy recording: evaluated, not fitted. Repeatable.",
-        ),
-    ] = None,
+    validate: ValidateOption = None,
     from_s: FromOption = 0.0,
     to_s: ToOption = math.inf,
-    validate_from_s: Annotated[float, typer.Option("--validate-from", help="Like --from, for --validate.")] = 0.0,
-    validate_to_s: Annotated[float, typer.Option("--validate-to", help="Like --to, for --validate.")] = math.inf,
+    validate_from_s: ValidateFromOption = 0.0,
+    validate_to_s: ValidateToOption = math.inf,
     tray: TrayOption = None,
     fans: FansOption = None,
     name: Annotated[str | None, typer.Option(help="Name of the twin. Default: the name of the file.")] = None,

@@ -22,6 +22,9 @@ from pipeline.cli.twins.training_data import (
     ToOption,
     TrainingData,
     TrayOption,
+    ValidateFromOption,
+    ValidateOption,
+    ValidateToOption,
     WindowOption,
     check_writable,
     data_cards,
@@ -30,7 +33,6 @@ from pipeline.cli.twins.training_data import (
     show_hints,
     twin_errors,
 )
-from pipeline.recordings.remote import matching, recording_path
 
 if TYPE_CHECKING:
     from twin.finishing import TrainedTwin
@@ -67,19 +69,11 @@ def train(
     recordings: RecordingsArgument,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="TWIN.onnx", help="Twin to write.")],
     model: Annotated[str, typer.Option(help="Kind of model: physical, narx, neural-ode or hybrid.")] = "hybrid",
-    validate: Annotated[
-        list[Path] | None,
-        typer.Option(
-            parser=recording_path,
-            callback=matching,
-            metavar="REC.mcap",
-            help="Held-out healthy recording: evaluated, not fitted. Repeatable.",
-        ),
-    ] = None,
+    validate: ValidateOption = None,
     from_s: FromOption = 0.0,
     to_s: ToOption = math.inf,
-    validate_from_s: Annotated[float, typer.Option("--validate-from", help="Like --from, for --validate.")] = 0.0,
-    validate_to_s: Annotated[float, typer.Option("--validate-to", help="Like --to, for --validate.")] = math.inf,
+    validate_from_s: ValidateFromOption = 0.0,
+    validate_to_s: ValidateToOption = math.inf,
     tray: TrayOption = None,
     fans: FansOption = None,
     window_s: WindowOption = None,

@@ -52,6 +52,17 @@ WindowOption: TypeAlias = Annotated[
         "all fans, or one for each. Repeatable.",
     ),
 ]
+ValidateOption: TypeAlias = Annotated[
+    list[Path] | None,
+    typer.Option(
+        parser=recording_path,
+        callback=matching,
+        metavar="REC.mcap",
+        help="Held-out healthy recording: evaluated, not fitted. Repeatable.",
+    ),
+]
+ValidateFromOption: TypeAlias = Annotated[float, typer.Option("--validate-from", help="Like --from, for --validate.")]
+ValidateToOption: TypeAlias = Annotated[float, typer.Option("--validate-to", help="Like --to, for --validate.")]
 FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans, counted from 0, e.g. 0,2.")]
 
 TACHO_ADVICE = "see `tacho` in [[tray]], or --window for recordings that do not say"

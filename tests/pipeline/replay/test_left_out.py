@@ -7,11 +7,8 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pipeline.replay.offline.comparison import CannotCompareError, Comparison
-from schemas.messages import Action
-from tests.support.killed_site import CHAIN, Site
 from tests.support.offline_replay import (
     alarms_of,
     recorded,
@@ -19,9 +16,9 @@ from tests.support.offline_replay import (
     verified,
     without_topics,
 )
+from tests.support.random_site import ANYTHING, random_site
 
 MADE = ("grid", "prediction", "score")
-ASKED = (Action.ACKNOWLEDGE, Action.SHELVE, Action.COMMISSION, Action.OUT_OF_SERVICE)
 
 
 def lean(path: Path, *topics: str) -> Path:
@@ -53,34 +50,11 @@ def test_alarms_and_snapshots_are_compared_where_there_are_no_scores(undisturbed
 
 
 @settings(deadline=None, max_examples=20)
-@given(
-    seed=st.integers(0, 1000),
-    raw_samples=st.sampled_from([1, 1, 4]),
-    calibrated=st.booleans(),
-    remembers=st.sampled_from([True, True, False]),
-    events=st.lists(
-        st.tuples(st.integers(5, 100), st.sampled_from([*CHAIN, "scorer", "acquisition", "silence", "loss", *ASKED])),
-        min_size=2,
-        max_size=5,
-    ),
-)
+@given(**ANYTHING)
 def test_it_is_made_again_after_any_kills_and_requests(
     tmp_path_factory, seed, raw_samples, calibrated, remembers, events
 ):
-    site = Site(tmp_path_factory.mktemp("site"), seed, raw_samples, calibrated=calibrated, remembers=remembers)
-    for samples, event in events:
-        site.run(samples)
-        if isinstance(event, Action):
-            site.ask(event, fan=samples % 4 - 1, duration_s=float(samples % 2))
-        elif event == "acquisition":
-            site.restart_source()
-        elif event == "silence":
-            site.fall_silent(0.8)
-        elif event == "loss":
-            site.loses(1 + samples % 3)
-        else:
-            site.kill(event)
-    site.run(50)
+    site = random_site(tmp_path_factory.mktemp("site"), seed, raw_samples, calibrated, remembers, events)
     whole = site.finished()
     path = lean(whole)
     assert len(recorded(path, "consumed")) < len(recorded(whole, "score")) + 10

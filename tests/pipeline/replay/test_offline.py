@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from mcap.records import Attachment
 
 from pipeline.recordings.metadata import CONFIGURATION
@@ -22,6 +21,7 @@ from schemas.messages import Action, Alarm, FanState, Score, Transition
 from schemas.units import NS_PER_S
 from tests.support.killed_site import CHAIN, Site
 from tests.support.offline_replay import alarms_of, changed, made_equal, recorded, verified
+from tests.support.random_site import ANYTHING, random_site
 from tests.support.twin_files import write_twin
 
 
@@ -43,38 +43,12 @@ def test_samples_that_time_had_given_up_are_given_up_again(tmp_path):
     assert made_equal(tray) > 400
 
 
-ASKED = (Action.ACKNOWLEDGE, Action.SHELVE, Action.COMMISSION, Action.OUT_OF_SERVICE)
-
-
 @settings(deadline=None, max_examples=20)
-@given(
-    seed=st.integers(0, 1000),
-    raw_samples=st.sampled_from([1, 1, 4]),
-    calibrated=st.booleans(),
-    remembers=st.sampled_from([True, True, False]),
-    events=st.lists(
-        st.tuples(st.integers(5, 100), st.sampled_from([*CHAIN, "scorer", "acquisition", "silence", "loss", *ASKED])),
-        min_size=2,
-        max_size=5,
-    ),
-)
+@given(**ANYTHING)
 def test_a_replay_decides_the_same_after_any_kills_and_requests(
     tmp_path_factory, seed, raw_samples, calibrated, remembers, events
 ):
-    site = Site(tmp_path_factory.mktemp("site"), seed, raw_samples, calibrated=calibrated, remembers=remembers)
-    for samples, event in events:
-        site.run(samples)
-        if isinstance(event, Action):
-            site.ask(event, fan=samples % 4 - 1, duration_s=float(samples % 2))
-        elif event == "acquisition":
-            site.restart_source()
-        elif event == "silence":
-            site.fall_silent(0.8)
-        elif event == "loss":
-            site.loses(1 + samples % 3)
-        else:
-            site.kill(event)
-    site.run(50)
+    site = random_site(tmp_path_factory.mktemp("site"), seed, raw_samples, calibrated, remembers, events)
     path = site.finished()
     has_loss = any(event == "loss" for _, event in events)
     try:
