@@ -27,7 +27,9 @@ from scoring.wear.trend import NS_PER_DAY, LimitForecast, Trend, WearSeries, for
 
 UNITS = {"balance": "command", "drag": "relative", "friction": "command", "gain": "relative"}
 """unit of each parameter; `command`: that of the fan's command"""
-ATTEMPT_PERIOD_NS = 10 * NS_PER_S
+TURN_NS = NS_PER_S
+"""how long a fan is due after the one before it: points of all fans of a large tray at once would hold up its scores"""
+ATTEMPT_PERIOD_TURNS = 10
 """how often a fan that is due for a point is tried"""
 MIN_FORECAST_DAYS = 1.0
 """no forecast before: weather and warming bearings change more within a day than wear does"""
@@ -60,7 +62,7 @@ class WearMonitor:
         self._diagnoser = diagnoser
         self._every_ns = round(every_s * NS_PER_S)
         self._unit = command_unit
-        self._last_attempt = 0
+        self._last_turn = 0
         self._disturbed_t_ns = np.full(len(healthy), NEVER_NS)
         """(fans,) the last sample that no point may look back on"""
         self._fans = [_FanWear() for _ in healthy]
@@ -87,21 +89,24 @@ class WearMonitor:
         held: the baseline is at its bound, so that its value says nothing about wear. limit_command: the alarm comes at
         this distance from the commissioned baseline.
         """
-        attempts = np.maximum((t_ns - origin_t_ns) // ATTEMPT_PERIOD_NS, self._last_attempt)
-        for row in np.flatnonzero(np.diff(attempts, prepend=self._last_attempt) > 0).tolist():
-            at_ns = int(t_ns[row])
-            slot = (at_ns - origin_t_ns) // self._every_ns
-            last_disturbed = self._last_disturbed(t_ns[: row + 1], disturbed[: row + 1])
-            undisturbed = last_disturbed <= at_ns - round(WINDOW_S * NS_PER_S)
+        turns = np.maximum((t_ns - origin_t_ns) // TURN_NS, self._last_turn)
+        fans, begin = np.arange(len(self._fans)), 0
+        for row in np.flatnonzero(np.diff(turns, prepend=self._last_turn) > 0).tolist():
+            at_ns, turn = int(t_ns[row]), int(turns[row])
+            has_turn = (turn - fans) // ATTEMPT_PERIOD_TURNS > (self._last_turn - fans) // ATTEMPT_PERIOD_TURNS
+            self._last_turn = turn
+            self._see_disturbances(t_ns[begin : row + 1], disturbed[begin : row + 1])
+            begin = row + 1
+            undisturbed = self._disturbed_t_ns <= at_ns - round(WINDOW_S * NS_PER_S)
             commissioned = np.isfinite(commissioned_command[row])
-            for fan in np.flatnonzero(eligible[row] & undisturbed & commissioned).tolist():
+            for fan in np.flatnonzero(has_turn & eligible[row] & undisturbed & commissioned).tolist():
+                slot = (at_ns - origin_t_ns - fan * TURN_NS) // self._every_ns
                 due = slot > self._fans[fan].slot
                 of_fan = (float(of[row, fan]) for of in (commissioned_command, shared_command))
                 if due and self._add_point(fan, at_ns, *of_fan, held=bool(held[row, fan])):
                     self._fans[fan].slot = slot
                     self._fans[fan].evaluate(at_ns, float(limit_command[fan]))
-        self._last_attempt = int(attempts[-1])
-        self._disturbed_t_ns = self._last_disturbed(t_ns, disturbed)
+        self._see_disturbances(t_ns[begin:], disturbed[begin:])
 
     def of(self, fan: int) -> Mapping[str, ParameterWear]:
         """The wear of a fan, by parameter; empty before its first point."""
@@ -151,7 +156,7 @@ class WearMonitor:
         """The whole state, as JSON values, and the present wear of each parameter for `fantwin wear`."""
         return {
             "command_unit": self._unit,
-            "last_attempt": self._last_attempt,
+            "last_turn": self._last_turn,
             "disturbed_t_ns": self._disturbed_t_ns.tolist(),
             "fans": [fan.snapshot() for fan in self._fans],
         }
@@ -162,10 +167,10 @@ class WearMonitor:
         Raises:
             ValueError, KeyError, TypeError, AttributeError: it is not such a snapshot.
         """
-        last_attempt, disturbed_t_ns, fans = self._read(snapshot)
+        last_turn, disturbed_t_ns, fans = self._read(snapshot)
         for fan, healthy in zip(fans, self._healthy, strict=True):
             fan.keep_reference_unless_of(healthy)
-        self._last_attempt, self._disturbed_t_ns, self._fans = last_attempt, disturbed_t_ns, fans
+        self._last_turn, self._disturbed_t_ns, self._fans = last_turn, disturbed_t_ns, fans
 
     def restore_of_former_twin(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a snapshot of the twin before: drag, friction and gain go on, the balance starts again.
@@ -183,11 +188,13 @@ class WearMonitor:
         disturbed_t_ns = np.array(stored.get("disturbed_t_ns", self._disturbed_t_ns), np.int64)  # the first had none
         if len(fans) != len(self._fans) or disturbed_t_ns.shape != self._disturbed_t_ns.shape:
             raise ValueError("wear of another number of fans")
-        return int(stored["last_attempt"]), disturbed_t_ns, fans
+        former = int(stored.get("last_attempt", 0)) * ATTEMPT_PERIOD_TURNS  # of all fans at once
+        return int(stored.get("last_turn", former)), disturbed_t_ns, fans
 
-    def _last_disturbed(self, t_ns: Array, disturbed: Array) -> Array:
-        """(fans,) time of the last disturbed sample of each fan, up to the end of these rows."""
-        return np.where(disturbed, t_ns[:, np.newaxis], self._disturbed_t_ns).max(axis=0)
+    def _see_disturbances(self, t_ns: Array, disturbed: Array) -> None:
+        """Keep the time of the last disturbed sample of each fan; (n,) and (n, fans), n may be 0."""
+        disturbed_t_ns = np.where(disturbed, t_ns[:, np.newaxis], NEVER_NS).max(axis=0, initial=NEVER_NS)
+        self._disturbed_t_ns = np.maximum(self._disturbed_t_ns, disturbed_t_ns)
 
     def _add_point(self, fan: int, at_ns: int, commissioned: float, shared: float, *, held: bool) -> bool:
         """Add a point for each parameter; False where the last seconds are too few for it, or too slow."""

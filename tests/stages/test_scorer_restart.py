@@ -268,7 +268,7 @@ def test_from_a_snapshot_of_another_twin_only_operator_settings_are_restored() -
 def test_from_a_snapshot_read_in_part_operator_settings_are_restored(of: str) -> None:
     memory = snapshot_of(raised())
     state = json.loads(memory.state_json)
-    state["wear"]["last_attempt"] = 5
+    state["wear"]["last_turn"] = 5
     state[of].popitem()
     successor = core_of(3)
     first, *emitted = successor.restore(replace(memory, state_json=json.dumps(state)))
@@ -280,7 +280,7 @@ def test_from_a_snapshot_read_in_part_operator_settings_are_restored(of: str) ->
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
     assert (score.state == FanState.COMMISSIONING).all()
-    assert json.loads(snapshot_of(successor).state_json)["wear"]["last_attempt"] == 0, "wear starts again"
+    assert json.loads(snapshot_of(successor).state_json)["wear"]["last_turn"] == 0, "wear starts again"
 
 
 def test_a_snapshot_that_was_not_used_is_reported_for_a_minute() -> None:

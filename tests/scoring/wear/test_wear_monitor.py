@@ -16,6 +16,7 @@ from schemas.messages import Action, Alarm, Header, Prediction, ScorerSnapshot, 
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.torque_balance import BalanceModel, TorqueBalance
 from scoring.wear.slow_change import WEAR_HINT
+from scoring.wear.wear_monitor import ATTEMPT_PERIOD_TURNS
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
     CALIBRATION,
@@ -234,13 +235,15 @@ def test_a_snapshot_from_before_wear_was_monitored_is_restored() -> None:
     assert wear_of(snapshot_of(successor)) == wear_of(snapshot_of(core_after_one_sample()))
 
 
-def test_a_snapshot_from_before_disturbances_were_stored_is_restored(after_eight_days) -> None:
+def test_a_snapshot_from_before_disturbances_and_turns_were_stored_is_restored(after_eight_days) -> None:
     memory = snapshot_of(after_eight_days[0])
     state = json.loads(memory.state_json)
     del state["wear"]["disturbed_t_ns"]
+    state["wear"]["last_attempt"] = state["wear"].pop("last_turn") // ATTEMPT_PERIOD_TURNS
     successor = core()
     successor.restore(replace(memory, state_json=json.dumps(state)))
-    assert wear_of(snapshot_of(successor)) == wear_of(memory)
+    last_turn = state["wear"]["last_attempt"] * ATTEMPT_PERIOD_TURNS
+    assert wear_of(snapshot_of(successor)) == wear_of(memory) | {"last_turn": last_turn}
 
 
 def core_after_one_sample() -> ScorerCore:
@@ -249,7 +252,7 @@ def core_after_one_sample() -> ScorerCore:
     return young
 
 
-@pytest.mark.parametrize("broken", [{"fans": []}, {"tried": "x"}, {"fans": 3}])
+@pytest.mark.parametrize("broken", [{"fans": []}, {"last_turn": "x"}, {"fans": 3}])
 def test_an_invalid_wear_snapshot_is_discarded(broken) -> None:
     memory = snapshot_of(core_after_one_sample())
     state = json.loads(memory.state_json)
@@ -295,12 +298,19 @@ def first_point_s(fan: int, core: ScorerCore) -> float | None:
     return (times[0] - EPOCH_NS) / 1e9 if times else None
 
 
+def test_the_points_of_a_tray_are_taken_one_second_after_the_other() -> None:
+    one = core()
+    one.step(burst(0, seconds=60.0))
+    first_s = first_point_s(HEALTHY, one)
+    assert first_s is not None and first_point_s(WORN, one) == pytest.approx(first_s + 1.0)
+
+
 def test_a_fan_gets_a_point_once_its_disturbance_is_out_of_the_window() -> None:
     one, block = core(), burst(0, seconds=60.0)
     measured = block.measured_speed_rad_s.copy()
     measured[435:520, WORN] = measured[434, WORN]  # more than half as long as a reading may repeat itself
     one.step(replace(block, measured_speed_rad_s=measured))
-    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
+    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 51.0)
 
 
 def with_a_fault(first_s: int = 7) -> Prediction:
@@ -316,7 +326,7 @@ def test_no_wear_point_uses_samples_of_a_fault_that_has_cleared() -> None:
     _, alarms = feed(one, [with_a_fault()])
     cleared_s = [(alarm.t_ns - EPOCH_NS) / 1e9 for alarm in alarms if alarm.transition == Transition.CLEARED]
     assert len(cleared_s) == 1 and 9.0 < cleared_s[0] < 15.0
-    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
+    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 51.0)
     (friction,) = worn(WORN, "friction", one)["series"]["value"]
     assert abs(friction) < 0.1, "nothing of the fault is in it"
 
@@ -335,13 +345,13 @@ def test_after_a_restart_it_is_known_how_far_back_a_fault_is() -> None:
     feed(killed, [cut(faulty, 0, 1500)])
     successor.restore(snapshot_of(killed))
     feed(successor, [cut(faulty, 1500, 3000)])
-    assert first_point_s(WORN, successor) == 50.0
+    assert first_point_s(WORN, successor) == 51.0
 
 
 def test_no_wear_point_uses_samples_from_before_a_fan_was_commissioned_again() -> None:
     one, block = core(), burst(0, seconds=60.0)
     feed(one, [cut(block, 0, 500), request_of(Action.COMMISSION, WORN), cut(block, 500, 3000)])
-    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
+    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 51.0)
 
 
 def test_a_fan_at_standstill_reports_nothing() -> None:
