@@ -193,7 +193,8 @@ def _ranges(command: Array, speed_rad_s: Array, tray: TrayConfig, twin: TrayTwin
         tray.speed_unit == "rad/s"
     ):  # numbers in rpm that are taken for rad/s are plausible ones, and ten times too large
         speeds += f" ({_speeds(speed_rad_s, 'rpm')})"
-    yield True, f"commands {low:g} to {high:g}, speeds {speeds}: are these what the fans do?"
+    commands = f"commands {low:g} to {high:g} (of {tray.command_min:g} to {tray.command_max:g})"
+    yield True, f"{commands}, speeds {speeds}: are these what the fans do?"
 
 
 def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Finding]:

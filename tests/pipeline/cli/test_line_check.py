@@ -54,7 +54,7 @@ def test_a_line_that_fits_is_shown_with_its_grid_and_ranges(line_hz: float, grid
     rate, ranges, _ = found(line_hz, tray__0__speed_unit="rpm")
     assert rate == (True, f"{line_hz} samples a second: grid of {grid_hz} Hz, gaps are longer than {gap_s} s")
     assert ranges[0]
-    assert ranges[1].startswith("commands 0.5 to 0.5, speeds 2865 to ")
+    assert ranges[1].startswith("commands 0.5 to 0.5 (of 0 to 1), speeds 2865 to ")
 
 
 def test_speeds_in_rad_s_are_also_shown_in_rpm() -> None:
@@ -62,7 +62,7 @@ def test_speeds_in_rad_s_are_also_shown_in_rpm() -> None:
     _, ranges, _ = found(10, speed_rad_s=900.0)
     assert ranges == (
         True,
-        "commands 0.5 to 0.5, speeds 900 to 919 rad/s (8594 to 8776 rpm): are these what the fans do?",
+        "commands 0.5 to 0.5 (of 0 to 1), speeds 900 to 919 rad/s (8594 to 8776 rpm): are these what the fans do?",
     )
 
 
