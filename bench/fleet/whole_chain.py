@@ -15,7 +15,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
@@ -112,7 +112,9 @@ def run(
             eventually(lambda: scores.have_reached(BEGINNING_S - waits_s), "they are scored", DEADLINE_S)
             before, began_s = _measured(watcher), time.monotonic()
             progress(f"measuring for {seconds:g} s")
-            send(seconds)
+            send(seconds / 2)
+            halfway = _measured(watcher)
+            send(seconds / 2)
             end_s = BEGINNING_S + seconds
             eventually(lambda: scores.have_reached(end_s - waits_s), "the last are scored", DEADLINE_S)
             took_s, after = time.monotonic() - began_s, _measured(watcher)
@@ -122,7 +124,7 @@ def run(
         finally:
             up.kill()
     fan_samples = hall.fans * seconds * RATE_HZ
-    rows = list(_rows(before, after, fan_samples))
+    rows = list(_rows((before, halfway, after), fan_samples))
     recorded = sum(path.stat().st_size for path in (twin.parent / "runs").glob("*.mcap"))
     return rows, {
         "fans": hall.fans,
@@ -201,14 +203,15 @@ def _measured(watcher: SiteWatcher) -> dict[str, Measured]:
     return found
 
 
-def _rows(before: dict[str, Measured], after: dict[str, Measured], fan_samples: float) -> Iterator[dict[str, Any]]:
-    all_s = 0.0
+def _rows(measured: Sequence[dict[str, Measured]], fan_samples: float) -> Iterator[dict[str, Any]]:
+    """measured: at the beginning, halfway and at the end."""
+    all_s, moments = 0.0, ("MB before", "halfway", "after")
     for stage in STAGES:
-        cpu_s = after[stage].cpu_s - before[stage].cpu_s
+        cpu_s = measured[-1][stage].cpu_s - measured[0][stage].cpu_s
         all_s += cpu_s
-        memory = {"MB before": before[stage].memory_mb, "MB after": after[stage].memory_mb}
+        memory = {moment: each[stage].memory_mb for moment, each in zip(moments, measured, strict=True)}
         yield {"stage": stage, **_cost(cpu_s, fan_samples), **memory}
-    yield {"stage": "all", **_cost(all_s, fan_samples), "MB before": None, "MB after": None}
+    yield {"stage": "all", **_cost(all_s, fan_samples), **dict.fromkeys(moments)}
 
 
 def _cost(cpu_s: float, fan_samples: float) -> dict[str, Any]:
