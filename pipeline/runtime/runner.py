@@ -224,10 +224,13 @@ class Runner:
                     self._call(name, lambda core=parts.core, now_ns=now_ns: core.tick(now_ns), from_timer=True)
                 if self.stage.undecoded:
                     self._follow()
-                news = self._owes_answer or self._lost() > reported_lost
-                if now >= next_health or (now >= next_loss and news):
+                news = False
+                if now >= next_loss:
+                    next_loss = now + LOSS_REPORT_S
+                    news = self._owes_answer or self._lost() > reported_lost
+                if news or now >= next_health:
                     self._owes_answer = False
-                    next_health, next_loss = now + HEALTH_PERIOD_S, now + LOSS_REPORT_S
+                    next_health = now + HEALTH_PERIOD_S
                     reported_lost = self._publish_health(status).lost
                 self._notifier.at_work(self._health.summary)
 
