@@ -67,13 +67,16 @@ class Prior:
     physics_mean.
 
     physics: (4,). physics_mean: (fans, 4). network: pulls the acceleration of the network towards a
-    given one where there are no data, or None.
+    given one where there are no data, or None. limits_steps: the damping of a step counts the pulls on the weights like
+    the data. Without, a weight of which the data show nothing goes all the way at once, however large the damping, and
+    a fit from a good start may find no step that is better.
     """
 
     weights: float
     physics: Array
     physics_mean: Array
     network: "NetworkPrior | None" = None
+    limits_steps: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,6 +352,8 @@ class FreeRunProblem:
                 squares_of_prior, slope_of_prior = self.prior.network.normal_equations(self._network(unknowns.weights))
                 hessian += squares_of_prior
                 slope += slope_of_prior
+                if self.prior.limits_steps:
+                    of_weights += np.diagonal(squares_of_prior) + self.prior.weights
             floor = 1e-12 * of_weights.max() + np.finfo(float).tiny
             hessian[np.diag_indices(self.weights)] += damping[0] * of_weights + self.prior.weights + floor
             move = np.linalg.solve(hessian, slope - self.prior.weights * unknowns.weights)

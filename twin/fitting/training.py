@@ -228,7 +228,8 @@ class _Training:
             progress("training on all samples", step, LAST_STEPS, rmse_rad_s)
             return step == LAST_STEPS
 
-        prior = replace(self._prior, physics=inertia_anchor(sum(piece.samples for piece in self._all_pieces)))
+        pull = inertia_anchor(sum(piece.samples for piece in self._all_pieces))
+        prior = replace(self._prior, physics=pull, limits_steps=True)
         fit = fit_free_run(
             self._model.with_theta(best.weights),
             best.physics,

@@ -80,7 +80,7 @@ def test_a_network_comes_from_windows_and_the_physics_of_each_fan_from_all_its_r
     assert used[-1] == run.speed_rad_s.size
     assert "training on all samples" in parts
     (error, std), (of_thinned, std_of_thinned) = error_and_uncertainty(whole), error_and_uncertainty(thinned)
-    assert of_thinned < 1.02 * error, "4 % more by windows alone"
+    assert of_thinned < 1.005 * error, "4 % more by windows alone, 1 % if the priors do not limit the steps"
     assert 0.8 < std_of_thinned / std < 1.25
 
 
