@@ -27,9 +27,10 @@ from twin.evaluation.accuracy import (
     Evaluation,
     Figures,
     UnseenStd,
-    evaluate_model,
     evaluation_pieces,
-    free_run_residuals,
+    free_run_readings,
+    residuals_of_readings,
+    sums_of_readings,
 )
 from twin.evaluation.reading_range import reading_sigma_rad_s
 from twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
@@ -91,7 +92,8 @@ def finish_twin(
     judged = validation_runs or runs
     progress("evaluation", 0, 0, np.nan)
     pieces = evaluation_pieces(judged)
-    healthy = healthy_residual(free_run_residuals(model, parameters, pieces), pieces)
+    expected = [free_run_readings(model, parameters, piece) for piece in pieces]
+    healthy = healthy_residual(residuals_of_readings(pieces, expected), pieces)
     sigma_rad_s = np.array(healthy.sigma_rad_s)
     unmeasured = np.flatnonzero(sigma_rad_s == 0.0)
     if unmeasured.size:
@@ -105,7 +107,7 @@ def finish_twin(
             f"the {model.kind} model of {name!r} diverges when run freely; record more levels, or try another kind"
         )
     unseen_std = unseen_std_of(uncertainty, drive.card if drive else None)
-    validation = evaluate_model(model, parameters, sigma_rad_s, judged, unseen_std)
+    validation = sums_of_readings(model, parameters, sigma_rad_s, pieces, expected, unseen_std).evaluation()
     progress("torque balance", 0, 0, np.nan)
     if drive is None:
         balance = fit_balance(runs, validation_runs, identification)

@@ -51,10 +51,14 @@ def main(
     show(tables, notes, as_json=json_output)
 
 
-def simulated_plant(command: Array, seed: int, lag_s: float = 0.012) -> SimulatedRun:
-    """The plant under duty (n, 1) at 100 Hz, from standstill, read by its tacho."""
-    parameters, tacho, rng = FanParameters(lag_s=lag_s), NoisyTacho(), np.random.default_rng([seed, 2])
-    state, true, read = at_rest(1), [], []
+def simulated_plant(command: Array, seed: int, parameters: FanParameters | None = None) -> SimulatedRun:
+    """Fans of the plant under duty (n, fans) at 100 Hz, from standstill, read by their tachos.
+
+    parameters: fields of numbers, or (fans,) each. seed: of the noise.
+    """
+    parameters = parameters or FanParameters()
+    tacho, rng = NoisyTacho(), np.random.default_rng([seed, 2])
+    state, true, read = at_rest(command.shape[1]), [], []
     for duty in command:
         true.append(state.speed_rad_s)
         read.append(tacho.read(state.speed_rad_s, rng))

@@ -9,7 +9,7 @@ and R2 are equations (32) to (34) of Peng and Chen, the band of two sigma (35) a
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,9 +126,23 @@ def sums_of_model(
     model: TwinModel, parameters: Array, sigma_rad_s: Array, runs: Sequence[Run], unseen_std: UnseenStd | None = None
 ) -> FigureSums:
     """What the figures are made of. Arguments as of evaluate_model."""
+    pieces = evaluation_pieces(runs)
+    expected = (free_run_readings(model, parameters, piece) for piece in pieces)
+    return sums_of_readings(model, parameters, sigma_rad_s, pieces, expected, unseen_std)
+
+
+def sums_of_readings(
+    model: TwinModel,
+    parameters: Array,
+    sigma_rad_s: Array,
+    pieces: Sequence[Run],
+    expected: Iterable[Array],
+    unseen_std: UnseenStd | None = None,
+) -> FigureSums:
+    """The sums over pieces. expected: of each piece, as of figure_sums. The others as of evaluate_model."""
     first, *others = (
-        figure_sums(model, parameters, sigma_rad_s, piece, free_run_readings(model, parameters, piece), unseen_std)
-        for piece in evaluation_pieces(runs)
+        figure_sums(model, parameters, sigma_rad_s, piece, its, unseen_std)
+        for piece, its in zip(pieces, expected, strict=True)
     )
     return sum(others, first)
 
@@ -204,8 +218,13 @@ def free_run_residuals(model: TwinModel, parameters: Array, pieces: Sequence[Run
 
     NaN where there is nothing to compare (compared_readings), infinite where the free run diverged.
     """
+    return residuals_of_readings(pieces, [free_run_readings(model, parameters, piece) for piece in pieces])
+
+
+def residuals_of_readings(pieces: Sequence[Run], expected: Sequence[Array]) -> Array:
+    """free_run_residuals of pieces whose free_run_readings are `expected`."""
     return np.concatenate(
-        [_residual(compared_readings(piece), free_run_readings(model, parameters, piece)) for piece in pieces]
+        [_residual(compared_readings(piece), its) for piece, its in zip(pieces, expected, strict=True)]
     )
 
 

@@ -38,7 +38,8 @@ Flags = NDArray[np.bool_]
 
 HUBER_DELTA = 3.0
 SCALE_ROUNDS, ERROR_ROUNDS = 2, 4  # with a constant scale, or with what was learned of the errors of readings
-MAX_CHUNK_NUMBERS = 4_000_000
+FAST_CHUNK_NUMBERS, MAX_CHUNK_NUMBERS = 500_000, 4_000_000
+ALIGNED_COLUMNS = 16  # sums over the units of a network are then the same to the bit, however the columns are cut
 DAMPING_DOWN, DAMPING_UP = 3.0, 4.0
 FIRST_DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e9
 HELD = 1e12
@@ -66,13 +67,16 @@ class Prior:
     physics_mean.
 
     physics: (4,). physics_mean: (fans, 4). network: pulls the acceleration of the network towards a
-    given one where there are no data, or None.
+    given one where there are no data, or None. limits_steps: the damping of a step counts the pulls on the weights like
+    the data. Without, a weight of which the data show nothing goes all the way at once, however large the damping, and
+    a fit from a good start may find no step that is better.
     """
 
     weights: float
     physics: Array
     physics_mean: Array
     network: "NetworkPrior | None" = None
+    limits_steps: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +283,7 @@ class FreeRunProblem:
         steps, batch = data.command.shape
         size = self.weights + len(PARAMETER_NAMES) + 1
         squares, gradient = np.empty((batch, size, size)), np.empty((batch, size))
-        width = max(1, MAX_CHUNK_NUMBERS // (steps * size))
+        width = _chunk_columns(steps * size)
         for first in range(0, batch, width):
             part = slice(first, first + width)
             sensitivity = self.sensitivities(point, part).transpose(1, 0, 2)
@@ -348,6 +352,8 @@ class FreeRunProblem:
                 squares_of_prior, slope_of_prior = self.prior.network.normal_equations(self._network(unknowns.weights))
                 hessian += squares_of_prior
                 slope += slope_of_prior
+                if self.prior.limits_steps:
+                    of_weights += np.diagonal(squares_of_prior) + self.prior.weights
             floor = 1e-12 * of_weights.max() + np.finfo(float).tiny
             hessian[np.diag_indices(self.weights)] += damping[0] * of_weights + self.prior.weights + floor
             move = np.linalg.solve(hessian, slope - self.prior.weights * unknowns.weights)
@@ -402,3 +408,10 @@ class FreeRunProblem:
         with np.errstate(over="ignore"):
             error_rad_s = np.where(compared, point.residual / self.errors.weight + self.errors.expected_rad_s, 0.0)
             return float(np.sqrt(np.sum(error_rad_s**2) / np.count_nonzero(compared)))
+
+
+def _chunk_columns(numbers: int) -> int:
+    """How many trajectories are differentiated at once, each with so many derivatives: as many as a cache holds, or
+    where that is few, as many as memory should."""
+    fast = FAST_CHUNK_NUMBERS // numbers // ALIGNED_COLUMNS * ALIGNED_COLUMNS
+    return fast or max(1, MAX_CHUNK_NUMBERS // numbers)

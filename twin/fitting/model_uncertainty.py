@@ -18,9 +18,11 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from schemas.model_uncertainty import ModelUncertainty
+from twin.evaluation.accuracy import evaluation_pieces
 from twin.fitting.fan_evidence import FanEvidence, acceleration_of, evidence_of_fans
 from twin.fitting.filtering import Basis
 from twin.fitting.identification import Identification
+from twin.fitting.thinning import coarser, thinning_factor
 from twin.fitting.training import data_scaling
 from twin.models.model import OdeModel
 from twin.models.network import Scaling
@@ -66,6 +68,10 @@ def model_uncertainty(
     typical_s = float(np.median(identification.time_constant_s))
     basis = _cosines(scale)
     least_rad_s, stands_below_rad_s = (share * scale.speed_scale_rad_s for share in (LEAST_NOISE, STANDS_BELOW))
+    if thinning_factor(evaluation_pieces(runs), float(identification.time_constant_s.max())) > 1:
+        runs, acting_runs = (
+            [coarser(piece, typical_s) for piece in evaluation_pieces(of)] for of in (runs, acting_runs)
+        )
     evidence = evidence_of_fans(
         model, parameters, runs, acting_runs, basis, 1.0 / typical_s, least_rad_s, stands_below_rad_s
     )

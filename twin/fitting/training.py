@@ -8,6 +8,8 @@ iterations instead of thousands, because the model is small enough for second-or
 2. The same until it no longer improves.
 3. The free run itself, over stretches as long as practical, from their measured speeds.
 
+The readings of many fans are thinned for all this (twin.fitting.thinning), and the last iterations use all of them.
+
 Where several networks are asked for, as many of the best starts go on, each by itself, and the model is the mean of
 those that end about as well as the best (twin.fitting.mean_model): then hardly anything depends on the seed.
 
@@ -16,6 +18,7 @@ the training runs where none are given. The best one is kept. The untrained netw
 physics) is a candidate. Training stops when held-out runs no longer improve.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
@@ -37,6 +40,7 @@ from twin.fitting.identification import Identification, inertia_anchor
 from twin.fitting.initial_weights import PLACEMENTS, initial_weights
 from twin.fitting.mean_model import mean_model
 from twin.fitting.reading_errors import counts, robust_scale
+from twin.fitting.thinning import thinning_factor, windows_of
 from twin.fitting.trajectories import MAX_SAMPLES, cut_into_trajectories, practical_samples, stretch_samples
 from twin.models.model import NetworkOde
 from twin.models.network import Scaling
@@ -51,6 +55,7 @@ SHORT_STRETCH_TIME_CONSTANTS = 10.0
 STARTS_OF_NETWORK, START_ITERATIONS, START_SAMPLES = 4, 5, 30_000
 MOST_NETWORKS = PLACEMENTS // STARTS_OF_NETWORK
 SHORT_SHARE = 0.75
+LAST_STEPS, LAST_ITERATIONS = 4, 20  # of many fans, on all samples; a step that is rejected costs little
 TOLERANCE = 1e-4
 ABOUT_AS_WELL = 1.03
 """a network whose free run has a larger loss, relative to that of the best one, is left out of the mean"""
@@ -106,8 +111,14 @@ def train_network(
         for number, start in enumerate(starts[:networks])
     ]
     least = min(one.best_loss for one in trained)
-    kept = [training.model_of(one.best) for one in trained if one.best_loss <= ABOUT_AS_WELL * least]
-    return *mean_model(kept), sum(one.iterations for one in trained)
+    kept = [one.best for one in trained if one.best_loss <= ABOUT_AS_WELL * least]
+    iterations = sum(one.iterations for one in trained)
+    if training.is_thinned:
+        last = [
+            training.on_all_samples(best, _numbered(progress, number, len(kept))) for number, best in enumerate(kept)
+        ]
+        kept, iterations = [best for best, _ in last], iterations + sum(count for _, count in last)
+    return *mean_model([training.model_of(best) for best in kept]), iterations
 
 
 def _numbered(progress: Progress, number: int, count: int) -> Progress:
@@ -126,19 +137,23 @@ class _Training:
         physics: Physics,
         prior_std: float,
     ) -> None:
+        slowest_s = float(identification.time_constant_s.max())
         self._model = model
-        self._pieces = evaluation_pieces(runs)
-        self._judged_runs, self._held_out = validation_runs or runs, bool(validation_runs)
+        self._all_pieces = evaluation_pieces(runs)
+        factor = thinning_factor(self._all_pieces, slowest_s)
+        self._pieces, self.is_thinned = windows_of(self._all_pieces, slowest_s), factor > 1
+        self._held_out = bool(validation_runs)
+        self._judged = windows_of(evaluation_pieces(validation_runs), slowest_s) if validation_runs else self._pieces
         self._identification = identification
         self._top_speed_rad_s = identification.top_speed_rad_s
         period_s = min(piece.median_period_s for piece in self._pieces)
-        short = stretch_samples(float(identification.time_constant_s.max()), period_s, SHORT_STRETCH_TIME_CONSTANTS)
-        self._stretches = cut_into_trajectories(self._pieces, short)
+        self._short = stretch_samples(slowest_s, period_s, SHORT_STRETCH_TIME_CONSTANTS)
+        self._stretches = cut_into_trajectories(self._pieces, self._short)
         self._physics = fitted_unknowns(identification.parameters, self._top_speed_rad_s)
         self._free = np.full(self._physics.shape, physics == "refined")
         # A lag that identification has not found stays out of the model.
         self._free[:, LAG] &= identification.parameters[:, LAG] > 0.0
-        pull = inertia_anchor(sum(piece.samples for piece in self._pieces))
+        pull = inertia_anchor(sum(piece.samples for piece in self._pieces) / factor)
         self._prior = Prior(PRIOR_PRECISION, pull, self._physics, _network_prior(model, identification, prior_std))
 
     def starts(self, rng: np.random.Generator, count: int, progress: Progress) -> list[Unknowns]:
@@ -197,12 +212,44 @@ class _Training:
         parameters = physical_parameters(unknowns.physics, self._top_speed_rad_s)
         return self._model.with_theta(unknowns.weights), parameters
 
+    def on_all_samples(self, best: Unknowns, progress: Progress) -> tuple[Unknowns, int]:
+        """The last iterations of a training on windows, and their number; none where its network stayed silent.
+
+        Windows say little of the physics of each fan. Their result is kept without asking which free run is best:
+        those of the windows would speak for what was fitted to them.
+        """
+        if not np.any(best.weights):
+            return best, 0
+
+        steps = itertools.count(1)
+
+        def iteration_done(_iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
+            step = next(steps)
+            progress("training on all samples", step, LAST_STEPS, rmse_rad_s)
+            return step == LAST_STEPS
+
+        pull = inertia_anchor(sum(piece.samples for piece in self._all_pieces))
+        prior = replace(self._prior, physics=pull, limits_steps=True)
+        fit = fit_free_run(
+            self._model.with_theta(best.weights),
+            best.physics,
+            self._top_speed_rad_s,
+            cut_into_trajectories(self._all_pieces, self._short),
+            free=self._free,
+            prior=prior,
+            max_iterations=LAST_ITERATIONS,
+            tolerance=TOLERANCE,
+            with_errors=True,
+            iteration_done=iteration_done,
+        )
+        return fit.point.unknowns, fit.iterations
+
     def _best_free_run(self, max_iterations: int, progress: Progress) -> "_BestFreeRun":
         untrained = Unknowns(np.zeros_like(self._model.network.theta), self._physics, np.zeros(0))
         return _BestFreeRun(
             self._model,
             untrained,
-            self._judged_runs,
+            self._judged,
             self._held_out,
             self._top_speed_rad_s,
             max_iterations,
@@ -232,13 +279,12 @@ class _BestFreeRun:
         self,
         model: NetworkOde,
         untrained: Unknowns,
-        runs: Sequence[Run],
+        pieces: Sequence[Run],
         held_out: bool,
         top_speed_rad_s: Array,
         max_iterations: int,
         progress: Progress,
     ) -> None:
-        pieces = evaluation_pieces(runs)
         whole = max(piece.samples for piece in pieces)
         self.data = cut_into_trajectories(pieces, practical_samples(pieces, whole))
         nothing = Prior(0.0, np.zeros(len(PARAMETER_NAMES)), np.zeros((len(top_speed_rad_s), len(PARAMETER_NAMES))))

@@ -1,8 +1,8 @@
-"""Linear recursions x[k] = factor[k-1] x[k-1] + forcing[k], all samples in one call of LAPACK.
+"""Linear recursions x[k] = factor[k-1] x[k-1] + forcing[k] of many signals side by side.
 
-A recursion of order one is a lower bidiagonal system of equations. Solved by substitution (dtbtrs) it costs what the
-recursion costs, without a Python step per sample. Filters, sensitivities and Newton steps of a free run are all of
-this kind.
+Filters, sensitivities and Newton steps of a free run are all of this kind. Many signals go from sample to sample
+together. Few would cost a Python step for each sample: they are solved as what a recursion of order one is, a lower
+bidiagonal system of equations, in one call of LAPACK (dtbtrs). Both do the same multiplications and additions.
 """
 
 import numpy as np
@@ -12,13 +12,32 @@ from twin.runs import Array
 
 (dtbtrs,) = get_lapack_funcs(("tbtrs",), dtype=np.float64)
 
+MANY_SIGNALS = 128
+"""from which a Python step for each sample costs less than the substitution"""
+
 
 def linear_recursion(factor: Array, forcing: Array) -> Array:
     """x (n, batch) or (n, batch, P), with x[0] = forcing[0].
 
     factor: (n - 1, batch), from each sample to the next. forcing: (n, batch) or (n, batch, P). A recursion that grows
-    beyond all numbers gives infinities or NaN, not an exception, and NaN in the columns after it, too.
+    beyond all numbers gives infinities or NaN, not an exception; of few signals also in the columns after it.
     """
+    many = forcing[0].size >= MANY_SIGNALS
+    return _sample_by_sample(factor, forcing) if many else _as_one_system(factor, forcing)
+
+
+def _sample_by_sample(factor: Array, forcing: Array) -> Array:
+    solution = np.empty_like(forcing, order="C")
+    solution[0] = forcing[0]
+    factors = factor.reshape(*factor.shape, *(1,) * (forcing.ndim - factor.ndim))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(1, len(forcing)):
+            np.multiply(factors[k - 1], solution[k - 1], out=solution[k])
+            solution[k] += forcing[k]
+    return solution
+
+
+def _as_one_system(factor: Array, forcing: Array) -> Array:
     samples, batch = forcing.shape[:2]
     # All columns together form one system: the factor between the last row of one and the first of the next is zero.
     bands = np.zeros((2, batch, samples))

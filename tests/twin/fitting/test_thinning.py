@@ -1,0 +1,107 @@
+"""Many fans are trained on windows of their runs and on all of their readings in the end; few fans as ever."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.support import fan_data
+from twin.build import evaluate, train_twin
+from twin.finishing import TrainedTwin
+from twin.fitting import thinning, training
+from twin.fitting.free_run_fit import fit_free_run
+from twin.fitting.thinning import coarser, thinning_factor, windows_of
+from twin.fitting.trajectories import Trajectories
+from twin.models.recursion import linear_recursion
+from twin.runs import Run
+
+TIME_CONSTANT_S = 0.3
+
+
+def tray(fans: int, seconds: float) -> Run:
+    """Fans at 100 Hz whose readings are all different."""
+    samples = round(100.0 * seconds)
+    readings = np.arange(float(samples * fans)).reshape(samples, fans)
+    return Run("tray", np.arange(samples) / 100.0, np.zeros((samples, fans)), readings)
+
+
+def test_windows_show_every_moment_and_every_fan_and_few_fans_are_not_thinned() -> None:
+    pieces = [tray(20, 40.0), tray(20, 90.0)]
+    factor = thinning_factor(pieces, TIME_CONSTANT_S)
+    assert factor == 20 // thinning.LEAST_FANS, "as many fans as are needed in each window"
+    windows = windows_of(pieces, TIME_CONSTANT_S)
+    shown = np.concatenate([np.isfinite(window.speed_rad_s) for window in windows])
+    assert sum(window.samples for window in windows) == sum(piece.samples for piece in pieces)
+    assert np.all(shown.sum(axis=1) == thinning.LEAST_FANS)
+    assert np.all(np.abs(shown.mean(axis=0) - 1.0 / factor) < 0.1), "every fan in its share of them"
+    whole = np.concatenate([piece.speed_rad_s for piece in pieces])
+    np.testing.assert_array_equal(np.concatenate([each.speed_rad_s for each in windows])[shown], whole[shown])
+    assert thinning_factor([tray(64, 40.0)], TIME_CONSTANT_S) == 64 * 4000 // thinning.ENOUGH_READINGS
+    for few in (tray(8, 80.0), tray(9, 1000.0), tray(64, 15.0), tray(64, 5.0)):
+        assert windows_of([few], TIME_CONSTANT_S) == [few]
+
+
+@pytest.fixture
+def fits_of_networks(monkeypatch: pytest.MonkeyPatch) -> list[Trajectories]:
+    """The data of each fit of a network, as they come."""
+    data: list[Trajectories] = []
+
+    def noted(model, physics, top_speed_rad_s, trajectories, **settings):
+        data.append(trajectories)
+        return fit_free_run(model, physics, top_speed_rad_s, trajectories, **settings)
+
+    monkeypatch.setattr(training, "fit_free_run", noted)
+    return data
+
+
+def test_a_network_comes_from_windows_and_the_physics_of_each_fan_from_all_its_readings(
+    monkeypatch: pytest.MonkeyPatch, fits_of_networks: list[Trajectories]
+) -> None:
+    run, then = (fan_data.rough_run(seed, 20.0, fans=12, low=25.0) for seed in (1, 2))
+
+    def trained() -> tuple[TrainedTwin, list[int], set[str]]:
+        parts: set[str] = set()
+        fits_of_networks.clear()
+        twin = train_twin([run], [], "hybrid", name="x", max_iterations=20, progress=lambda part, *_: parts.add(part))
+        return twin, [int(data.compared.sum()) for data in fits_of_networks], parts
+
+    def error_and_uncertainty(twin: TrainedTwin) -> tuple[float, float]:
+        table = twin.card.model_uncertainty
+        assert table is not None
+        return evaluate(twin, [then]).pooled.rmse_rad_s, float(np.median(table.seen_std_rad_s))
+
+    whole, used, parts = trained()
+    assert used[-1] == run.speed_rad_s.size
+    assert "training on all samples" not in parts
+    monkeypatch.setattr(thinning, "ENOUGH_READINGS", run.speed_rad_s.size // 3)
+    monkeypatch.setattr(thinning, "LEAST_FANS", 4)
+    thinned, used, parts = trained()
+    assert max(used[:-1]) <= 0.4 * run.speed_rad_s.size
+    assert used[-1] == run.speed_rad_s.size
+    assert "training on all samples" in parts
+    (error, std), (of_thinned, std_of_thinned) = error_and_uncertainty(whole), error_and_uncertainty(thinned)
+    assert of_thinned < 1.005 * error, "4 % more by windows alone, 1 % if the priors do not limit the steps"
+    assert 0.8 < std_of_thinned / std < 1.25
+
+
+def test_coarser_samples_lie_on_the_course_of_the_speed_and_lose_no_command() -> None:
+    run = fan_data.rough_run(1, 20.0, fans=2)
+    ramp = np.column_stack((3.0 * run.t_s, -run.t_s))
+    ramp[100:120, 1] = np.nan
+    coarse = coarser(replace(run, speed_rad_s=ramp), TIME_CONSTANT_S)
+    assert coarse.median_period_s == pytest.approx(0.07), "the odd number of samples in a quarter of it"
+    known = np.isfinite(coarse.speed_rad_s[:, 1])
+    np.testing.assert_allclose(coarse.speed_rad_s[:, 0], 3.0 * coarse.t_s)
+    np.testing.assert_allclose(coarse.speed_rad_s[known, 1], -coarse.t_s[known], atol=0.03)
+    assert 2 <= np.count_nonzero(~known) <= 3
+    between = (run.t_s > coarse.t_s[0] - 1e-9) & (run.t_s < coarse.t_s[-1] + 0.065)
+    np.testing.assert_allclose(0.07 * coarse.command.sum(axis=0), 0.01 * run.command[between].sum(axis=0))
+    assert coarser(run, 0.1) is run
+
+
+def test_a_recursion_of_many_signals_is_that_of_each() -> None:
+    rng = np.random.default_rng(1)
+    factor, forcing = rng.uniform(0.5, 1.0, (99, 3)), rng.normal(size=(100, 3, 50))
+    together = linear_recursion(factor, forcing)
+    alone = np.stack([linear_recursion(factor, forcing[..., each]) for each in range(50)], axis=-1)
+    np.testing.assert_allclose(together, alone, rtol=1e-12, atol=1e-12)
