@@ -6,6 +6,7 @@ of the stages, message by message. The library reads the same file and decodes n
 
 from __future__ import annotations
 
+import shutil
 import sys
 import tempfile
 import time
@@ -100,7 +101,8 @@ def recording(folder: Path, seconds: float) -> Path:
     )
     assert done.returncode == 0, done.stderr
     path = folder / "recording.mcap"
-    stages = Stages(load_config(DEMO / "demo.toml"), path, 10**18)
+    site = shutil.copytree(DEMO, folder / "site")  # its stages leave files there
+    stages = Stages(load_config(site / "demo.toml"), path, 10**18)
     for entry in read_recording(recording):
         assert isinstance(entry.message, Raw)
         for k, t_ns in enumerate(entry.message.host_receive_t_ns.tolist()):
