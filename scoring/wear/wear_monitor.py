@@ -10,6 +10,7 @@ See docs/explanation/wear.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -30,7 +31,9 @@ UNITS = {"balance": "command", "drag": "relative", "friction": "command", "gain"
 TURN_NS = NS_PER_S
 """how long a fan is due after the one before it: points of all fans of a large tray at once would hold up its scores"""
 ATTEMPT_PERIOD_TURNS = 10
-"""how often a fan that is due for a point is tried"""
+"""how often a fan that is due for a point is tried, at most"""
+FANS_OF_TURN = 4
+"""that are tried at the same time, at most: in large trays a fan is tried less often"""
 MIN_FORECAST_DAYS = 1.0
 """no forecast before: weather and warming bearings change more within a day than wear does"""
 REPORT_WITHIN_DAYS = 7.0
@@ -62,6 +65,7 @@ class WearMonitor:
         self._diagnoser = diagnoser
         self._every_ns = round(every_s * NS_PER_S)
         self._unit = command_unit
+        self._period_turns = max(ATTEMPT_PERIOD_TURNS, math.ceil(len(healthy) / FANS_OF_TURN))
         self._last_turn = 0
         self._disturbed_t_ns = np.full(len(healthy), NEVER_NS)
         """(fans,) the last sample that no point may look back on"""
@@ -93,7 +97,7 @@ class WearMonitor:
         fans, begin = np.arange(len(self._fans)), 0
         for row in np.flatnonzero(np.diff(turns, prepend=self._last_turn) > 0).tolist():
             at_ns, turn = int(t_ns[row]), int(turns[row])
-            has_turn = (turn - fans) // ATTEMPT_PERIOD_TURNS > (self._last_turn - fans) // ATTEMPT_PERIOD_TURNS
+            has_turn = (turn - fans) // self._period_turns > (self._last_turn - fans) // self._period_turns
             self._last_turn = turn
             self._see_disturbances(t_ns[begin : row + 1], disturbed[begin : row + 1])
             begin = row + 1

@@ -57,6 +57,9 @@ MOST_NETWORKS = PLACEMENTS // STARTS_OF_NETWORK
 SHORT_SHARE = 0.75
 LAST_STEPS, LAST_ITERATIONS = 4, 20  # of many fans, on all samples; a step that is rejected costs little
 TOLERANCE = 1e-4
+MUCH_WORSE = 2.0
+"""a fit to all samples whose free run over the windows has a larger loss, relative to that before, is not kept: the
+initial speeds of its stretches may have hidden an instability"""
 ABOUT_AS_WELL = 1.03
 """a network whose free run has a larger loss, relative to that of the best one, is left out of the mean"""
 MAX_STALLED_ITERATIONS = 10
@@ -95,7 +98,8 @@ def train_network(
 ) -> tuple[NetworkOde, Array, int]:
     """Train the model's network. Returns the trained model, the parameters (fans, 4) and the iterations taken.
 
-    max_iterations: of each network; those of the starts come before and are not counted. physics:
+    max_iterations: of each network; those of the starts come before and are not counted, the few on all samples of many
+    fans come on top. physics:
     "refined" fits J, alpha, C_D and the lag of each fan along with the network (of a tacho that counts alpha and C_D
     only); "fixed" leaves them as they were identified, as published.
     prior_std: how far the network's acceleration may be from the physics where there are no data, in units of its scale
@@ -111,14 +115,12 @@ def train_network(
         for number, start in enumerate(starts[:networks])
     ]
     least = min(one.best_loss for one in trained)
-    kept = [one.best for one in trained if one.best_loss <= ABOUT_AS_WELL * least]
-    iterations = sum(one.iterations for one in trained)
+    kept = [one for one in trained if one.best_loss <= ABOUT_AS_WELL * least]
+    found, iterations = [one.best for one in kept], sum(one.iterations for one in trained)
     if training.is_thinned:
-        last = [
-            training.on_all_samples(best, _numbered(progress, number, len(kept))) for number, best in enumerate(kept)
-        ]
-        kept, iterations = [best for best, _ in last], iterations + sum(count for _, count in last)
-    return *mean_model([training.model_of(best) for best in kept]), iterations
+        last = [training.on_all_samples(one, _numbered(progress, number, len(kept))) for number, one in enumerate(kept)]
+        found, iterations = [unknowns for unknowns, _ in last], iterations + sum(count for _, count in last)
+    return *mean_model([training.model_of(unknowns) for unknowns in found]), iterations
 
 
 def _numbered(progress: Progress, number: int, count: int) -> Progress:
@@ -212,12 +214,13 @@ class _Training:
         parameters = physical_parameters(unknowns.physics, self._top_speed_rad_s)
         return self._model.with_theta(unknowns.weights), parameters
 
-    def on_all_samples(self, best: Unknowns, progress: Progress) -> tuple[Unknowns, int]:
+    def on_all_samples(self, trained: "_BestFreeRun", progress: Progress) -> tuple[Unknowns, int]:
         """The last iterations of a training on windows, and their number; none where its network stayed silent.
 
-        Windows say little of the physics of each fan. Their result is kept without asking which free run is best:
-        those of the windows would speak for what was fitted to them.
+        Windows say little of the physics of each fan. Their result is kept unless its free run is much worse: free runs
+        over the windows speak for what was fitted to them.
         """
+        best = trained.best
         if not np.any(best.weights):
             return best, 0
 
@@ -242,7 +245,8 @@ class _Training:
             with_errors=True,
             iteration_done=iteration_done,
         )
-        return fit.point.unknowns, fit.iterations
+        found = fit.point.unknowns
+        return found if trained.loss_of(found) <= MUCH_WORSE * trained.best_loss else best, fit.iterations
 
     def _best_free_run(self, max_iterations: int, progress: Progress) -> "_BestFreeRun":
         untrained = Unknowns(np.zeros_like(self._model.network.theta), self._physics, np.zeros(0))
@@ -301,16 +305,20 @@ class _BestFreeRun:
             physical.learn_errors(physical.evaluate(start, self.guess_rad_s))
             self.problem.errors = physical.errors
         self.problem.scale_rad_s = robust_scale(self._free_run(untrained).residual, self.data)
-        self.best, self.best_loss = untrained, float(self._free_run(untrained).cost.sum())
+        self.best, self.best_loss = untrained, self.loss_of(untrained)
         self.stalled_iterations = 0
 
     def consider(self, unknowns: Unknowns) -> None:
         """Keep these unknowns if the robust loss of their free run from the measured start is the smallest so far."""
-        loss = float(self._free_run(unknowns).cost.sum())
+        loss = self.loss_of(unknowns)
         if loss < self.best_loss:
             self.best, self.best_loss, self.stalled_iterations = unknowns, loss, 0
         else:
             self.stalled_iterations += 1
+
+    def loss_of(self, unknowns: Unknowns) -> float:
+        """The robust loss of the free run from the measured start; NaN or infinite where it diverges."""
+        return float(self._free_run(unknowns).cost.sum())
 
     def iteration_done(self, iteration: int, unknowns: Unknowns, rmse_rad_s: float) -> bool:
         """See free_run_fit.IterationDone."""
