@@ -143,11 +143,11 @@ def test_wear_goes_on_in_a_replay_as_it_did_when_a_twin_took_over(tmp_path: Path
     site = Site(tmp_path, 7, raw_samples=4, learns=True, scorer_settings=settings)
     model = small_hybrid(1)
     site.put_in_force("tray1-1", write_twin(tmp_path / "1.onnx", model, fans=FANS, name="tray1-1").read_bytes())
-    site.run(2300)
+    site.run(2400)
     balance = asdict(made_up_card(model, FANS).balance) | {"friction": [1.0] * FANS}
     second = write_twin(tmp_path / "2.onnx", model, fans=FANS, name="tray1-2", balance=balance)
     site.put_in_force("tray1-2", second.read_bytes())
-    site.run(2300)
+    site.run(2400)
     recording, replayed = site.finished(), tmp_path / "replayed.mcap"
     with open_replay_input([recording], None, (), None) as replay_input:
         (tray,) = rescore(replay_input, replayed, verify=True)
