@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,7 +17,7 @@ from schemas.messages import Action, Alarm, Header, Prediction, ScorerSnapshot, 
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.torque_balance import BalanceModel, TorqueBalance
 from scoring.wear.slow_change import WEAR_HINT
-from scoring.wear.wear_monitor import ATTEMPT_PERIOD_TURNS
+from scoring.wear.wear_monitor import ATTEMPT_PERIOD_TURNS, FANS_OF_TURN, WearMonitor
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
     CALIBRATION,
@@ -303,6 +304,27 @@ def test_the_points_of_a_tray_are_taken_one_second_after_the_other() -> None:
     one.step(burst(0, seconds=60.0))
     first_s = first_point_s(HEALTHY, one)
     assert first_s is not None and first_point_s(WORN, one) == pytest.approx(first_s + 1.0)
+
+
+def test_in_a_large_tray_few_fans_are_tried_at_a_time_and_each_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[tuple[int, int]] = []
+
+    def in_vain(_monitor: WearMonitor, fan: int, at_ns: int, *_of_fan: float, held: bool) -> bool:
+        tried.append((at_ns, fan))
+        return held
+
+    monkeypatch.setattr(WearMonitor, "_add_point", in_vain)
+    fans, seconds = 100, 76
+    healthy: Any = [None] * fans
+    nobody: Any = None
+    t_ns = EPOCH_NS + np.arange(seconds) * 10**9
+    known, nowhere = np.zeros((seconds, fans)), np.zeros((seconds, fans), np.bool_)
+    monitor = WearMonitor(healthy, nobody, 600.0, "1")
+    for rows in (slice(0, 33), slice(33, seconds)):
+        of = known[rows], known[rows], nowhere[rows], known[0]
+        monitor.update(t_ns[rows], EPOCH_NS - 600 * 10**9, ~nowhere[rows], nowhere[rows], *of)
+    assert max(Counter(at_ns for at_ns, fan in tried if at_ns > EPOCH_NS).values()) == FANS_OF_TURN
+    assert set(Counter(fan for at_ns, fan in tried if at_ns > EPOCH_NS).values()) == {3}, "every 25 s"
 
 
 def test_a_fan_gets_a_point_once_its_disturbance_is_out_of_the_window() -> None:
