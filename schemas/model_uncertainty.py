@@ -102,7 +102,8 @@ class ModelUncertainty:
         cell = self._first_cell + row.before * (len(self.columns) - 1) + column.before
         if not self.seen_std_rad_s or not self._has_unseen.take(cell).any():
             return np.zeros(speed_rad_s.shape)  # as nearly always
-        return np.sqrt(np.maximum(self._between(row, column) ** 2 - self._seen_squared, 0.0))
+        unseen = np.sqrt(np.maximum(self._between(row, column) ** 2 - self._seen_squared, 0.0))
+        return np.where(self._has_unseen.take(cell), unseen, 0.0)  # whatever the other fans and samples are
 
     def _places(self, speed_rad_s: Array, command: Array) -> tuple[_Place, _Place]:
         """On the axes of rows and of columns."""

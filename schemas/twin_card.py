@@ -10,7 +10,8 @@ The graph beside it (float64) takes `state` (fans, n_state), `command` (n, fans)
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
@@ -195,6 +196,12 @@ class DriveCard:
     kick_s: Positive
     rest_s: Positive
     lowest_command: tuple[NotNegative, ...]
+
+    def of_fans(self, rows: Sequence[int]) -> DriveCard:
+        """That of the fans in these rows; a single one for all fans is returned as it is."""
+        if len(self.lowest_command) == 1:
+            return self
+        return replace(self, lowest_command=tuple(self.lowest_command[row] for row in rows))
 
     def raised(self, command: Array) -> Array:
         """(n, fans) the commands with those on the plateau raised to its end; the torque balance is taken with them.

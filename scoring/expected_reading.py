@@ -17,6 +17,7 @@ import numpy as np
 
 from schemas.messages import Array
 from schemas.tacho import Tacho
+from scoring.column_state import ColumnState
 
 
 class ExpectedReading:
@@ -25,9 +26,18 @@ class ExpectedReading:
     def __init__(self, tachos: Sequence[Tacho], period_s: float) -> None:
         """tachos: one for each fan. period_s: of the grid."""
         self._means = [
-            (fans, _WindowMean(len(fans), tacho.window_s, tacho.delay_s, period_s), _Range(tacho.held_s / period_s))
+            (
+                fans,
+                _WindowMean(len(fans), tacho.window_s, tacho.delay_s, period_s),
+                _Range(len(fans), tacho.held_s / period_s),
+            )
             for tacho, fans in _averaging(tachos)
         ]
+
+    @property
+    def states(self) -> list[ColumnState]:
+        """All that is kept of each fan that has a tacho which averages."""
+        return [state for _, *states in self._means for state in states]
 
     def start(self, fans: Array, speed_rad_s: Array) -> None:
         """Start again for some fans, (fans,) of bool, as if each had turned at this speed, (fans,), for long."""
@@ -50,7 +60,7 @@ class ExpectedReading:
         return middle, half_range
 
 
-class AveragedCommand:
+class AveragedCommand(ColumnState):
     """The command of each fan, averaged over the window of its tacho and over the unknown age of a reading."""
 
     def __init__(self, tachos: Sequence[Tacho], period_s: float) -> None:
@@ -69,6 +79,15 @@ class AveragedCommand:
         self._known_rows = np.zeros(len(tachos), np.int64)
         """(fans,) for how many samples in a row the command has been known"""
 
+    @property
+    def states(self) -> list[ColumnState]:
+        """All that is kept of each fan."""
+        return [self, *(state for _, *states in self._means for state in states)]
+
+    def columns(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {"known_rows": self._known_rows}
+
     def reset(self) -> None:
         """Start again: samples are missing."""
         self._known_rows[:] = 0
@@ -86,7 +105,7 @@ class AveragedCommand:
         return np.where(known_rows > self._memory_rows, averaged, np.nan)
 
 
-class _WindowMean:
+class _WindowMean(ColumnState):
     """The mean of the last `window_s`, `delay_s` ago, of columns that are linear between samples."""
 
     def __init__(self, columns: int, window_s: float, delay_s: float, period_s: float) -> None:
@@ -96,6 +115,9 @@ class _WindowMean:
         self._integral = np.zeros((self.depth + 1, columns))
         """at the last samples, in units times samples; it grows as long as the stage runs, a double is fine enough"""
         self._last = np.zeros(columns)
+
+    def columns(self) -> dict[str, Array]:
+        return {"integral": self._integral, "last": self._last}
 
     def start(self, fans: Array, value: Array) -> None:
         past = np.arange(-self.depth, 1.0)[:, np.newaxis] * value
@@ -113,21 +135,22 @@ class _WindowMean:
         )
 
 
-class _Range:
+class _Range(ColumnState):
     """The smallest and the largest of the last `length` samples of columns that are linear between samples."""
 
-    def __init__(self, length: float) -> None:
+    def __init__(self, columns: int, length: float) -> None:
         self._length = length
-        self._past = np.zeros((0, 0))
+        self._past = np.full((math.ceil(length) + 1, columns), np.nan)
+        """NaN before the first sample"""
+
+    def columns(self) -> dict[str, Array]:
+        return {"past": self._past}
 
     def start(self, fans: Array, value: Array) -> None:
-        if not len(self._past):
-            self._past = np.zeros((math.ceil(self._length) + 1, len(value)))
         self._past = np.where(fans, value, self._past)
 
     def update(self, values: Array) -> tuple[Array, Array]:
-        if not len(self._past):
-            self.start(np.ones(values.shape[1], np.bool_), values[0])
+        self.start(np.isnan(self._past[-1]), values[0])
         both = np.vstack((self._past, values))
         oldest = _ago(both, len(values), self._length)
         rows = np.lib.stride_tricks.sliding_window_view(both, math.floor(self._length) + 1, axis=0)[-len(values) :]

@@ -19,6 +19,7 @@ from schemas.messages import Array
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 from scoring.baseline.movement import Movement
+from scoring.column_state import ColumnState
 from scoring.detectors.detector import Detector, DetectorContext, Signal
 from scoring.detectors.motion import HealthyMotion, Motion
 from scoring.detectors.smoothed import SmoothedSettings
@@ -168,6 +169,39 @@ class FanScorer:
                 yield slice(first + begin, first + begin + rows)
                 begin += rows
             self._complete(piece)
+
+    def is_interval_over(self, t_ns: Array) -> bool | None:
+        """Of a block of the times t_ns, (n,): whether it begins a new interval of the baselines. None: an interval
+        ends within it, or no fan is commissioned yet.
+        """
+        if self.origin_t_ns is None or not all(residual.is_commissioned for residual in self.residuals.values()):
+            return None
+        first, last = (self._interval_of(int(t)) for t in (t_ns[0], t_ns[-1]))
+        return first != self._intervals.interval if first == last else None
+
+    def begin_block(self, t_ns: int, *, is_interval_over: bool) -> None:
+        """Let an interval begin at t_ns, or go on from there."""
+        self.origin_t_ns, self._intervals.interval = t_ns, -1 if is_interval_over else 0
+
+    def skip_block(self, t_ns: int) -> None:
+        """A block up to t_ns has been scored elsewhere, and the states of this one are those after it."""
+        self._intervals.interval = self._interval_of(t_ns)
+
+    def _interval_of(self, t_ns: int) -> int:
+        assert self.origin_t_ns is not None
+        return (t_ns - self.origin_t_ns) // self._intervals.interval_ns
+
+    @property
+    def states(self) -> list[ColumnState]:
+        """All that is kept of each fan, apart from what fans share."""
+        return [
+            self._intervals,
+            self._motion,
+            *(self._healthy_motion.states if self._healthy_motion else ()),
+            *(state for state in (self._movement, self._gaps) if state),
+            *self.detectors.values(),
+            *(state for residual in self.residuals.values() for state in residual.states),
+        ]
 
     def learn_nothing(self, fans: Array) -> None:
         """See IntervalScorer."""

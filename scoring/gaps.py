@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.messages import Array
-from scoring.detectors.state import ColumnState
-
-NEVER_NS = -(1 << 62)
+from scoring.column_state import NEVER_NS, ColumnState
 
 
 class Gaps(ColumnState):

@@ -17,8 +17,8 @@ from schemas.messages import Array
 from scoring.baseline.baseline import MIN_STEADY_READINGS
 from scoring.baseline.intervals import Intervals, first_end
 from scoring.baseline.movement import Movement
+from scoring.column_state import ColumnState
 from scoring.detectors.detector import Detector, DetectorInput, Signal
-from scoring.detectors.state import restore_column
 from scoring.piece import Piece
 from scoring.residual import Residual
 from scoring.residual_samples import SampledResidual, ScoredResidual
@@ -28,7 +28,7 @@ PlacedDetectors = Sequence[tuple[int, Detector]]
 """Detectors, and their places in the table."""
 
 
-class IntervalScorer:
+class IntervalScorer(ColumnState):
     """Scores the residuals of one tray's fans; keeps what the present interval is worth to the baselines."""
 
     def __init__(
@@ -54,7 +54,8 @@ class IntervalScorer:
         self._counts = counts
         self._held_ns = held_ns
         self._movement = movement
-        self._interval = 0
+        self.interval = 0
+        """the number of the present one"""
         self._below_half_limit = np.ones(fans, np.bool_)
         """(fans,) whether every statistic stayed below half of its limit in the present interval so far"""
         self._within_limit = np.ones(fans, np.bool_)
@@ -66,13 +67,13 @@ class IntervalScorer:
         numbers: (rows left,) the interval of each. spans: of several, as far as they can be scored together. highest:
         the last of them is the first in which a score exceeds it; None: whatever they are.
         """
-        if numbers[0] != self._interval:
+        if numbers[0] != self.interval:
             self._end_interval(piece.samples.period_ns)
         intervals = Intervals.of(numbers, self.interval_ns // piece.samples.period_ns)
         if len(intervals) > 1 and not (spans and self._only_refines(piece, slice(begin, begin + intervals.rows))):
             intervals = intervals.first(1)
         rows = self._score(piece, begin, intervals, highest)
-        self._interval = int(numbers[rows - 1])
+        self.interval = int(numbers[rows - 1])
         return rows
 
     def learn_nothing(self, fans: Array) -> None:
@@ -89,17 +90,16 @@ class IntervalScorer:
 
     def snapshot(self) -> dict[str, Any]:
         """The state as JSON can hold it."""
-        return {
-            "interval": self._interval,
-            "below_half_limit": self._below_half_limit.tolist(),
-            "within_limit": self._within_limit.tolist(),
-        }
+        return {"interval": self.interval, **super().snapshot()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a snapshot. Raises as ColumnState.restore does."""
-        for flags, name in ((self._below_half_limit, "below_half_limit"), (self._within_limit, "within_limit")):
-            restore_column(flags, name, state[name])
-        self._interval = int(state["interval"])
+        super().restore(state)
+        self.interval = int(state["interval"])
+
+    def columns(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {"below_half_limit": self._below_half_limit, "within_limit": self._within_limit}
 
     def _end_interval(self, period_ns: int) -> None:
         expected = self.interval_ns // period_ns

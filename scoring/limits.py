@@ -6,7 +6,7 @@ twin that was not calibrated has a limit on its smoothed speed residual only, fr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationError, field_validator, model_validator
@@ -94,13 +94,13 @@ class Limits(_Entry):
                 raise PydanticCustomError("unknown_detector", "{name}: there is no such detector", {"name": name})
         return {name: _settings_of(name, known[name], entries[name]) for name in known if name in entries}
 
-    def of(self, fans: range | None) -> Limits:
+    def of(self, fans: Sequence[int] | None) -> Limits:
         """Limits of a tray with some of the fans; None: of fans that the twin does not know one by one."""
 
         def part(of: HealthyResidual) -> HealthyResidual:
             offsets = of.fan_offsets.of(fans) if of.fan_offsets and fans is not None else None
             stds = of.low_frequency_std_of_fans
-            known = tuple(stds[fan] for fan in fans) if stds and fans is not None else ()
+            known = tuple(stds[fan % len(stds)] for fan in fans) if stds and fans is not None else ()
             return of.model_copy(update={"fan_offsets": offsets, "low_frequency_std_of_fans": known})
 
         return self.model_copy(update={"speed": part(self.speed), "balance": part(self.balance)})

@@ -18,6 +18,7 @@ from scoring.residual_samples import JoinedResidual, ResidualSamples, ScoredResi
 from scoring.samples import Samples
 from scoring.scored_block import Observation, ScoredBlock
 
+NO_STATISTIC = int(Statistic.NONE)
 NOTHING = np.zeros((0, 0))
 
 
@@ -83,7 +84,7 @@ class Piece:
             if row.comes_first:
                 largest = np.where(ratios[number] > 1.0, number, largest)
         statistics = np.array([row.statistic for row in self.table])
-        scores.statistic[:] = np.where(np.isnan(scores.score), Statistic.NONE, statistics[largest])
+        scores.statistic[:] = np.where(np.isnan(scores.score), NO_STATISTIC, statistics[largest])
         known, scored_now = np.zeros((2, *scores.score.shape), np.bool_)
         for source in in_use:
             known |= self.residuals[source].valid

@@ -12,8 +12,10 @@ from schemas.messages import Array
 from scoring.baseline.baseline import Baseline, BaselineState, IntervalSums
 from scoring.baseline.healthy_residual import FanOffsets
 from scoring.baseline.intervals import Intervals
+from scoring.baseline.joint_shared_offset import JointSharedOffset
 from scoring.baseline.shared_offset import LEAST_FANS, SharedOffset
 from scoring.baseline.speed_scaling import speed_scaling
+from scoring.column_state import ColumnState
 from scoring.detectors.detector import DetectorContext, Signal
 from scoring.detectors.deviation import smoothed_deviation
 from scoring.detectors.drift import DEFAULT_REFERENCE_SIGMAS, DriftSettings
@@ -60,8 +62,20 @@ class Residual:
                 reach_sigmas=healthy.baseline.adaptation_limit_sigmas,
                 compares_fast=compares_fast,
             )
+        self._sharing: SharedOffset | JointSharedOffset | None = self._shared
+        """the same; while several trays are scored in one pass, that of each"""
         self._shares_at_first = shares_at_first
         self._low_pass = LowPass(fans, self._smoothing_s)
+
+    def share_as(self, of_trays: Sequence[Residual]) -> None:
+        """Let the fans share what those of each of these trays share, which goes on there."""
+        shared = [each._shared for each in of_trays if each._shared]
+        self._sharing = JointSharedOffset(shared) if shared else None
+
+    @property
+    def states(self) -> tuple[ColumnState, ...]:
+        """All that is kept of each fan, apart from what fans share."""
+        return self.baseline, self._low_pass
 
     def context(self, fans: int, *, capped: bool) -> DetectorContext:
         """What the detectors of this residual are built with."""
@@ -106,14 +120,14 @@ class Residual:
         """Samples of the present interval and later ones. moving: (intervals, fans) see Movement; None: no fan."""
         baseline, scaling, commissioned = self.baseline, of.scaling, self._commissioned
         learned = of.valid & (of.seen | baseline.is_commissioning)
-        if self._shared is None:
+        if self._sharing is None:
             return SampledResidual(of, intervals, None, np.zeros(of.valid.shape), of.residual, learned)
         if self._shares_at_first and not commissioned.any():
             offset, known = of.residual, of.valid & of.seen
         else:
             offset, known = of.residual - baseline.commissioned * scaling, of.valid & commissioned & of.seen
-        over = self._shared.over(offset, of.speed_sigmas, known, intervals, commissioned, moving)
-        shared = intervals.spread(over.values[:, np.newaxis]) * of.speed_sigmas
+        over = self._sharing.over(offset, of.speed_sigmas, known, intervals, commissioned, moving)
+        shared = intervals.spread(over.values) * of.speed_sigmas
         return SampledResidual(of, intervals, over, shared, of.residual - shared, learned)
 
     def runs_up_to(self, sampled: SampledResidual) -> int:
@@ -138,7 +152,7 @@ class Residual:
             standardised=standardised.clip(-of.clip, of.clip),
             persistent=(standardised / persistent_std).clip(-of.clip, of.clip),
             shift=shift,
-            baseline=own + sampled.shared if self._shared else own,  # a sum would make -0.0 of older recordings 0.0
+            baseline=own + sampled.shared if self._sharing else own,  # a sum would make -0.0 of older recordings 0.0
             shared=sampled.shared,
             intervals=sampled.intervals,
             state=state,
@@ -172,8 +186,8 @@ class Residual:
     def take(self, sampled: SampledResidual, scored: ScoredResidual) -> None:
         """Go on in the last of the intervals."""
         self.baseline.take(scored.state, scored.sums)
-        if self._shared and sampled.over:
-            self._shared.take(sampled.over)
+        if self._sharing and sampled.over:
+            self._sharing.take(sampled.over)
 
     def joined(self, parts: Sequence[ScoredResidual]) -> JoinedResidual:
         """What was scored in successive parts."""
@@ -199,16 +213,21 @@ class Residual:
         few_readings: Array | None = None,
     ) -> None:
         """End the interval; see Baseline.end_interval."""
-        at_first = self._shares_at_first and not self._commissioned.any()
-        if self._shared:
-            is_known = self._shared.is_known
-            alone = self._shared.end_interval(samples, self._commissioned, below_half_limit, moving, at_first=at_first)
+        at_first = self._shares_at_first and not self.is_commissioned
+        if self._sharing:
+            is_known = self._sharing.is_known
+            alone = self._sharing.end_interval(samples, self._commissioned, below_half_limit, moving, at_first=at_first)
             below_half_limit = below_half_limit & ~alone
-            if at_first and self._shared.is_known and not is_known:
+            if at_first and self._sharing.is_known and not is_known:
                 within_limit = np.zeros_like(within_limit)  # this interval does not know yet what is shared
         self.baseline.end_interval(samples, within_limit, below_half_limit, moving, few_readings)
-        if self._shared and at_first and self._commissioned.any():
+        if self._shared and at_first and self.is_commissioned:
             self._shared.begin_from_here()
+
+    @property
+    def is_commissioned(self) -> bool:
+        """Whether a fan has a baseline to be measured against."""
+        return bool(self._commissioned.any())
 
     @property
     def _commissioned(self) -> Array:
@@ -230,9 +249,9 @@ class Residual:
     def _independent_intervals(self, state: BaselineState) -> Array:
         """The number of independent intervals whose mean would vary as much as baseline and shared part do."""
         own = self.baseline.independent_intervals(state)
-        if self._shared is None:
+        if self._sharing is None:
             return own
-        return own * self._shared.independent_intervals / (own + self._shared.independent_intervals)
+        return own * self._sharing.independent_intervals / (own + self._sharing.independent_intervals)
 
     def smooth(self, of: JoinedResidual, period_s: float) -> Array:
         """(n, fans) the low-passed residual less its baseline, sigma, as displayed; NaN where not scored."""

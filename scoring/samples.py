@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from schemas.messages import Array, InvalidReason, Prediction
 from scoring.detectors.detector import Signal
 from scoring.unseen_error import UnseenError
 
+NO_SPEED = int(InvalidReason.NO_SPEED)
 BALANCE_COUNTS = tuple(map(int, (InvalidReason.NONE, InvalidReason.WARMING_UP, InvalidReason.OUT_OF_RANGE)))
 IDLE = tuple(map(int, (InvalidReason.STOPPED, InvalidReason.STARTING)))
 NOT_ARRIVED = tuple(map(int, (InvalidReason.GAP, InvalidReason.STALE)))
@@ -64,8 +65,13 @@ class Samples:
 
     def rows(self, rows: slice) -> Samples:
         """Some of the samples."""
-        columns = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "period_ns"}
-        return Samples(period_ns=self.period_ns, **{name: column[rows] for name, column in columns.items()})
+        columns = {name: column[rows] for name, column in vars(self).items() if name != "period_ns"}
+        return Samples(period_ns=self.period_ns, **columns)
+
+    def fans(self, fans: slice) -> Samples:
+        """Those of some fans."""
+        columns = {name: column[:, fans] for name, column in vars(self).items() if name not in ("period_ns", "t_ns")}
+        return Samples(period_ns=self.period_ns, t_ns=self.t_ns, **columns)
 
 
 def samples_of(prediction: Prediction, unseen_error: UnseenError | None = None) -> Samples:
@@ -100,7 +106,7 @@ def samples_of(prediction: Prediction, unseen_error: UnseenError | None = None) 
         command=prediction.command,
         predicted_rad_s=prediction.predicted_speed_rad_s,
         idle=among(invalid_reason, *IDLE),
-        missing=invalid_reason == InvalidReason.NO_SPEED,
+        missing=invalid_reason == NO_SPEED,
         reading_missing=reading_missing_of(prediction),
         alive=arrived(invalid_reason),
     )

@@ -8,6 +8,13 @@ from schemas.messages import Array, FanState, InvalidReason, Prediction, Score
 from scoring.scored_block import ScoredBlock
 
 BAND_SIGMAS = 2.0
+NONE, WARMING_UP = np.uint8(InvalidReason.NONE), np.uint8(InvalidReason.WARMING_UP)
+COMMISSIONING = np.uint8(FanState.COMMISSIONING)
+IDLE_STATES = (
+    (np.uint8(InvalidReason.STOPPED), np.uint8(FanState.STOPPED)),
+    (np.uint8(InvalidReason.STARTING), np.uint8(FanState.STARTING)),
+)
+"""of a fan that is not scored because its command stops it, or has just started it"""
 
 
 def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array) -> Score:
@@ -17,10 +24,9 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array)
     if len(item.reading_range_rad_s):
         band = band + item.reading_range_rad_s
     of_prediction = item.invalid_reason
-    idle = ((InvalidReason.STOPPED, FanState.STOPPED), (InvalidReason.STARTING, FanState.STARTING))
-    for reason, of_idle in idle:
-        state = np.where((of_prediction == reason) & ~valid, int(of_idle), state)
-    why = np.where(of_prediction == InvalidReason.NONE, InvalidReason.WARMING_UP, of_prediction)
+    for reason, of_idle in IDLE_STATES:
+        state = np.where((of_prediction == reason) & ~valid, of_idle, state)
+    why = np.where(of_prediction == NONE, WARMING_UP, of_prediction)
     return Score(
         fans=item.fans,
         period_ns=item.period_ns,
@@ -30,9 +36,9 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array)
         predicted_speed_rad_s=item.predicted_speed_rad_s,
         band_variance=band**2,
         smoothed_residual_rad_s=scored.speed_smoothed * sigma,
-        state=np.where(scored.commissioning & ~valid, int(FanState.COMMISSIONING), state).astype(np.uint8),
+        state=np.where(scored.commissioning & ~valid, COMMISSIONING, state).astype(np.uint8),
         valid=valid,
-        invalid_reason=np.where(valid, InvalidReason.NONE, why).astype(np.uint8),
+        invalid_reason=np.where(valid, NONE, why).astype(np.uint8),
         torque_balance_command=item.torque_balance_command,
         speed_baseline_rad_s=scored.speed_baseline * sigma,
         balance_baseline_command=scored.balance_baseline * item.torque_balance_sigma_command,

@@ -69,6 +69,10 @@ class ScoredBlock:
         """A part of the block; writing to it writes to the block."""
         return ScoredBlock(**{name: column[rows] for name, column in vars(self).items()})
 
+    def fans(self, fans: slice) -> ScoredBlock:
+        """Those of some fans, as `rows`."""
+        return ScoredBlock(**{name: column[..., fans] for name, column in vars(self).items()})
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Observation:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from schemas.messages import Array
+from scoring.column_state import ColumnState
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +36,7 @@ class BalanceModel:
     """(fans,) with a smaller command the drive is off; None: where friction is not overcome"""
 
 
-class TorqueBalance:
+class TorqueBalance(ColumnState):
     """The balance of a tray's fans, block by block. The result does not depend on how samples are cut into blocks.
 
     It starts with the first two known samples of a fan, and again after unknown samples, after the drive was off, and
@@ -55,6 +56,16 @@ class TorqueBalance:
         _lfilter()  # now, not under load with the first long block: it is large
         self._filtered = np.zeros(fans)
         self._weight = np.zeros(fans)
+
+    def columns(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {
+            "speed": self._speed,
+            "command": self._command,
+            "lagged": self._lagged,
+            "filtered": self._filtered,
+            "weight": self._weight,
+        }
 
     def reset(self) -> None:
         """Start again: samples are missing."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +34,16 @@ class UnseenError:
     viscous: Array
     drag: Array
     command_width: float
+
+    def of_fans(self, rows: Sequence[int]) -> UnseenError:
+        """That of the fans in these rows."""
+        return replace(
+            self,
+            table=self.table and self.table.of_fans(rows),
+            drive=self.drive and self.drive.of_fans(rows),
+            viscous=self.viscous[rows],
+            drag=self.drag[rows],
+        )
 
     def of(self, prediction: Prediction) -> tuple[Array, Array]:
         """(n, fans) each, of the predicted speed, rad/s, and of the torque balance, in the unit of the command.

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,17 +22,19 @@ import numpy as np
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, healthy_twin
+from pipeline.runtime.joint_tray_scorer import JointTrayScorer
 from pipeline.runtime.judged_share import JudgedShare
 from pipeline.runtime.learned_scorer import LearnedTwinScorer
 from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.snapshot_store import Elsewhere, SnapshotStore
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError
 from pipeline.runtime.tray_scorer import DATA_LOST_AFTER_NS, TrayScorer
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.blocks import select
 from schemas.fan_numbers import fans_in_words
 from schemas.messages import (
     Alarm,
+    Message,
     ModelCard,
     Prediction,
     Request,
@@ -40,6 +42,7 @@ from schemas.messages import (
     ScorerSnapshot,
     Transition,
 )
+from schemas.side_by_side import present_columns
 from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_text import AlarmText
@@ -116,7 +119,7 @@ class ScorerCore(Core):
         """the snapshot is of later times than now: the first prediction shows whether all times have gone back"""
 
     def _start_new(self) -> None:
-        self._tray = TrayScorer(self._fans, self._text, self._config, self._twin, self._decision_rules)
+        self.tray = TrayScorer(self._fans, self._text, self._config, self._twin, self._decision_rules)
         self._last_t_ns = self._snapshot_t_ns = np.iinfo(np.int64).min
         self._input_producer = ""
         """who made the last prediction"""
@@ -132,7 +135,7 @@ class ScorerCore(Core):
         """
         try:
             state = current_keys(json.loads(snapshot.state_json), FORMER_SCORER_KEYS)
-            self._tray.alarms.restore(state["alarms"])
+            self.tray.alarms.restore(state["alarms"])
             input_producer = str(state["input_producer"])
         except RESTORE_ERRORS:
             self._start_new()
@@ -144,22 +147,22 @@ class ScorerCore(Core):
             self._not_restored = FORMER_TWIN if self._is_learned and self._restore_wear(state) else ANOTHER_TWIN
         else:
             try:
-                self._tray.restore_baselines(state)
+                self.tray.restore_baselines(state)
             except RESTORE_ERRORS:
                 self._start_new()
-                self._tray.alarms.restore(state["alarms"])
+                self.tray.alarms.restore(state["alarms"])
                 self._counts["snapshots_not_understood"] += 1
                 self._not_restored = READ_IN_PART
         self._last_t_ns = self._snapshot_t_ns = snapshot.t_ns
         self._input_producer, self._is_restored = input_producer, True
         if self._not_restored:
-            return [replace(snapshot, restored=True), *self._tray.alarms.discard_all(snapshot.t_ns, keep_silenced=True)]
-        return [replace(snapshot, restored=True), *self._tray.alarms.republish()]
+            return [replace(snapshot, restored=True), *self.tray.alarms.discard_all(snapshot.t_ns, keep_silenced=True)]
+        return [replace(snapshot, restored=True), *self.tray.alarms.republish()]
 
     def _restore_wear(self, state: Mapping[str, Any]) -> bool:
         """Continue the wear of the twin before; False if it cannot be read."""
         try:
-            self._tray.wear.restore_of_former_twin(state["wear"])
+            self.tray.wear.restore_of_former_twin(state["wear"])
         except RESTORE_ERRORS:
             return False
         return True
@@ -181,18 +184,24 @@ class ScorerCore(Core):
         at_start, self._at_start = self._at_start, []
         return at_start
 
-    def step(self, item: Prediction | Request | ModelCard) -> list[Score | Alarm | ScorerSnapshot]:
-        """Score a block and return its score and alarm transitions; or answer a request. The twin is that of the
-        configuration, so its card says nothing new."""
+    def step(self, item: Prediction | Request | ModelCard) -> list[Message]:
+        """Score a block and return its score and alarm transitions; or answer a request."""
+        admitted = self.admit(item)
+        if admitted.block is None:
+            return list(admitted.before)
+        return [*admitted.before, *self.finish(admitted.block, self.tray.score(admitted.block))]
+
+    def admit(self, item: Prediction | Request | ModelCard) -> Admitted:
+        """See Core. The twin is that of the configuration, so its card says nothing new."""
         if isinstance(item, ModelCard):
-            return []
+            return Admitted([])
         if isinstance(item, Request):
             self._may_be_set_back = False
-            return [*self.tick(0), *self._answer(item)]
+            return Admitted([*self.tick(0), *self._answer(item)])
         if item.fans != self._fans:
             self._wrong_fans = item.fans
             self._counts["lost_wrong_fan_count"] += len(item.t_ns)
-            return []
+            return Admitted([])
         self._wrong_fans = 0
         self._set_snapshot_back(item)
         before_score = [*self.tick(0), *self._discard_if_of_other_times(item)]
@@ -202,23 +211,34 @@ class ScorerCore(Core):
         if not new.any():
             if len(item.t_ns):
                 self._old_samples.add(item.t_ns, item.period_ns, self._last_t_ns)
-            return before_score
+            return Admitted(before_score)
         self._old_samples.clear()
         self._last_t_ns, self._input_producer = int(item.t_ns[new][-1]), item.header.producer
-        score, alarms = self._tray.score(item if new.all() else select(item, new))
-        self._unscored.update(item.period_ns, score.valid, score.invalid_reason)
+        block = item if new.all() else select(item, new)
+        is_over = self.tray.fan_scorer.is_interval_over(block.t_ns)
+        samples = len(block.t_ns)
+        has_steps = int(block.t_ns[-1] - block.t_ns[0]) == (samples - 1) * block.period_ns
+        if is_over is None or not has_steps or self._fans == 1:  # NumPy adds up a single column in another order
+            return Admitted(before_score, block)
+        times = block.period_ns, samples, is_over
+        return Admitted(before_score, block, (self._twin.sha256, self._fans, *times, *present_columns(block)))
+
+    def finish(self, block: Prediction, made: tuple[Score, list[Alarm]]) -> list[Score | Alarm | ScorerSnapshot]:
+        """See Core. made: the score of the block, and the messages on alarms."""
+        score, alarms = made
+        self._unscored.update(block.period_ns, score.valid, score.invalid_reason)
         self._judged_share.add(score.valid, score.invalid_reason)
         self._owes_snapshot |= bool(alarms)
-        snapshots = self._take_snapshot() if self._is_snapshot_due(item.period_ns) else []
+        snapshots = self._take_snapshot() if self._is_snapshot_due(block.period_ns) else []
         # the snapshot first: whoever takes over from one that is killed now must not raise these alarms again
-        return [*before_score, score, *snapshots, *alarms]
+        return [score, *snapshots, *alarms]
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md says what each counts."""
         of_alarms = {
-            "alarms_raised": self._tray.alarms.raised,
-            "alarms_cleared": self._tray.alarms.cleared,
-            "excursions_too_short": self._tray.alarms.too_short,
+            "alarms_raised": self.tray.alarms.raised,
+            "alarms_cleared": self.tray.alarms.cleared,
+            "excursions_too_short": self.tray.alarms.too_short,
         }
         return {**self._counts, **of_alarms}
 
@@ -227,13 +247,13 @@ class ScorerCore(Core):
         not; fans that change slowly."""
         of_twin = [] if self._twin.is_calibrated else [NOT_CALIBRATED]
         of_store = [self._snapshot_store.note] if self._snapshot_store and self._snapshot_store.note else []
-        return [*of_twin, *of_store, *self._judged_share.notes, *self._tray.wear.notices(), *self._tray.followed]
+        return [*of_twin, *of_store, *self._judged_share.notes, *self.tray.wear.notices(), *self.tray.followed]
 
     def problem(self) -> str:
         """What people should look at: input, snapshot, fans without a score, baselines at their limit, wear."""
         if self._wrong_fans:
             return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
-        origin_t_ns = self._tray.fan_scorer.origin_t_ns
+        origin_t_ns = self.tray.fan_scorer.origin_t_ns
         is_new = origin_t_ns is None or self._last_t_ns < origin_t_ns + SHOWN_NS
         problems = [
             self._not_restored if is_new else "",
@@ -242,13 +262,13 @@ class ScorerCore(Core):
             self._old_samples.problem("predictions", "scorer"),
         ]
         problems += [self._snapshot_store.problem] if self._snapshot_store else []
-        held = np.flatnonzero(self._tray.fan_scorer.held_baselines)
+        held = np.flatnonzero(self.tray.fan_scorer.held_baselines)
         if len(held):
             names = fans_in_words(held.tolist())
             problems.append(
                 f"the baseline of fan {names} is at its adaptation limit: inspect the fan, or commission it again"
             )
-        problems.append(self._tray.wear.problem(self._last_t_ns))
+        problems.append(self.tray.wear.problem(self._last_t_ns))
         return "; ".join(filter(None, problems))
 
     def close(self) -> list[ScorerSnapshot]:
@@ -278,7 +298,7 @@ class ScorerCore(Core):
         first_t_ns, ahead_ns = int(item.t_ns[0]), self._last_t_ns - int(item.t_ns[0])
         if item.header.producer == self._input_producer or ahead_ns < 0:
             return
-        t_ns = first_t_ns - item.period_ns - max(self._tray.fan_scorer.longest_memory_ns, DATA_LOST_AFTER_NS)
+        t_ns = first_t_ns - item.period_ns - max(self.tray.fan_scorer.longest_memory_ns, DATA_LOST_AFTER_NS)
         state = with_times_moved(self._state(), t_ns - self._last_t_ns)
         self._start_new()
         self._at_start = self.restore(ScorerSnapshot(t_ns=t_ns, twin_sha256=self._twin.sha256, state_json=_json(state)))
@@ -299,23 +319,23 @@ class ScorerCore(Core):
         self._is_restored = False
         if item.header.producer == self._input_producer:
             return []  # the producer of the last prediction still runs, and repeats what it has kept
-        first_t_ns, origin_t_ns = int(item.t_ns[0]), self._tray.fan_scorer.origin_t_ns
+        first_t_ns, origin_t_ns = int(item.t_ns[0]), self.tray.fan_scorer.origin_t_ns
         again = origin_t_ns is not None and first_t_ns <= origin_t_ns
         if not again and first_t_ns >= self._last_t_ns - BACK_IN_TIME_NS:
             return []
-        discarded, self._not_restored = self._tray.alarms.discard_all(first_t_ns, keep_silenced=False), ""
+        discarded, self._not_restored = self.tray.alarms.discard_all(first_t_ns, keep_silenced=False), ""
         self._start_new()
         self._counts["snapshots_of_other_times"] += 1
         return discarded
 
     def _answer(self, request: Request) -> list[Alarm | ScorerSnapshot]:
-        alarms = self._tray.alarms.answer(request, max(self._last_t_ns, 0))
+        alarms = self.tray.alarms.answer(request, max(self._last_t_ns, 0))
         if not alarms:
             self._counts["requests_repeated"] += 1
             return []
         commissioned = np.zeros(self._fans, np.bool_)
         commissioned[[alarm.fan for alarm in alarms if alarm.transition == Transition.COMMISSIONING]] = True
-        self._tray.recommission(commissioned, self._last_t_ns)
+        self.tray.recommission(commissioned, self._last_t_ns)
         self._counts["requests"] += 1
         return [*self._take_snapshot(), *alarms]  # whoever has the answer can rely on it
 
@@ -335,7 +355,20 @@ class ScorerCore(Core):
         return [snapshot]
 
     def _state(self) -> dict[str, Any]:
-        return {**self._tray.snapshot(), "input_producer": self._input_producer}
+        return {**self.tray.snapshot(), "input_producer": self._input_producer}
+
+
+class JointScorers:
+    """Scores trays of one process, see Joint."""
+
+    def __init__(self) -> None:
+        self._joint = JointTrayScorer()
+
+    def process(
+        self, cores: Sequence[ScorerCore], blocks: Sequence[Prediction]
+    ) -> Sequence[tuple[Score, Sequence[Alarm]]]:
+        """What `finish` of each is given."""
+        return self._joint.score([core.tray for core in cores], blocks)
 
 
 def _json(state: Mapping[str, Any]) -> str:
@@ -402,5 +435,6 @@ STAGE = Stage(
     writes=("score", "alarm", "snapshot"),
     config=ScorerConfig,
     build=build,
+    joint=JointScorers,
     check=check,
 )

@@ -9,9 +9,8 @@ import numpy as np
 from pipeline.runtime.twin_file import TwinFile
 from schemas.messages import Array
 from schemas.units import NS_PER_S
+from scoring.column_state import NEVER_NS, ColumnState
 from scoring.expected_reading import ExpectedReading
-
-NEVER_NS = np.iinfo(np.int64).min // 2
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class FreeRunInputs:
         return after + 1 + int(rows[0]) if len(rows) else len(self.missing)
 
 
-class FreeRun:
+class FreeRun(ColumnState):
     """The free runs of all fans: which are running, since when, and their state. All arrays are (fans,)."""
 
     def __init__(self, twin: TwinFile, start_samples: int) -> None:
@@ -65,6 +64,24 @@ class FreeRun:
         self._period_s = period_ns / NS_PER_S
         self._reading = ExpectedReading(self._twin.tachos, self._period_s)
 
+    @property
+    def states(self) -> list[ColumnState]:
+        """All that is kept of each fan."""
+        return [self, *self._reading.states]
+
+    def columns(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {
+            "running": self.running,
+            "started_t_ns": self.started_t_ns,
+            "held_command": self.held_command,
+            "known_t_ns": self._known_t_ns,
+            "out_of_range_t_ns": self._out_of_range_t_ns,
+            "readings": self._readings,
+            "sum_rad_s": self._sum_rad_s,
+            "state": self._state.T,
+        }
+
     def hold(self, t_ns: Array, command: Array, known: Array) -> tuple[Array, Array]:
         """Hold the last known command where one is unknown. t_ns: (n,); command, known: (n, fans).
 
@@ -76,7 +93,7 @@ class FreeRun:
             known_t_ns = np.where(rows < 0, self._known_t_ns, t_ns[rows])
             command = np.where(rows < 0, self.held_command, np.take_along_axis(command, rows, axis=0))
         before_t_ns = np.concatenate((self._known_t_ns[np.newaxis], known_t_ns[:-1]))
-        self.held_command, self._known_t_ns = command[-1], known_t_ns[-1]
+        self.held_command, self._known_t_ns = command[-1].copy(), known_t_ns[-1].copy()
         return command, before_t_ns
 
     def last_out_of_range(self, t_ns: Array, beyond: Array) -> Array:

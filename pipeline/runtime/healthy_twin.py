@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pydantic import Field, ValidationError
@@ -13,7 +13,7 @@ from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context, StageConfig, StageError
 from pipeline.runtime.tray_twin import TrayTwin
 from schemas.standstill import Standstill
-from schemas.tacho import INSTANTANEOUS, Tacho
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from scoring.detectors.missing_readings import MissingReadingsSettings
 from scoring.detectors.running_on import RunningOnSettings
 from scoring.detectors.standstill import StandstillSettings
@@ -90,6 +90,17 @@ class HealthyTwin:
     unseen_error: UnseenError | None = None
     """where healthy runs do not show it; None: its card says nothing about it"""
     is_calibrated: bool = True
+
+    def of_trays(self, count: int, fans: int) -> HealthyTwin:
+        """The same for the fans of so many trays with as many fans each; without balances."""
+        rows = [*range(fans)] * count
+        return replace(
+            self,
+            limits=self.limits.of(rows),
+            balances=(),
+            tachos=tacho_of_each_fan(self.tachos, fans) * count,
+            unseen_error=self.unseen_error and self.unseen_error.of_fans(rows),
+        )
 
 
 def limits_in_force(

@@ -12,7 +12,7 @@ import secrets
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import replace
 from itertools import chain
 
@@ -22,7 +22,7 @@ from pipeline.config.registry import STAGES
 from pipeline.config.shards import Shard, chosen_shard
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.runtime.building import build_and_join
-from pipeline.runtime.clock import StageClock, is_of_replay
+from pipeline.runtime.clock import StageClock
 from pipeline.runtime.due_messages import DueMessages
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
@@ -34,10 +34,10 @@ from pipeline.runtime.receiving import Receiver
 from pipeline.runtime.sessions import Session, Sessions
 from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Core, Stage
-from schemas.blocks import join
+from pipeline.runtime.steps import Steps
 from schemas.codec import encode, type_name
 from schemas.envelope import Envelope
-from schemas.messages import Header, Health, Message, Note, StageStatus, newest_t_ns
+from schemas.messages import Header, Health, Note, StageStatus
 from schemas.streams import stage_losses
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
@@ -130,10 +130,16 @@ class Runner:
         self._tracker = self._receiver.tracker
         self._notifier = Notifier.from_environment()
         self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
-        self._owes_answer = False
-        """a command has arrived: the next health, which says so, is sent soon"""
-        self._active_core: str | None = None
-        """the core whose method is being called, or has raised"""
+        self._steps = Steps(
+            stage,
+            self._parts,
+            receiver=self._receiver,
+            sessions=self._sessions,
+            kept=self._kept,
+            outputs=self._outputs,
+            health=self._health,
+            clock=self._clock,
+        )
 
     def run(self) -> Health:
         """Run to the end and return the last health, which is published whatever happens.
@@ -163,7 +169,7 @@ class Runner:
                 ending.fail(work.error, f"crashed: {type(work.error).__name__}: {work.error}")
         self._inbox.close()
         ending.finish("stopping the source", self._sources.stop(), SOURCES_STOPPED)
-        failed = self._active_core
+        failed = self._steps.active
         for name, parts in self._parts.items():
             self._close_core(name, parts, failed)
         ending.run("reporting what was consumed", self._outputs.report_last, CORES_CLOSED)
@@ -211,7 +217,7 @@ class Runner:
         reported_lost = 0
         while not until():
             if self._due:
-                self._step(self._due.pop())
+                self._step_once()
             elif (item := self._inbox.get(max(0.0, next_tick - time.monotonic()))) is not None:
                 self._handle(item)
                 if self._due.joins:
@@ -221,15 +227,15 @@ class Runner:
                 next_tick = now + TICK_S
                 for name, parts in self._parts.items():
                     now_ns = self._clock.tick_ns(name)
-                    self._call(name, lambda core=parts.core, now_ns=now_ns: core.tick(now_ns), from_timer=True)
+                    self._steps.call(name, lambda core=parts.core, now_ns=now_ns: core.tick(now_ns), from_timer=True)
                 if self.stage.undecoded:
                     self._follow()
                 news = False
                 if now >= next_loss:
                     next_loss = now + LOSS_REPORT_S
-                    news = self._owes_answer or self._lost() > reported_lost
+                    news = self._steps.owes_answer or self._lost() > reported_lost
                 if news or now >= next_health:
-                    self._owes_answer = False
+                    self._steps.owes_answer = False
                     next_health = now + HEALTH_PERIOD_S
                     reported_lost = self._publish_health(status).lost
                 self._notifier.at_work(self._health.summary)
@@ -249,7 +255,7 @@ class Runner:
                 self._discard_waiting()
                 return
             if self._due:
-                self._step(self._due.pop())
+                self._step_once()
                 continue
             if left is None and sources.wait(0) and not self._receiver.awaits_more:
                 left = self._inbox.waiting()
@@ -269,12 +275,12 @@ class Runner:
             elif isinstance(item, FromBus) and self._receiver.reads(item.key) and not self.stage.may_drop:
                 self._counts["lost_at_stop"] += 1
 
-    def _close_core(self, name: str, parts: BuiltStage, failed: str | None) -> None:
+    def _close_core(self, name: str, parts: BuiltStage, failed: Set[str]) -> None:
         what = name or "the core"
-        if name == failed:
+        if name in failed:
             self._ending.run(f"aborting {what}", parts.core.abort, CORES_CLOSED)
         else:
-            close = functools.partial(self._call, name, parts.core.close, from_timer=True)
+            close = functools.partial(self._steps.call, name, parts.core.close, from_timer=True)
             self._ending.run(f"closing {what}", close, CORES_CLOSED)
 
     def _report_end(self) -> Health:
@@ -309,53 +315,15 @@ class Runner:
             now_ns = HOST_CLOCK.now_ns()
             self._health.add_input("", now_ns, now_ns)
             core = self._parts[item.core].core
-            self._call(item.core, lambda: core.step(item.item))
+            self._steps.call(item.core, lambda: core.step(item.item))
         elif isinstance(item, KeptQuery):
             self._kept.answer(item)
         else:
             self._receiver.take(item)
 
-    def _step(self, envelopes: Sequence[Envelope]) -> None:
-        """Process one message, or several of a tray that differ only in their samples."""
-        first, count = envelopes[0], len(envelopes)
-        header = first.header
-        name = header.tray if header.tray in self._parts else ""
-        if name not in self._parts:
-            self._counts["unknown_tray"] += count
-            return
-        if self._has_source and is_of_replay(header.producer):  # a recorded command must not drive today's fan
-            self._counts["refused_of_replay"] += count
-            return
-        if first.topic != "health" and self._sessions.is_ignored(header.producer, header.tray):
-            self._counts["refused_of_second"] += count
-            for envelope in envelopes:
-                self._tracker.refuse_second(envelope)
-            return
-        for envelope in envelopes:
-            self._kept.add(envelope)
-        if first.topic == self.stage.reads[0] and not self._has_source:  # samples of a device depend on no input
-            for envelope in envelopes:
-                self._outputs.advance(header.tray, first.topic, envelope.header)
-        self._owes_answer |= self._has_source
-        core = self._parts[name].core
-        as_it_is = self.stage.wants_envelopes or self._receiver.is_undecoded(first)
-        item = first if as_it_is else join([envelope.message for envelope in envelopes])
-        self._call(name, lambda: core.step(item), input_tray=header.tray)
-
-    def _call(
-        self, name: str, produce: Callable[[], Sequence[Message]], *, input_tray: str = "", from_timer: bool = False
-    ) -> None:
-        """Let the core called `name` produce messages, and publish them.
-
-        Messages of a core that serves all trays belong to the tray in their header, or else to `input_tray`.
-        """
-        self._active_core = name
-        for message in produce():
-            tray = name or message.header.tray or input_tray
-            stamped = self._outputs.publish(tray, message, from_timer=from_timer)
-            t_ns = newest_t_ns(stamped)
-            self._health.add_output(t_ns, HOST_CLOCK.now_ns(), self._clock.now_ns(tray, t_ns))
-        self._active_core = None
+    def _step_once(self) -> None:
+        """Process the next message, or as many as can be at once."""
+        self._steps.step(self._due.pop_of_each() if self.stage.joint and self._due.joins else [self._due.pop()])
 
     def _has_caught_up(self) -> bool:
         return not (self._receiver.is_catching_up or self._due) or self._ending.left_s(CAUGHT_UP) < 0
@@ -363,6 +331,7 @@ class Runner:
     def _counters(self) -> Counter[str]:
         counters = (
             self._counts
+            + self._steps.counts
             + self._receiver.counts
             + Counter(self._tracker.counters())
             + Counter(lost_at_stop=self._sources.lost)
@@ -409,5 +378,6 @@ class Runner:
         self._on_health(health)
         if "health" in self.stage.reads:
             # the bus does not return a session's own messages
-            self._step([Envelope(self._health_publisher.key, "health", payload, HOST_CLOCK.now_ns(), health)])
+            own = Envelope(self._health_publisher.key, "health", payload, HOST_CLOCK.now_ns(), health)
+            self._steps.step([[own]])
         return health

@@ -6,7 +6,7 @@ publishes what it returns. The runner is the only loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,6 +25,21 @@ class StageConfig(Section):
     """Base of every stage's section in the configuration file."""
 
 
+@dataclass(frozen=True, eq=False)
+class Admitted:
+    """What a core makes of an item before its main work.
+
+    Attributes:
+        before: messages to be published first.
+        block: what is to be processed; None: nothing.
+        key: blocks of several trays with equal keys can be processed in one pass; None: this one alone.
+    """
+
+    before: Sequence[Message]
+    block: Any = None
+    key: Hashable = None
+
+
 class StageError(UserError):
     """A stage cannot start or continue: one line that says what, where and what to do."""
 
@@ -40,6 +55,15 @@ class Core(Protocol):
     def step(self, item: Any) -> Sequence[Message]:
         """Process one message (or one item of the stage's source) and return the resulting messages."""
         ...
+
+    def admit(self, item: Any) -> Admitted:
+        """The first part of `step`, in a stage that processes the blocks of several trays in one pass (`Stage.joint`).
+        The default does all that `step` does."""
+        return Admitted(self.step(item))
+
+    def finish(self, block: Any, made: Any) -> Sequence[Message]:
+        """The last part of `step`: the messages on what was made of an admitted block."""
+        return ()
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Called about every 50 ms. `now_ns` is the host's time, or the replay's while one feeds the stage."""
@@ -82,6 +106,15 @@ class Core(Protocol):
     def problem(self) -> str:
         """One line on what is wrong now and what to do; empty when all is well."""
         return ""
+
+
+class Joint(Protocol):
+    """Processes admitted blocks, for one process of a stage."""
+
+    def process(self, cores: Sequence[Any], blocks: Sequence[Any]) -> Sequence[Any]:
+        """What is made of the block of each core, for its `finish`: to the bit what would be made of it alone. Blocks
+        of several cores have equal keys."""
+        ...
 
 
 class Source(Protocol):
@@ -186,6 +219,7 @@ class Stage:
         undecoded: topics whose messages `step` is given as envelopes, of which only the header has been decoded: for a
             core that looks into few of them.
         may_drop: a consumer that may drop messages: its missing messages do not count as losses.
+        joint: for cores that process the blocks of several trays in one pass; None: each tray alone.
         check: lists, without side effects, what would keep the stage from working (a missing port, a twin that
             does not fit); one line each. `fantwin doctor` prints them.
         chooses: of the topics in `reads`, those that it reads with this section and these trays of the site.
@@ -204,6 +238,7 @@ class Stage:
     wants_envelopes: bool = False
     undecoded: tuple[str, ...] = ()
     may_drop: bool = False
+    joint: Callable[[], Joint] | None = None
     check: Callable[[Context], Sequence[str]] = no_problems
     chooses: Callable[[Any, Sequence[TrayConfig]], Sequence[str]] | None = None
 

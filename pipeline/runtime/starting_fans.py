@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.runtime.free_run import NEVER_NS
 from schemas.messages import Array
 from schemas.standstill import Standstill
 from schemas.units import NS_PER_S
+from scoring.column_state import NEVER_NS, ColumnState
 
 START_TIME_CONSTANTS = 5.0  # of a fan that slows down: how long the start kick of its drive lasts
 
 
-class StartingFans:
+class StartingFans(ColumnState):
     """Of one tray. Blocks are given in the order of their times."""
 
     def __init__(self, fans: int, standstill: Standstill, warm_up_ns: int, reach_s: float) -> None:
@@ -24,6 +24,10 @@ class StartingFans:
         """(fans,) stopped by the command before, and no free run has settled since"""
         self._stopped_t_ns = np.full(fans, NEVER_NS)
         """(fans,) when the command stopped the fan last"""
+
+    def columns(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {"starting": self._starting, "stopped_t_ns": self._stopped_t_ns}
 
     def has_started_up(self, t_ns: Array, stopped: Array) -> Array:
         """(n, fans) whether the last stop is so long ago that a start would be over. t_ns: (n,). stopped: (n, fans)."""

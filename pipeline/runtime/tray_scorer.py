@@ -8,7 +8,7 @@ See docs/explanation/deciding.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -16,13 +16,13 @@ import numpy as np
 
 from pipeline.runtime.decision_rules import DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
-from schemas.messages import Alarm, Array, FanState, Prediction, Score
+from schemas.messages import Alarm, Array, Prediction, Score
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_manager import AlarmContext, AlarmManager
 from scoring.alarms.alarm_text import AlarmText
-from scoring.alarms.fan_condition import ALARM, RETURNING, ConditionSettings
+from scoring.alarms.fan_condition import ALARM, NORMAL, RETURNING, ConditionSettings
 from scoring.alarms.holding import holding_detectors
-from scoring.alarms.tray_conditions import AlarmEvent
+from scoring.alarms.tray_conditions import UNKNOWN, AlarmEvent
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.fan_scorer import FanScorer
@@ -30,11 +30,34 @@ from scoring.interval_scorer import HALF_LIMIT
 from scoring.samples import Samples, among, arrived, samples_of
 from scoring.score_message import score_of
 from scoring.scored_block import ScoredBlock
+from scoring.unseen_error import UnseenError
 from scoring.wear.followed import followed_fans, shared_by_all
 from scoring.wear.reference import healthy_fans
-from scoring.wear.wear_monitor import WearMonitor
+from scoring.wear.wear_monitor import WearInputs, WearMonitor
 
 DATA_LOST_AFTER_NS = 2 * NS_PER_S  # an active alarm is not confirmed by data after so long without a score
+
+
+def fan_scorer_of(fans: int, twin: HealthyTwin, decision_rules: DecisionRules) -> FanScorer:
+    """The statistics of so many fans, from the beginning."""
+    return FanScorer(
+        fans,
+        twin.limits,
+        tachos=twin.tachos,
+        forgets_over_gaps=decision_rules >= DecisionRules.TIME_AND_GAPS,
+        skips_transients=decision_rules >= DecisionRules.HOLDING,
+        allows_for_counts=decision_rules >= DecisionRules.ONE_ALARM,
+        limits_motion=decision_rules >= DecisionRules.HEALTHY_MOTION,
+        begins_still=decision_rules >= DecisionRules.FIRST_BASELINE,
+        keeps_shared=decision_rules >= DecisionRules.SHARED_STAYS,
+        shares_at_first=decision_rules >= DecisionRules.SHARED_AT_FIRST,
+        compares_fast=decision_rules >= DecisionRules.FAST_FANS,
+    )
+
+
+def unseen_error_of(twin: HealthyTwin, decision_rules: DecisionRules) -> UnseenError | None:
+    """How far the twin may be wrong where healthy runs do not show it; None: that does not count."""
+    return twin.unseen_error if decision_rules >= DecisionRules.UNSEEN else None
 
 
 class TrayScorer:
@@ -44,26 +67,12 @@ class TrayScorer:
         self, fans: int, text: AlarmText, config: ScorerConfig, twin: HealthyTwin, decision_rules: DecisionRules
     ) -> None:
         """From the beginning: no fan is commissioned, and none has an alarm."""
-        forgets_over_gaps = decision_rules >= DecisionRules.TIME_AND_GAPS
+        self.fans, self.twin, self.decision_rules = fans, twin, decision_rules
         judges_rest = decision_rules >= DecisionRules.AT_REST
         self._holds = decision_rules >= DecisionRules.HOLDING
-        self._twin = twin
         self._text = text
-        self._unseen_error = twin.unseen_error if decision_rules >= DecisionRules.UNSEEN else None
         self._sigma_rad_s = np.ones(fans)
-        self.fan_scorer = FanScorer(
-            fans,
-            twin.limits,
-            tachos=twin.tachos,
-            forgets_over_gaps=forgets_over_gaps,
-            skips_transients=self._holds,
-            allows_for_counts=decision_rules >= DecisionRules.ONE_ALARM,
-            limits_motion=decision_rules >= DecisionRules.HEALTHY_MOTION,
-            begins_still=decision_rules >= DecisionRules.FIRST_BASELINE,
-            keeps_shared=decision_rules >= DecisionRules.SHARED_STAYS,
-            shares_at_first=decision_rules >= DecisionRules.SHARED_AT_FIRST,
-            compares_fast=decision_rules >= DecisionRules.FAST_FANS,
-        )
+        self.fan_scorer = fan_scorer_of(fans, twin, decision_rules)
         advice = Advice(twin.command_unit) if self._holds else None
         if judges_rest:
             lowest_command = twin.standstill.turning_command if twin.standstill else 0.0
@@ -94,7 +103,7 @@ class TrayScorer:
             alarm_ratio=config.alarm_ratio,
             latching=config.latching,
             confirming=config.confirming,
-            data_lost_after_ns=DATA_LOST_AFTER_NS if forgets_over_gaps else None,
+            data_lost_after_ns=DATA_LOST_AFTER_NS if decision_rules >= DecisionRules.TIME_AND_GAPS else None,
             settling_ns=self.fan_scorer.longest_memory_ns,
             detectors=holding if self._holds else (),
         )
@@ -102,11 +111,24 @@ class TrayScorer:
 
     def score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
         """The score of a block of new samples, and the messages on alarms."""
-        self._sigma_rad_s = item.sigma_rad_s
-        samples = samples_of(item, self._unseen_error)
-        scored, state, events = self._decide(item, samples)
-        self._feed_diagnoser(item, scored)
+        samples = samples_of(item, unseen_error_of(self.twin, self.decision_rules))
+        scored, stretches = self.fan_scorer.stretches(samples, (lambda: self.alarms.is_quiet) if self._holds else None)
+        state, events = self.decide(item, scored, stretches)
         score = score_of(item, scored, state, samples.speed_unseen)
+        return score, self.finish(item, samples, scored, state, events, score)
+
+    def finish(
+        self,
+        item: Prediction,
+        samples: Samples,
+        scored: ScoredBlock,
+        state: Array,
+        events: list[AlarmEvent],
+        score: Score,
+    ) -> list[Alarm]:
+        """The messages on alarms of a block that has been decided."""
+        self._sigma_rad_s = item.sigma_rad_s
+        self._feed_diagnoser(item, scored)
         self._feed_wear(item, scored, state)
         sigma_rad_s, sigma_command = item.sigma_rad_s, item.torque_balance_sigma_command
 
@@ -115,12 +137,12 @@ class TrayScorer:
             return float((of_speed * sigma_rad_s)[fan]), float((of_balance * sigma_command)[fan])
 
         context = AlarmContext(balance_command=scored.balance_smoothed * sigma_command, limits=limits)
-        return score, self.alarms.emit(events, score, context)
+        return self.alarms.emit(events, score, context)
 
     @property
     def followed(self) -> list[str]:
         """A line for what most fans share, if it is much, and for each fan whose baseline has followed it far."""
-        healthy, residual = self._twin.limits.speed, self.fan_scorer.residuals["speed"]
+        healthy, residual = self.twin.limits.speed, self.fan_scorer.residuals["speed"]
         limit, units = healthy.baseline.adaptation_limit_sigmas, self._text.units
         of_each = followed_fans(residual.baseline, limit, self._sigma_rad_s, units)
         return [*shared_by_all(residual.shared_offset, healthy.shared_limit), *of_each]
@@ -164,11 +186,15 @@ class TrayScorer:
             limit_at("balance", speed, statistic, period_s, of_balance, samples.balance_unseen[row]),
         )
 
-    def _decide(self, item: Prediction, samples: Samples) -> tuple[ScoredBlock, Array, list[AlarmEvent]]:
-        """The scores, the states (n, fans) and the alarms' events. While an alarm is active, baselines stay."""
+    def decide(
+        self, item: Prediction, scored: ScoredBlock, stretches: Iterable[slice]
+    ) -> tuple[Array, list[AlarmEvent]]:
+        """The states (n, fans) and the alarms' events. While an alarm is active, baselines stay.
+
+        stretches: the rows that are scored, one stretch after the other.
+        """
         speed = np.where(np.isfinite(item.predicted_speed_rad_s), item.predicted_speed_rad_s, item.measured_speed_rad_s)
         events: list[AlarmEvent] = []
-        scored, stretches = self.fan_scorer.stretches(samples, (lambda: self.alarms.is_quiet) if self._holds else None)
         state = np.empty(scored.score.shape, np.uint8)
         for rows in stretches:
             was_active = self.alarms.active
@@ -181,7 +207,7 @@ class TrayScorer:
                 in_alarm = among(state[rows], ALARM, RETURNING).any(axis=0)
                 self.fan_scorer.learn_nothing(was_active | self.alarms.active | in_alarm)
             events += [replace(event, row=event.row + rows.start) for event in happened]
-        return scored, state, events
+        return state, events
 
     def _feed_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
         command = item.averaged_command if len(item.averaged_command) else item.command
@@ -200,15 +226,18 @@ class TrayScorer:
 
     def _feed_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:
         assert self.fan_scorer.origin_t_ns is not None
-        sigma_command, known = item.torque_balance_sigma_command, np.isfinite(item.torque_balance_command)
-        normal, period_s = state == FanState.NORMAL, item.period_ns / NS_PER_S
-        self.wear.update(
-            item.t_ns,
-            self.fan_scorer.origin_t_ns,
-            eligible=(scored.score < HALF_LIMIT) & normal & known,
-            disturbed=(scored.score >= HALF_LIMIT) | ~(normal | (state == FanState.UNKNOWN)),
-            commissioned_command=scored.balance_commissioned * sigma_command,
-            shared_command=scored.balance_shared * sigma_command,
-            held=scored.balance_at_limit,
-            limit_command=self.fan_scorer.persistent_limit_sigmas("balance", period_s) * sigma_command,
-        )
+        normal = state == NORMAL
+
+        def inputs() -> WearInputs:
+            sigma_command = item.torque_balance_sigma_command
+            limit_sigmas = self.fan_scorer.persistent_limit_sigmas("balance", item.period_ns / NS_PER_S)
+            return WearInputs(
+                eligible=(scored.score < HALF_LIMIT) & normal & np.isfinite(item.torque_balance_command),
+                commissioned_command=scored.balance_commissioned * sigma_command,
+                shared_command=scored.balance_shared * sigma_command,
+                held=scored.balance_at_limit,
+                limit_command=limit_sigmas * sigma_command,
+            )
+
+        disturbed = (scored.score >= HALF_LIMIT) | ~(normal | (state == UNKNOWN))
+        self.wear.update(item.t_ns, self.fan_scorer.origin_t_ns, disturbed, inputs)

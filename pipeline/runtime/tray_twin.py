@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from pipeline.runtime.onnx_metadata import read_onnx_metadata
 from pipeline.runtime.stage import StageError
 from schemas.messages import Array
 from schemas.tacho import Tacho, tacho_of_each_fan
-from schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, TwinCard
+from schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, DriveCard, TwinCard
 from scoring.unseen_error import UnseenError
 
 if TYPE_CHECKING:
@@ -46,6 +47,11 @@ class Balance:
     lowest_speed_rad_s: Array
     filter_rate_per_s: float
 
+    def of_fans(self, rows: Sequence[int]) -> Balance:
+        """That of the fans in these rows."""
+        arrays = {name: values[rows] for name, values in vars(self).items() if name != "filter_rate_per_s"}
+        return Balance(**arrays, filter_rate_per_s=self.filter_rate_per_s)
+
     @classmethod
     def from_card(cls, card: BalanceCard, fans: int) -> Balance:
         """The balance of a card for a tray of so many fans."""
@@ -58,7 +64,7 @@ class TrayTwin:
     """A twin's card, and what it holds for each fan of a tray. A twin of one fan serves every fan.
 
     card_json: the card as it stands in the file. sha256: of the file. sigma_rad_s: (fans,), standard deviation of the
-    healthy residual.
+    healthy residual. tachos: (fans,) how the speed of each is measured. drive: None: the command acts as it is.
     """
 
     card: TwinCard
@@ -66,16 +72,13 @@ class TrayTwin:
     sha256: str
     sigma_rad_s: Array
     balance: Balance
+    tachos: tuple[Tacho, ...]
+    drive: DriveCard | None
 
     @property
     def fans(self) -> int:
         """The number of fans of the tray."""
         return len(self.sigma_rad_s)
-
-    @property
-    def tachos(self) -> tuple[Tacho, ...]:
-        """(fans,) how the speed of each fan is measured."""
-        return tacho_of_each_fan(self.card.tacho, self.fans)
 
     @property
     def off_below(self) -> Array:
@@ -203,6 +206,8 @@ def tray_twin(path: Path, content: bytes, fans: int | None) -> TrayTwin:
         sha256=hashlib.sha256(content).hexdigest(),
         sigma_rad_s=for_fans(card.sigma_rad_s, fans),
         balance=Balance.from_card(card.balance, fans),
+        tachos=tacho_of_each_fan(card.tacho, fans),
+        drive=card.drive,
     )
 
 

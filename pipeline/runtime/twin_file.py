@@ -10,7 +10,8 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -31,9 +32,30 @@ FIRST_RUN_LIMIT_S = 10.0
 
 @dataclass(frozen=True)
 class TwinFile(TrayTwin):
-    """A twin ready to run for a tray. `advance` runs a block of samples from a state; it keeps nothing itself."""
+    """A twin ready to run for a tray.
 
-    advance: Advance
+    advance_with: how to run it with some parameters. parameters: (fans, n_parameters) those of the fans.
+    """
+
+    advance_with: Callable[[Array], Advance]
+    parameters: Array
+
+    @cached_property
+    def advance(self) -> Advance:
+        """Runs a block of samples from a state; it keeps nothing itself."""
+        return self.advance_with(self.parameters)
+
+    def of_trays(self, count: int) -> TwinFile:
+        """The same for the fans of so many trays."""
+        rows = [*range(self.fans)] * count
+        return replace(
+            self,
+            sigma_rad_s=self.sigma_rad_s[rows],
+            balance=self.balance.of_fans(rows),
+            tachos=self.tachos * count,
+            drive=self.drive and self.drive.of_fans(rows),
+            parameters=self.parameters[rows],
+        )
 
     def initial_state(self, speed_rad_s: Array, command: Array) -> Array:
         """(fans, n_state) of fans that have run for long at speed_rad_s (fans,) under command (fans,)."""
@@ -59,9 +81,16 @@ class TwinFile(TrayTwin):
         known = tray_twin(path, content, fans)
         _check_graph(path, session, known.card)
         parameters = for_fans(known.card.parameters, known.fans)
+
+        def twin(options: Any = None) -> TwinFile:
+            def advance_with(parameters: Array) -> Advance:
+                return _advance(session, parameters, options)
+
+            return cls(**vars(known), advance_with=advance_with, parameters=parameters)
+
         with _time_limit(FIRST_RUN_LIMIT_S) as options:
-            _check_run(path, cls(**vars(known), advance=_advance(session, parameters, options)), options)
-        return cls(**vars(known), advance=_advance(session, parameters))
+            _check_run(path, twin(options), options)
+        return twin()
 
 
 def load_twin(context: Context) -> TwinFile:

@@ -34,6 +34,7 @@ from scoring.former_snapshot_keys import FORMER_ALARM_KEYS, current_keys
 PERSISTING_SHARE = (
     0.5  # a fault persists while the torque balance is at least this share of its value in the last message
 )
+STANDSTILL = int(Statistic.STANDSTILL)
 MAX_REQUESTERS = 64  # the latest whose requests are remembered; docs/reference/alarms.md gives the consequences
 
 
@@ -100,7 +101,7 @@ class AlarmManager:
             alarms.append(self._emit(replace(self._next_message(fan), **measured, transition=transition, **changed)))
 
         def causes_at(row: int, fan: int) -> tuple[Diagnosis, ...]:
-            t_ns, against_command = int(score.t_ns[row]), score.statistic[row, fan] == Statistic.STANDSTILL
+            t_ns, against_command = int(score.t_ns[row]), score.statistic[row, fan] == STANDSTILL
             return (self._diagnoser.of_standstill if against_command else self._diagnoser.diagnose)(fan, t_ns)
 
         begins = self._standstill_begins(score)
@@ -125,7 +126,7 @@ class AlarmManager:
                 t_ns = int(score.t_ns[event.row])
                 self._diagnoser.raised(fan, t_ns, event.alarm_state.onset_t_ns)
                 changed["causes"] = causes_at(event.row, fan)
-            elif event.transition == Transition.SEVERITY and score.statistic[event.row, fan] == Statistic.STANDSTILL:
+            elif event.transition == Transition.SEVERITY and score.statistic[event.row, fan] == STANDSTILL:
                 changed["causes"] = causes_at(event.row, fan)
             elif event.transition == Transition.CLEARED:
                 self.cleared += 1
@@ -138,7 +139,7 @@ class AlarmManager:
 
     def _standstill_begins(self, score: Score) -> deque[tuple[int, int]]:
         """Rows and fans at which the statistic becomes that of standstill."""
-        now = score.statistic == Statistic.STANDSTILL
+        now = score.statistic == STANDSTILL
         before = np.vstack((self._against_command, now))[:-1]
         self._against_command = now[-1].copy()
         return deque((row, fan) for row, fan in np.argwhere(now & ~before).tolist())

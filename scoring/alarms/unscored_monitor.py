@@ -7,7 +7,7 @@ import numpy as np
 from schemas.fan_numbers import fans_in_words
 from schemas.messages import Array, InvalidReason
 from schemas.units import NS_PER_S
-from scoring.samples import among
+from scoring.samples import IDLE, among
 
 FIRST_WARM_UP_NS = 60 * NS_PER_S  # a fan that was never scored may warm up for this long before it is reported
 REASONS = {
@@ -38,7 +38,7 @@ class UnscoredMonitor:
 
     def update(self, period_ns: int, valid: Array, invalid_reason: Array) -> None:
         """Process a block; valid, invalid_reason: (n, fans)."""
-        judged = valid | among(invalid_reason, *JUDGED_AT_REST)
+        judged = valid | among(invalid_reason, *IDLE)
         scored = judged.any(axis=0)
         rows_since = np.where(scored, np.argmax(judged[::-1], axis=0), len(valid))
         self._unscored_ns = np.where(scored, 0, self._unscored_ns) + rows_since * period_ns

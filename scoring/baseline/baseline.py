@@ -29,7 +29,7 @@ import numpy as np
 from schemas.messages import Array
 from scoring.baseline.intervals import Intervals, first_end
 from scoring.baseline.settings import BaselineSettings
-from scoring.detectors.state import ColumnState
+from scoring.column_state import ColumnState
 
 COMMISSIONING_INTERVALS = 10
 MIN_VALID_SHARE = 0.5  # of an interval's samples
@@ -294,6 +294,10 @@ class Baseline(ColumnState):
         """See ColumnState."""
         super().restore(state)
         self._find_learned_scale()
+
+    def arrays(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {**self.columns(), "learned_scale": self.learned_scale}
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""

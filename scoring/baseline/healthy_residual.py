@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from scoring.baseline.settings import BaselineSettings
@@ -23,7 +25,7 @@ class FanOffsets(BaseModel):
             raise ValueError("offset_sigmas must have one value for each of speeds_rad_s")
         return self
 
-    def of(self, fans: range) -> FanOffsets:
+    def of(self, fans: Sequence[int]) -> FanOffsets:
         """The offsets of some of the fans."""
         return self.model_copy(update={"offset_sigmas": tuple(self.offset_sigmas[fan] for fan in fans)})
 

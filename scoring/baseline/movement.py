@@ -11,7 +11,7 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.baseline.intervals import Intervals
-from scoring.detectors.state import ColumnState
+from scoring.column_state import ColumnState
 
 MOVING_SHARE = 0.05  # of the speed
 MAX_MOVING_INTERVALS = 60  # of commissioning, after which they count like others: some fans always move

@@ -25,7 +25,7 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.baseline.intervals import Intervals, first_end
-from scoring.detectors.state import ColumnState
+from scoring.column_state import ColumnState
 
 SMOOTHING_S = 8.0  # longer than a tacho counts, shorter than supply and air take to change by much
 LEAST_FANS = 2
@@ -45,15 +45,9 @@ class SharedOverIntervals(NamedTuple):
     """What fans share in successive intervals."""
 
     values: Array
-    """(intervals,) the offset for each rad/s, in each"""
-    compared: Array
-    """(intervals,) the one when fans were last compared"""
-    commissioned: Array
-    """(intervals,) the one of the commissioning, as far as it is known"""
-    informed: Array
-    """(intervals,) the sum of the information from which it was found again"""
-    searched: Array
-    """(intervals,) in how many intervals it was looked for"""
+    """(intervals, 1), or (intervals, fans) of several trays: the offset for each rad/s, in each"""
+    states: Array
+    """(intervals, 5) the state in each, see _State; of one tray"""
     products: Array
     squares: Array
     counts: Array
@@ -94,16 +88,16 @@ class SharedOffset(ColumnState):
         regression): errors of the twin there, as large as half of its residual, must not become large offsets at high
         speed. `limit` is two standard deviations of the shared one.
         """
-        self._limit = limit
-        self._ridge = (residual_std / limit) ** 2
-        self._gain, self._gain_alone = (-np.expm1(-interval_s / time_s) for time_s in (SMOOTHING_S, adaptation_s))
+        self.limit = limit
+        self.ridge = (residual_std / limit) ** 2
+        self.gain, self._gain_alone = (-np.expm1(-interval_s / time_s) for time_s in (SMOOTHING_S, adaptation_s))
         self._reach_sigmas = reach_sigmas
         self._compares_fast = compares_fast
         self._most_searched = SEARCHED_S / interval_s
-        self._value = np.zeros(1)
-        self._compared = np.zeros(1)
+        self.value = np.zeros(1)
+        self.compared = np.zeros(1)
         """the value when fans were last compared"""
-        self._commissioned = np.zeros(1)
+        self.commissioned = np.zeros(1)
         """what fans shared when the first of them got its baseline, or all were commissioned again, as far as it is
         known; the limit is from there"""
         self._informed, self._searched = np.zeros((2, 1))
@@ -112,16 +106,16 @@ class SharedOffset(ColumnState):
         """its value at that time, and how much of it was known, 0 to 1: it may still move by the rest, in limits"""
         self._first = np.zeros(1, np.int64)
         """intervals in which fans were compared before any of them had a baseline"""
-        self._products = np.zeros(fans, np.int64)
-        self._squares = np.zeros(fans, np.int64)
-        self._counts = np.zeros(fans, np.int64)
+        self.products = np.zeros(fans, np.int64)
+        self.squares = np.zeros(fans, np.int64)
+        self.counts = np.zeros(fans, np.int64)
 
     @property
     def since_commissioning(self) -> float:
         """How far the offset was from that of the last commissioning of all fans when fans were last compared, for each
         rad/s, in the unit of the residual: what only one fan that turned alone has added since is not shared.
         """
-        return float(self._compared[0] - self._commissioned[0])
+        return float(self.compared[0] - self.commissioned[0])
 
     @property
     def is_known(self) -> bool:
@@ -131,7 +125,7 @@ class SharedOffset(ColumnState):
     @property
     def independent_intervals(self) -> float:
         """The number of independent intervals of a fan whose mean would vary as much."""
-        return (2.0 / self._gain - 1.0) * len(self._counts)
+        return (2.0 / self.gain - 1.0) * len(self.counts)
 
     def over(
         self,
@@ -147,19 +141,12 @@ class SharedOffset(ColumnState):
         offset: (n, fans) from the commissioned baseline, sigma. speed_sigmas: (n, fans) the speed over sigma, with its
         sign. commissioned: (fans,). moving: (intervals, fans); None: no fan. See `end_interval`.
         """
-        known = np.where(valid, offset, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
-        speed = np.where(valid, speed_sigmas, 0.0)
-        sums = np.array((known * speed, speed * speed)).swapaxes(0, 1)
-        products, squares = intervals.sums(np.rint(sums * FIXED_POINT_ONE).astype(np.int64)).swapaxes(0, 1)
-        counts = intervals.sums(valid.astype(np.int64))
-        products[0] += self._products
-        squares[0] += self._squares
-        counts[0] += self._counts
+        products, squares, counts = sums(offset, speed_sigmas, valid, intervals)
+        products[0] += self.products
+        squares[0] += self.squares
+        counts[0] += self.counts
         states, ends = self._states(products, squares, counts, intervals.expected, commissioned, moving)
-        values, compared, at_commissioning, informed, searched = states.T
-        return SharedOverIntervals(
-            values, compared, at_commissioning, informed, searched, products, squares, counts, ends
-        )
+        return SharedOverIntervals(states[:, :1], states, products, squares, counts, ends)
 
     def _states(
         self,
@@ -172,7 +159,7 @@ class SharedOffset(ColumnState):
     ) -> tuple[Array, int]:
         """(intervals, 5) the state in each, see _State; and up to which these hold: until the end of the first interval
         in which a fan turned alone, itself counted."""
-        state = self._now
+        state = self.now
         if len(counts) == 1:
             return np.array([state]), 1
         known = (counts >= MIN_VALID_SHARE * expected) & (squares > 0)
@@ -181,14 +168,14 @@ class SharedOffset(ColumnState):
         turning = known.sum(axis=1)
         is_compared = turning >= LEAST_FANS
         alone = (turning > 0) & ~is_compared & (commissioned.sum() >= LEAST_FANS)
-        fast = self._fast(known, squares, counts)
-        ridge = self._ridge * FIXED_POINT_ONE * counts
+        fast = self.fast(known, squares, counts)
+        ridge = self.ridge * FIXED_POINT_ONE * counts
         states, k = np.empty((len(counts), len(state))), 0
-        while k < len(counts) and self._is_becoming_known(state):
+        while k < len(counts) and self.is_becoming_known(state):
             states[k] = state
             if is_compared[k]:
                 state = self._compared_once(
-                    state, self._gain, products[k, fast[k]], squares[k, fast[k]], ridge[k, fast[k]]
+                    state, self.gain, products[k, fast[k]], squares[k, fast[k]], ridge[k, fast[k]]
                 )
             k += 1
         states[k:] = self._compared_often(state, is_compared[k:], fast[k:], products[k:], squares[k:], ridge[k:])
@@ -197,14 +184,14 @@ class SharedOffset(ColumnState):
     def _compared_once(self, state: _State, gain: float, products: Array, squares: Array, ridge: Array) -> _State:
         """After an interval in which fans were compared; products, squares, ridge: of these."""
         value = self._moved(state, gain, products, squares, ridge)
-        if not self._is_becoming_known(state):
+        if not self.is_becoming_known(state):
             return state._replace(value=value, compared=value)
         begun, known = float(self._begun[0]), float(self._begun_information[0])
         least = max(known + MORE_INFORMATION, LEAST_INFORMATION)
         weight = max(_information(squares, ridge) - least, 0.0)
         informed = state.informed + weight
         commissioned = state.commissioned + weight / (1.0 + informed) * (value - state.commissioned)
-        reach = self._limit * (1.0 - known)
+        reach = self.limit * (1.0 - known)
         return _State(
             value, value, _between(commissioned, begun - reach, begun + reach), informed, state.searched + 1.0
         )
@@ -215,32 +202,26 @@ class SharedOffset(ColumnState):
         middle = (len(offsets) - 1) // 2
         nearest = _between(state.value, float(offsets[middle]), float(offsets[-1 - middle]))
         value = state.value + gain * (nearest - state.value)
-        return _between(value, state.commissioned - self._limit, state.commissioned + self._limit)
+        return _between(value, state.commissioned - self.limit, state.commissioned + self.limit)
 
     def _compared_often(
         self, state: _State, is_compared: Array, fast: Array, products: Array, squares: Array, ridge: Array
     ) -> Array:
         """(intervals, 5) the state in each interval, once it is known what was shared at the commissioning."""
-        number = fast.sum(axis=1)
-        divisor = np.where(fast, squares + ridge, 1.0)
-        offsets = np.sort(np.where(fast, _drawn(products, ridge, state.commissioned) / divisor, np.inf), axis=1)
-        each, middle = np.arange(len(number)), np.maximum(number - 1, 0) // 2
-        low, high = offsets[each, middle].tolist(), offsets[each, np.maximum(number - 1, 0) - middle].tolist()
-        least, most = state.commissioned - self._limit, state.commissioned + self._limit
-        states, value, compared = np.tile(state, (len(number), 1)), state.value, state.compared
+        low, high = (of.tolist() for of in middle_offsets(fast, products, squares, ridge, state.commissioned))
+        least, most = state.commissioned - self.limit, state.commissioned + self.limit
+        states, value, compared = np.tile(state, (len(is_compared), 1)), state.value, state.compared
         for k, compares in enumerate(is_compared.tolist()):
             states[k, :2] = value, compared
             if compares:
-                value += self._gain * (_between(value, low[k], high[k]) - value)
+                value += self.gain * (_between(value, low[k], high[k]) - value)
                 value = compared = _between(value, least, most)
         return states
 
     def take(self, of: SharedOverIntervals) -> None:
         """Go on in the last of some intervals."""
-        self._set(
-            _State(*(column[-1] for column in (of.values, of.compared, of.commissioned, of.informed, of.searched)))
-        )
-        self._products[:], self._squares[:], self._counts[:] = of.products[-1], of.squares[-1], of.counts[-1]
+        self._set(_State(*of.states[-1]))
+        self.products[:], self.squares[:], self.counts[:] = of.products[-1], of.squares[-1], of.counts[-1]
 
     def end_interval(
         self, samples: int, commissioned: Array, learns: Array, moving: Array | None, *, at_first: bool
@@ -252,39 +233,40 @@ class SharedOffset(ColumnState):
 
         Returns (fans,) which fan turned alone, so that its baseline is to learn nothing.
         """
-        known = (self._counts >= MIN_VALID_SHARE * samples) & (self._squares > 0)
+        known = (self.counts >= MIN_VALID_SHARE * samples) & (self.squares > 0)
         if moving is not None:
             known &= ~moving
         is_compared = known.sum() >= LEAST_FANS
         alone = known & (not is_compared) & (commissioned.sum() >= LEAST_FANS)
-        fast = self._fast(known, self._squares, self._counts)
-        used, gain = (fast, self._gain) if is_compared else (alone & learns, self._gain_alone)
+        fast = self.fast(known, self.squares, self.counts)
+        used, gain = (fast, self.gain) if is_compared else (alone & learns, self._gain_alone)
         if at_first and is_compared:
             self._first += 1
             gain = max(gain, 1.0 / float(self._first[0]))
-            information = _information(self._squares[used], self._ridge * FIXED_POINT_ONE * self._counts[used])
+            information = _information(self.squares[used], self.ridge * FIXED_POINT_ONE * self.counts[used])
             self._begun_information += gain * (information - self._begun_information)
         if used.any():
-            products, squares, counts = self._products[used], self._squares[used], self._counts[used]
-            ridge = self._ridge * FIXED_POINT_ONE * counts
+            products, squares, counts = self.products[used], self.squares[used], self.counts[used]
+            ridge = self.ridge * FIXED_POINT_ONE * counts
             if is_compared:
-                self._set(self._compared_once(self._now, gain, products, squares, ridge))
+                self._set(self._compared_once(self.now, gain, products, squares, ridge))
             else:
-                compared = float(self._compared[0])
+                compared = float(self.compared[0])
                 reach = self._reach_sigmas / float(np.sqrt(squares / (counts * FIXED_POINT_ONE))[0])
-                value = self._moved(self._now, gain, products, squares, ridge)
-                self._value[:] = _between(value, compared - reach, compared + reach)
-        self._products[:] = self._squares[:] = self._counts[:] = 0
+                value = self._moved(self.now, gain, products, squares, ridge)
+                self.value[:] = _between(value, compared - reach, compared + reach)
+        self.products[:] = self.squares[:] = self.counts[:] = 0
         return alone
 
-    def _is_becoming_known(self, state: _State) -> bool:
+    def is_becoming_known(self, state: _State) -> bool:
         """Whether it is still being found what fans shared when they were commissioned."""
         if not self._compares_fast or self.is_known or self._begun_information[0] >= WELL_KNOWN:
             return False
         return state.informed < ENOUGH_INFORMATION and state.searched < self._most_searched
 
     @property
-    def _now(self) -> _State:
+    def now(self) -> _State:
+        """The present state."""
         return _State(*(float(column[0]) for column in self._columns_of_state))
 
     def _set(self, state: _State) -> None:
@@ -293,11 +275,11 @@ class SharedOffset(ColumnState):
 
     @property
     def _columns_of_state(self) -> tuple[Array, ...]:
-        return self._value, self._compared, self._commissioned, self._informed, self._searched
+        return self.value, self.compared, self.commissioned, self._informed, self._searched
 
     def begin_from_here(self) -> None:
         """The first fan has its baseline, found without what is shared now."""
-        self._commissioned[:] = self._begun[:] = self._value
+        self.commissioned[:] = self._begun[:] = self.value
         self._informed[:] = self._searched[:] = 0.0
         self._first[:] = 0
 
@@ -307,13 +289,13 @@ class SharedOffset(ColumnState):
         keeps_value: also where these are all fans. What they share is a share of the speed; baselines that are learned
         without it take it as an offset, which is wrong at all other speeds.
         """
-        self._products[fans] = self._squares[fans] = self._counts[fans] = 0
+        self.products[fans] = self.squares[fans] = self.counts[fans] = 0
         if not fans.all():
             return
         if not keeps_value:
-            self._value[:] = self._compared[:] = 0.0
-        self._commissioned[:] = self._compared[:] = self._value
-        self._begun[:] = self._value
+            self.value[:] = self.compared[:] = 0.0
+        self.commissioned[:] = self.compared[:] = self.value
+        self._begun[:] = self.value
         self._first[:] = 0
         self._informed[:] = self._searched[:] = self._begun_information[:] = 0.0
 
@@ -322,7 +304,7 @@ class SharedOffset(ColumnState):
         known = {"informed": [0.0], "searched": [0.0], "begun": [0.0], "begun_information": [1.0]}
         super().restore({"commissioned": [0.0], "first": [0], **known, **state})
 
-    def _fast(self, known: Array, squares: Array, counts: Array) -> Array:
+    def fast(self, known: Array, squares: Array, counts: Array) -> Array:
         """(..., fans) those of the known ones that are not much slower than the second fastest of them."""
         if not self._compares_fast:
             return known
@@ -333,23 +315,45 @@ class SharedOffset(ColumnState):
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
         return {
-            "value": self._value,
-            "compared": self._compared,
-            "commissioned": self._commissioned,
+            "value": self.value,
+            "compared": self.compared,
+            "commissioned": self.commissioned,
             "first": self._first,
             "informed": self._informed,
             "searched": self._searched,
             "begun": self._begun,
             "begun_information": self._begun_information,
-            "products": self._products,
-            "squares": self._squares,
-            "counts": self._counts,
+            "products": self.products,
+            "squares": self.squares,
+            "counts": self.counts,
         }
 
 
-def _drawn(products: Array, ridge: Array, commissioned: float) -> Array:
+def sums(offset: Array, speed_sigmas: Array, valid: Array, intervals: Intervals) -> tuple[Array, Array, Array]:
+    """(intervals, fans) of samples (n, fans): of the offset times the speed, of its square, and of the valid ones."""
+    known = np.where(valid, offset, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
+    speed = np.where(valid, speed_sigmas, 0.0)
+    values = np.array((known * speed, speed * speed)).swapaxes(0, 1)
+    products, squares = intervals.sums(np.rint(values * FIXED_POINT_ONE).astype(np.int64)).swapaxes(0, 1)
+    return products, squares, intervals.sums(valid.astype(np.int64))
+
+
+def middle_offsets(
+    fast: Array, products: Array, squares: Array, ridge: Array, commissioned: Array | float
+) -> tuple[Array, Array]:
+    """(rows,) the two offsets in the middle of those that are fast, both the same of an odd number. All (rows, fans);
+    commissioned: (rows, 1), or one for all.
+    """
+    number = fast.sum(axis=1)
+    divisor = np.where(fast, squares + ridge, 1.0)
+    offsets = np.sort(np.where(fast, _drawn(products, ridge, commissioned) / divisor, np.inf), axis=1)
+    each, last = np.arange(len(number)), np.maximum(number - 1, 0)
+    return offsets[each, last // 2], offsets[each, last - last // 2]
+
+
+def _drawn(products: Array, ridge: Array, commissioned: Array | float) -> Array:
     """The products, such that the ridge draws towards the value of the commissioning."""
-    return products + commissioned * ridge if commissioned else products
+    return products + commissioned * ridge
 
 
 def _information(squares: Array, ridge: Array) -> float:

@@ -17,8 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from schemas.messages import Alarm, Array
 from schemas.tacho import Tacho
+from scoring.column_state import ColumnState
 from scoring.detectors.alarm_units import AlarmUnits
-from scoring.detectors.state import ColumnState
 
 Signal = Literal["speed", "balance", "tacho"]
 """The input of a detector: the speed residual, the torque balance, or the readings of the tacho."""

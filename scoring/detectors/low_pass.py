@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from schemas.messages import Array
-from scoring.detectors.state import ColumnState
+from scoring.column_state import ColumnState
 from scoring.torque_balance import FEW_ROWS, by_rows, filter_rows
 
 MEMORY_TIME_CONSTANTS = 5.0  # after these, less than one percent of an output is left

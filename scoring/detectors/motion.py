@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from schemas.messages import Array
+from scoring.column_state import ColumnState
 from scoring.detectors.low_pass import LowPass
-from scoring.detectors.state import ColumnState
 
 TIME_CONSTANT_S = 1.0
 RECENT_S = 5.0
@@ -73,6 +73,11 @@ class HealthyMotion:
         share = np.divide(of_command, largest_command, out=np.zeros_like(of_command), where=largest_command > 0.0)
         moved = np.maximum(of_twin, share * np.fmax(fastest_rad_s, np.abs(speed_rad_s)))
         return np.where(np.isfinite(predicted_rad_s), moved, np.inf)
+
+    @property
+    def states(self) -> tuple[ColumnState, ...]:
+        """All that is kept."""
+        return self._command, self._predicted
 
     @property
     def memory_s(self) -> float:

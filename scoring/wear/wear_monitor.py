@@ -11,7 +11,7 @@ See docs/explanation/wear.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -55,6 +55,23 @@ class ParameterWear:
     forecast: LimitForecast
 
 
+@dataclass(frozen=True, eq=False)
+class WearInputs:
+    """What the points of a block are taken from, (n, fans) each but limit_command, (fans,).
+
+    eligible: a point may be taken at this sample. commissioned_command: baseline of the balance at the end of
+    commissioning, at the reference speed, NaN before. shared_command: what of the present one the fans of the tray have
+    in common, which is no wear of one of them. held: the baseline is at its bound, so that its value says nothing about
+    wear. limit_command: the alarm comes at this distance from the commissioned baseline.
+    """
+
+    eligible: Array
+    commissioned_command: Array
+    shared_command: Array
+    held: Array
+    limit_command: Array
+
+
 class WearMonitor:
     """The wear of one tray's fans. The result does not depend on how samples are cut into blocks."""
 
@@ -78,21 +95,18 @@ class WearMonitor:
         self,
         t_ns: Array,
         origin_t_ns: int,
-        eligible: Array,
         disturbed: Array,
-        commissioned_command: Array,
-        shared_command: Array,
-        held: Array,
-        limit_command: Array,
+        inputs: Callable[[], WearInputs],
     ) -> None:
-        """Process a block that the diagnoser has taken; (n, fans) each but t_ns, (n,), and limit_command, (fans,).
+        """Process a block that the diagnoser has taken. t_ns: (n,).
 
-        eligible: a point may be taken at this sample. disturbed: this sample must not be within the window of a point.
-        commissioned_command: baseline of the balance at the end of commissioning, at the reference speed, NaN before.
-        shared_command: what of the present one the fans of the tray have in common, which is no wear of one of them.
-        held: the baseline is at its bound, so that its value says nothing about wear. limit_command: the alarm comes at
-        this distance from the commissioned baseline.
+        disturbed: (n, fans) this sample must not be within the window of a point. inputs: asked for only if a fan has
+        its turn in the block.
         """
+        if (int(t_ns[-1]) - origin_t_ns) // TURN_NS <= self._last_turn:
+            self._see_disturbances(t_ns, disturbed)
+            return
+        of = inputs()
         turns = np.maximum((t_ns - origin_t_ns) // TURN_NS, self._last_turn)
         fans, begin = np.arange(len(self._fans)), 0
         for row in np.flatnonzero(np.diff(turns, prepend=self._last_turn) > 0).tolist():
@@ -102,14 +116,14 @@ class WearMonitor:
             self._see_disturbances(t_ns[begin : row + 1], disturbed[begin : row + 1])
             begin = row + 1
             undisturbed = self._disturbed_t_ns <= at_ns - round(WINDOW_S * NS_PER_S)
-            commissioned = np.isfinite(commissioned_command[row])
-            for fan in np.flatnonzero(has_turn & eligible[row] & undisturbed & commissioned).tolist():
+            commissioned = np.isfinite(of.commissioned_command[row])
+            for fan in np.flatnonzero(has_turn & of.eligible[row] & undisturbed & commissioned).tolist():
                 slot = (at_ns - origin_t_ns - fan * TURN_NS) // self._every_ns
                 due = slot > self._fans[fan].slot
-                of_fan = (float(of[row, fan]) for of in (commissioned_command, shared_command))
-                if due and self._add_point(fan, at_ns, *of_fan, held=bool(held[row, fan])):
+                of_fan = (float(of_all[row, fan]) for of_all in (of.commissioned_command, of.shared_command))
+                if due and self._add_point(fan, at_ns, *of_fan, held=bool(of.held[row, fan])):
                     self._fans[fan].slot = slot
-                    self._fans[fan].evaluate(at_ns, float(limit_command[fan]))
+                    self._fans[fan].evaluate(at_ns, float(of.limit_command[fan]))
         self._see_disturbances(t_ns[begin:], disturbed[begin:])
 
     def of(self, fan: int) -> Mapping[str, ParameterWear]:
@@ -197,6 +211,8 @@ class WearMonitor:
 
     def _see_disturbances(self, t_ns: Array, disturbed: Array) -> None:
         """Keep the time of the last disturbed sample of each fan; (n,) and (n, fans), n may be 0."""
+        if not disturbed.any():
+            return
         disturbed_t_ns = np.where(disturbed, t_ns[:, np.newaxis], NEVER_NS).max(axis=0, initial=NEVER_NS)
         self._disturbed_t_ns = np.maximum(self._disturbed_t_ns, disturbed_t_ns)
 

@@ -18,7 +18,7 @@ from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import cut, join
 from schemas.messages import Grid, Header, InvalidReason, ModelCard, Prediction
 from schemas.model_uncertainty import ModelUncertainty
-from schemas.tacho import INSTANTANEOUS, Tacho
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from scoring.samples import speed_residual_rad_s
 from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
 from tests.support.twin_files import PARAMETERS, SIGMA_RAD_S, made_up_card, small_hybrid, still_balance, write_twin
@@ -48,14 +48,18 @@ def physical_twin(fans: int = 1, fixed_rate: bool = False, **changes: Any) -> Tw
         assert np.isfinite(command).all()
         return run_freely(state, command, period_s)
 
-    card = replace(made_up_card(PhysicalModel(), fans), speed_range_rad_s=(0.0, 1e9))
+    made_up = replace(made_up_card(PhysicalModel(), fans), speed_range_rad_s=(0.0, 1e9))
+    card = replace(made_up, name="fake", fixed_rate=fixed_rate, **changes)
     return TwinFile(
-        card=replace(card, name="fake", fixed_rate=fixed_rate, **changes),
+        card=card,
         card_json="{}",
         sha256="0",
         sigma_rad_s=np.full(fans, 3.0),
         balance=still_balance(fans),
-        advance=advance,
+        tachos=tacho_of_each_fan(card.tacho, fans),
+        drive=card.drive,
+        advance_with=lambda _parameters: advance,
+        parameters=np.zeros((fans, 0)),
     )
 
 
@@ -346,7 +350,7 @@ def test_an_unknown_command_of_one_fan_never_reaches_the_graph_and_leaves_the_ot
 
 def test_a_twin_that_diverges_is_not_valid_and_is_restarted() -> None:
     twin = physical_twin()
-    unstable = TwinFile(**{**vars(twin), "advance": lambda s, c, h: (np.where(c > 50, np.inf, c), s)})
+    unstable = replace(twin, advance_with=lambda _: lambda s, c, h: (np.where(c > 50, np.inf, c), s))
     core = core_of(unstable)
     prediction = feed(core, split(grid_of(np.array([40.0, 40.0, 60.0, 40.0, 40.0])), 1))
     out = InvalidReason.OUT_OF_RANGE
@@ -366,7 +370,7 @@ def test_a_fan_whose_twin_diverged_never_feeds_nan_to_the_graph() -> None:
         speed = np.where(command > 50, np.inf, command)
         return speed, np.column_stack((speed[-1], command[-1]))
 
-    core = core_of(TwinFile(**{**vars(physical_twin(2)), "advance": advance}), start_samples=2)
+    core = core_of(replace(physical_twin(2), advance_with=lambda _: advance), start_samples=2)
     command = np.full((20, 2), 40.0)
     command[5, 0] = 60.0
     prediction = feed(core, split(grid_of(command), 1))
@@ -396,7 +400,7 @@ def test_the_whole_block_of_all_fans_is_one_run_of_the_graph() -> None:
         shapes.append(command.shape)
         return twin.advance(state, command, period_s)
 
-    core = core_of(TwinFile(**{**vars(twin), "advance": counted}))
+    core = core_of(replace(twin, advance_with=lambda _: counted))
     core.step(grid_of(stairs(50, 4)))
     core.step(grid_of(stairs(50, 4), first=50))
     assert shapes == [(50, 4), (50, 4)]
@@ -456,7 +460,7 @@ def test_a_bridge_of_absurdly_many_samples_is_not_run() -> None:
         steps.append(len(command))
         return np.zeros(command.shape), state
 
-    core = core_of(replace(twin, advance=counted))
+    core = core_of(replace(twin, advance_with=lambda _: counted))
     grid = grid_of(np.zeros(2), period_ns=1)
     grid.t_ns[1] = grid.t_ns[0] + 300_000_000  # within hold_limit_s
     core.step(grid)

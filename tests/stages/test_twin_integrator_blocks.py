@@ -44,7 +44,7 @@ def unstable_twin() -> TwinFile:
             speed[k], now = now, np.where(wanted > 85, np.inf, 0.9 * now + wanted)
         return speed, np.column_stack((now, command[-1]))
 
-    return replace(physical_twin(FANS), advance=advance)
+    return replace(physical_twin(FANS), advance_with=lambda _: advance)
 
 
 @pytest.fixture(scope="module")

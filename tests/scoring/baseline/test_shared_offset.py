@@ -222,7 +222,7 @@ def test_many_intervals_at_once_are_the_same_as_one_after_the_other() -> None:
         add(one, offset[rows], speed[rows], valid[rows])
         one.end_interval(SAMPLES, ALL[:fans], ALL[:fans], None, at_first=False)
     assert once.ends == intervals
-    together = np.array([once.values, once.compared, once.commissioned, once.informed, once.searched]).T[: once.ends]
+    together = once.states[: once.ends]
     np.testing.assert_array_equal(together, states)
     assert states[0][3] == 0.0, "it is still being found at first"
     assert states[-1][3] == states[-100][3] >= 60.0, "and known at last"

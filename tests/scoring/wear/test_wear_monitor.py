@@ -17,7 +17,7 @@ from schemas.messages import Action, Alarm, Header, Prediction, ScorerSnapshot, 
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.torque_balance import BalanceModel, TorqueBalance
 from scoring.wear.slow_change import WEAR_HINT
-from scoring.wear.wear_monitor import ATTEMPT_PERIOD_TURNS, FANS_OF_TURN, WearMonitor
+from scoring.wear.wear_monitor import ATTEMPT_PERIOD_TURNS, FANS_OF_TURN, WearInputs, WearMonitor
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
     CALIBRATION,
@@ -321,8 +321,8 @@ def test_in_a_large_tray_few_fans_are_tried_at_a_time_and_each_is_tried_again(mo
     known, nowhere = np.zeros((seconds, fans)), np.zeros((seconds, fans), np.bool_)
     monitor = WearMonitor(healthy, nobody, 600.0, "1")
     for rows in (slice(0, 33), slice(33, seconds)):
-        of = known[rows], known[rows], nowhere[rows], known[0]
-        monitor.update(t_ns[rows], EPOCH_NS - 600 * 10**9, ~nowhere[rows], nowhere[rows], *of)
+        of = WearInputs(~nowhere[rows], known[rows], known[rows], nowhere[rows], known[0])
+        monitor.update(t_ns[rows], EPOCH_NS - 600 * 10**9, nowhere[rows], lambda of=of: of)
     assert max(Counter(at_ns for at_ns, fan in tried if at_ns > EPOCH_NS).values()) == FANS_OF_TURN
     assert set(Counter(fan for at_ns, fan in tried if at_ns > EPOCH_NS).values()) == {3}, "every 25 s"
 

@@ -10,13 +10,24 @@ import numpy as np
 
 from schemas.messages import Array
 
+NEVER_NS = -(1 << 62)
+"""a time long before all others"""
+
 
 class ColumnState(ABC):
     """Keeps all its state in arrays, so that a snapshot is the arrays by name."""
 
     @abstractmethod
     def columns(self) -> dict[str, Array]:
-        """The arrays that hold the state, by the name they have in a snapshot. `restore` writes into them."""
+        """The arrays that hold the state, by the name they have in a snapshot. `restore` writes into them.
+
+        The last axis of each is over the fans, if it is of fans. Names of times end in `_t_ns`; NEVER_NS stands for
+        none.
+        """
+
+    def arrays(self) -> dict[str, Array]:
+        """The columns, and what else is kept that follows from them."""
+        return self.columns()
 
     def snapshot(self) -> dict[str, Any]:
         """The state as JSON can hold it, which has no NaN."""

@@ -1,0 +1,73 @@
+"""Scores blocks of several trays with one twin in one pass; each tray gets what it would get alone, to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.runtime.tray_scorer import TrayScorer, fan_scorer_of, unseen_error_of
+from schemas.messages import Alarm, Prediction, Score
+from schemas.side_by_side import apart, side_by_side
+from scoring.fan_scorer import FanScorer
+from scoring.joint_scorer import score_together
+from scoring.samples import samples_of
+from scoring.score_message import score_of
+from scoring.unseen_error import UnseenError
+
+MOST_KEPT = 16
+"""joint scorers, each for one number of trays: what they hold is small, and building one takes a millisecond"""
+
+
+@dataclass(frozen=True, eq=False)
+class _OfTrays:
+    """What so many trays are scored with."""
+
+    scorer: FanScorer
+    unseen_error: UnseenError | None
+
+
+class JointTrayScorer:
+    """Of one process, for trays with any twins."""
+
+    def __init__(self) -> None:
+        self._kept: dict[Any, _OfTrays] = {}
+        """by twin, fans of a tray, and number of trays; the latest ones"""
+
+    def score(self, scorers: Sequence[TrayScorer], items: Sequence[Prediction]) -> list[tuple[Score, list[Alarm]]]:
+        """As TrayScorer.score of each. All have the same twin, number of fans and of samples, equal steps of time, and
+        FanScorer.is_interval_over of these times is equal, and known.
+        """
+        if len(scorers) == 1:
+            return [scorers[0].score(items[0])]
+        fans, joint, block = scorers[0].fans, self._of_trays(scorers), side_by_side(items)
+        samples = samples_of(block, joint.unseen_error)
+        of_fans, times = [each.fan_scorer for each in scorers], [item.t_ns for item in items]
+        scored = score_together(joint.scorer, of_fans, samples, times)
+        of_each = [slice(k * fans, (k + 1) * fans) for k in range(len(scorers))]
+        parts = [scored.fans(part) for part in of_each]
+        whole = [slice(0, len(block.t_ns))]
+        decided = [each.decide(item, part, whole) for each, item, part in zip(scorers, items, parts, strict=True)]
+        state = np.concatenate([of_tray for of_tray, _ in decided], axis=1)
+        scores = apart(score_of(block, scored, state, samples.speed_unseen), times)
+        return [
+            (score, each.finish(item, samples.fans(part), of_tray, states, events, score))
+            for each, item, part, of_tray, (states, events), score in zip(
+                scorers, items, of_each, parts, decided, scores, strict=True
+            )
+        ]
+
+    def _of_trays(self, scorers: Sequence[TrayScorer]) -> _OfTrays:
+        first, count = scorers[0], len(scorers)
+        key = first.twin.sha256, first.fans, count
+        found = self._kept.pop(key, None)
+        if found is None:
+            twin, rules = first.twin.of_trays(count, first.fans), first.decision_rules
+            scorer = fan_scorer_of(count * first.fans, twin, rules)
+            found = _OfTrays(scorer, unseen_error_of(twin, rules))
+        self._kept[key] = found
+        if len(self._kept) > MOST_KEPT:
+            del self._kept[next(iter(self._kept))]
+        return found

@@ -1,0 +1,117 @@
+"""The steps of a process: its cores process what is due, and what they make is published."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.devices.host_clock import HOST_CLOCK
+from pipeline.runtime.clock import StageClock, is_of_replay
+from pipeline.runtime.health import HealthBuilder
+from pipeline.runtime.joint_step import step_together
+from pipeline.runtime.kept_snapshots import KeptForOthers
+from pipeline.runtime.outputs import Outputs
+from pipeline.runtime.receiving import Receiver
+from pipeline.runtime.sessions import Sessions
+from pipeline.runtime.stage import BuiltStage, Stage
+from schemas.blocks import join
+from schemas.envelope import Envelope
+from schemas.messages import Message, newest_t_ns
+
+
+@dataclass(frozen=True, eq=False)
+class _Due:
+    """An item for a core, and the tray of the message that it is made of."""
+
+    name: str
+    tray: str
+    item: Any
+
+
+class Steps:
+    """Of all cores of a process."""
+
+    def __init__(
+        self,
+        stage: Stage,
+        parts: Mapping[str, BuiltStage],
+        *,
+        receiver: Receiver,
+        sessions: Sessions,
+        kept: KeptForOthers,
+        outputs: Outputs,
+        health: HealthBuilder,
+        clock: StageClock,
+    ) -> None:
+        """parts: by the tray that a core serves; an empty name: all."""
+        self._stage = stage
+        self._parts = parts
+        self._joint = stage.joint() if stage.joint else None
+        self._has_source = any(part.source for part in parts.values())
+        self._receiver, self._sessions, self._kept = receiver, sessions, kept
+        self._outputs, self._health, self._clock = outputs, health, clock
+        self.counts: Counter[str] = Counter()
+        self.active: frozenset[str] = frozenset()
+        """the cores of which a method is being called, or has raised"""
+        self.owes_answer = False
+        """a command has arrived: the next health, which says so, is sent soon"""
+
+    def step(self, messages: Iterable[Sequence[Envelope]]) -> None:
+        """Process messages, each of another tray; or several of a tray, which differ only in their samples."""
+        due = [each for envelopes in messages if (each := self._accepted(envelopes))]
+        if self._joint is None or len(due) < 2:
+            for each in due:
+                core = self._parts[each.name].core
+                self.call(each.name, lambda core=core, item=each.item: core.step(item), input_tray=each.tray)
+            return
+        self.active = frozenset(each.name for each in due)
+        cores = [self._parts[each.name].core for each in due]
+        made = step_together(self._joint, cores, [each.item for each in due])
+        for each, of_core in zip(due, made, strict=True):
+            self._publish(each.name, of_core, each.tray)
+        self.active = frozenset()
+
+    def call(
+        self, name: str, produce: Callable[[], Sequence[Message]], *, input_tray: str = "", from_timer: bool = False
+    ) -> None:
+        """Let the core called `name` produce messages, and publish them.
+
+        Messages of a core that serves all trays belong to the tray in their header, or else to `input_tray`.
+        """
+        self.active = frozenset((name,))
+        self._publish(name, produce(), input_tray, from_timer=from_timer)
+        self.active = frozenset()
+
+    def _accepted(self, envelopes: Sequence[Envelope]) -> _Due | None:
+        """What a core is given of messages; None: nothing."""
+        first, count = envelopes[0], len(envelopes)
+        header = first.header
+        name = header.tray if header.tray in self._parts else ""
+        if name not in self._parts:
+            self.counts["unknown_tray"] += count
+            return None
+        if self._has_source and is_of_replay(header.producer):  # a recorded command must not drive today's fan
+            self.counts["refused_of_replay"] += count
+            return None
+        if first.topic != "health" and self._sessions.is_ignored(header.producer, header.tray):
+            self.counts["refused_of_second"] += count
+            for envelope in envelopes:
+                self._receiver.tracker.refuse_second(envelope)
+            return None
+        for envelope in envelopes:
+            self._kept.add(envelope)
+        if first.topic == self._stage.reads[0] and not self._has_source:  # samples of a device depend on no input
+            for envelope in envelopes:
+                self._outputs.advance(header.tray, first.topic, envelope.header)
+        self.owes_answer |= self._has_source
+        as_it_is = self._stage.wants_envelopes or self._receiver.is_undecoded(first)
+        return _Due(name, header.tray, first if as_it_is else join([envelope.message for envelope in envelopes]))
+
+    def _publish(self, name: str, made: Sequence[Message], input_tray: str, *, from_timer: bool = False) -> None:
+        for message in made:
+            tray = name or message.header.tray or input_tray
+            stamped = self._outputs.publish(tray, message, from_timer=from_timer)
+            t_ns = newest_t_ns(stamped)
+            self._health.add_output(t_ns, HOST_CLOCK.now_ns(), self._clock.now_ns(tray, t_ns))

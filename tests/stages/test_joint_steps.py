@@ -1,0 +1,146 @@
+"""Trays that are processed in one pass: each gets what it would get alone, to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.config.loading import parse_config
+from pipeline.runtime.building import build_parts
+from pipeline.runtime.joint_step import step_together
+from pipeline.runtime.stage import Context, Core, Joint, load_stage
+from schemas.codec import encode
+from schemas.messages import Alarm, Grid, Header, Message, Prediction, Raw
+from schemas.units import NS_PER_S
+from simulation.faults import Fault
+from simulation.tray import SimulatedTray, TraySettings
+
+EPOCH_NS, SECONDS, BLOCK = 1_700_000_000 * NS_PER_S, 40.0, 5
+TWIN = Path(__file__).parents[2] / "pipeline" / "demo" / "twin.onnx"
+FAULTS: tuple[tuple[Fault, ...], ...] = (
+    (),
+    (Fault("rotor", 3, 20.0, 26.0, 1.0),),
+    (Fault("tacho-dropout", 0, 15.0, 30.0, 0.6), Fault("inlet", 5, 22.0, 30.0, 1.6)),
+    (Fault("tacho-stuck", 7, 18.0, 24.0),),
+    (),
+    (Fault("supply", 2, 25.0, 31.0, 0.85),),
+    (),
+)
+"""of each tray; the fifth loses samples, and the last one is silent for 3 s"""
+LOSING, SILENT = 4, 6
+
+
+class Counting:
+    """A stage's way to process blocks; remembers how many trays were in each pass."""
+
+    def __init__(self, joint: Joint) -> None:
+        self._joint = joint
+        self.trays: list[int] = []
+
+    def process(self, cores: Sequence[Any], blocks: Sequence[Any]) -> Sequence[Any]:
+        self.trays.append(len(cores))
+        return self._joint.process(cores, blocks)
+
+
+@pytest.fixture(scope="module")
+def grids() -> list[list[Grid]]:
+    """Of each tray."""
+    cores = cores_of("resampler")
+    return [
+        [grid for raw in raws(number) for grid in core.step(raw) if isinstance(grid, Grid)]
+        for number, core in enumerate(cores)
+    ]
+
+
+def cores_of(stage: str) -> list[Core]:
+    table = '[[tray]]\nname = "tray{}"\nfans = 8\ntwin = "' + str(TWIN) + '"\n'
+    text = "[resampler]\nrate_hz = 100\n" + "".join(map(table.format, range(len(FAULTS))))
+    config = parse_config(text, Path("/nowhere/fantwin.toml"), (), ("resampler", "twin_integrator", "scorer"))
+    context = Context(
+        site=config.site,
+        trays=config.trays,
+        config=config.sections[stage],
+        folder=config.folder,
+        run_folder=config.run_folder,
+        started_t_ns=EPOCH_NS,
+    )
+    return [parts.core for parts in build_parts(load_stage(stage), context).values()]
+
+
+def raws(number: int) -> Iterator[Raw]:
+    settings = TraySettings(
+        seed=number + 1, duration_s=SECONDS, faults=FAULTS[number], lost=0.02 if number == LOSING else 0.0
+    )
+    tray, samples = SimulatedTray(settings), []
+    while tray.due_s() is not None:
+        samples.append(tray.take())
+    for sequence, first in enumerate(range(0, len(samples), BLOCK)):
+        block = samples[first : first + BLOCK]
+        if number == SILENT and 28.0 <= block[0].t_s < 31.0:
+            continue
+        yield Raw(
+            header=Header("source", sequence, f"tray{number}"),
+            fans=8,
+            host_receive_t_ns=np.array([EPOCH_NS + round(each.t_s * NS_PER_S) for each in block]),
+            device_clock_us=np.array([each.clock_us for each in block], np.uint32),
+            device_sequence=np.array([each.sequence for each in block], np.uint32),
+            command=np.array([each.command for each in block]),
+            speed_rad_s=np.array([each.speed_rad_s for each in block]),
+        )
+
+
+def alone(stage: str, items: Sequence[Sequence[Message]]) -> tuple[list[Core], list[list[Message]]]:
+    """What the core of each tray makes of its messages."""
+    cores = cores_of(stage)
+    return cores, [
+        [made for item in of_tray for made in core.step(item)] for core, of_tray in zip(cores, items, strict=True)
+    ]
+
+
+def together(stage: str, items: Sequence[Sequence[Message]]) -> tuple[list[Core], list[list[Message]], list[int]]:
+    """The same in turns of one message of each tray; and the number of trays in each pass."""
+    cores, made = cores_of(stage), [[] for _ in items]
+    joint_of = load_stage(stage).joint
+    assert joint_of
+    joint = Counting(joint_of())
+    for turn in zip_longest(*items):
+        present = [number for number, item in enumerate(turn) if item is not None]
+        of_turn = step_together(joint, [cores[number] for number in present], [turn[number] for number in present])
+        for number, messages in zip(present, of_turn, strict=True):
+            made[number] += messages
+    return cores, made, joint.trays
+
+
+def share_of_joint(trays: Sequence[int]) -> float:
+    """Of the blocks, those that were processed with others."""
+    return sum(count for count in trays if count > 1) / sum(trays)
+
+
+def assert_equal(expected: list[list[Message]], found: list[list[Message]]) -> None:
+    for number, (of_alone, of_joint) in enumerate(zip(expected, found, strict=True)):
+        assert len(of_alone) == len(of_joint), number
+        for place, (one, other) in enumerate(zip(of_alone, of_joint, strict=True)):
+            assert encode(one) == encode(other), f"message {place} of tray {number}, a {type(one).__name__}"
+
+
+def test_trays_in_one_pass_are_predicted_and_scored_as_each_alone(grids: list[list[Grid]]) -> None:
+    of_integrators, messages = alone("twin_integrator", grids)
+    joint_integrators, joint_messages, trays = together("twin_integrator", grids)
+    assert_equal(messages, joint_messages)
+    assert [core.counters() for core in of_integrators] == [core.counters() for core in joint_integrators]
+    assert share_of_joint(trays) > 0.8
+
+    predictions = [[each for each in of_tray if isinstance(each, Prediction)] for of_tray in messages]
+    of_scorers, scored = alone("scorer", predictions)
+    joint_scorers, joint_scored, trays = together("scorer", predictions)
+    assert_equal(scored, joint_scored)
+    assert [core.counters() for core in of_scorers] == [core.counters() for core in joint_scorers]
+    assert share_of_joint(trays) > 0.4, "not before fans are commissioned, nor where an interval of baselines ends"
+    assert len({each.fan for of_tray in scored for each in of_tray if isinstance(each, Alarm)}) >= 4
+    for one, other in zip(of_scorers, joint_scorers, strict=True):
+        assert_equal([list(one.close())], [list(other.close())])
