@@ -185,6 +185,7 @@ class Stage:
         wants_envelopes: whether `step` is given envelopes instead of messages.
         undecoded: topics whose messages `step` is given as envelopes, of which only the header has been decoded: for a
             core that looks into few of them.
+        is_patient: nobody waits for what it does with a message: messages are taken at the next tick, together.
         may_drop: a consumer that may drop messages: its missing messages do not count as losses.
         check: lists, without side effects, what would keep the stage from working (a missing port, a twin that
             does not fit); one line each. `fantwin doctor` prints them.
@@ -203,6 +204,7 @@ class Stage:
     core_per_tray: bool = True
     wants_envelopes: bool = False
     undecoded: tuple[str, ...] = ()
+    is_patient: bool = False
     may_drop: bool = False
     check: Callable[[Context], Sequence[str]] = no_problems
     chooses: Callable[[Any, Sequence[TrayConfig]], Sequence[str]] | None = None
