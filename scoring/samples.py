@@ -100,7 +100,7 @@ def samples_of(prediction: Prediction, unseen_error: UnseenError | None = None) 
         command=prediction.command,
         predicted_rad_s=prediction.predicted_speed_rad_s,
         idle=among(invalid_reason, *IDLE),
-        missing=invalid_reason == InvalidReason.NO_SPEED,
+        missing=invalid_reason == int(InvalidReason.NO_SPEED),
         reading_missing=reading_missing_of(prediction),
         alive=arrived(invalid_reason),
     )

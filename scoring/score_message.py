@@ -19,8 +19,8 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array)
     of_prediction = item.invalid_reason
     idle = ((InvalidReason.STOPPED, FanState.STOPPED), (InvalidReason.STARTING, FanState.STARTING))
     for reason, of_idle in idle:
-        state = np.where((of_prediction == reason) & ~valid, int(of_idle), state)
-    why = np.where(of_prediction == InvalidReason.NONE, InvalidReason.WARMING_UP, of_prediction)
+        state = np.where((of_prediction == int(reason)) & ~valid, int(of_idle), state)
+    why = np.where(of_prediction == int(InvalidReason.NONE), int(InvalidReason.WARMING_UP), of_prediction)
     return Score(
         fans=item.fans,
         period_ns=item.period_ns,
@@ -32,7 +32,7 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array)
         smoothed_residual_rad_s=scored.speed_smoothed * sigma,
         state=np.where(scored.commissioning & ~valid, int(FanState.COMMISSIONING), state).astype(np.uint8),
         valid=valid,
-        invalid_reason=np.where(valid, InvalidReason.NONE, why).astype(np.uint8),
+        invalid_reason=np.where(valid, int(InvalidReason.NONE), why).astype(np.uint8),
         torque_balance_command=item.torque_balance_command,
         speed_baseline_rad_s=scored.speed_baseline * sigma,
         balance_baseline_command=scored.balance_baseline * item.torque_balance_sigma_command,
@@ -44,7 +44,7 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array)
 def unscored(item: Prediction) -> Score:
     """The message of a block that was not scored, because there is no twin."""
     unknown = np.full(item.command.shape, np.nan)
-    why = np.where(item.invalid_reason == InvalidReason.NONE, InvalidReason.NO_TWIN, item.invalid_reason)
+    why = np.where(item.invalid_reason == int(InvalidReason.NONE), int(InvalidReason.NO_TWIN), item.invalid_reason)
     return Score(
         fans=item.fans,
         period_ns=item.period_ns,

@@ -205,14 +205,14 @@ class TwinIntegratorCore(Core):
         settled = warm | (running & ~in_range)
         in_range &= np.isfinite(predicted) | ~running
         self._counts["not_predicted_out_of_range"] += int((settled & ~in_range).sum())
-        invalid_reason = np.where(settled, InvalidReason.OUT_OF_RANGE, InvalidReason.WARMING_UP)
-        invalid_reason = np.where(settled & in_range, InvalidReason.NONE, invalid_reason)
+        invalid_reason = np.where(settled, int(InvalidReason.OUT_OF_RANGE), int(InvalidReason.WARMING_UP))
+        invalid_reason = np.where(settled & in_range, int(InvalidReason.NONE), invalid_reason)
         judged = grid.valid
         if self._starting is not None:
             starting = self._starting.is_starting(inputs.stopped, warm)
-            invalid_reason = np.where(starting, InvalidReason.STARTING, invalid_reason)
-            invalid_reason = np.where(inputs.stopped, InvalidReason.STOPPED, invalid_reason)
-            judged = judged | ((inputs.stopped | starting) & (grid.invalid_reason == InvalidReason.NO_SPEED))
+            invalid_reason = np.where(starting, int(InvalidReason.STARTING), invalid_reason)
+            invalid_reason = np.where(inputs.stopped, int(InvalidReason.STOPPED), invalid_reason)
+            judged = judged | ((inputs.stopped | starting) & (grid.invalid_reason == int(InvalidReason.NO_SPEED)))
         invalid_reason = np.where(judged, invalid_reason, grid.invalid_reason).astype(np.uint8)
         return self._prediction(grid, predicted, reading_range, invalid_reason)
 
@@ -275,7 +275,7 @@ class TwinIntegratorCore(Core):
         return reading_rad_s, half_range_rad_s
 
     def _without_twin(self, grid: Grid) -> Prediction:
-        invalid_reason = np.where(grid.valid, InvalidReason.NO_TWIN, grid.invalid_reason).astype(np.uint8)
+        invalid_reason = np.where(grid.valid, int(InvalidReason.NO_TWIN), grid.invalid_reason).astype(np.uint8)
         nothing = np.full(grid.command.shape, np.nan)
         return self._prediction(grid, nothing, nothing, invalid_reason)
 
@@ -322,7 +322,7 @@ class TwinIntegratorCore(Core):
             measured_speed_rad_s=grid.speed_rad_s,
             predicted_speed_rad_s=predicted,
             sigma_rad_s=self._twin.sigma_rad_s,
-            valid=invalid_reason == InvalidReason.NONE,
+            valid=invalid_reason == int(InvalidReason.NONE),
             invalid_reason=invalid_reason,
             twin=self._twin.card.name,
             torque_balance_command=balance,

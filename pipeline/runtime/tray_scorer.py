@@ -201,12 +201,12 @@ class TrayScorer:
     def _feed_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:
         assert self.fan_scorer.origin_t_ns is not None
         sigma_command, known = item.torque_balance_sigma_command, np.isfinite(item.torque_balance_command)
-        normal, period_s = state == FanState.NORMAL, item.period_ns / NS_PER_S
+        normal, period_s = state == int(FanState.NORMAL), item.period_ns / NS_PER_S
         self.wear.update(
             item.t_ns,
             self.fan_scorer.origin_t_ns,
             eligible=(scored.score < HALF_LIMIT) & normal & known,
-            disturbed=(scored.score >= HALF_LIMIT) | ~(normal | (state == FanState.UNKNOWN)),
+            disturbed=(scored.score >= HALF_LIMIT) | ~(normal | (state == int(FanState.UNKNOWN))),
             commissioned_command=scored.balance_commissioned * sigma_command,
             shared_command=scored.balance_shared * sigma_command,
             held=scored.balance_at_limit,
