@@ -186,9 +186,9 @@ def encode(message: Message) -> bytes:
     layout.record.write(message, proto)
     parts = [proto.SerializeToString()]
     samples, fans = _sample_count(layout, message), getattr(message, "fans", -1)
-    for column in layout.columns:
-        with np.errstate(over="ignore"):  # beyond the range of float32 is infinite
-            values = np.asarray(getattr(message, column.name), dtype=column.dtype)
+    with np.errstate(over="ignore"):  # beyond the range of float32 is infinite
+        arrays = [np.asarray(getattr(message, column.name), dtype=column.dtype) for column in layout.columns]
+    for column, values in zip(layout.columns, arrays, strict=True):
         _check_shape(layout, column, values, samples, values.size if fans < 0 else fans)
         if values.size == 0:
             continue

@@ -4,18 +4,18 @@ Reads: topic `command` (fan commands in the tray's command unit, set-points in r
 the [[tray]] names (pipeline/devices/source_kinds.py; speed in the tray's speed unit).
 Writes: topic `raw`: device clock (us, wraps), device sequence (wraps), host time of receipt (ns), command, speed
 (rad/s).
-Timing: a message holds what arrives within `block_s`. It is sent as soon as the next samples, by the time between the
-last two arrivals, would come later than that: a line that is slower than `block_s` waits for nothing.
+Timing: a message holds what arrives within `block_s` (pipeline/devices/sample_blocks.py), and is sent when the last of
+that has arrived.
 
 One process and one core per tray. What is done here is the same for all sources: check ranges, count lost and
-repeated samples, convert units, put samples into messages.
+repeated samples, convert units, make messages of samples.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -27,8 +27,8 @@ from pipeline.devices.device_clock import UINT32
 from pipeline.devices.device_sequence import DeviceSequence
 from pipeline.devices.host_clock import HOST_CLOCK, HostClock
 from pipeline.devices.input_quality import InputQuality
+from pipeline.devices.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
 from pipeline.devices.sample_source import (
-    LinkDown,
     LinkUp,
     Reading,
     ReadingBatch,
@@ -95,7 +95,7 @@ def _uint32(values: Iterable[int | None]) -> Array:
     return np.array([value % UINT32 for value in values if value is not None], np.uint32)
 
 
-Item: TypeAlias = ReadingBatch | LinkUp | LinkDown | Command
+Item: TypeAlias = BlockEvent | Command
 
 
 class AcquisitionCore(Core):
@@ -106,22 +106,23 @@ class AcquisitionCore(Core):
         tray: TrayConfig,
         config: AcquisitionConfig,
         source: SampleSource,
+        blocks: SampleBlocks,
         started_t_ns: int,
         host_clock: HostClock,
     ) -> None:
-        """host_clock: gives the times of receipt and of ticks; its steps are reported."""
+        """source: takes commands. blocks: its readings. host_clock: gives the times of receipt and of ticks; its steps
+        are reported."""
         self._tray = tray
         self._host_clock = host_clock
         self._seen_step = host_clock.last_step
         self._config = config
         self._source = source
+        self._blocks = blocks
+        self._processed: BlockEvent | None = None
+        """the last event of the blocks"""
         self._sequence = DeviceSequence()
-        self._block: list[_Received] = []
-        self._block_ns = round(config.block_s * NS_PER_S)
         self._most_samples = most_samples(tray.fans)
         """in a message, however fast a line is"""
-        self._arrived_t_ns = started_t_ns
-        """the newest samples"""
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
@@ -129,11 +130,12 @@ class AcquisitionCore(Core):
 
     def step(self, item: Item) -> list[Raw]:
         """Handle input from the source, a change of its connection, or a command to send."""
-        if isinstance(item, ReadingBatch):
-            return self._receive(item)
         if isinstance(item, Command):
             self._send(item)
             return []
+        self._processed = item
+        if isinstance(item, ReadingBlock):
+            return self._receive(item)
         if isinstance(item, LinkUp):
             self._counts["line_up"] += 1
             self._down_reason = None
@@ -143,17 +145,19 @@ class AcquisitionCore(Core):
             self._down_reason = item.reason
         self._sequence.connection_interrupted()
         self._quality.connection_changed()
-        return self._flush()
+        return []
 
     def tick(self, now_ns: int) -> list[Raw]:
-        """Publish a block that has waited long enough."""
+        """Publish what has waited long enough for more."""
         self._follow_host_clock()
         self._now_ns = now_ns
-        return self._flush() if self._block and now_ns - self._block[0].t_ns >= self._block_ns else []
+        waiting = self._blocks.take_waiting(now_ns, self._processed)
+        return self._receive(waiting) if waiting else []
 
     def close(self) -> list[Raw]:
-        """Publish the rest of a block."""
-        return self._flush()
+        """Publish what a source that has not ended in time has kept."""
+        rest = self._blocks.take_rest()
+        return self._receive(rest) if rest else []
 
     def counters(self) -> Mapping[str, int]:
         """Input by kind; docs/reference/wire-protocol.md explains each counter."""
@@ -162,8 +166,9 @@ class AcquisitionCore(Core):
         return {**self._counts, **({"lost_refused": lost_refused} if lost_refused else {}), **steps}
 
     def samples_in(self, item: Item) -> int:
-        """The readings in a batch."""
-        return sum(isinstance(each, Reading) for each in item.items) if isinstance(item, ReadingBatch) else 0
+        """The readings in a block."""
+        batches = item.batches if isinstance(item, ReadingBlock) else ()
+        return sum(isinstance(each, Reading) for batch in batches for each in batch.items)
 
     def problem(self) -> str:
         """What is wrong with the connection now, and for a minute that the host clock was set."""
@@ -195,32 +200,29 @@ class AcquisitionCore(Core):
             if step and not step.ahead_ns:
                 self._quality.wait_no_longer_than_since(step.at_ns)
 
-    def _receive(self, batch: ReadingBatch) -> list[Raw]:
+    def _receive(self, block: ReadingBlock) -> list[Raw]:
+        """A message of the samples of the block; several if these are many or differ in their columns."""
+        messages: list[Raw] = []
+        samples: list[_Received] = []
+        for batch in block.batches:
+            for received in self._samples(batch):
+                if samples and (len(samples) == self._most_samples or received.columns != samples[0].columns):
+                    messages.append(raw_message(samples, self._tray))
+                    samples = []
+                samples.append(received)
+        return [*messages, raw_message(samples, self._tray)] if samples else messages
+
+    def _samples(self, batch: ReadingBatch) -> Iterator[_Received]:
+        """The samples that are new and plausible; all others are counted."""
         if batch.byte_count:
             self._counts["bytes"] += batch.byte_count
         self._quality.add_input(batch.received_t_ns)
         self._now_ns = max(self._now_ns, batch.received_t_ns)
-        messages: list[Raw] = []
         for item in batch.items:
             reading = self._plausible(item)
-            if reading is None or not self._sequence.is_new(reading, self._counts):
-                continue
-            self._counts["samples"] += 1
-            received = _Received(reading, batch.received_t_ns)
-            if self._block and received.columns != self._block[0].columns:
-                messages += self._flush()
-            self._block.append(received)
-            if len(self._block) >= self._most_samples:
-                messages += self._flush()
-        return messages + self._flush_if_next_is_late(batch.received_t_ns)
-
-    def _flush_if_next_is_late(self, received_t_ns: int) -> list[Raw]:
-        """Publish the block unless samples are expected that still belong to it: as soon as those before them."""
-        if not self._block:
-            return []
-        next_t_ns = 2 * received_t_ns - self._arrived_t_ns
-        self._arrived_t_ns = received_t_ns
-        return self._flush() if next_t_ns - self._block[0].t_ns >= self._block_ns else []
+            if reading is not None and self._sequence.is_new(reading, self._counts):
+                self._counts["samples"] += 1
+                yield _Received(reading, batch.received_t_ns)
 
     def _plausible(self, item: Reading | Rejected) -> Reading | None:
         """The reading, without implausible speeds; None, and counted, if it cannot be used."""
@@ -281,10 +283,6 @@ class AcquisitionCore(Core):
             self._quality.add_valid()
         return replace(reading, speed=speeds)
 
-    def _flush(self) -> list[Raw]:
-        block, self._block = self._block, []
-        return [raw_message(block, self._tray)] if block else []
-
     def _send(self, wanted: Command) -> None:
         """Send a command to the device; one that this tray cannot carry out is refused as a whole."""
         tray = self._tray
@@ -320,8 +318,9 @@ def build(context: Context) -> BuiltStage:
         StageError: a setting of the source is missing.
     """
     source = build_tray_source(context)
-    core = AcquisitionCore(context.tray, context.config, source, context.started_t_ns, HOST_CLOCK)
-    return BuiltStage(core, source)
+    blocks = SampleBlocks(source, round(context.config.block_s * NS_PER_S))
+    core = AcquisitionCore(context.tray, context.config, source, blocks, context.started_t_ns, HOST_CLOCK)
+    return BuiltStage(core, blocks)
 
 
 def check(context: Context) -> list[str]:

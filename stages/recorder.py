@@ -369,6 +369,7 @@ STAGE = Stage(
     build=build,
     core_per_tray=False,
     wants_envelopes=True,
+    is_patient=True,
     check=check,
     chooses=recorded_topics,
 )

@@ -14,6 +14,8 @@ from pipeline.runtime.tracked_streams import Request
 INBOX_SIZE = 4096
 INBOX_BYTES = 128 << 20
 """the inbox is full when it holds as many messages or as many bytes"""
+MOST_PATIENT = 64
+"""so many items wait for the next tick, if none of them is urgent"""
 _BLOCKED_CHECK_S = 0.05
 
 
@@ -72,19 +74,23 @@ class Inbox:
         self._closed = False
         self.dropped = 0
 
-    def put(self, item: Item) -> bool:
-        """Add an item; False, and nothing is added, once the inbox is closed."""
+    def put(self, item: Item, *, is_urgent: bool = True) -> bool:
+        """Add an item; False, and nothing is added, once the inbox is closed.
+
+        is_urgent: wake the stage for it. Otherwise it is taken with the next urgent one, or at the next tick: items
+        that are taken together cost less.
+        """
         with self._changed:
             while self._drops_oldest and self._is_full() and self._drop_oldest():
                 self.dropped += 1
             while self._is_full() and not self._closed:
                 self._changed.wait(_BLOCKED_CHECK_S)
-            return self._add(item)
+            return self._add(item, is_urgent=is_urgent or len(self._items) >= MOST_PATIENT)
 
     def put_at_once(self, item: Item) -> None:
         """Add an item even if the inbox is full: for items whose number is bounded elsewhere."""
         with self._changed:
-            self._add(item)
+            self._add(item, is_urgent=True)
 
     def get(self, timeout_s: float) -> Item | None:
         """The next item; None when there is none in time."""
@@ -106,12 +112,13 @@ class Inbox:
     def _is_full(self) -> bool:
         return len(self._items) >= INBOX_SIZE or self._bytes >= INBOX_BYTES
 
-    def _add(self, item: Item) -> bool:
+    def _add(self, item: Item, *, is_urgent: bool) -> bool:
         if self._closed:
             return False
         self._items.append(item)
         self._bytes += _size(item)
-        self._changed.notify_all()
+        if is_urgent:
+            self._changed.notify_all()
         return True
 
     def _drop_oldest(self) -> bool:

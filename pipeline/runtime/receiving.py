@@ -76,13 +76,16 @@ class Receiver:
         if follows_clock:
             for tray in self._shard.trays:
                 self._bus.subscribe(tray_key(self._site, tray, "clock"), self.on_message)
-        self._bus.subscribe(health_key(self._site, "*", "*"), self.on_message)
+        self._bus.subscribe(health_key(self._site, "*", "*"), self._on_health)
         self._bus.watch_alive(alive_key(self._site, "*", "*"), self._on_liveness)
         self._bus.watch_alive(sessions_key(self._site), self._on_liveness)
 
     def on_message(self, key: str, payload: bytes) -> None:
         """A message has come, in a thread of the bus: put it into the inbox."""
-        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()))
+        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=not self._stage.is_patient)
+
+    def _on_health(self, key: str, payload: bytes) -> None:
+        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=False)
 
     def _on_liveness(self, key: str, alive: bool) -> None:
         self._inbox.put(Liveness(key, alive))

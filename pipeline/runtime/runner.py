@@ -42,6 +42,8 @@ from schemas.streams import stage_losses
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 TICK_S = 0.05
+WATCH_S = 0.25
+"""how often it is seen whether `stop` has been set while the loop hangs; the loop itself sees it at its next tick"""
 HEALTH_PERIOD_S = 1.0
 LOSS_REPORT_S = (
     0.2  # losses, and that a command has arrived, are reported this soon: a killed stage leaves few unreported
@@ -154,7 +156,7 @@ class Runner:
         """
         work, ending = Step(self._work), self._ending
         alone_until_s = 0.0
-        while not work.wait(TICK_S):
+        while not work.wait(WATCH_S):
             if self.launcher_gone.is_set():
                 alone_until_s = alone_until_s or time.monotonic() + PRODUCERS_END_LIMIT_S
                 if time.monotonic() > alone_until_s:

@@ -218,6 +218,7 @@ class Stage:
         wants_envelopes: whether `step` is given envelopes instead of messages.
         undecoded: topics whose messages `step` is given as envelopes, of which only the header has been decoded: for a
             core that looks into few of them.
+        is_patient: nobody waits for what it does with a message: messages are taken at the next tick, together.
         may_drop: a consumer that may drop messages: its missing messages do not count as losses.
         joint: for cores that process the blocks of several trays in one pass; None: each tray alone.
         check: lists, without side effects, what would keep the stage from working (a missing port, a twin that
@@ -237,6 +238,7 @@ class Stage:
     core_per_tray: bool = True
     wants_envelopes: bool = False
     undecoded: tuple[str, ...] = ()
+    is_patient: bool = False
     may_drop: bool = False
     joint: Callable[[], Joint] | None = None
     check: Callable[[Context], Sequence[str]] = no_problems

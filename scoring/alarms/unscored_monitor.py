@@ -47,7 +47,7 @@ class UnscoredMonitor:
 
     def problem(self) -> str:
         """Which fans are not scored, in one line; empty for none. Times double, so that the line rarely changes."""
-        first_warm_up = ~self._was_scored & (self._invalid_reason == InvalidReason.WARMING_UP)
+        first_warm_up = ~self._was_scored & (self._invalid_reason == int(InvalidReason.WARMING_UP))
         limit_ns = np.where(first_warm_up, max(self._limit_ns, FIRST_WARM_UP_NS), self._limit_ns)
         late = self._unscored_ns >= limit_ns
         parts = []

@@ -13,6 +13,7 @@ import pytest
 from pipeline.config.models import TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.devices.host_clock import HostClock
+from pipeline.devices.sample_blocks import SampleBlocks
 from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.serial_port import ReceivedBytes
@@ -417,7 +418,7 @@ def test_a_tray_without_a_port_is_refused_in_one_line() -> None:
 def test_the_stage_is_built_with_the_serial_line_as_its_source() -> None:
     parts = STAGE.build(context("/dev/ttyTEST"))
     assert isinstance(parts.core, AcquisitionCore)
-    assert isinstance(parts.source, SerialSource)
+    assert isinstance(parts.source, SampleBlocks) and isinstance(parts.source.source, SerialSource)
     assert STAGES[STAGE.name].scope == "tray"
 
 

@@ -7,11 +7,13 @@ from pathlib import Path
 
 from pipeline.config.models import TrayConfig
 from pipeline.devices.host_clock import HOST_CLOCK, HostClock
-from pipeline.devices.sample_source import LinkDown, LinkUp, SourceContext
+from pipeline.devices.sample_blocks import SampleBlocks
+from pipeline.devices.sample_source import LinkDown, LinkUp, ReadingBatch, SourceContext
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.serial_port import ReceivedBytes
 from pipeline.devices.serial_source import ByteLink, SerialSource
 from schemas.messages import Raw
+from schemas.units import NS_PER_S
 from stages.acquisition import AcquisitionConfig, AcquisitionCore, Item
 
 
@@ -34,7 +36,7 @@ class FakeLink:
 
 
 class SerialCore(AcquisitionCore):
-    """Decodes bytes as the serial source does before it hands them to the core."""
+    """Decodes bytes and puts readings into blocks, as is done before the core gets them."""
 
     def __init__(
         self,
@@ -46,9 +48,12 @@ class SerialCore(AcquisitionCore):
     ) -> None:
         assert isinstance(tray.source, SerialConfig)
         self.source = SerialSource(tray.source, SourceContext(tray.fans, tray.speed_unit, Path()), link)
-        super().__init__(tray, config, self.source, started_t_ns, host_clock)
+        self.blocks = SampleBlocks(self.source, round(config.block_s * NS_PER_S))
+        super().__init__(tray, config, self.source, self.blocks, started_t_ns, host_clock)
 
-    def step(self, item: Item | ReceivedBytes) -> list[Raw]:
+    def step(self, item: Item | ReadingBatch | ReceivedBytes) -> list[Raw]:
         if isinstance(item, ReceivedBytes | LinkUp | LinkDown):
-            return super().step(self.source.decode(item))
+            item = self.source.decode(item)
+        if isinstance(item, ReadingBatch | LinkUp | LinkDown):
+            return [raw for event in self.blocks.add(item) for raw in super(SerialCore, self).step(event)]
         return super().step(item)

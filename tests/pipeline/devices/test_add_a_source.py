@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.config.loading import load_config, parse_config
 from pipeline.config.models import ConfigError
-from pipeline.devices.sample_source import SourceEvent
+from pipeline.devices.sample_blocks import BlockEvent, SampleBlocks
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.source_kinds import SOURCE_KINDS, SourceKind
 from pipeline.runtime.stage import BuiltStage, Context
@@ -45,8 +45,17 @@ def context(text: str = CONFIGURATION) -> Context:
 
 def built(text: str = CONFIGURATION) -> tuple[BuiltStage, ToySource]:
     parts = STAGE.build(context(text))
-    assert isinstance(parts.source, ToySource)
-    return parts, parts.source
+    assert isinstance(parts.source, SampleBlocks) and isinstance(parts.source.source, ToySource)
+    return parts, parts.source.source
+
+
+def events_of(parts: BuiltStage) -> list[BlockEvent]:
+    """What the source delivers, up to its end."""
+    events: list[BlockEvent] = []
+    assert parts.source
+    parts.source.start(events.append)
+    parts.source.stop()
+    return events
 
 
 def test_the_configuration_of_a_new_kind_is_checked_by_its_own_model() -> None:
@@ -57,10 +66,8 @@ def test_the_configuration_of_a_new_kind_is_checked_by_its_own_model() -> None:
 
 
 def test_a_new_source_shares_range_checks_units_blocks_and_loss_counting() -> None:
-    parts, source = built()
-    events: list[SourceEvent] = []
-    source.start(events.append)
-    (raw,) = (message for event in events for message in parts.core.step(event))
+    parts, _ = built()
+    (raw,) = (message for event in events_of(parts) for message in parts.core.step(event))
     assert isinstance(raw, Raw)
     expected = np.array([[2 * math.pi] * 2, [math.nan] * 2, [4 * math.pi] * 2])
     np.testing.assert_allclose(raw.speed_rad_s, expected, rtol=1e-15)
@@ -85,10 +92,8 @@ def test_commands_reach_a_new_source_in_the_unit_of_its_tray() -> None:
 
 def test_a_reading_with_another_number_of_fans_is_refused_and_counted() -> None:
     parts, _ = built()
-    _, other = built(CONFIGURATION.replace("fans = 2", "fans = 3"))
-    events: list[SourceEvent] = []
-    other.start(events.append)
-    assert [message for event in events for message in parts.core.step(event)] == []
+    others, _ = built(CONFIGURATION.replace("fans = 2", "fans = 3"))
+    assert [message for event in events_of(others) for message in parts.core.step(event)] == []
     assert parts.core.counters()["wrong_fan_count"] == 3
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import queue
 import threading
@@ -125,18 +124,21 @@ def test_every_byte_value_passes_unchanged_in_both_directions(device: Device, li
 
 def test_a_byte_that_came_just_before_the_device_was_disconnected_is_delivered():
     class Unplugged:
-        """Disconnected between the two reads."""
+        """A pipe whose far end has been closed."""
 
-        def read(self, _size: int) -> bytes:
-            return b"x"
+        def __init__(self) -> None:
+            self.near, far = os.pipe()
+            os.write(far, b"x")
+            os.close(far)
 
-        @property
-        def in_waiting(self) -> int:
-            raise OSError(errno.EIO, "gone")
+        def fileno(self) -> int:
+            return self.near
 
     delivered: list[ReceivedBytes] = []
-    port = cast("serial.Serial", Unplugged())
+    unplugged = Unplugged()
+    port = cast("serial.Serial", unplugged)
     assert SerialPort("unused", 115200)._read_until_disconnected(port, delivered.append)
+    os.close(unplugged.near)
     assert [each.data for each in delivered] == [b"x"]
 
 

@@ -1,0 +1,59 @@
+"""What is not urgent wakes nobody: it is taken, in order, with the next urgent item, at a tick, or once many wait."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from pipeline.runtime.inbox import MOST_PATIENT, FromBus, Inbox, Item
+
+LONG_S = 20.0
+MOMENT_S = 0.1
+
+
+def item(number: int) -> FromBus:
+    return FromBus("key", b"", number)
+
+
+class Getter:
+    """A stage that waits for an item."""
+
+    def __init__(self, inbox: Inbox) -> None:
+        self.got: Item | None = None
+        self.thread = threading.Thread(target=self._get, args=(inbox,), daemon=True)
+        self.thread.start()
+
+    def _get(self, inbox: Inbox) -> None:
+        self.got = inbox.get(LONG_S)
+
+    def is_woken(self, timeout_s: float) -> bool:
+        self.thread.join(timeout_s)
+        return not self.thread.is_alive()
+
+
+def woken_by(put_last: Callable[[Inbox], object], patient: int) -> Item | None:
+    """What a waiting stage gets first after so many items that are not urgent, and one more."""
+    inbox = Inbox(drops_oldest=False)
+    getter = Getter(inbox)
+    for number in range(patient):
+        inbox.put(item(number), is_urgent=False)
+    assert not getter.is_woken(MOMENT_S)
+    put_last(inbox)
+    assert getter.is_woken(LONG_S / 2)
+    return getter.got
+
+
+def test_an_urgent_item_wakes_the_stage_which_takes_the_others_first() -> None:
+    assert woken_by(lambda inbox: inbox.put(item(99)), patient=2) == item(0)
+    assert woken_by(lambda inbox: inbox.put_at_once(item(99)), patient=2) == item(0)
+
+
+def test_many_items_wake_the_stage_although_none_is_urgent() -> None:
+    assert woken_by(lambda inbox: inbox.put(item(99), is_urgent=False), patient=MOST_PATIENT) == item(0)
+
+
+def test_a_stage_that_asks_gets_what_is_there() -> None:
+    inbox = Inbox(drops_oldest=False)
+    inbox.put(item(1), is_urgent=False)
+    assert inbox.get(LONG_S) == item(1)
+    assert inbox.get(0) is None
