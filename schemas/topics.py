@@ -102,7 +102,7 @@ TOPICS: tuple[Topic, ...] = (
         Health,
         "1 Hz for each stage",
         True,
-        8,
+        16,
         2 * MIB,
         "status and losses of a stage",
         is_of_session=True,

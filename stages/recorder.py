@@ -25,7 +25,7 @@ from pipeline.recordings.metadata import recording_metadata
 from pipeline.recordings.open_part import OpenPart, PartsFolder
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import LEFT_OUT_KEY, RecordingError
-from pipeline.recordings.recorder_config import RecorderConfig, recorded_topics
+from pipeline.recordings.recorder_config import FLUSH_S, RecorderConfig, flush_interval_s, recorded_topics
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from schemas.envelope import Envelope
@@ -54,15 +54,23 @@ class Recorder(Core):
     second the recorder tries to resume.
     """
 
-    def __init__(self, parts: PartsFolder, config: RecorderConfig, now_ns: int, left_out: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        parts: PartsFolder,
+        config: RecorderConfig,
+        now_ns: int,
+        left_out: Collection[str] = (),
+        flush_s: float = FLUSH_S,
+    ) -> None:
         """Begin the first part, at `now_ns`. If the disk is full or gone, wait for it. left_out: topics that are not
-        recorded on purpose.
+        recorded on purpose. flush_s: how often it flushes.
 
         Raises:
             RecordingError: nothing can be recorded there.
         """
         self._parts = parts
         self._config = config
+        self._flush_ns = round(flush_s * NS_PER_S)
         self._part: OpenPart | None = None
         self._ledger = SequenceLedger(parts.before, left_out)
         self._before = parts.before
@@ -108,7 +116,7 @@ class Recorder(Core):
             self._checked_ns = self._began_ns = now_ns
             self._paused_ns = min(self._paused_ns, now_ns)
             self._interference.clock_set_back(now_ns)
-            self._flushed_ns = now_ns - int(self._config.flush_interval_s * NS_PER_S)
+            self._flushed_ns = now_ns - self._flush_ns
             self._unflushed_ns = None if self._unflushed_ns is None else self._flushed_ns  # due at once
         self._now_ns = now_ns
         if self._part and self._is_flush_due():
@@ -192,11 +200,10 @@ class Recorder(Core):
 
     def _is_flush_due(self) -> bool:
         """Whether a message would be unflushed for too long at the next tick; not at every tick behind a backlog."""
-        interval_ns = self._config.flush_interval_s * NS_PER_S
         return (
             self._unflushed_ns is not None
-            and self._now_ns - self._unflushed_ns >= interval_ns - TICK_NS
-            and self._now_ns - self._flushed_ns >= interval_ns / 4
+            and self._now_ns - self._unflushed_ns >= self._flush_ns - TICK_NS
+            and self._now_ns - self._flushed_ns >= self._flush_ns / 4
         )
 
     def _is_full(self, part: OpenPart) -> bool:
@@ -314,7 +321,8 @@ def build(context: Context) -> BuiltStage:
     """
     config: RecorderConfig = context.config
     metadata, attachments = recording_metadata(context)
-    metadata["flush_interval_s"] = f"{config.flush_interval_s:g}"
+    flush_s = flush_interval_s(config, context.trays)
+    metadata["flush_interval_s"] = f"{flush_s:g}"
     reads = STAGE.reads if context.reads is None else context.reads
     left_out = tuple(name for name in STAGE.reads if name not in reads)
     if left_out:
@@ -340,7 +348,7 @@ def build(context: Context) -> BuiltStage:
             )
         own = {tray_key(context.site, tray.name, topic) for tray in context.trays for topic in KEEPS}
         kept = {key: last for topic in KEEPS for key, last in parts.last_messages(topic).items() if key in own}
-        return BuiltStage(Recorder(parts, config, context.started_t_ns, left_out), kept=kept)
+        return BuiltStage(Recorder(parts, config, context.started_t_ns, left_out, flush_s), kept=kept)
     except RecordingError as error:
         raise StageError(f"{error} (recorder.file)") from error
 

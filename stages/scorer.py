@@ -53,6 +53,7 @@ from scoring.snapshot_times import with_times_moved
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
 SNAPSHOT_PERIOD_SAMPLES = 3000  # at least: at slow rates snapshots would be most of a recording
 MOST_FANS_AT_ONCE = 64  # of a tray whose snapshot is taken with each alarm
+SAVED_OF_PUBLISHED = 3  # of a larger tray: every third is published while nothing happens, for the recording's size
 REST_NS_PER_FAN = 5_000_000  # between snapshots with alarms of a larger tray: each takes a millisecond a fan after days
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "baselines, alarms and wear start from the beginning"
@@ -110,6 +111,8 @@ class ScorerCore(Core):
         self._rest_ns = fans * REST_NS_PER_FAN if fans > MOST_FANS_AT_ONCE else 0
         self._owes_snapshot = False
         """alarms have changed since the last one"""
+        self._unpublished = SAVED_OF_PUBLISHED - 1
+        """snapshots that were saved since the last one that was published; the first one is"""
         self._start_new()
         stored = snapshot_store.load() if snapshot_store and not continues else None
         self._at_start = self.restore(stored) if stored else self._continued(continues) if continues else []
@@ -229,7 +232,7 @@ class ScorerCore(Core):
         self._unscored.update(block.period_ns, score.valid, score.invalid_reason)
         self._judged_share.add(score.valid, score.invalid_reason)
         self._owes_snapshot |= bool(alarms)
-        snapshots = self._take_snapshot() if self._is_snapshot_due(block.period_ns) else []
+        snapshots = self._take_due_snapshot() if self._is_snapshot_due(block.period_ns) else []
         # the snapshot first: whoever takes over from one that is killed now must not raise these alarms again
         return [score, *snapshots, *alarms]
 
@@ -343,6 +346,14 @@ class ScorerCore(Core):
         """Whether alarms have changed since the last snapshot, or it is old; period_ns: between samples."""
         rest_ns = self._rest_ns if self._owes_snapshot else max(SNAPSHOT_PERIOD_NS, SNAPSHOT_PERIOD_SAMPLES * period_ns)
         return self._last_t_ns - self._snapshot_t_ns >= rest_ns
+
+    def _take_due_snapshot(self) -> list[ScorerSnapshot]:
+        """Save the state; returns it if it is to be published, too."""
+        unpublished = self._unpublished + 1
+        is_published = not self._rest_ns or self._owes_snapshot or unpublished == SAVED_OF_PUBLISHED
+        snapshots = self._take_snapshot()
+        self._unpublished = 0 if is_published else unpublished
+        return snapshots if is_published else []
 
     def _take_snapshot(self) -> list[ScorerSnapshot]:
         """The state for a restart."""

@@ -2,7 +2,7 @@
 
 Rough fans under random stairs, all healthy, watched by a calibrated twin: speeds with all their digits, which do not
 compress. The cores of the stages make what a site sends, in this process, without health. The recorder's own writer
-writes it, flushed once a second.
+writes it, flushed as often as the recorder does by default.
 
     python -m bench.runtime.recording_size
 """
@@ -28,13 +28,13 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from pipeline.config.loading import parse_config
 from pipeline.recordings.reading import read_recording
-from pipeline.recordings.recorder_config import SAMPLES
+from pipeline.recordings.recorder_config import FLEET_FLUSH_S, FLUSH_S, MOST_FANS_RECORDED_WHOLE, SAMPLES
 from pipeline.recordings.writing import RecordingWriter
 from schemas.envelope import Envelope
 from schemas.messages import ScorerSnapshot
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
-from scoring.wear.trend import CAPACITY, NS_PER_DAY
+from scoring.wear.trend import WearSeries
 from simulation.published_fan import RATE_HZ, rough_run
 from tests.support.killed_site import CHAIN, Stages
 from twin.runs import Run
@@ -42,8 +42,13 @@ from twin.runs import Run
 BLOCKS_S = (0.05, 0.1, 1.0)
 TRAYS = {1: 120.0, 8: 120.0, 64: 120.0, 1024: 20.0}
 """fans of a tray, and the seconds that are recorded"""
-SLOW_RATES_HZ, SLOW_SAMPLES = (10.0, 1.0), 20
+SLOW_FANS, SLOW_TRAYS = 512, (1, 8, 64, 512)
+"""fans of the site, and of a tray"""
+SLOW_RATES_HZ, SLOW_S, HELD_S = (10.0, 1.0), 40.0, 8.0
+"""HELD_S: so long a command stays the same; in the run it jumps every 0.5 to 2 s"""
 SNAPSHOT_FANS, SNAPSHOTS = 64, 4
+WEAR_POINTS, WEAR_EVERY_NS = (0, 128, 1000), 600 * NS_PER_S
+"""of each parameter since commissioning: none, as many as are kept, and those of a week, when several are one"""
 
 
 def main(json_output: JsonOption = False) -> None:
@@ -54,10 +59,8 @@ def main(json_output: JsonOption = False) -> None:
         twin = calibrated_twin(folder)
         tables = {
             f"one tray at {RATE_HZ:g} Hz: bytes for each fan-sample by topics": fast_rows(twin, folder),
-            f"{max(TRAYS):,} fans, each sample a message: bytes for each fan-sample": slow_rows(folder),
-            "a snapshot with the full history of wear: bytes for each fan": [
-                {"snapshot": snapshot_bytes(twin, folder)}
-            ],
+            f"{SLOW_FANS:,} fans, each sample a message: bytes of raw samples for each fan-sample": slow_rows(folder),
+            "snapshots: bytes for each fan": snapshot_rows(twin, folder),
         }
     show(tables, [], as_json=json_output)
 
@@ -71,8 +74,11 @@ def fast_rows(twin: Path, folder: Path) -> list[dict[str, Any]]:
         run = rough_run(3, seconds, fans, fan_variation=0.0).run
         for block_s in BLOCKS_S:
             whole = list(read_recording(site_recording(run, block_s, twin, folder)))
+            flush_s = FLUSH_S if fans <= MOST_FANS_RECORDED_WHOLE else FLEET_FLUSH_S
             sizes = {
-                name: bytes_of_each([each for each in whole if each.topic in topics], run.samples * fans, folder)
+                name: bytes_of_each(
+                    [each for each in whole if each.topic in topics], run.samples * fans, folder, flush_s
+                )
                 for name, topics in recorded.items()
             }
             rows.append({"fans": fans, "message, s": block_s, **sizes})
@@ -80,34 +86,45 @@ def fast_rows(twin: Path, folder: Path) -> list[dict[str, Any]]:
 
 
 def slow_rows(folder: Path) -> list[dict[str, Any]]:
-    """Of raw samples, by rate and fans of a tray."""
+    """By rate and fans of a tray, with commands that are new in most samples, and with held ones."""
     rows: list[dict[str, Any]] = []
-    run = rough_run(3, SLOW_SAMPLES / min(SLOW_RATES_HZ), max(TRAYS), fan_variation=0.0).run
+    progress(f"{SLOW_FANS} fans at slow rates")
+    run = rough_run(3, SLOW_S, SLOW_FANS, fan_variation=0.0).run
     for rate_hz in SLOW_RATES_HZ:
-        progress(f"{run.fans} fans at {rate_hz:g} Hz")
-        site = slowed(run, rate_hz)
-        for fans in TRAYS:
-            messages = sorted(
-                (each for first in range(0, site.fans, fans) for each in tray_of(site, first, fans, rate_hz)),
-                key=lambda envelope: envelope.received_t_ns,
-            )
-            each = bytes_of_each(messages, site.samples * site.fans, folder)
-            rows.append({"rate, Hz": rate_hz, "fans of a tray": fans, "trays": site.fans // fans, "raw": each})
+        sites = {"command jumps": slowed(run, rate_hz, 0.0), "command held": slowed(run, rate_hz, HELD_S)}
+        for fans in SLOW_TRAYS:
+            found: dict[str, float] = {}
+            for name, site in sites.items():
+                messages = sorted(
+                    (each for first in range(0, site.fans, fans) for each in tray_of(site, first, fans, rate_hz)),
+                    key=lambda envelope: envelope.received_t_ns,
+                )
+                found[name] = bytes_of_each(messages, site.samples * site.fans, folder, FLEET_FLUSH_S)
+            rows.append({"rate, Hz": rate_hz, "fans of a tray": fans, "trays": SLOW_FANS // fans, **found})
     return rows
 
 
-def snapshot_bytes(twin: Path, folder: Path) -> float:
-    """Of a fan of a tray of SNAPSHOT_FANS."""
+def snapshot_rows(twin: Path, folder: Path) -> list[dict[str, Any]]:
+    """By points of wear; for each fan of a tray of SNAPSHOT_FANS."""
     progress("snapshots")
     run = rough_run(3, 10.0, SNAPSHOT_FANS, fan_variation=0.0).run
-    snapshots = snapshots_with_full_wear(list(read_recording(site_recording(run, 1.0, twin, folder))))
-    return bytes_of_each(snapshots, len(snapshots) * SNAPSHOT_FANS, folder)
+    recorded = list(read_recording(site_recording(run, 1.0, twin, folder)))
+    rows: list[dict[str, Any]] = []
+    for points in WEAR_POINTS:
+        snapshots = snapshots_with_wear(recorded, points)
+        rows.append({"points": points, "bytes": bytes_of_each(snapshots, len(snapshots) * SNAPSHOT_FANS, folder)})
+    return rows
 
 
-def slowed(run: Run, rate_hz: float) -> Run:
-    """SLOW_SAMPLES of the samples of a run, as far apart as at a slower rate."""
-    rows = np.arange(SLOW_SAMPLES) * round(RATE_HZ / rate_hz)
-    return replace(run, t_s=run.t_s[rows], command=run.command[rows], speed_rad_s=run.speed_rad_s[rows])
+def slowed(run: Run, rate_hz: float, held_s: float) -> Run:
+    """A run at a slower rate. held_s: so long the command of a fan stays the same, of each at other times; 0: as in the
+    run."""
+    rows = np.arange(0, run.samples, round(RATE_HZ / rate_hz))
+    held = max(1, round(held_s * RATE_HZ))
+    began = np.arange(run.fans) * held // run.fans
+    kept = np.maximum((rows[:, np.newaxis] + began) // held * held - began, 0)
+    command = np.take_along_axis(run.command, kept if held_s else np.repeat(rows[:, np.newaxis], run.fans, 1), axis=0)
+    return replace(run, t_s=run.t_s[rows], command=command, speed_rad_s=run.speed_rad_s[rows])
 
 
 def tray_of(run: Run, first: int, fans: int, rate_hz: float) -> Iterator[Envelope]:
@@ -121,8 +138,8 @@ def tray_of(run: Run, first: int, fans: int, rate_hz: float) -> Iterator[Envelop
         yield Envelope.of(tray_key(SITE, f"tray{first}", "raw"), timed, int(t_ns[0]))
 
 
-def snapshots_with_full_wear(recorded: Sequence[Envelope]) -> list[Envelope]:
-    """The last recorded snapshot several times, as after a day: the history of wear of each fan is full."""
+def snapshots_with_wear(recorded: Sequence[Envelope], points: int) -> list[Envelope]:
+    """The last recorded snapshot several times, with so many points of wear of each fan."""
     last = next(each for each in reversed(recorded) if each.topic == "snapshot")
     snapshot = last.message
     assert isinstance(snapshot, ScorerSnapshot)
@@ -132,34 +149,33 @@ def snapshots_with_full_wear(recorded: Sequence[Envelope]) -> list[Envelope]:
     for number in range(SNAPSHOTS):
         for fan in state["wear"]["fans"]:
             for parameter in fan["parameters"].values():
-                parameter["series"] = {
-                    "t_ns": (START_NS + np.sort(rng.integers(0, NS_PER_DAY, CAPACITY))).tolist(),
-                    "value": rng.normal(size=CAPACITY).tolist(),
-                    "std_error": rng.uniform(size=CAPACITY).tolist(),
-                    "count": [1, 1],
-                }
+                series = WearSeries()
+                for point in range(points):
+                    t_ns = START_NS + point * WEAR_EVERY_NS + int(rng.integers(WEAR_EVERY_NS))
+                    series.add(t_ns, rng.normal(0.0, 0.02), rng.uniform(0.005, 0.02))
+                parameter["series"] = {name: column.tolist() for name, column in series.snapshot().items()}
         message = replace(snapshot, state_json=json.dumps(state))
         found.append(Envelope.of(last.key, message, START_NS + 60 * number * NS_PER_S))
     return found
 
 
-def bytes_of_each(envelopes: Sequence[Envelope], things: int, folder: Path) -> float:
+def bytes_of_each(envelopes: Sequence[Envelope], things: int, folder: Path, flush_s: float = FLUSH_S) -> float:
     """Bytes of a file for each of the things in these messages, by what the second half of the messages adds to it."""
     half = len(envelopes) // 2
-    added = size(envelopes, folder) - size(envelopes[:half], folder)
+    added = size(envelopes, folder, flush_s) - size(envelopes[:half], folder, flush_s)
     return added / (things * (1.0 - half / len(envelopes)))
 
 
-def size(envelopes: Sequence[Envelope], folder: Path) -> int:
+def size(envelopes: Sequence[Envelope], folder: Path, flush_s: float) -> int:
     """Bytes of a file with these messages."""
     path = folder / "size.mcap"
     flushed_ns = START_NS
     with RecordingWriter(path, {}, overwrite=True) as writer:
         for envelope in envelopes:
-            writer.add(envelope)
-            if envelope.received_t_ns - flushed_ns >= NS_PER_S:
+            if envelope.received_t_ns - flushed_ns >= flush_s * NS_PER_S:
                 writer.flush()
                 flushed_ns = envelope.received_t_ns
+            writer.add(envelope)
     return path.stat().st_size
 
 

@@ -13,6 +13,8 @@ from schemas.topics import BY_NAME, TOPICS
 
 MOST_FANS_RECORDED_WHOLE = 64
 """of a site, without `topics`: a larger site makes gigabytes an hour of what a replay makes again"""
+FLUSH_S, FLEET_FLUSH_S = 1.0, 5.0
+"""up to MOST_FANS_RECORDED_WHOLE fans, and above: at 1 Hz a chunk of one second holds nothing that repeats"""
 RECORDED = tuple(topic.name for topic in TOPICS if topic.recorded)
 SAMPLES = tuple(name for name in RECORDED if BY_NAME[name].has_samples)
 """the topics that may be left out"""
@@ -32,7 +34,12 @@ class RecorderConfig(StageConfig):
         description="relative to run_folder; its parts are NAME.mcap, NAME-2.mcap and so on, of a shard "
         "SHARD.NAME.mcap",
     )
-    flush_interval_s: float = Field(default=1.0, gt=0, description="a crash loses at most this much")
+    flush_interval_s: float | None = Field(
+        default=None,
+        gt=0,
+        description=f"a crash loses at most this much; without it {FLUSH_S:g}, and {FLEET_FLUSH_S:g} where a recorder "
+        f"has more than {MOST_FANS_RECORDED_WHOLE} fans",
+    )
     part_bytes: int = Field(default=100_000_000, ge=0, description="a new part begins at this size; 0: never")
     part_s: float = Field(default=0.0, ge=0, description="a new part begins after this time; 0: never")
     min_free_bytes: int = Field(default=100_000_000, ge=0, description="free space to leave on the disk")
@@ -71,3 +78,10 @@ def recorded_topics(config: RecorderConfig, trays: Sequence[TrayConfig]) -> tupl
     if samples is None:
         samples = SAMPLES if sum(tray.fans for tray in trays) <= MOST_FANS_RECORDED_WHOLE else (RAW,)
     return tuple(name for name in RECORDED if name in samples or name not in SAMPLES)
+
+
+def flush_interval_s(config: RecorderConfig, trays: Sequence[TrayConfig]) -> float:
+    """How often a recorder that has these trays flushes to the disk."""
+    if config.flush_interval_s is not None:
+        return config.flush_interval_s
+    return FLUSH_S if sum(tray.fans for tray in trays) <= MOST_FANS_RECORDED_WHOLE else FLEET_FLUSH_S

@@ -32,7 +32,7 @@ from schemas.envelope import Envelope
 from schemas.messages import Health, Message, newest_t_ns
 from schemas.topics import topic_of
 
-CHUNK_BYTES = 64 * 1024
+CHUNK_BYTES = 256 * 1024
 """A crash loses what is not in a finished chunk; a reader holds one chunk in memory."""
 UNSYNCED_BYTES = 4 << 20
 """About the most that is kept in memory until it is flushed to the disk."""

@@ -87,7 +87,13 @@ class TrayScorer:
             plain_words=decision_rules >= DecisionRules.PLAIN_WORDS,
         )
         healthy = healthy_fans(twin.balances, twin.limits.balance)
-        self.wear = WearMonitor(healthy, self._diagnoser, config.wear_every_s, twin.command_unit)
+        self.wear = WearMonitor(
+            healthy,
+            self._diagnoser,
+            config.wear_every_s,
+            twin.command_unit,
+            rounds_points=decision_rules >= DecisionRules.ROUNDED_WEAR,
+        )
         off_delay_s = config.least_off_delay_s(twin.tachos)
         holding = holding_detectors(
             self.fan_scorer.detectors,

@@ -1,7 +1,8 @@
 """Slow wear: the trend of a parameter per day with its confidence interval, and when it will reach a limit.
 
 Points are (time, value, standard error). Memory is bounded: when the series is full, neighbours are merged in pairs,
-and from then on a stored point is the mean of twice as many.
+and from then on a stored point is the mean of twice as many. A complete point is kept to the second, its value to a
+hundredth of its standard error: all digits would be most of a snapshot, and say nothing.
 
 Slope: the median of the slopes between all pairs of points (Theil 1950; Sen, JASA 63 (1968) 1379), which tolerates a
 third of outliers. Interval: residuals of a fan are correlated over hours (temperature, day and night), so that
@@ -17,6 +18,7 @@ A limit is reached between the earliest and the latest time at which the line wi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -97,8 +99,11 @@ class WearSeries:
         """The last value; 0 if there is none."""
         return self._value[-1] if self._value else 0.0
 
-    def add(self, t_ns: int, value: float, std_error: float) -> None:
-        """Add a point. It is ignored if not finite, not newer than the last, or without a positive std_error."""
+    def add(self, t_ns: int, value: float, std_error: float, *, is_rounded: bool = True) -> None:
+        """Add a point. It is ignored if not finite, not newer than the last, or without a positive std_error.
+
+        is_rounded: as stored points are; False: they keep all digits, as before.
+        """
         if not (np.isfinite(value) and np.isfinite(std_error) and std_error > 0.0):
             return
         if self._t_ns and t_ns <= self._t_ns[-1]:
@@ -108,13 +113,17 @@ class WearSeries:
             self._t_ns[-1], self._value[-1], self._std_error[-1] = _merged(
                 (self._t_ns[-1], self._value[-1], self._std_error[-1]), (t_ns, value, std_error)
             )
-            return
-        if len(self._t_ns) == CAPACITY:
-            self._halve()
-        self._t_ns.append(t_ns)
-        self._value.append(value)
-        self._std_error.append(std_error)
-        self._points_in_last = 1
+        else:
+            if len(self._t_ns) == CAPACITY:
+                self._halve(is_rounded=is_rounded)
+            self._t_ns.append(t_ns)
+            self._value.append(value)
+            self._std_error.append(std_error)
+            self._points_in_last = 1
+        if is_rounded and self._points_in_last == self._points_per_stored:
+            self._t_ns[-1], self._value[-1], self._std_error[-1] = _rounded(
+                (self._t_ns[-1], self._value[-1], self._std_error[-1])
+            )
 
     def trend(self) -> Trend | None:
         """The line through the points; None while there are too few independent points."""
@@ -177,9 +186,11 @@ class WearSeries:
         series._points_per_stored, series._points_in_last = (int(count) for count in snapshot["count"])
         return series
 
-    def _halve(self) -> None:
+    def _halve(self, *, is_rounded: bool) -> None:
         points = list(zip(self._t_ns, self._value, self._std_error, strict=True))
         pairs = [_merged(first, second) for first, second in zip(points[::2], points[1::2], strict=True)]
+        if is_rounded:
+            pairs = [_rounded(pair) for pair in pairs]
         self._t_ns, self._value, self._std_error = (list(column) for column in zip(*pairs, strict=True))
         self._points_per_stored *= 2
 
@@ -244,3 +255,10 @@ def _merged(first: tuple[int, float, float], second: tuple[int, float, float]) -
     share = float(weights[1] / weights.sum())
     t_ns = first[0] + round(share * (second[0] - first[0]))
     return t_ns, first[1] + share * (second[1] - first[1]), float(weights.sum() ** -0.5)
+
+
+def _rounded(point: tuple[int, float, float]) -> tuple[int, float, float]:
+    """A point to the second, its value to a hundredth of its standard error or finer, and that to three digits."""
+    t_ns, value, std_error = point
+    digits = 2 - math.floor(math.log10(std_error))
+    return t_ns // NS_PER_S * NS_PER_S, round(value, digits), round(std_error, digits)

@@ -75,13 +75,22 @@ class WearInputs:
 class WearMonitor:
     """The wear of one tray's fans. The result does not depend on how samples are cut into blocks."""
 
-    def __init__(self, healthy: Sequence[HealthyFan], diagnoser: Diagnoser, every_s: float, command_unit: str) -> None:
+    def __init__(
+        self,
+        healthy: Sequence[HealthyFan],
+        diagnoser: Diagnoser,
+        every_s: float,
+        command_unit: str,
+        *,
+        rounds_points: bool = True,
+    ) -> None:
         """healthy: each fan by the present twin. diagnoser: holds the last seconds. every_s: interval between the
-        points of a fan."""
+        points of a fan. rounds_points: as scoring.wear.trend says; False: by former rules."""
         self._healthy = healthy
         self._diagnoser = diagnoser
         self._every_ns = round(every_s * NS_PER_S)
         self._unit = command_unit
+        self._rounds_points = rounds_points
         self._period_turns = max(ATTEMPT_PERIOD_TURNS, math.ceil(len(healthy) / FANS_OF_TURN))
         self._last_turn = 0
         self._disturbed_t_ns = np.full(len(healthy), NEVER_NS)
@@ -232,7 +241,7 @@ class WearMonitor:
             points["balance"] = window.fan_offset - shared - own_offset, window.fan_offset_std_error
         for parameter, (change, std_error) in points.items():
             if max(abs(change), std_error) < MAX_CHANGE:
-                wear.series[parameter].add(at_ns, change, std_error)
+                wear.series[parameter].add(at_ns, change, std_error, is_rounded=self._rounds_points)
         wear.reference = reference
         return True
 

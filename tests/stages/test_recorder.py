@@ -575,6 +575,25 @@ def test_a_large_site_records_raw_samples_and_leaves_out_what_follows_from_them(
     assert chosen(33) == {"raw"}
 
 
+@pytest.mark.parametrize(
+    ("fans", "lines", "flush_s"), [(32, "", 1.0), (33, "", 5.0), (33, "flush_interval_s = 0.5", 0.5)]
+)
+def test_a_recorder_of_many_fans_flushes_less_often(tmp_path, fans, lines, flush_s):
+    trays = "".join(f'[[tray]]\nname = "{name}"\nfans = {fans}\n' for name in ("a", "b"))
+    config = parse_config(trays + "[recorder]\n" + lines, tmp_path / "c.toml", (), ("recorder",))
+    of_site = {"trays": config.trays, "config": config.sections["recorder"], "started_t_ns": NOW_NS}
+    core = STAGE.build(replace(context(tmp_path), **of_site)).core
+    path = next(tmp_path.rglob("recording.mcap.active"))
+    core.step(envelope(raw(0), "raw", NOW_NS))
+    before = path.stat().st_size
+    core.tick(NOW_NS + round((flush_s - 0.1) * SECOND_NS))
+    assert path.stat().st_size == before
+    core.tick(NOW_NS + round(flush_s * SECOND_NS))
+    assert path.stat().st_size > before
+    core.close()
+    assert read_metadata(path.with_suffix("")).metadata["flush_interval_s"] == f"{flush_s:g}"
+
+
 def test_the_topics_of_samples_can_be_chosen():
     assert chosen(33, "topics = ['raw', 'grid', 'prediction', 'score']") == set(SAMPLES)
     assert chosen(2, "topics = ['score', 'raw']") == {"raw", "score"}

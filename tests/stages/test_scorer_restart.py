@@ -192,6 +192,20 @@ def test_without_events_there_is_a_snapshot_every_minute_and_at_slow_rates_every
     assert np.diff(taken_ns).tolist() == [apart_s * NS_PER_S] * 2
 
 
+def test_while_nothing_happens_a_large_tray_publishes_every_third_snapshot_and_saves_all(tmp_path: Path) -> None:
+    store = SnapshotStore(tmp_path / "m")
+    scorer = core_of(80, snapshot_store=store)
+    published_s, saved_s = list[float](), set[float]()
+    for second in range(0, 600, 5):
+        made = scorer.step(replace(prediction_of(np.full((1, 80), 0.1)), t_ns=np.array([EPOCH_NS + second * NS_PER_S])))
+        published_s += [(each.t_ns - EPOCH_NS) / NS_PER_S for each in made if isinstance(each, ScorerSnapshot)]
+        saved = store.load()
+        assert saved is not None
+        saved_s.add((saved.t_ns - EPOCH_NS) / NS_PER_S)
+    assert sorted(saved_s) == list(range(0, 600, 60))
+    assert published_s == [0.0, 180.0, 360.0, 540.0]
+
+
 def raised() -> ScorerCore:
     """A fan with an acknowledged alarm, one that is shelved without one, one with nothing."""
     scorer = commissioned(core_of(3), 3)

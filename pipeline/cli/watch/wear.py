@@ -47,8 +47,9 @@ def wear(
     """Show how each fan has changed since commissioning, how fast, and when its limit will be reached
     (docs/explanation/wear.md).
 
-    The values are those of the scorer's last snapshot, which is at most a minute or 3,000 samples old. Exit code 0:
-    shown; 1: nothing is known; 3: a recording could not be read in full.
+    The values are those of the last snapshot that the scorer has sent, which is at most a minute or 3,000 samples old,
+    of a tray of more than 64 fans three times as old. Exit code 0: shown; 1: nothing is known; 3: a recording could not
+    be read in full.
 
     Example: fantwin wear
 

@@ -275,7 +275,8 @@ def test_after_a_damaged_length_the_next_whole_chunk_is_found(tmp_path, whole):
     assert contents_of(path).streams[STREAM].missing == 5
 
 
-def test_a_sector_of_zeros_costs_the_chunks_it_touches(tmp_path):
+def test_a_sector_of_zeros_costs_the_chunks_it_touches(tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.recordings.writing.CHUNK_BYTES", 64 * 1024)
     path = write(tmp_path / "r.mcap", 1000)
     content = bytearray(path.read_bytes())
     with path.open("rb") as file:

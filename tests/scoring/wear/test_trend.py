@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from schemas.units import NS_PER_S
 from scoring.wear.trend import CAPACITY, NS_PER_DAY, LimitForecast, Trend, WearSeries, forecast_limit
 
 START_NS = 1_700_000_000_000_000_000
@@ -123,3 +124,33 @@ def test_a_restored_series_continues_without_a_difference() -> None:
         after.add(START_NS + k * NS_PER_DAY, 0.001 * k + np.sin(k), 0.1)
     assert after.trend() == straight.trend()
     assert all(np.array_equal(after.snapshot()[key], value) for key, value in straight.snapshot().items())
+
+
+@pytest.mark.parametrize("error", [3.3e-7, 0.01, 0.99, 1.0, 250.0])
+def test_complete_points_are_kept_to_the_second_and_to_a_hundredth_of_their_error(error: float) -> None:
+    points, exact = WearSeries(), WearSeries()
+    rng = np.random.default_rng(3)
+    for k in range(CAPACITY + 31):  # the last one is still incomplete
+        t_ns, value = START_NS + k * NS_PER_DAY + int(rng.integers(NS_PER_S)), 3.0 + error * rng.normal()
+        points.add(t_ns, value, error * 1.2345678)
+        exact.add(t_ns, value, error * 1.2345678, is_rounded=False)
+    rounded, all_digits = points.snapshot(), exact.snapshot()
+    assert rounded["count"].tolist() == all_digits["count"].tolist() == [2, 1]
+    assert not (rounded["t_ns"][:-1] % NS_PER_S).any() and rounded["t_ns"][-1] % NS_PER_S
+    assert np.abs(rounded["t_ns"] - all_digits["t_ns"]).max() < 2 * NS_PER_S
+    assert np.abs((rounded["value"] - all_digits["value"]) / all_digits["std_error"]).max() < 0.012
+    assert all(float(f"{value:.3g}") == value for value in rounded["std_error"][:-1])
+    assert rounded["std_error"] == pytest.approx(all_digits["std_error"], rel=0.01)
+
+
+def test_few_digits_do_not_stop_a_point_that_is_the_mean_of_thousands() -> None:
+    years, slope = WearSeries(), 1e-6
+    rng = np.random.default_rng(8)
+    for k in range(200_000):
+        years.add(START_NS + k * 600 * NS_PER_S, slope * k / 144 + 0.01 * rng.normal(), 0.01)
+    per_stored = years.snapshot()["count"][0]
+    assert per_stored >= 2048 and years.snapshot()["std_error"][0] == pytest.approx(
+        0.01 / np.sqrt(per_stored), rel=0.01
+    )
+    trend = trend_of(years)
+    assert trend.low <= slope <= trend.high and trend.high - trend.low < slope
