@@ -29,6 +29,9 @@ from schemas.envelope import Envelope
 from schemas.messages import Clock, Health, StageStatus
 from schemas.topics import ALL_TRAYS, alive_key, health_key, sessions_key, topic_of, tray_key
 
+MANY_TRAYS = 16
+"""in a process that processes several trays in one pass: then it takes messages at its ticks, together"""
+
 
 class Receiver:
     """Takes items of the inbox that came from the bus, and puts the messages that are due into `due`."""
@@ -53,6 +56,7 @@ class Receiver:
         self._site = config.site
         self._shard = shard
         self._trays = frozenset(shard.trays)
+        self._is_patient = stage.is_patient or (stage.joint is not None and len(shard.trays) >= MANY_TRAYS)
         self._producer = producer
         self._bus = bus
         self._inbox = inbox
@@ -82,7 +86,7 @@ class Receiver:
 
     def on_message(self, key: str, payload: bytes) -> None:
         """A message has come, in a thread of the bus: put it into the inbox."""
-        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=not self._stage.is_patient)
+        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=not self._is_patient)
 
     def _on_health(self, key: str, payload: bytes) -> None:
         self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=False)
