@@ -34,6 +34,7 @@ from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
 from twin.models.model import Model
 from twin.models.network_ode import NetworkOde
 from twin.models.physics import PARAMETER_NAMES
+from twin.networks import ForEachNetwork, one_after_another
 from twin.progress import Progress, unreported, within
 from twin.runs import Array, Run, common_fans, common_tacho
 
@@ -50,6 +51,7 @@ def train_twin(
     network_inputs: tuple[str, ...] = BOTH_INPUTS,
     physics: Physics = "refined",
     networks: int = 1,
+    each_network: ForEachNetwork = one_after_another,
     command_unit: str = "",
     fan_numbers: Sequence[int] | None = None,
     data: Sequence[DataCard] = (),
@@ -63,7 +65,7 @@ def train_twin(
     figures. If empty, the training runs are used instead, and the card says so. network_inputs: of the hybrid's and
     neural ODE's network. physics: whether a hybrid's physics are refined along with its network, or stay as they were
     identified. networks: how many are trained and averaged, 1 to MOST_NETWORKS. trainer "adam" trains one, keeps the
-    physics as identified, and keeps the weights with the smallest training error.
+    physics as identified, and keeps the weights with the smallest training error. each_network: who trains them.
     fan_numbers (what the recordings call the runs' fans; default: counted from 0), command_unit, data and
     validation_data (the files that the runs are from) and created (default: now) go into the card. The same seed and
     runs give the same model.
@@ -99,6 +101,7 @@ def train_twin(
             progress,
             drive,
             networks,
+            each_network,
         )
     )
     model, parameters = fitted.model, fitted.parameters

@@ -8,8 +8,6 @@ its arguments, so it does not matter how many jobs there were.
 from __future__ import annotations
 
 import logging
-import signal
-import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -21,10 +19,10 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
 
 import typer
-from joblib import Parallel, cpu_count, delayed, parallel_config
-from joblib.externals.loky import BrokenProcessPool, get_reusable_executor
+from joblib import cpu_count
 from threadpoolctl import threadpool_limits
 
+from pipeline.cli.processes import ENDED_FROM_OUTSIDE, end_processes, in_processes
 from pipeline.cli.progress import recordings_progress
 from pipeline.errors import UsageError, UserError
 from pipeline.optional_dependencies import how_to_install, is_installed
@@ -51,7 +49,7 @@ CONNECT_S = 10.0
 """for a scheduler to answer, and for its first worker"""
 SAME_VERSIONS = ("fantwin", "numpy", "onnxruntime", "scipy")
 """of workers and of the command: results depend on them"""
-ENDED_FROM_OUTSIDE = "a process that worked on recordings was ended from outside, as the system does if memory is short"
+RECORDINGS = "recordings"
 
 Recording = TypeVar("Recording", Path, tuple[Path, ...])
 """a file, or the parts of one recording"""
@@ -103,8 +101,7 @@ class RecordingsInParallel:
 
     def __exit__(self, *_error: object) -> None:
         if self._has_processes:
-            running: Any = {"reuse": True}
-            get_reusable_executor(**running).shutdown(kill_workers=True)  # a fit that follows needs their memory
+            end_processes()  # a fit that follows needs their memory
         self._resources.close()
 
     def map(self, work: Callable[[Recording], Result], recordings: Sequence[Recording], doing: str) -> Iterator[Result]:
@@ -134,20 +131,7 @@ class RecordingsInParallel:
         """The outcomes in the order of the recordings. When it is closed early, the processes are ended."""
         jobs = min(self._jobs, max(len(recordings), 1))
         self._has_processes |= jobs > 1
-        with parallel_config("loky", initializer=_leave_ctrl_c_to_the_command):
-            options: Any = {"batch_size": 1, "return_as": "generator"}
-            parallel: Any = Parallel(jobs, **options)
-        try:
-            outcomes = parallel(delayed(attempt)(recording) for recording in recordings)
-            try:
-                for outcome in outcomes:  # noqa: UP028  the end below must come before they are closed
-                    yield outcome
-            finally:
-                with warnings.catch_warnings():  # of tasks that are cancelled, as is wanted
-                    warnings.simplefilter("ignore")
-                    outcomes.close()
-        except BrokenProcessPool as error:
-            raise UserError(f"{ENDED_FROM_OUTSIDE}: fewer --jobs than {jobs} need less") from error
+        return in_processes(attempt, recordings, jobs, RECORDINGS)
 
     def _on_cluster(self, attempt: Callable[[Recording], Any], recordings: Sequence[Recording]) -> Generator[Any]:
         """The same on the workers of a cluster. When it is closed early, what has not begun is cancelled.
@@ -163,7 +147,7 @@ class RecordingsInParallel:
             while futures:
                 yield futures.popleft().result()  # a result that is held nowhere else is forgotten by the cluster
         except KilledWorker as error:
-            raise UserError(f"{ENDED_FROM_OUTSIDE}: see {self._scheduler}") from error
+            raise UserError(f"{ENDED_FROM_OUTSIDE.format(what=RECORDINGS)}: see {self._scheduler}") from error
         except (CancelledError, CommClosedError, TimeoutError) as error:
             raise UserError(f"--scheduler {self._scheduler}: the connection to it was lost") from error
         finally:
@@ -208,11 +192,6 @@ def _attempt(recording: Recording, work: Callable[[Recording], Result], copies: 
         files = recording if isinstance(recording, tuple) else (recording,)
         is_named = any(str(file) in str(error) for file in files)
         return _Bad(error if is_named else UserError(f"{name_of(recording)}: {error}"))
-
-
-def _leave_ctrl_c_to_the_command() -> None:
-    """A terminal sends it to all processes; the command ends its workers itself."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager

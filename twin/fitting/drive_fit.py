@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from schemas.standstill import Standstill
 from schemas.twin_card import DriveCard
 from twin.errors import TwinError
-from twin.fitting.free_run_fit import ERROR_ROUNDS, HEAVIER, HUBER_DELTA
+from twin.fitting.free_run_fit import ERROR_ROUNDS
+from twin.fitting.free_run_problem import HEAVIER, HUBER_DELTA
 from twin.fitting.identification import Identification
 from twin.fitting.reading_errors import ReadingErrors, reading_errors, robust_scale
 from twin.fitting.trajectories import MAX_SAMPLES, Trajectories, cut_into_trajectories, practical_samples

@@ -30,7 +30,8 @@ from scipy.stats import t as student_t
 
 from twin.errors import TwinError
 from twin.fitting.filtering import filtered_regression
-from twin.fitting.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, Unknowns, fit_free_run
+from twin.fitting.free_run_fit import FreeRunFit, fit_free_run
+from twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior, Unknowns
 from twin.fitting.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings, misfit_warnings, short_warnings
 from twin.fitting.reading_errors import counts, robust_scale
 from twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
@@ -44,6 +45,7 @@ from twin.progress import Progress, unreported
 from twin.runs import Array, Run, common_fans
 
 LAMBDA_LADDER = 9
+COLUMNS_AT_ONCE = 320  # fans times rungs: fewer cost as much as these, more need more memory
 STRETCH_TIME_CONSTANTS = 10.0
 MAX_ITERATIONS = 60
 BLOCKS = 40
@@ -172,12 +174,18 @@ def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array, progress: Pro
     ladder = np.geomspace(4.0 / longest_s, 0.5 / step_s, LAMBDA_LADDER)
     alike = [with_measured_command(piece) for piece in pieces]
     trajectories = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, 1.0))
-    candidates, errors = np.zeros((len(ladder), fans, len(PARAMETER_NAMES))), np.zeros((len(ladder), fans))
+    candidates = np.zeros((len(ladder), fans, len(PARAMETER_NAMES)))
     for rung, lambda_per_s in enumerate(ladder):
         progress("identification: first estimate", rung, len(ladder), np.nan)
         filtered = np.array([filtering_operator(alike, fan, lambda_per_s) for fan in range(fans)])
         candidates[rung] = _stable(filtered, top_speed_rad_s)
-        errors[rung] = _free_run_errors(candidates[rung], trajectories)
+    together = max(1, COLUMNS_AT_ONCE // len(trajectories.fan))
+    errors = np.concatenate(
+        [
+            _free_run_errors(candidates[first : first + together], trajectories)
+            for first in range(0, len(ladder), together)
+        ]
+    )
     smallest = errors.min(axis=0)
     for fan in np.flatnonzero(~np.isfinite(smallest)):
         raise TwinError(f"fan {fan}: the speed does not follow the command; check which columns are command and speed")
@@ -190,16 +198,30 @@ def _stable(parameters: Array, top_speed_rad_s: Array) -> Array:
     return physical_parameters(fitted_unknowns(parameters, top_speed_rad_s), top_speed_rad_s)
 
 
-def _free_run_errors(parameters: Array, trajectories: Trajectories) -> Array:
-    """(fans,) mean absolute free-run error in rad/s, the published loss; infinite when it does not exist."""
-    equation = FanEquation(parameters[trajectories.fan], None)
-    initial, guess = trajectories.starting_speed_rad_s(), trajectories.interpolated_speed_rad_s()
-    speed, _ = free_run(equation, initial, trajectories.command, trajectories.step_s, guess)
-    compared, shown = trajectories.compared, trajectories.measurement.of_speed(speed)
-    error = np.where(compared, np.abs(trajectories.speed_rad_s - shown), 0.0).sum(axis=0)
-    fans = len(parameters)
-    mean = np.bincount(trajectories.fan, error, fans) / np.bincount(trajectories.fan, compared.sum(axis=0), fans)
-    return np.where(np.isfinite(mean), mean, np.inf)
+def _free_run_errors(candidates: Array, trajectories: Trajectories) -> Array:
+    """(rungs, fans) mean absolute free-run error in rad/s of candidates (rungs, fans, 4), the published loss; infinite
+    when it does not exist.
+    """
+    rungs, fans = candidates.shape[:2]
+    equation = FanEquation(np.concatenate(candidates[:, trajectories.fan]), None)
+    initial, command, step_s, guess = (
+        np.concatenate([of_one] * rungs, axis=-1)
+        for of_one in (
+            trajectories.starting_speed_rad_s(),
+            trajectories.command,
+            trajectories.step_s,
+            trajectories.interpolated_speed_rad_s(),
+        )
+    )
+    speed, _ = free_run(equation, initial, command, step_s, guess)
+    compared = trajectories.compared
+    samples = np.bincount(trajectories.fan, compared.sum(axis=0), fans)
+    errors = []
+    for of_rung in np.split(speed, rungs, axis=1):
+        shown = trajectories.measurement.of_speed(of_rung)
+        error = np.where(compared, np.abs(trajectories.speed_rad_s - shown), 0.0).sum(axis=0)
+        errors.append(np.bincount(trajectories.fan, error, fans) / samples)
+    return np.where(np.isfinite(errors), errors, np.inf)
 
 
 def _refine(

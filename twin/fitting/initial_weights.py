@@ -9,6 +9,7 @@ hidden units as additional regressors. That is cheap enough to draw many placeme
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,10 +31,11 @@ def initial_weights(
     model: NetworkOde, pieces: Sequence[Run], identification: Identification, rng: np.random.Generator, keep: int
 ) -> list[Array]:
     """The best `keep` of many random starts: weights (P,) each, as many with kinks as without, best first."""
+    acting = _acting(pieces, identification)
     best: list[tuple[Array, float]] = []
     for kinks, count in ((True, keep - keep // 2), (False, keep // 2)):
         drawn = [
-            _fit_output_layer(_placed(model, pieces, rng, kinks), pieces, identification)
+            _fit_output_layer(_placed(model, pieces, rng, kinks), acting, identification)
             for _ in range(PLACEMENTS // 2)
         ]
         best += sorted(drawn, key=lambda candidate: candidate[1])[:count]
@@ -78,9 +80,20 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float, size: int) -
     return np.exp(rng.uniform(np.log(low), np.log(high), size))
 
 
-def _fit_output_layer(placed: NetworkOde, pieces: Sequence[Run], identification: Identification) -> tuple[Array, float]:
+def _acting(pieces: Sequence[Run], identification: Identification) -> list[Run]:
+    """The pieces with the commands that act, after the lag, as the tachos show them."""
+    lag_s = identification.parameters[:, LAG]
+    return [
+        replace(
+            piece, command=effective_command(piece.command, piece.step_s[:, np.newaxis], lag_s, piece.command[0])[0]
+        )
+        for piece in map(with_measured_command, pieces)
+    ]
+
+
+def _fit_output_layer(placed: NetworkOde, acting: Sequence[Run], identification: Identification) -> tuple[Array, float]:
     """The weights (P,) with those of the output fitted, and the sum of squares that is left."""
-    target, regressors = _output_regression(placed, pieces, identification)
+    target, regressors = _output_regression(placed, acting, identification)
     # Random tanh units are close to collinear; the ridge keeps their weights of order one.
     squares = regressors.T @ regressors
     ridge = RIDGE * np.trace(squares) / len(squares) * np.eye(len(squares))
@@ -89,20 +102,16 @@ def _fit_output_layer(placed: NetworkOde, pieces: Sequence[Run], identification:
     return theta, float(np.sum((target - regressors @ output) ** 2))
 
 
-def _output_regression(model: NetworkOde, pieces: Sequence[Run], identification: Identification) -> tuple[Array, Array]:
+def _output_regression(model: NetworkOde, acting: Sequence[Run], identification: Identification) -> tuple[Array, Array]:
     """Filtered target (m,), less the known acceleration, and output-layer regressors (m, units + 1) of all fans."""
     targets, regressors = [], []
     lambda_per_s = float(np.median(identification.lambda_per_s))
-    for piece in map(with_measured_command, pieces):
-        acting, _ = effective_command(
-            piece.command, piece.step_s[:, np.newaxis], identification.parameters[:, LAG], piece.command[0]
-        )
-        for fan, parameters in enumerate(identification.parameters):
-            speed_rad_s = piece.speed_rad_s[:, fan]
-            if np.isfinite(speed_rad_s).sum() < 2:
-                continue
-            basis = _output_basis(model, parameters)
-            target, columns = filtered_regression(piece.t_s, speed_rad_s, acting[:, fan], basis, lambda_per_s)
+    for piece in acting:
+        for fan in np.flatnonzero(np.isfinite(piece.speed_rad_s).sum(axis=0) >= 2).tolist():
+            basis = _output_basis(model, identification.parameters[fan])
+            target, columns = filtered_regression(
+                piece.t_s, piece.speed_rad_s[:, fan], piece.command[:, fan], basis, lambda_per_s
+            )
             targets.append(target - columns[:, 0])
             regressors.append(columns[:, 1:])
     return np.concatenate(targets), np.concatenate(regressors)

@@ -16,6 +16,7 @@ from twin.fitting.training import GRID_PRIOR_STD, Physics, data_scaling, train_n
 from twin.models.model import Model, NetworkOde, OdeModel
 from twin.models.network import TanhNetwork
 from twin.models.physical import PhysicalModel
+from twin.networks import ForEachNetwork, one_after_another
 from twin.progress import Progress, unreported
 from twin.runs import Array, Run
 
@@ -30,8 +31,8 @@ SILENT_NETWORK = "the network is not used: free runs with it were no better than
 class FitRequest:
     """Data and settings of a fit. See build.train_twin; max_iterations None: the default of the fit.
 
-    drive: what the commands of the runs have passed already; the model is put behind it. networks: see
-    training.train_network.
+    drive: what the commands of the runs have passed already; the model is put behind it. networks,
+    each_network: see training.train_network.
     """
 
     runs: Sequence[Run]
@@ -45,6 +46,7 @@ class FitRequest:
     progress: Progress = unreported
     drive: FoundDrive | None = None
     networks: int = 1
+    each_network: ForEachNetwork = one_after_another
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,5 +138,6 @@ def _by_levenberg_marquardt(untrained: NetworkOde, request: FitRequest, limit: i
         physics=request.physics,
         prior_std=prior_std,
         networks=request.networks,
+        each=request.each_network,
         progress=request.progress,
     )

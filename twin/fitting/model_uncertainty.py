@@ -13,21 +13,24 @@ motion get less weight than held ones.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import cholesky, get_lapack_funcs, solve_triangular
 
 from schemas.model_uncertainty import ModelUncertainty
 from twin.evaluation.accuracy import evaluation_pieces
-from twin.fitting.fan_evidence import FanEvidence, acceleration_of, evidence_of_fans
+from twin.fitting.fan_evidence import FanEvidence, evidence_of_fans
 from twin.fitting.filtering import Basis
 from twin.fitting.identification import Identification
 from twin.fitting.thinning import coarser, thinning_factor
 from twin.fitting.training import data_scaling
 from twin.models.model import OdeModel
 from twin.models.network import Scaling
-from twin.models.physics import acceleration_by_speed
+from twin.models.physics import acceleration, acceleration_by_speed
 from twin.runs import Array, Run
+
+(dpotri,) = get_lapack_funcs(("potri",), dtype=np.float64)
 
 PRIOR_STD = 0.3
 """of the acceleration where nothing was recorded, in its scale: held for long, 0.15 of the range of speeds for a fan of
@@ -80,8 +83,13 @@ def model_uncertainty(
     reach = np.linspace(-2.0 * REACH, 2.0 * REACH, SETTLING_SPEEDS)
     reach_rad_s = scale.speed_offset_rad_s + scale.speed_scale_rad_s * reach
     settled_rad_s, std_rad_s = [], []
+
+    @lru_cache(maxsize=1)
+    def settling(friction: float) -> Settling:
+        return Settling(model, commands - friction, reach_rad_s)
+
     for own, its, root in zip(parameters, evidence, _roots([each.squares for each in evidence]), strict=True):
-        settled_rad_s.append(settled_speed_rad_s(model, own, commands - its.friction, reach_rad_s))
+        settled_rad_s.append(settling(its.friction).of_fan(own))
         speeds_rad_s = settled_rad_s[-1][:, np.newaxis] + offsets_rad_s
         held_s = _held_s(own, speeds_rad_s, SLOWEST * typical_s)
         std_rad_s.append(_left_rad_s2(root, basis, speeds_rad_s, commands) * held_s)
@@ -132,15 +140,21 @@ def _seen_std_rad_s(
     return float(f"{np.quantile(std_rad_s, SEEN_QUANTILE):.4g}")
 
 
-def settled_speed_rad_s(model: OdeModel, own: Array, commands: Array, speeds_rad_s: Array) -> Array:
-    """(commands,) the speeds at which a fan settles under acting commands, between the given ones, which rise.
+class Settling:
+    """The speeds at which fans with one network settle under acting commands, between the given ones, which rise."""
 
-    own: (4,) its physics.
-    """
-    command, speed_rad_s = (values.ravel() for values in np.meshgrid(commands, speeds_rad_s, indexing="ij"))
-    acceleration = acceleration_of(model, own)(speed_rad_s, command).reshape(len(commands), -1)
-    braking = -np.minimum.accumulate(acceleration, axis=1)
-    return np.array([np.interp(0.0, of_command, speeds_rad_s) for of_command in braking])
+    def __init__(self, model: OdeModel, commands: Array, speeds_rad_s: Array) -> None:
+        self._model, self._commands, self._speeds_rad_s = model, len(commands), speeds_rad_s
+        command, speed_rad_s = np.meshgrid(commands, speeds_rad_s, indexing="ij")
+        self._command, self._speed_rad_s = command.ravel(), speed_rad_s.ravel()
+        network = model.network
+        self._learned = 0.0 if network is None else network.acceleration(self._speed_rad_s, self._command)
+
+    def of_fan(self, own: Array) -> Array:
+        """(commands,) rad/s, of the fan with the physics own (4,)."""
+        known = acceleration(self._speed_rad_s[:, np.newaxis], self._command[:, np.newaxis], own[np.newaxis])[:, 0]
+        braking = -np.minimum.accumulate((self._learned + known).reshape(self._commands, -1), axis=1)
+        return np.array([np.interp(0.0, of_command, self._speeds_rad_s) for of_command in braking])
 
 
 def _left_rad_s2(root: Array, basis: Basis, speeds_rad_s: Array, commands: Array) -> Array:
@@ -161,18 +175,19 @@ def _roots(squares: Sequence[Array]) -> Iterator[Array]:
     """
     prior = np.eye(COSINES) / (1.0 - OWN_VARIANCE)
     of_common = [_loosened(each) for each in squares]
-    for number, each in enumerate(squares):
-        others = sum((its for other, its in enumerate(of_common) if other != number), prior)
-        yield cholesky(_loosened(others) + each, lower=True)
+    of_all = sum(of_common, np.zeros_like(prior))
+    for each, its in zip(squares, of_common, strict=True):
+        yield cholesky(_loosened(prior + (of_all - its)) + each, lower=True)
 
 
 def _loosened(information: Array) -> Array:
     """(C, C) the information that is left where a part of variance OWN_VARIANCE is added: (information^-1 +
     OWN_VARIANCE)^-1. That of a fan about what is common, and that of all the others about a fan.
     """
-    values, vectors = np.linalg.eigh(information)
-    values = np.maximum(values, 0.0)
-    return (vectors * (values / (1.0 + OWN_VARIANCE * values))) @ vectors.T
+    # The same as (1 - (1 + OWN_VARIANCE information)^-1) / OWN_VARIANCE, which exists where nothing is known.
+    one = np.eye(len(information))
+    below, _ = dpotri(cholesky(one + OWN_VARIANCE * information, lower=True), lower=1)
+    return (one - (np.tril(below) + np.tril(below, -1).T)) / OWN_VARIANCE
 
 
 def _cosines(scale: Scaling) -> Basis:

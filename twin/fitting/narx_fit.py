@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from twin.fitting.free_run_fit import HUBER_DELTA
+from twin.fitting.free_run_problem import HUBER_DELTA
 from twin.fitting.reading_errors import NORMAL_90_PERCENT
 from twin.models.narx import INPUTS, ORDER, UNITS, Narx, regressor_rows
 from twin.models.network import Scaling

@@ -5,11 +5,12 @@ comes what is not known of the fan's own physics, as an error of the speed at wh
 """
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from schemas.model_uncertainty import ModelUncertainty
-from twin.fitting.model_uncertainty import SETTLING_SPEEDS, settled_speed_rad_s, significant
+from twin.fitting.model_uncertainty import SETTLING_SPEEDS, Settling, significant
 from twin.models.model import OdeModel
 from twin.models.physical import fitted_unknowns, physical_parameters
 from twin.runs import Array
@@ -32,11 +33,13 @@ def placed_uncertainty(
     speeds_rad_s = REACH * top_speed_rad_s * np.linspace(-1.0, 1.0, SETTLING_SPEEDS)
     commands, largest = np.array(of_type.commands), np.max(np.array(of_type.std_rad_s), axis=0)
     settled, tables = [], []
-    for own, spread, lost in zip(parameters, covariance, friction, strict=True):
-        own_rad_s, *moved_rad_s = (
-            settled_speed_rad_s(model, each, commands - lost, speeds_rad_s)
-            for each in (own, *_moved(own, spread, top_speed_rad_s))
-        )
+
+    @lru_cache(maxsize=1)
+    def settling(lost: float) -> Settling:
+        return Settling(model, commands - lost, speeds_rad_s)
+
+    for own, spread, lost in zip(parameters, covariance, friction.tolist(), strict=True):
+        own_rad_s, *moved_rad_s = (settling(lost).of_fan(each) for each in (own, *_moved(own, spread, top_speed_rad_s)))
         unknown_rad_s = np.sqrt(np.sum(np.square(np.array(moved_rad_s) - own_rad_s), axis=0))
         settled.append(own_rad_s)
         tables.append(np.hypot(largest, unknown_rad_s[:, np.newaxis]))

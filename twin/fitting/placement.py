@@ -14,7 +14,8 @@ import numpy as np
 
 from schemas.twin_card import TwinCard
 from twin.errors import TwinError
-from twin.fitting.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, Unknowns, fit_free_run
+from twin.fitting.free_run_fit import FreeRunFit, fit_free_run
+from twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior, Unknowns, sums_by_fan
 from twin.fitting.identification import Identification
 from twin.fitting.reading_errors import counts, robust_scale
 from twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
@@ -146,8 +147,8 @@ def _covariance(problem: FreeRunProblem, fit: FreeRunFit, correlated_samples: fl
     squares, _ = problem.normal_equations(fit.point)
     by_initial = squares[:, -1, -1]
     coupling = squares[:, :-1, -1] / by_initial[:, np.newaxis]
-    curvature = np.zeros((problem.fans, len(PARAMETER_NAMES), len(PARAMETER_NAMES)))
-    np.add.at(curvature, data.fan, squares[:, :-1, :-1] - coupling[:, :, None] * squares[:, None, :-1, -1])
+    own = squares[:, :-1, :-1] - coupling[:, :, None] * squares[:, None, :-1, -1]
+    curvature = sums_by_fan(own, data.fan, problem.fans)
     curvature = (curvature + np.diag(problem.prior.physics)) / correlated_samples
     free = np.flatnonzero(problem.free)
     covariance = np.zeros_like(curvature)

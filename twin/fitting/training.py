@@ -20,33 +20,28 @@ physics) is a candidate. Training stops when held-out runs no longer improve.
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from twin.evaluation.accuracy import evaluation_pieces
-from twin.fitting.free_run_fit import (
-    NONE_FREE,
-    FreeRunFit,
-    FreeRunProblem,
-    NetworkPrior,
-    Point,
-    Prior,
-    Unknowns,
-    fit_free_run,
-)
+from twin.fitting.free_run_fit import FreeRunFit, fit_free_run
+from twin.fitting.free_run_problem import NONE_FREE, FreeRunProblem, NetworkPrior, Point, Prior, Unknowns
 from twin.fitting.identification import Identification, inertia_anchor
 from twin.fitting.initial_weights import PLACEMENTS, initial_weights
 from twin.fitting.mean_model import mean_model
 from twin.fitting.reading_errors import counts, robust_scale
 from twin.fitting.thinning import thinning_factor, windows_of
 from twin.fitting.trajectories import MAX_SAMPLES, cut_into_trajectories, practical_samples, stretch_samples
+from twin.models.integration import WIDE_BATCH
 from twin.models.model import NetworkOde
 from twin.models.network import Scaling
 from twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
 from twin.models.physics import LAG, PARAMETER_NAMES
-from twin.progress import Progress, unreported, within
+from twin.networks import ForEachNetwork, one_after_another
+from twin.progress import Progress, unreported
 from twin.runs import Array, Run
 
 Physics = Literal["fixed", "refined"]
@@ -94,6 +89,7 @@ def train_network(
     physics: Physics = "refined",
     prior_std: float = GRID_PRIOR_STD,
     networks: int = 1,
+    each: ForEachNetwork = one_after_another,
     progress: Progress = unreported,
 ) -> tuple[NetworkOde, Array, int]:
     """Train the model's network. Returns the trained model, the parameters (fans, 4) and the iterations taken.
@@ -104,27 +100,30 @@ def train_network(
     only); "fixed" leaves them as they were identified, as published.
     prior_std: how far the network's acceleration may be from the physics where there are no data, in units of its scale
     (twin.fitting.cross_validation chooses it). Zero: the weights stay zero.
-    networks: how many are trained; the model is the mean of those that end about as well as the best.
+    networks: how many are trained; the model is the mean of those that end about as well as the best. each: who trains
+    them.
     """
     if prior_std == 0.0:
         return model.with_theta(np.zeros_like(model.network.theta)), identification.parameters, 0
     training = _Training(model, runs, validation_runs, identification, physics, prior_std)
     starts = training.starts(np.random.default_rng(seed), STARTS_OF_NETWORK * networks, progress)
-    trained = [
-        training.continued(start, max_iterations, _numbered(progress, number, networks))
-        for number, start in enumerate(starts[:networks])
-    ]
+    trained = each(partial(training.continued, max_iterations), starts[:networks], "training", progress)
     least = min(one.best_loss for one in trained)
     kept = [one for one in trained if one.best_loss <= ABOUT_AS_WELL * least]
     found, iterations = [one.best for one in kept], sum(one.iterations for one in trained)
     if training.is_thinned:
-        last = [training.on_all_samples(one, _numbered(progress, number, len(kept))) for number, one in enumerate(kept)]
+        last = each(training.on_all_samples, kept, "training on all samples", progress)
         found, iterations = [unknowns for unknowns, _ in last], iterations + sum(count for _, count in last)
     return *mean_model([training.model_of(unknowns) for unknowns in found]), iterations
 
 
-def _numbered(progress: Progress, number: int, count: int) -> Progress:
-    return within(f"network {number + 1} of {count}", progress) if count > 1 else progress
+@dataclass(frozen=True, eq=False)
+class _Trained:
+    """The unknowns with the best free run of a training, its loss, and the iterations that it took."""
+
+    best: Unknowns
+    best_loss: float
+    iterations: int
 
 
 class _Training:
@@ -183,7 +182,7 @@ class _Training:
         ranked = sorted(fits, key=lambda fit: fit.rmse_rad_s if np.isfinite(fit.rmse_rad_s) else np.inf)
         return [fit.point.unknowns for fit in ranked]
 
-    def continued(self, start: Unknowns, max_iterations: int, progress: Progress) -> "_BestFreeRun":
+    def continued(self, max_iterations: int, start: Unknowns, progress: Progress) -> _Trained:
         """A training from a start to its end."""
         best_run = self._best_free_run(max_iterations, progress)
         best_run.consider(start)
@@ -207,14 +206,14 @@ class _Training:
             )
             best_run.stage_done(fit.iterations)
             best = best_run.best
-        return best_run
+        return _Trained(best_run.best, best_run.best_loss, best_run.iterations)
 
     def model_of(self, unknowns: Unknowns) -> tuple[NetworkOde, Array]:
         """The model of these unknowns, and the parameters (fans, 4)."""
         parameters = physical_parameters(unknowns.physics, self._top_speed_rad_s)
         return self._model.with_theta(unknowns.weights), parameters
 
-    def on_all_samples(self, trained: "_BestFreeRun", progress: Progress) -> tuple[Unknowns, int]:
+    def on_all_samples(self, trained: _Trained, progress: Progress) -> tuple[Unknowns, int]:
         """The last iterations of a training on windows, and their number; none where its network stayed silent.
 
         Windows say little of the physics of each fan. Their result is kept unless its free run is much worse: free runs
@@ -246,7 +245,8 @@ class _Training:
             iteration_done=iteration_done,
         )
         found = fit.point.unknowns
-        return found if trained.loss_of(found) <= MUCH_WORSE * trained.best_loss else best, fit.iterations
+        loss = self._best_free_run(0, progress).loss_of(found)
+        return found if loss <= MUCH_WORSE * trained.best_loss else best, fit.iterations
 
     def _best_free_run(self, max_iterations: int, progress: Progress) -> "_BestFreeRun":
         untrained = Unknowns(np.zeros_like(self._model.network.theta), self._physics, np.zeros(0))
@@ -293,6 +293,10 @@ class _BestFreeRun:
         self.data = cut_into_trajectories(pieces, practical_samples(pieces, whole))
         nothing = Prior(0.0, np.zeros(len(PARAMETER_NAMES)), np.zeros((len(top_speed_rad_s), len(PARAMETER_NAMES))))
         self.problem = FreeRunProblem(model, self.data, top_speed_rad_s, NONE_FREE, nothing)
+        self.beginning = self.problem
+        if len(self.data.fan) >= WIDE_BATCH:
+            rows = int(np.flatnonzero(self.data.early.any(axis=1)).max(initial=0)) + 1
+            self.beginning = FreeRunProblem(model, self.data.first_samples(rows), top_speed_rad_s, NONE_FREE, nothing)
         self.held_out = held_out
         self.max_iterations = max_iterations
         self.progress = progress
@@ -334,9 +338,11 @@ class _BestFreeRun:
     def _free_run(self, unknowns: Unknowns) -> Point:
         """From the speeds whose free runs are nearest to the first measured ones, as in twin.evaluation.accuracy."""
         started = Unknowns(unknowns.weights, unknowns.physics, self.data.starting_speed_rad_s())
-        point = self.problem.evaluate(started, self.guess_rad_s)
-        early = self.data.early
-        residual = self.data.speed_rad_s - self.data.measurement.of_speed(point.speed_rad_s)
+        begun, rows = self.beginning.trajectories, slice(len(self.beginning.trajectories.command))
+        first_rad_s = self.beginning.evaluate(started, self.guess_rad_s[rows]).speed_rad_s
+        early = self.data.early[rows]
+        residual = begun.speed_rad_s - begun.measurement.of_speed(first_rad_s)
         missed = np.sum(residual, axis=0, where=early) / early.sum(axis=0)
         nearer = started.initial_speed_rad_s + np.where(np.isfinite(missed), missed, 0.0)
-        return self.problem.evaluate(replace(started, initial_speed_rad_s=nearer), point.speed_rad_s)
+        guess_rad_s = first_rad_s if self.beginning is self.problem else self.guess_rad_s
+        return self.problem.evaluate(replace(started, initial_speed_rad_s=nearer), guess_rad_s)

@@ -6,7 +6,7 @@ first the time before: a stretch that continues another begins earlier by that t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -74,6 +74,19 @@ class Trajectories:
             self.step_s[:, chosen],
             self.tacho,
             self.lead_in[chosen],
+        )
+
+    def of_fans(self, chosen: NDArray[np.bool_]) -> "Trajectories":
+        """The stretches of some fans (fans,), which are counted from 0 again."""
+        columns = np.flatnonzero(chosen[self.fan])
+        number = np.cumsum(chosen) - 1
+        tacho = tuple(its for its, is_chosen in zip(self.tacho, chosen.tolist(), strict=True) if is_chosen)
+        return replace(self.of_columns(columns), fan=number[self.fan[columns]], tacho=tacho)
+
+    def first_samples(self, count: int) -> "Trajectories":
+        """The first samples of all stretches, so many of each."""
+        return replace(
+            self, command=self.command[:count], speed_rad_s=self.speed_rad_s[:count], step_s=self.step_s[:count]
         )
 
     def interpolated_speed_rad_s(self) -> Array:

@@ -43,12 +43,21 @@ class RightHandSide(Protocol):
         """The acceleration and its derivative by speed, both (..., batch)."""
         ...
 
+    def stepped(self, initial_speed_rad_s: Array, command: Array, step_s: Array) -> tuple[Array, Array]:
+        """What step_through returns for the acceleration, for many fans side by side. step_s: (n, batch)."""
+        ...
+
 
 class Linearised(RightHandSide, Protocol):
     """A right-hand side with the derivatives by its unknowns."""
 
-    def linearise(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array, Array]:
-        """The acceleration and its derivatives by speed and by command (..., batch), and by theta (..., batch, P)."""
+    def linearise(
+        self, speed_rad_s: Array, command: Array, by_theta: Array | None = None
+    ) -> tuple[Array, Array, Array, Array]:
+        """The acceleration and its derivatives by speed and by command (..., batch), and by theta (..., batch, P).
+
+        by_theta: an array to write the last one into.
+        """
         ...
 
 
@@ -76,7 +85,7 @@ def free_run(
     step_s = np.broadcast_to(step_s.reshape(samples, -1), command.shape)
     if batch >= WIDE_BATCH:
         with np.errstate(over="ignore", invalid="ignore"):
-            return step_through(rhs.acceleration, initial_speed_rad_s, command, step_s)
+            return rhs.stepped(initial_speed_rad_s, command, step_s)
     speed_rad_s = np.empty_like(command)
     current = np.array(initial_speed_rad_s, dtype=np.float64)
     window = largest = max(SHORTEST_WINDOW, MAX_WINDOW // batch)
@@ -160,21 +169,26 @@ def rk4_step_derivatives(
     """
     total_by_speed = np.zeros_like(speed_rad_s)
     total_by_command = np.zeros_like(speed_rad_s)
-    total_by_theta: Array | float = 0.0
     k = k_by_speed = k_by_command = np.zeros_like(speed_rad_s)
-    k_by_theta: Array | float = 0.0
+    direct = k_by_theta = total_by_theta = np.zeros(0)
     for reach, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
         reach_s = reach * step_s
-        k, slope, by_command, direct = rhs.linearise(speed_rad_s + reach_s * k, command)
+        is_first = reach == 0.0
+        k, slope, by_command, direct = rhs.linearise(speed_rad_s + reach_s * k, command, None if is_first else direct)
         k_by_speed = slope * (1.0 + reach_s * k_by_speed)
         k_by_command = slope * reach_s * k_by_command + by_command
-        k_by_theta = (slope * reach_s)[..., np.newaxis] * k_by_theta + direct
         total_by_speed += weight * k_by_speed
         total_by_command += weight * k_by_command
-        total_by_theta = total_by_theta + weight * k_by_theta
+        # The largest arrays are written in place.
+        if is_first:
+            k_by_theta, total_by_theta, direct = direct, direct.copy(), np.empty_like(direct)
+            continue
+        k_by_theta *= (slope * reach_s)[..., np.newaxis]
+        k_by_theta += direct
+        total_by_theta += k_by_theta if weight == 1.0 else np.multiply(k_by_theta, weight, out=direct)
     sixth_s = step_s / 6.0
-    by_theta = sixth_s[..., np.newaxis] * np.asarray(total_by_theta)
-    return 1.0 + sixth_s * total_by_speed, sixth_s * total_by_command, by_theta
+    total_by_theta *= sixth_s[..., np.newaxis]
+    return 1.0 + sixth_s * total_by_speed, sixth_s * total_by_command, total_by_theta
 
 
 def free_run_sensitivities(
@@ -187,7 +201,8 @@ def free_run_sensitivities(
     """
     by_speed, by_command, by_theta = rk4_step_derivatives(rhs, speed_rad_s[:-1], command[:-1], step_s[:-1])
     steps, batch, parameters = by_theta.shape
-    forcing = np.zeros((steps + 1, batch, parameters + 2))
+    forcing = np.empty((steps + 1, batch, parameters + 2))
+    forcing[0], forcing[1:, :, -1] = 0.0, 0.0
     forcing[0, :, -1] = 1.0
     forcing[1:, :, :-2] = by_theta
     forcing[1:, :, -2] = by_command * command_by_lag[:-1]

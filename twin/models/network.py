@@ -83,10 +83,11 @@ class TanhNetwork:
         """(..., batch, units) outputs of the hidden layer."""
         input_weights, input_bias, _, _ = self.weights()
         scaled = self._scaled_inputs(speed_rad_s, command)
-        pre = scaled[0][..., np.newaxis] * input_weights[0] + input_bias
+        pre = scaled[0][..., np.newaxis] * input_weights[0]
+        pre += input_bias
         if len(scaled) == 2:
             pre += scaled[1][..., np.newaxis] * input_weights[1]
-        return np.tanh(pre)
+        return np.tanh(pre, out=pre)
 
     def acceleration(self, speed_rad_s: Array, command: Array) -> Array:
         """(..., batch) in rad/s^2."""
@@ -104,17 +105,19 @@ class TanhNetwork:
         by_speed = per_speed.sum() - (hidden * hidden) @ per_speed
         return rate * (hidden @ output_weights + output_bias), rate * by_speed
 
-    def linearise(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array, Array]:
-        """The acceleration and its derivatives by speed and by command (..., batch), and by theta (..., batch, P)."""
+    def linearise(self, speed_rad_s: Array, command: Array, by_theta: Array) -> tuple[Array, Array, Array]:
+        """The acceleration and its derivatives by speed and by command (..., batch); those by theta (..., batch, P) are
+        written into `by_theta`.
+        """
         value, by_speed, by_command, hidden, by_bias = self._by_inputs(speed_rad_s, command)
         rate = self.scaling.acceleration_scale_rad_s2
-        by_theta = np.empty((*speed_rad_s.shape, self.parameter_count))
         for index, scaled in enumerate(self._scaled_inputs(speed_rad_s, command)):
-            by_theta[..., index * self.units : (index + 1) * self.units] = by_bias * scaled[..., np.newaxis]
+            of_input = by_theta[..., index * self.units : (index + 1) * self.units]
+            np.multiply(by_bias, scaled[..., np.newaxis], out=of_input)
         by_theta[..., -2 * self.units - 1 : -self.units - 1] = by_bias
-        by_theta[..., -self.units - 1 : -1] = rate * hidden
+        np.multiply(rate, hidden, out=by_theta[..., -self.units - 1 : -1])
         by_theta[..., -1] = rate
-        return value, by_speed, by_command, by_theta
+        return value, by_speed, by_command
 
     def linearise_inputs(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array]:
         """`linearise` without the derivatives by theta."""
@@ -126,7 +129,9 @@ class TanhNetwork:
         input_weights, _, output_weights, output_bias = self.weights()
         rate = self.scaling.acceleration_scale_rad_s2
         hidden = self.hidden(speed_rad_s, command)
-        by_bias = rate * output_weights * (1.0 - hidden * hidden)
+        by_bias = hidden * hidden
+        np.subtract(1.0, by_bias, out=by_bias)
+        by_bias *= rate * output_weights
         by_speed = by_bias @ (input_weights[0] / self.scaling.speed_scale_rad_s)
         by_command = np.zeros_like(by_speed)
         if len(self.inputs) > 1:

@@ -26,13 +26,12 @@ def acceleration_by_speed(speed_rad_s: Array, parameters: Array) -> Array:
     return -(viscous + 2.0 * drag * np.abs(speed_rad_s)) / inertia
 
 
-def acceleration_by_parameters(speed_rad_s: Array, command: Array, parameters: Array) -> Array:
-    """(..., fans, 3) derivatives of the acceleration by J, alpha and C_D."""
+def acceleration_by_parameters(speed_rad_s: Array, command: Array, parameters: Array, out: Array) -> None:
+    """Write the derivatives of the acceleration by J, alpha and C_D into `out` (..., fans, 3)."""
     inertia = parameters.T[0]
-    by_inertia = -acceleration(speed_rad_s, command, parameters) / inertia
-    by_viscous = -speed_rad_s / inertia
-    by_drag = -speed_rad_s * np.abs(speed_rad_s) / inertia
-    return np.stack((by_inertia, by_viscous, by_drag), axis=-1)
+    out[..., 0] = -acceleration(speed_rad_s, command, parameters) / inertia
+    out[..., 1] = -speed_rad_s / inertia
+    out[..., 2] = -speed_rad_s * np.abs(speed_rad_s) / inertia
 
 
 def time_constant_s(speed_rad_s: Array, parameters: Array) -> Array:

@@ -13,6 +13,7 @@ from twin.models.drive import Drive, drive_settings
 from twin.models.integration import free_run
 from twin.models.lag import effective_command
 from twin.models.network import TanhNetwork
+from twin.models.stepping import step_fans
 from twin.runs import Array
 
 ODE_LAYOUT = StateLayout(speed=1, command=1)
@@ -53,21 +54,29 @@ class FanEquation:
             by_speed + physics.acceleration_by_speed(speed_rad_s, self.parameters),
         )
 
-    def linearise(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array, Array]:
+    def stepped(self, initial_speed_rad_s: Array, command: Array, step_s: Array) -> tuple[Array, Array]:
+        """See integration.RightHandSide."""
+        return step_fans(self.network, self.parameters, initial_speed_rad_s, command, step_s)
+
+    def linearise(
+        self, speed_rad_s: Array, command: Array, by_theta: Array | None = None
+    ) -> tuple[Array, Array, Array, Array]:
         """See integration.Linearised."""
+        weights = self.network.parameter_count if self.network is not None and self.has_free_weights else 0
+        if by_theta is None:
+            of_physics = 0 if self.parameters is None else physics.LAG
+            by_theta = np.empty((*speed_rad_s.shape, weights + of_physics))
         value = by_speed = by_command = np.zeros_like(speed_rad_s)
-        by_theta = []
         if self.network is not None and self.has_free_weights:
-            value, by_speed, by_command, by_weights = self.network.linearise(speed_rad_s, command)
-            by_theta.append(by_weights)
+            value, by_speed, by_command = self.network.linearise(speed_rad_s, command, by_theta[..., :weights])
         elif self.network is not None:
             value, by_speed, by_command = self.network.linearise_inputs(speed_rad_s, command)
         if self.parameters is not None:
             value = value + physics.acceleration(speed_rad_s, command, self.parameters)
             by_speed = by_speed + physics.acceleration_by_speed(speed_rad_s, self.parameters)
             by_command = by_command + 1.0 / self.parameters[:, 0]
-            by_theta.append(physics.acceleration_by_parameters(speed_rad_s, command, self.parameters))
-        return value, by_speed, by_command, by_theta[0] if len(by_theta) == 1 else np.concatenate(by_theta, axis=-1)
+            physics.acceleration_by_parameters(speed_rad_s, command, self.parameters, by_theta[..., weights:])
+        return value, by_speed, by_command, by_theta
 
     @property
     def _physics(self) -> Array:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
+from pipeline.cli.networks_in_parallel import NetworksInParallel
 from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import interruptible, training_progress
-from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel, SchedulerOption, SkipBadOption
 from pipeline.cli.twins.figures import figures_in, sentence, shown
 from pipeline.cli.twins.training_data import (
     FansOption,
@@ -36,6 +37,7 @@ from pipeline.cli.twins.training_data import (
 
 if TYPE_CHECKING:
     from twin.finishing import TrainedTwin
+    from twin.networks import ForEachNetwork
     from twin.progress import Progress
 
 
@@ -92,12 +94,20 @@ def train(
     networks: Annotated[
         int | None,
         typer.Option(
-            help="Networks to train and average (hybrid, neural ODE), up to that many times as long. Default: "
+            help="Networks to train and average (hybrid, neural ODE). Default: "
             f"{NETWORKS}, and 1 where they cannot be averaged."
         ),
     ] = None,
     command_unit: Annotated[str, typer.Option(help="Unit of the command, for the card, e.g. %.")] = "",
-    jobs: JobsOption = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs",
+            "-j",
+            min=1,
+            help="Recordings to read, and networks to train, at a time. Default: one for each core.",
+        ),
+    ] = None,
     scheduler: SchedulerOption = None,
     skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
@@ -122,13 +132,14 @@ def train(
             held_out = read_held_out(training_data, validate, validation_part, pool) if validate else None
         if not json_output:
             show_hints(training_data.hints)
-        with training_progress(training_data) as start:
+        with training_progress(training_data) as start, NetworksInParallel(jobs) as each_network:
             trained = fit_twin(
                 training_data,
                 held_out,
                 name or output.stem,
                 TrainingSettings(model, seed, trainer, iterations, network_inputs, physics, networks, command_unit),
                 start(""),
+                each_network,
             )
         trained.save(output)
     result = as_json(trained, training_data, output)
@@ -154,14 +165,17 @@ def fit_twin(
     name: str,
     settings: TrainingSettings = DEFAULT_SETTINGS,
     progress: Progress | None = None,
+    each_network: ForEachNetwork | None = None,
 ) -> TrainedTwin:
-    """A twin of what was read. held_out: on which its weights are chosen and its band is measured.
+    """A twin of what was read. held_out: on which its weights are chosen and its band is measured. each_network: who
+    trains its networks; None: this process, one after another.
 
     Raises:
         TwinError: the data do not suffice.
     """
     from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
     from twin.kinds import find_kind  # noqa: PLC0415
+    from twin.networks import one_after_another  # noqa: PLC0415
     from twin.progress import unreported  # noqa: PLC0415
 
     can_average = find_kind(settings.model).averages_networks and settings.trainer == "levenberg-marquardt"
@@ -176,6 +190,7 @@ def fit_twin(
         network_inputs=tuple(settings.network_inputs.split(",")),
         physics=settings.physics,
         networks=settings.networks if settings.networks is not None else NETWORKS if can_average else 1,
+        each_network=each_network or one_after_another,
         command_unit=settings.command_unit,
         fan_numbers=training_data.fans,
         data=data_cards(training_data),

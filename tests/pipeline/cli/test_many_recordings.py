@@ -91,6 +91,19 @@ def test_one_process_and_two_print_and_write_the_same(folder: Path, tmp_path: Pa
     assert outcomes[0] == outcomes[1]
 
 
+def test_networks_that_are_trained_two_at_a_time_give_the_same_twin(folder: Path, tmp_path: Path) -> None:
+    outcomes = []
+    for jobs in (1, 2):
+        output = tmp_path / f"with-{jobs}"
+        output.mkdir()
+        options = ("--networks", 3, "--iterations", 3, "--to", 15, "--json", "--jobs", jobs)
+        result = fantwin("train", folder / RECORDINGS[0], *options, "-o", output / "trained.onnx")
+        assert result.exit_code == 0, result.output
+        assert ("training, 2 networks at a time" in result.stderr) == (jobs == 2)
+        outcomes.append(outcome_of(result, output))
+    assert outcomes[0] == outcomes[1]
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_recordings_at_urls_give_what_files_give(folder: Path, tmp_path: Path, command: str) -> None:
     memory = pytest.importorskip("fsspec", reason="the extra `remote` is not installed").filesystem("memory")

@@ -6,6 +6,7 @@ import pytest
 from twin.models import integration
 from twin.models.integration import free_run, free_run_sensitivities, step_through
 from twin.models.lag import effective_command, effective_command_by_lag
+from twin.models.network import Scaling, TanhNetwork
 from twin.models.right_hand_side import FanEquation
 
 PARAMETERS = np.array([[0.15, 0.012, 0.0025, 0.0]])
@@ -54,6 +55,26 @@ def test_a_free_run_solved_at_once_is_the_one_stepped_through(guess: str) -> Non
     speed, final = free_run(equation, start, command, step_s, guesses[guess])
     np.testing.assert_allclose(speed, stepped, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(final, end, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "has_physics"),
+    [(None, True), (("speed", "command"), True), (("speed", "command"), False), (("speed",), True)],
+)
+def test_many_fans_are_stepped_through_to_the_bit(inputs: tuple[str, ...] | None, has_physics: bool) -> None:
+    rng, fans = np.random.default_rng(8), integration.WIDE_BATCH
+    parameters = PARAMETERS * rng.uniform(0.9, 1.1, (fans, 4))
+    scaling = Scaling(120.0, 130.0, 45.0, 50.0, 80.0)
+    network = None
+    if inputs is not None:
+        network = TanhNetwork(10, inputs, scaling, rng.normal(size=10 * (len(inputs) + 2) + 1))
+    equation = FanEquation(parameters if has_physics else None, network)
+    command, start = rng.uniform(0.0, 90.0, (60, fans)), rng.uniform(0.0, 150.0, fans)
+    step_s = rng.uniform(0.0, 0.03, command.shape)
+    stepped, end = step_through(equation.acceleration, start, command, step_s)
+    speed, final = free_run(equation, start, command, step_s)
+    np.testing.assert_array_equal(speed, stepped)
+    np.testing.assert_array_equal(final, end)
 
 
 def test_a_diverging_fan_does_not_affect_the_others() -> None:

@@ -29,7 +29,8 @@ def test_derivatives_agree_with_finite_differences() -> None:
         - physics.acceleration(speed - difference, command, PARAMETERS)
     ) / (2 * difference)
     np.testing.assert_allclose(physics.acceleration_by_speed(speed, PARAMETERS), by_speed, rtol=1e-6)
-    exact = physics.acceleration_by_parameters(speed, command, PARAMETERS)
+    exact = np.empty((2, 3))
+    physics.acceleration_by_parameters(speed, command, PARAMETERS, exact)
     for index in range(3):
         move = np.zeros_like(PARAMETERS)
         move[:, index] = 1e-6 * PARAMETERS[:, index]
