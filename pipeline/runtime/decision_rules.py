@@ -81,6 +81,9 @@ class DecisionRules(IntEnum):
     ROUNDED_WEAR = 21
     """Points of wear are kept to the second, and to a hundredth of their standard error. Before, they had all digits.
     No alarm differs."""
+    SMALL_STEPS = 22
+    """On a grid that is slower than the training data, the twin goes on in steps as long as those. Before, one step of
+    a second could make it unstable."""
 
 
 CURRENT_RULES = max(DecisionRules)

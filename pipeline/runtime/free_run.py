@@ -43,8 +43,11 @@ class FreeRunInputs:
 class FreeRun(ColumnState):
     """The free runs of all fans: which are running, since when, and their state. All arrays are (fans,)."""
 
-    def __init__(self, twin: TwinFile, start_samples: int) -> None:
-        """start_samples: how many readings a start averages."""
+    def __init__(self, twin: TwinFile, start_samples: int, *, small_steps: bool) -> None:
+        """start_samples: how many readings a start averages. small_steps: the twin goes on in steps about as long as
+        those it was trained with; False only to decide as before there were several in a sample.
+        """
+        self._small_steps = small_steps
         self._twin = twin
         self._start_samples = start_samples
         fans = twin.fans
@@ -62,6 +65,8 @@ class FreeRun(ColumnState):
         """End all free runs; the next ones are on a grid of this period."""
         self.stop(np.ones_like(self.running))
         self._period_s = period_ns / NS_PER_S
+        self._steps = max(1, round(self._period_s * self._twin.card.rate_hz)) if self._small_steps else 1
+        """of the twin in a sample"""
         self._reading = ExpectedReading(self._twin.tachos, self._period_s)
 
     @property
@@ -130,6 +135,14 @@ class FreeRun(ColumnState):
         self.running |= fans
         self.forget_readings(fans)
 
+    def _run(self, command: Array) -> tuple[Array, Array]:
+        """(n, fans) the speeds when each of these commands begins, and the state after the last: each is held."""
+        steps = self._steps
+        step_s = np.full(len(command) * steps, self._period_s / steps)
+        held = command if steps == 1 else np.repeat(command, steps, axis=0)
+        speed_rad_s, state = self._twin.advance(self._state, held, step_s)
+        return speed_rad_s[::steps], state
+
     def advance(self, command: Array) -> tuple[Array, Array, Array]:
         """Run over a block, or over its first part. command: (n, fans), n >= 1.
 
@@ -142,7 +155,7 @@ class FreeRun(ColumnState):
             nothing = np.full(command.shape, np.nan)
             return nothing, nothing, np.zeros_like(self.running)
         while True:
-            speed_rad_s, state = self._twin.advance(self._state, command[:rows], np.full(rows, self._period_s))
+            speed_rad_s, state = self._run(command[:rows])
             finite = np.isfinite(speed_rad_s)
             diverged = self.running & ~(finite.all(axis=0) & np.isfinite(state).all(axis=1))
             if rows == 1 or not diverged.any():

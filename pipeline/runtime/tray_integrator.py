@@ -96,7 +96,8 @@ class TrayIntegrator:
         self._lowest_command, self._highest_command = twin.usable_commands
         self._standstill = twin.card.standstill
         self._off_below = twin.off_below if self._standstill is None else _off_below(twin, self._standstill)
-        self._run = FreeRun(twin, config.start_samples)
+        small_steps = decision_rules >= DecisionRules.SMALL_STEPS
+        self._run = FreeRun(twin, config.start_samples, small_steps=small_steps)
         self._starting: StartingFans | None = None
         if self._standstill is not None:
             self._starting = StartingFans(twin.fans, self._standstill, self._warm_up_ns, reach_s)

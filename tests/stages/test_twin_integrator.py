@@ -155,13 +155,16 @@ def test_the_block_size_does_not_change_a_bit_of_the_prediction(tmp_path: Path, 
 
 
 def test_the_grid_rate_changes_the_prediction_by_the_integration_error_only(tmp_path: Path) -> None:
-    """Order four without a lag, order two with one: the lagged command acts by its mean over each step."""
+    """Order four without a lag, order two with one: the lagged command acts by its mean over each step. By the rules of
+    before the twin took steps of its own on a slow grid."""
 
     def difference_rad_s(lag_s: float, every: int) -> float:
         path = write_twin(tmp_path / "twin.onnx", small_hybrid(), parameters=[[*PARAMETERS[:LAG], lag_s]])
         twin = TwinFile.load(path, 1)
-        fast = feed(core_of(twin), [grid_of(command)]).predicted_speed_rad_s
-        slow = feed(core_of(twin), [grid_of(command[::every], period_ns=every * STEP_NS)]).predicted_speed_rad_s
+        fast, slow = (
+            feed(core_of(twin, decision_rules=DecisionRules.ROUNDED_WEAR), [grid]).predicted_speed_rad_s
+            for grid in (grid_of(command), grid_of(command[::every], period_ns=every * STEP_NS))
+        )
         assert np.ptp(fast) > 100
         return float(np.abs(fast[::every] - slow).max())
 
@@ -391,6 +394,18 @@ def test_a_discrete_twin_at_another_rate_says_so_and_judges_nothing() -> None:
     assert (prediction.invalid_reason == InvalidReason.NO_TWIN).all()
     assert "rate_hz = 100" in core.problem()
     assert feed(core_of(physical_twin(fixed_rate=True)), [grid_of(stairs(20))]).valid.all()
+
+
+def test_on_a_grid_slower_than_its_training_the_twin_takes_steps_as_long_as_those() -> None:
+    twin = physical_twin()
+    per_second = round(twin.card.rate_hz)
+    seconds = np.repeat(np.array([60.0, 80.0, 40.0, 70.0]), 3)
+    slow = grid_of(seconds, period_ns=10**9)
+    fine = grid_of(np.repeat(seconds, per_second), period_ns=10**9 // per_second)
+    found, expected = (feed(core_of(twin), [grid]).predicted_speed_rad_s for grid in (slow, fine))
+    np.testing.assert_array_equal(found, expected[::per_second])
+    (before,) = feed(core_of(twin, decision_rules=DecisionRules.ROUNDED_WEAR), [slow]).predicted_speed_rad_s[-1]
+    assert not abs(before - found[-1, 0]) < 0.01 * found[-1, 0], "one step of a second is too long for this fan"
 
 
 def test_the_whole_block_of_all_fans_is_one_run_of_the_graph() -> None:

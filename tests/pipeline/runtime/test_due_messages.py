@@ -86,6 +86,25 @@ def test_so_many_values_come_together_at_most():
     assert popped(due) == [half[:2], half[2:], [larger]]
 
 
+def test_of_many_trays_as_many_messages_are_taken_of_each_as_all_have():
+    due = begun()
+    a, b = [raw("a", k) for k in range(5)], [raw("b", k) for k in range(2)]
+    due.add([*a, *b])
+    assert due.pop_of_each() == [a[:2], b]
+    assert due.pop_of_each() == [a[2:]], "what is left of one tray comes as if there were no other"
+    assert not due
+
+
+def test_of_large_trays_no_more_are_taken_at_once_than_are_joined_of_one():
+    due = begun()
+    large = [raw(tray, k, samples=MOST_JOINED_VALUES // 4, fans=2) for k in range(3) for tray in TRAYS]
+    due.add(large)
+    assert due.pop_of_each() == [large[:1], large[1:2]], "half of the values each, so nothing is joined"
+    larger = DueMessages(TRAYS, joins=True)
+    larger.add([raw(tray, 0, samples=MOST_JOINED_VALUES, fans=2) for tray in TRAYS])
+    assert [len(group) for group in larger.pop_of_each()] == [1]
+
+
 def test_one_core_for_all_trays_gets_every_message_in_order():
     due = DueMessages([""], joins=True)
     mixed = [raw("a", 0), raw("a", 1), raw("b", 0), request("", 0), raw("a", 2)]
@@ -96,13 +115,21 @@ def test_one_core_for_all_trays_gets_every_message_in_order():
 STEPS = st.lists(st.one_of(st.none(), st.tuples(st.sampled_from(["a", "b", "c"]), st.booleans())), max_size=40)
 
 
-@given(STEPS, st.booleans())
-def test_nothing_is_lost_or_overtaken_within_a_tray(steps: Sequence[tuple[str, bool] | None], joins: bool) -> None:
+@given(STEPS, st.booleans(), st.booleans())
+def test_nothing_is_lost_or_overtaken_within_a_tray(
+    steps: Sequence[tuple[str, bool] | None], joins: bool, of_each: bool
+) -> None:
     due, added, taken = DueMessages(TRAYS, joins=joins), [], []
     for step in steps:
         if step is not None:
             added.append(request(step[0], len(added)) if step[1] else raw(step[0], len(added)))
             due.add(added[-1:])
+        elif due and of_each:
+            at_once = due.pop_of_each()
+            assert len({group[0].header.tray for group in at_once if group[0].header.tray in TRAYS}) == len(
+                [group for group in at_once if group[0].header.tray in TRAYS]
+            )
+            taken += at_once
         elif due:
             taken.append(due.pop())
     taken += popped(due)

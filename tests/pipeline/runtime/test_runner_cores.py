@@ -11,8 +11,9 @@ import pytest
 
 from pipeline.runtime.inbox import INBOX_SIZE
 from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import BuiltStage, Context, Core, StageError
-from schemas.messages import Grid, Header, Health, Message, StageStatus
+from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, StageError
+from schemas.messages import Grid, Header, Health, InputPosition, Message, Raw, StageStatus
+from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, toy
 
 
@@ -23,6 +24,75 @@ def test_each_tray_has_its_own_core_and_sequence(config):
     got = {(g.header.tray, g.header.sequence) for g in (bench.next(Grid), bench.next(Grid))}
     bench.end()
     assert got == {(TRAY_A, 0), (TRAY_B, 0)}
+
+
+class Joined(Passer):
+    """A core whose blocks are processed in one pass with those of other trays; the first one waits."""
+
+    busy, may_go_on = threading.Event(), threading.Event()
+    aborted: ClassVar[list[str]] = []
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        self.name = name
+
+    def step(self, item: Any) -> Sequence[Message]:
+        self.busy.set()
+        assert self.may_go_on.wait(20)
+        return super().step(item)
+
+    def admit(self, item: Any) -> Admitted:
+        return Admitted((), item, "all")
+
+    def finish(self, block: Any, made: Any) -> Sequence[Message]:
+        return made
+
+    def abort(self) -> None:
+        self.aborted.append(self.name)
+
+
+class InOnePass:
+    """Processes blocks of Joined."""
+
+    passes: ClassVar[list[int]] = []
+
+    def process(self, cores: Sequence[Joined], blocks: Sequence[Raw]) -> Sequence[Any]:
+        self.passes.append(len(cores))
+        if any(int(block.host_receive_t_ns[0]) < 0 for block in blocks):
+            raise ZeroDivisionError("on purpose")
+        return [core.step(block) for core, block in zip(cores, blocks, strict=True)]
+
+
+@pytest.mark.parametrize("raises", [False, True])
+def test_what_waits_of_several_trays_is_processed_in_one_pass(config, raises):
+    for event in (Joined.busy, Joined.may_go_on):
+        event.clear()
+    Joined.aborted.clear()
+    InOnePass.passes.clear()
+    stage = toy(lambda context: BuiltStage(Joined(context.tray.name)), joint=InOnePass)
+    bench = Bench(stage, config)
+    bench.feed(TRAY_A, 1)
+    assert Joined.busy.wait(20)
+    for tray, t_ns in ((TRAY_B, -2 if raises else 2), (TRAY_A, 3), (TRAY_B, 4)):
+        bench.feed(tray, t_ns)
+    eventually(lambda: bench.runner._inbox.waiting() >= 3, "they wait")
+    Joined.may_go_on.set()
+    if raises:
+        bench.thread.join(20)
+        bench.bus.close()
+        assert bench.crashes
+        assert sorted(Joined.aborted) == [TRAY_A, TRAY_B], "each may be half updated"
+        return
+    grids = [bench.next(Grid) for _ in range(4)]
+    bench.end()
+    assert InOnePass.passes == [2]
+    found = [(grid.header.tray, int(grid.t_ns[0]), grid.header.input_position) for grid in grids]
+    assert found == [
+        (TRAY_A, 1, InputPosition("raw", "feeder", 0, 1, 0)),
+        (TRAY_B, 2, InputPosition("raw", "feeder", 0, 1, 0)),
+        (TRAY_A, 3, InputPosition("raw", "feeder", 1, 2, 0)),
+        (TRAY_B, 4, InputPosition("raw", "feeder", 1, 2, 0)),
+    ]
 
 
 def test_items_a_source_delivers_while_stopping_are_processed_before_the_end(config):
