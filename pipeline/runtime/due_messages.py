@@ -18,8 +18,8 @@ from schemas.envelope import Envelope
 
 MOST_JOINED_VALUES = 8192
 """samples times fans: beyond that a sample hardly costs less, and health and other trays wait for longer"""
-MOST_TRAYS = 64
-"""at once"""
+MOST_TRAYS, MOST_VALUES = 64, 4 * MOST_JOINED_VALUES
+"""at once, of all together"""
 
 
 class DueMessages:
@@ -54,9 +54,9 @@ class DueMessages:
             self.bytes += len(envelope.payload)
             self._waiting.setdefault(tray if tray in self._trays else "", deque()).append(envelope)
 
-    def pop(self, most: int = MOST_JOINED_VALUES, of_values: int = MOST_JOINED_VALUES) -> list[Envelope]:
+    def pop(self, most_values: int = MOST_JOINED_VALUES) -> list[Envelope]:
         """The next message; or several of one tray, topic and producer that differ only in their samples, but no more
-        messages than `most`, nor more values after the first message than `of_values`.
+        values together than `most_values`.
 
         The first of a key comes alone: so the position of the first output that is made of it shows whether a session
         had consumed anything before.
@@ -70,13 +70,8 @@ class DueMessages:
         is_first = taken[0].key not in self._begun
         self._begun.add(taken[0].key)
         if self.joins and tray and not is_first:
-            left = of_values - _values(taken[0])
-            while (
-                waiting
-                and len(taken) < most
-                and _differ_in_samples(taken[0], waiting[0])
-                and (left := left - _values(waiting[0])) >= 0
-            ):
+            left = most_values - _values(taken[0])
+            while waiting and _differ_in_samples(taken[0], waiting[0]) and (left := left - _values(waiting[0])) >= 0:
                 taken.append(waiting.popleft())
         if waiting:
             self._waiting[tray] = waiting
@@ -84,13 +79,10 @@ class DueMessages:
         return taken
 
     def pop_of_each(self) -> list[list[Envelope]]:
-        """What `pop` gives of each of the next trays: as many messages of each as all of them have, and of all together
-        hardly more values than are joined of one."""
-        next_ones = list(islice(self._waiting.values(), MOST_TRAYS))
-        of_first = [_values(waiting[0]) for waiting in next_ones]
+        """What `pop` gives of each of the next trays, about MOST_VALUES of all together."""
+        of_first = [_values(waiting[0]) for waiting in islice(self._waiting.values(), MOST_TRAYS)]
         trays = max(1, bisect_right(list(accumulate(of_first)), MOST_JOINED_VALUES))
-        most = min(len(waiting) for waiting in next_ones[:trays])
-        return [self.pop(most if trays > 1 else MOST_JOINED_VALUES, MOST_JOINED_VALUES // trays) for _ in range(trays)]
+        return [self.pop(min(MOST_JOINED_VALUES, MOST_VALUES // trays)) for _ in range(trays)]
 
 
 def _differ_in_samples(one: Envelope, other: Envelope) -> bool:

@@ -86,12 +86,12 @@ def test_so_many_values_come_together_at_most():
     assert popped(due) == [half[:2], half[2:], [larger]]
 
 
-def test_of_many_trays_as_many_messages_are_taken_of_each_as_all_have():
+def test_of_several_trays_comes_at_once_what_waits_of_each():
     due = begun()
     a, b = [raw("a", k) for k in range(5)], [raw("b", k) for k in range(2)]
-    due.add([*a, *b])
-    assert due.pop_of_each() == [a[:2], b]
-    assert due.pop_of_each() == [a[2:]], "what is left of one tray comes as if there were no other"
+    due.add([*a, request("a", 0), *b])
+    assert due.pop_of_each() == [a, b]
+    assert [len(group) for group in due.pop_of_each()] == [1], "the request comes after what was sent before it"
     assert not due
 
 
@@ -99,7 +99,7 @@ def test_of_large_trays_no_more_are_taken_at_once_than_are_joined_of_one():
     due = begun()
     large = [raw(tray, k, samples=MOST_JOINED_VALUES // 4, fans=2) for k in range(3) for tray in TRAYS]
     due.add(large)
-    assert due.pop_of_each() == [large[:1], large[1:2]], "half of the values each, so nothing is joined"
+    assert due.pop_of_each() == [large[0:4:2], large[1:4:2]], "two of each, as if there were no other tray"
     larger = DueMessages(TRAYS, joins=True)
     larger.add([raw(tray, 0, samples=MOST_JOINED_VALUES, fans=2) for tray in TRAYS])
     assert [len(group) for group in larger.pop_of_each()] == [1]
