@@ -172,12 +172,17 @@ class FanScorer:
 
     def is_interval_over(self, t_ns: Array) -> bool | None:
         """Of a block of the times t_ns, (n,): whether it begins a new interval of the baselines. None: an interval
-        ends within it, or no fan is commissioned yet.
+        ends within it, or no fan is commissioned yet, or a fan is being commissioned when an interval ends: NumPy adds
+        up the column of a single such fan in another order than columns side by side.
         """
-        if self.origin_t_ns is None or not all(residual.is_commissioned for residual in self.residuals.values()):
+        residuals = self.residuals.values()
+        if self.origin_t_ns is None or not all(residual.is_commissioned for residual in residuals):
             return None
         first, last = (self._interval_of(int(t)) for t in (t_ns[0], t_ns[-1]))
-        return first != self._intervals.interval if first == last else None
+        is_over = first != self._intervals.interval
+        if first != last or (is_over and any(residual.baseline.is_learning_first for residual in residuals)):
+            return None
+        return is_over
 
     def begin_block(self, t_ns: int, *, is_interval_over: bool) -> None:
         """Let an interval begin at t_ns, or go on from there."""

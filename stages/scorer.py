@@ -4,7 +4,8 @@ Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in
 operators request about alarms), and `twin` where twins are learned (pipeline.runtime.learned_scorer).
 Writes: topic `score` (residuals, baselines, the statistic closest to its limit, state), `alarm` (every transition of a
 fan's alarm), `snapshot` (the state to continue from after a restart).
-Timing: one score message for every prediction message, immediately; delays count the time of valid samples.
+Timing: one score message for every prediction message, immediately, in a process of many trays at its next tick; of
+messages that wait together, one. Delays count the time of valid samples.
 
 How a block is scored is in pipeline.runtime.tray_scorer. Here is what a stage adds: samples that come again, requests,
 snapshots, and health. See docs/explanation/deciding.md.
@@ -220,7 +221,7 @@ class ScorerCore(Core):
         block = item if new.all() else select(item, new)
         is_over = self.tray.fan_scorer.is_interval_over(block.t_ns)
         samples = len(block.t_ns)
-        has_steps = int(block.t_ns[-1] - block.t_ns[0]) == (samples - 1) * block.period_ns
+        has_steps = bool((np.diff(block.t_ns) == block.period_ns).all())
         if is_over is None or not has_steps or self._fans == 1:  # NumPy adds up a single column in another order
             return Admitted(before_score, block)
         times = block.period_ns, samples, is_over

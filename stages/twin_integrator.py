@@ -4,8 +4,9 @@ Reads: topic `grid` (command, measured speed rad/s, uniform time), and `new_twin
 (pipeline.runtime.learned_integrator).
 Writes: topic `prediction` (measured and predicted speed rad/s, sigma rad/s), and `twin` (the model card) at start and
 when a new twin takes over.
-Timing: one prediction message for every grid message, immediately and of the same size; the graph runs once per message
-for all fans. Where a new twin names a sample within a message as its first, there is one for each twin.
+Timing: one prediction message for every grid message, immediately, in a process of many trays at its next tick; of
+messages that wait together, one. The graph runs once for all fans of a message, or of many trays. Where a new twin
+names a sample within a message as its first, there is one prediction for each twin.
 
 The prediction is a *free run*: it starts from the mean of the first measured speeds and is never corrected by a
 measurement again. It needs commands only, so a missing reading does not disturb it. While no samples arrive, the last

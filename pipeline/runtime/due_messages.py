@@ -2,8 +2,8 @@
 
 What a message costs hardly depends on the number of its samples, and the output of a core does not depend on how its
 input is cut (schemas.blocks). A stage that is behind joins what waits, so each sample costs it less. A stage that keeps
-up finds one message at a time, and waits for no other. A stage that processes several trays in one pass takes what
-waits of many of them at once.
+up finds one message at a time. A stage that processes several trays in one pass takes what waits of many of them at
+once.
 """
 
 from __future__ import annotations

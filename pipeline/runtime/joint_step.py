@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from typing import Any
 
 from pipeline.runtime.stage import Admitted, Core, Joint
@@ -12,17 +12,18 @@ MOST_FANS = 512
 """in one pass: with more, a fan costs hardly less"""
 
 
-def step_together(joint: Joint, cores: Sequence[Core], items: Sequence[Any]) -> list[list[Message]]:
-    """What `core.step(item)` returns for each of several trays, to the bit."""
+def step_together(joint: Joint, cores: Sequence[Core], items: Sequence[Any]) -> Iterator[list[Message]]:
+    """What `core.step(item)` returns for each of several trays, to the bit.
+
+    A core finishes its step when its messages are asked for: what it saves then is not ahead of what is published.
+    """
     admitted = [core.admit(item) for core, item in zip(cores, items, strict=True)]
     made: dict[int, Any] = {}
     for numbers in _passes(admitted):
         blocks = [admitted[number].block for number in numbers]
         made |= zip(numbers, joint.process([cores[number] for number in numbers], blocks), strict=True)
-    return [
-        [*each.before, *(core.finish(each.block, made[number]) if number in made else ())]
-        for number, (core, each) in enumerate(zip(cores, admitted, strict=True))
-    ]
+    for number, (core, each) in enumerate(zip(cores, admitted, strict=True)):
+        yield [*each.before, *(core.finish(each.block, made[number]) if number in made else ())]
 
 
 def _passes(admitted: Sequence[Admitted]) -> list[list[int]]:

@@ -266,7 +266,8 @@ class Runner:
             item = self._inbox.get(TICK_S)
             if item is not None:
                 self._handle(item)
-                left = None if left is None else max(0, left - 1)
+                taken = 1 + (self._handle_what_waits() if self._due.joins else 0)
+                left = None if left is None else max(0, left - taken)
 
     def _discard_waiting(self) -> None:
         self._inbox.close()  # from now on it takes nothing, and the sources count what they deliver
@@ -305,13 +306,15 @@ class Runner:
         self._ending.run("reporting the last health", report, HEALTH_SENT)
         return reported[0] if reported else self._build_health(StageStatus.DEGRADED, with_counts=False)
 
-    def _handle_what_waits(self) -> None:
+    def _handle_what_waits(self) -> int:
         """Take what else is in the inbox now, so that messages of a tray are joined. Not so much that what the inbox
-        holds back would be in memory here."""
-        for _ in range(min(self._inbox.waiting(), INBOX_SIZE - len(self._due))):
+        holds back would be in memory here. Returns how many items that were."""
+        most = min(self._inbox.waiting(), INBOX_SIZE - len(self._due))
+        for taken in range(most):
             if self._due.bytes >= MOST_DUE_BYTES or (item := self._inbox.get(0)) is None:
-                return
+                return taken
             self._handle(item)
+        return max(0, most)
 
     def _handle(self, item: Item) -> None:
         if isinstance(item, FromSource):

@@ -71,7 +71,7 @@ class Steps:
         made = step_together(self._joint, cores, [each.item for each in due])
         for each, of_core in zip(due, made, strict=True):
             self._publish(each.name, of_core, each.tray)
-        self.active = frozenset()
+            self.active -= {each.name}
 
     def call(
         self, name: str, produce: Callable[[], Sequence[Message]], *, input_tray: str = "", from_timer: bool = False

@@ -114,6 +114,11 @@ class Baseline(ColumnState):
         return self.intervals < COMMISSIONING_INTERVALS
 
     @property
+    def is_learning_first(self) -> bool:
+        """Whether commissioning may go on with the present interval, of any fan."""
+        return bool((self.is_commissioning & (self._counts > 0)).any())
+
+    @property
     def state(self) -> BaselineState:
         """(1, fans) of the present interval."""
         columns = (self.value, self.commissioned, self.intervals, self.total_information, self.learned_scale)

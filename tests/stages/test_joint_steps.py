@@ -26,12 +26,13 @@ FAULTS: tuple[tuple[Fault, ...], ...] = (
     (),
     (Fault("rotor", 3, 20.0, 26.0, 1.0),),
     (Fault("tacho-dropout", 0, 15.0, 30.0, 0.6), Fault("inlet", 5, 22.0, 30.0, 1.6)),
-    (Fault("tacho-stuck", 7, 18.0, 24.0),),
-    (),
+    (Fault("tacho-stuck", 7, 18.0, 24.0), Fault("tacho-dropout", 1, 3.0, 9.3, 1.0)),
+    (Fault("tacho-dropout", 6, 3.0, 9.3, 1.0),),
     (Fault("supply", 2, 25.0, 31.0, 0.85),),
     (),
 )
-"""of each tray; the fifth loses samples, and the last one is silent for 3 s"""
+"""of each tray; the fifth loses samples, and the last one is silent for 3 s. In two trays one fan is commissioned later
+than the others."""
 LOSING, SILENT = 4, 6
 
 

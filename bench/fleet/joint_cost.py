@@ -1,0 +1,99 @@
+"""What a message of a small tray costs integrator and scorer: each tray alone, and all trays in one pass.
+
+Rough fans at 100 Hz under random stairs, watched by a calibrated twin of one such fan. The messages of all trays are
+made beforehand and taken by the cores in this process. Both ways make the same messages, to the bit
+(tests/stages/test_joint_steps.py).
+
+    python -m bench.fleet.joint_cost
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from bench.detection.plant import START_NS
+from bench.fleet.hall import Hall
+from bench.fleet.stage_cost import SITE, STAGES, calibrated_twin
+from bench.printing import JsonOption, progress, show
+from bench.stage_context import stage_context
+from pipeline.config.loading import parse_config
+from pipeline.runtime.building import build_parts
+from pipeline.runtime.joint_step import step_together
+from pipeline.runtime.stage import Core, load_stage
+from schemas.messages import Grid, Message, Prediction
+from simulation.published_fan import RATE_HZ
+
+BEGINNING_S = 25.0
+"""in which baselines are found; it is not measured"""
+BLOCKS_S = (0.05, 0.01)
+
+
+def main(
+    trays: Annotated[int, typer.Option(min=2, help="Of eight fans each.")] = 64,
+    seconds: Annotated[float, typer.Option(help="That are measured.")] = 10.0,
+    json_output: JsonOption = False,
+) -> None:
+    """Print microseconds of the processor for each message, by stage, length of the messages, and way."""
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        progress("training and calibrating the twin")
+        twin = calibrated_twin(Path(folder))
+        for block_s in BLOCKS_S:
+            for together in (False, True):
+                progress(f"messages of {block_s:g} s, {'in one pass' if together else 'each tray alone'}")
+                rows.append(_row(twin, trays, block_s, seconds, together=together))
+    show({"us of the processor for a message of a tray of 8": rows}, [], as_json=json_output)
+
+
+def _row(twin: Path, trays: int, block_s: float, seconds: float, *, together: bool) -> dict[str, Any]:
+    hall = Hall(8 * trays, 8, block_s)
+    resampler, integrator, scorer = (_stepper(stage, twin, hall, together=together) for stage in STAGES)
+    messages, spent = hall.messages(START_NS, []), {"twin_integrator": 0.0, "scorer": 0.0}
+    for number in range(round((BEGINNING_S + seconds) * RATE_HZ / hall.block)):
+        if number == round(BEGINNING_S * RATE_HZ / hall.block):
+            spent = dict.fromkeys(spent, 0.0)
+        grids = _only(Grid, resampler(next(messages)))
+        if not grids:
+            continue
+        began_s = time.process_time()
+        predictions = _only(Prediction, integrator(grids))
+        between_s = time.process_time()
+        scorer(predictions)
+        spent["twin_integrator"] += between_s - began_s
+        spent["scorer"] += time.process_time() - between_s
+    count = trays * seconds * RATE_HZ / hall.block
+    way = "in one pass" if together else "each tray alone"
+    return {"message, s": block_s, "trays": trays, "way": way} | {name: of / count * 1e6 for name, of in spent.items()}
+
+
+def _stepper(stage: str, twin: Path, hall: Hall, *, together: bool) -> Callable[[Sequence[Any]], list[list[Message]]]:
+    """Steps the cores of all trays, with a message for each."""
+    table = f'[[tray]]\nname = "{{}}"\nfans = 8\ntwin = "{twin}"\n'
+    text = f'site = "{SITE}"\n[resampler]\nrate_hz = {RATE_HZ:g}\n' + "".join(map(table.format, hall.names))
+    context = stage_context(parse_config(text, twin.parent / "fantwin.toml", (), STAGES), stage)
+    declared = load_stage(stage)
+    cores: list[Core] = [parts.core for parts in build_parts(declared, context).values()]
+    joint = declared.joint() if declared.joint and together else None
+
+    def step(items: Sequence[Any]) -> list[list[Message]]:
+        if joint is not None:
+            return list(step_together(joint, cores, items))
+        return [list(core.step(item)) for core, item in zip(cores, items, strict=True)]
+
+    return step
+
+
+def _only(kind: type[Message], of_trays: list[list[Message]]) -> list[Any]:
+    """The message of this kind of each tray; none while there is none."""
+    found = [message for messages in of_trays for message in messages if isinstance(message, kind)]
+    return found if len(found) == len(of_trays) else []
+
+
+if __name__ == "__main__":
+    typer.run(main)
