@@ -1,6 +1,6 @@
 """Messages of several trays put side by side into one with the fans of all, and one taken apart again.
 
-Messages with as many samples can be processed in one pass, which costs little more than one of them alone.
+Messages with the same number of samples can be processed in one pass, which costs little more than one of them alone.
 """
 
 from __future__ import annotations

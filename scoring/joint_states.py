@@ -11,7 +11,7 @@ from scoring.column_state import NEVER_NS, ColumnState
 
 
 class JointStates:
-    """States of trays with as many fans each, whose present blocks are processed in one pass.
+    """States of trays with the same number of fans, whose present blocks are processed in one pass.
 
     The times of a tray whose block begins later than the first one are moved back by as much.
     """

@@ -10,7 +10,7 @@ Result = TypeVar("Result")
 
 
 class ForEachNetwork(Protocol):
-    """Does the same for each network. Results do not depend on who does it."""
+    """Applies a function to each network. Results do not depend on the process that runs it."""
 
     def __call__(
         self, work: Callable[[Item, Progress], Result], items: Sequence[Item], doing: str, progress: Progress

@@ -1,4 +1,5 @@
-"""Processes of this host that do the same with many things, several at a time; results come in the order of the things.
+"""Worker processes of this host that apply one function to many items, several at a time. Results come in the order of
+the items.
 
 joblib keeps its processes until they are ended, so that one command can use them several times.
 """

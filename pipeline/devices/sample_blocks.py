@@ -1,9 +1,9 @@
 """What a source delivers within the time of one message is handed to the stage together.
 
 So a stage with a line of 100 samples a second is woken 20 times a second, not 100 times. The rule is the same for all
-sources. Readings are handed over as soon as the next ones, by the time between the last two arrivals, would come later
-than the time of a message: a line that is slower than that waits for nothing. What stays away is not waited for: the
-stage takes what waits at its ticks.
+sources. Readings are handed over as soon as the next ones, by the time between
+the last two arrivals, would come later than the time of a message: so a slow line is not delayed. If the next ones do
+not arrive, the stage takes the waiting ones at its next tick.
 """
 
 from __future__ import annotations

@@ -82,8 +82,9 @@ class DecisionRules(IntEnum):
     """Points of wear are kept to the second, and to a hundredth of their standard error. Before, they had all digits.
     No alarm differs."""
     SMALL_STEPS = 22
-    """On a grid that is slower than the training data, the twin goes on in steps as long as those. Before, one step of
-    a second could make it unstable."""
+    """On a grid that is slower than the training data, the twin takes several steps for each sample, each about as
+    long as the sampling period of the training data. Before, it took one, which could be unstable, for example at 1 Hz.
+    """
 
 
 CURRENT_RULES = max(DecisionRules)

@@ -15,7 +15,7 @@ MOST_FANS = 512
 def step_together(joint: Joint, cores: Sequence[Core], items: Sequence[Any]) -> Iterator[list[Message]]:
     """What `core.step(item)` returns for each of several trays, to the bit.
 
-    A core finishes its step when its messages are asked for: what it saves then is not ahead of what is published.
+    A core finishes its step only when its messages are taken, so what it saves is never ahead of what is published.
     """
     admitted = [core.admit(item) for core, item in zip(cores, items, strict=True)]
     made: dict[int, Any] = {}

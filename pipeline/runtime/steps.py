@@ -59,7 +59,7 @@ class Steps:
         """a command has arrived: the next health, which says so, is sent soon"""
 
     def step(self, messages: Iterable[Sequence[Envelope]]) -> None:
-        """Process messages, each of another tray; or several of a tray, which differ only in their samples."""
+        """Process groups of messages, each of a different tray; those of a group differ only in their samples."""
         due = [each for envelopes in messages if (each := self._accepted(envelopes))]
         if self._joint is None or len(due) < 2:
             for each in due:

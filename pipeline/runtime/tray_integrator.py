@@ -131,12 +131,12 @@ class TrayIntegrator:
         return self.twin.sha256, self.twin.fans, grid.period_ns, len(grid.t_ns), *present_columns(grid)
 
     def continue_from(self, of_tray: TrayIntegrator) -> None:
-        """Continue the grid of another one, whose states this one has been given."""
+        """Continue the grid of another integrator; its states are copied into this one afterwards."""
         self.begin(of_tray._period_ns, is_of_another_session=False)
         self._last_t_ns = of_tray._last_t_ns
 
     def skip(self, grid: Grid) -> None:
-        """A block has been predicted elsewhere, and the states of this one are those after it."""
+        """Skip a block that a joint integrator has predicted; the states here are already those after it."""
         silent = (grid.invalid_reason[-1] == GAP) | (grid.invalid_reason[-1] == STALE)
         self._in_announced_gap, self._last_t_ns = bool(silent.all()), int(grid.t_ns[-1])
 
@@ -222,7 +222,7 @@ class TrayIntegrator:
         )
 
     def _missing(self, t_ns: Array, in_gap: Array) -> Array:
-        """Number of grid samples missing before each, (n,); counts those that the resampler announced as no gap."""
+        """Number of grid samples missing before each, (n,). Counts those that were not announced as a gap."""
         period_ns = self._period_ns
         last_t_ns = t_ns[0] - period_ns if self._last_t_ns is None else self._last_t_ns
         since_ns = t_ns - np.concatenate(([last_t_ns], t_ns[:-1]))

@@ -48,7 +48,7 @@ class JointSharedOffset:
         _commissioned: Array,
         _moving: Array | None,
     ) -> SharedOverIntervals:
-        """What is shared in the present interval, see SharedOffset.over; the samples are of this one only."""
+        """What is shared in the present interval, see SharedOffset.over; all samples are in this interval."""
         products, squares, counts = sums(offset, speed_sigmas, valid, intervals)
         for column, name in ((products, "products"), (squares, "squares"), (counts, "counts")):
             column[0] += np.concatenate([getattr(each, name) for each in self._of_trays])

@@ -1,8 +1,9 @@
 """A free run of many fans, sample after sample, without the temporary arrays of `right_hand_side.FanEquation`.
 
-With many fans side by side a step costs mostly NumPy's calls. What does not change from step to step, or depends on the
-command alone, is calculated once, and every result is written where it is needed next. The operations and their order
-are those of `integration.rk4_step` and of the acceleration of FanEquation: the speeds are the same to the bit.
+With many fans, creating temporary arrays takes a large part of a step. What does not change from step to step, or
+depends on the command alone, is calculated once, and every result is written where it is needed next. The operations
+and their order are those of `integration.rk4_step` and of the acceleration of FanEquation: the speeds are the same to
+the bit.
 """
 
 import numpy as np
