@@ -122,7 +122,7 @@ class TwinIntegratorCore(Core):
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md explains each counter."""
-        return self._counts + self.tray.counters()
+        return {**self._counts, **self.tray.counters()}
 
     def problem(self) -> str:
         """A twin that does not fit the grid it receives, or a grid whose times have gone back."""

@@ -12,6 +12,9 @@ from schemas.units import NS_PER_S
 from scoring.column_state import NEVER_NS, ColumnState
 from scoring.expected_reading import ExpectedReading
 
+MOST_STEPS = 1000
+"""of the twin in a sample: 10 s of a twin that was trained at 100 Hz"""
+
 
 @dataclass(frozen=True)
 class FreeRunInputs:
@@ -65,7 +68,8 @@ class FreeRun(ColumnState):
         """End all free runs; the next ones are on a grid of this period."""
         self.stop(np.ones_like(self.running))
         self._period_s = period_ns / NS_PER_S
-        self._steps = max(1, round(self._period_s * self._twin.card.rate_hz)) if self._small_steps else 1
+        trained_steps = round(min(self._period_s * self._twin.card.rate_hz, MOST_STEPS))
+        self._steps = max(1, trained_steps) if self._small_steps else 1
         """of the twin in a sample"""
         self._reading = ExpectedReading(self._twin.tachos, self._period_s)
 

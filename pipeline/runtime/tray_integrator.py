@@ -5,7 +5,6 @@ What a stage adds, samples that come again and the card of the twin, is in stage
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Hashable
 from itertools import pairwise
 
@@ -50,6 +49,7 @@ NO_SPEED, NO_TWIN, CLOCK_RESTARTED, STOPPED, STARTING = (
         InvalidReason.STARTING,
     )
 )
+OUT_OF_RANGE_COUNT = "not_predicted_out_of_range"
 HIGHEST_SPEED = 1.5  # times the top training speed: the balance is used up to there
 
 
@@ -65,17 +65,15 @@ class FanCounts(ColumnState):
     """What is counted of each fan."""
 
     def __init__(self, fans: int) -> None:
-        self._columns = {
-            name: np.zeros(fans, np.int64) for name in ("free_runs", "diverged", "not_predicted_out_of_range")
-        }
+        self._columns = {name: np.zeros(fans, np.int64) for name in ("free_runs", "diverged", OUT_OF_RANGE_COUNT)}
 
     def add(self, name: str, counted: Array) -> None:
         """Count those, (..., fans) of bool."""
         self._columns[name] += np.count_nonzero(counted.reshape(-1, counted.shape[-1]), axis=0)
 
-    def totals(self) -> Counter[str]:
-        """Of all fans; those that are not zero."""
-        return +Counter({name: int(column.sum()) for name, column in self._columns.items()})
+    def totals(self) -> dict[str, int]:
+        """Of all fans."""
+        return {name: int(column.sum()) for name, column in self._columns.items()}
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
@@ -146,9 +144,11 @@ class TrayIntegrator:
         starting = (self._starting,) if self._starting is not None else ()
         return [*self._run.states, *starting, self._balance, *self._averaged_command.states, self._counts]
 
-    def counters(self) -> Counter[str]:
-        """docs/explanation/deciding.md explains each counter."""
-        return self._counts.totals() + Counter(missing_grid_samples=self._missing_grid_samples)
+    def counters(self) -> dict[str, int]:
+        """docs/explanation/deciding.md explains each counter. Those that are 0 are left out, but for samples out of
+        range."""
+        counts = {**self._counts.totals(), "missing_grid_samples": self._missing_grid_samples}
+        return {name: count for name, count in counts.items() if count or name == OUT_OF_RANGE_COUNT}
 
     def predict(self, grid: Grid) -> Prediction:
         """The prediction of a block of new samples."""
@@ -177,7 +177,7 @@ class TrayIntegrator:
             warm &= self._starting.has_started_up(grid.t_ns, inputs.stopped)
         settled = warm | (running & ~in_range)
         in_range &= np.isfinite(predicted) | ~running
-        self._counts.add("not_predicted_out_of_range", settled & ~in_range)
+        self._counts.add(OUT_OF_RANGE_COUNT, settled & ~in_range)
         invalid_reason = np.where(settled, OUT_OF_RANGE, WARMING_UP)
         invalid_reason = np.where(settled & in_range, NONE, invalid_reason)
         judged = grid.valid

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.models import TrayConfig
+from pipeline.devices.sample_blocks import SampleBlocks
 from pipeline.devices.serial_source import SerialSource
 from pipeline.runtime.stage import Context
 from stages import acquisition, recorder, twin_integrator, viewer
@@ -32,7 +33,8 @@ def test_the_port_is_found_beside_the_configuration(tmp_path, monkeypatch):
     (tmp_path / "line").touch()
     here = context(tmp_path, acquisition.AcquisitionConfig(), port="line")
     assert acquisition.check(here) == []
-    source = acquisition.build(here).source
+    blocks = acquisition.build(here).source
+    source = blocks.source if isinstance(blocks, SampleBlocks) else None
     assert isinstance(source, SerialSource) and source._path == tmp_path / "line"
     (problem,) = acquisition.check(context(tmp_path, acquisition.AcquisitionConfig(), port="none"))
     assert f"{tmp_path / 'none'}: no such port" in problem
