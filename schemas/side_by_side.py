@@ -18,22 +18,21 @@ AnyMessage = TypeVar("AnyMessage", bound=Message)
 
 
 def side_by_side(messages: Sequence[AnyMessage]) -> AnyMessage:
-    """One message with the fans of all in order; the rest is that of the first, also the times. They have as many
-    samples, and the same optional columns (`present_columns`).
+    """One message with the fans of all in order; the rest is that of the first, also the times. They have the same
+    number of samples, and the same optional columns (`present_columns`).
     """
-    first: Any = messages[0]
-    if len(messages) == 1:
-        return first
+    of_all: Sequence[Any] = messages
+    first = of_all[0]
     joined = {
         name: np.concatenate([getattr(message, name) for message in messages], axis=-1)
         for name, column in columns(type(first)).items()
         if column.by_fan
     }
-    return replace(first, fans=sum(getattr(message, "fans") for message in messages), **joined)  # noqa: B009
+    return replace(first, fans=sum(message.fans for message in of_all), **joined)
 
 
 def apart(message: AnyMessage, t_ns: Sequence[Array]) -> list[AnyMessage]:
-    """A message for each of several trays with as many fans, and with these times, (n,). Columns are views."""
+    """A message for each of several trays with equal numbers of fans, and with these times, (n,). Columns are views."""
     of_all: Any = message
     fans = of_all.fans // len(t_ns)
     by_fan = [(name, getattr(message, name)) for name, column in columns(type(message)).items() if column.by_fan]

@@ -43,7 +43,6 @@ from schemas.messages import (
     ScorerSnapshot,
     Transition,
 )
-from schemas.side_by_side import present_columns
 from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_text import AlarmText
@@ -219,13 +218,7 @@ class ScorerCore(Core):
         self._old_samples.clear()
         self._last_t_ns, self._input_producer = int(item.t_ns[new][-1]), item.header.producer
         block = item if new.all() else select(item, new)
-        is_over = self.tray.fan_scorer.is_interval_over(block.t_ns)
-        samples = len(block.t_ns)
-        has_steps = bool((np.diff(block.t_ns) == block.period_ns).all())
-        if is_over is None or not has_steps or self._fans == 1:  # NumPy adds up a single column in another order
-            return Admitted(before_score, block)
-        times = block.period_ns, samples, is_over
-        return Admitted(before_score, block, (self._twin.sha256, self._fans, *times, *present_columns(block)))
+        return Admitted(before_score, block, self.tray.joint_key(block))
 
     def finish(self, block: Prediction, made: tuple[Score, list[Alarm]]) -> list[Score | Alarm | ScorerSnapshot]:
         """See Core. made: the score of the block, and the messages on alarms."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
+from pipeline.runtime.latest_kept import LatestKept
 from pipeline.runtime.tray_integrator import TrayIntegrator
 from schemas.messages import Grid, Prediction
 from schemas.side_by_side import apart, side_by_side
@@ -18,8 +18,8 @@ class JointTrayIntegrator:
     """Of one process, for trays with any twins."""
 
     def __init__(self) -> None:
-        self._kept: dict[Any, TrayIntegrator] = {}
-        """by twin, fans of a tray, and number of trays; the latest ones"""
+        self._kept = LatestKept[TrayIntegrator](MOST_KEPT)
+        """by twin, fans of a tray, and number of trays"""
 
     def predict(self, integrators: Sequence[TrayIntegrator], grids: Sequence[Grid]) -> list[Prediction]:
         """As TrayIntegrator.predict of each; the keys of their blocks are equal (`joint_key`)."""
@@ -38,11 +38,8 @@ class JointTrayIntegrator:
 
     def _of_trays(self, integrators: Sequence[TrayIntegrator]) -> TrayIntegrator:
         first, count = integrators[0], len(integrators)
-        key = first.twin.sha256, first.twin.fans, count
-        found = self._kept.pop(key, None)
-        if found is None:
-            found = TrayIntegrator(first.twin.of_trays(count), first.config, first.decision_rules)
-        self._kept[key] = found
-        if len(self._kept) > MOST_KEPT:
-            del self._kept[next(iter(self._kept))]
-        return found
+
+        def build() -> TrayIntegrator:
+            return TrayIntegrator(first.twin.of_trays(count), first.config, first.decision_rules)
+
+        return self._kept.get((first.twin.sha256, first.twin.fans, count), build)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from pipeline.runtime.latest_kept import LatestKept
 from pipeline.runtime.tray_scorer import TrayScorer, fan_scorer_of, unseen_error_of
 from schemas.messages import Alarm, Prediction, Score
 from schemas.side_by_side import apart, side_by_side
@@ -33,13 +33,11 @@ class JointTrayScorer:
     """Of one process, for trays with any twins."""
 
     def __init__(self) -> None:
-        self._kept: dict[Any, _OfTrays] = {}
-        """by twin, fans of a tray, and number of trays; the latest ones"""
+        self._kept = LatestKept[_OfTrays](MOST_KEPT)
+        """by twin, fans of a tray, and number of trays"""
 
     def score(self, scorers: Sequence[TrayScorer], items: Sequence[Prediction]) -> list[tuple[Score, list[Alarm]]]:
-        """As TrayScorer.score of each. All have the same twin, number of fans and of samples, equal steps of time, and
-        FanScorer.is_interval_over of these times is equal, and known.
-        """
+        """As TrayScorer.score of each; the keys of their blocks are equal (`joint_key`)."""
         if len(scorers) == 1:
             return [scorers[0].score(items[0])]
         fans, joint, block = scorers[0].fans, self._of_trays(scorers), side_by_side(items)
@@ -61,13 +59,9 @@ class JointTrayScorer:
 
     def _of_trays(self, scorers: Sequence[TrayScorer]) -> _OfTrays:
         first, count = scorers[0], len(scorers)
-        key = first.twin.sha256, first.fans, count
-        found = self._kept.pop(key, None)
-        if found is None:
+
+        def build() -> _OfTrays:
             twin, rules = first.twin.of_trays(count, first.fans), first.decision_rules
-            scorer = fan_scorer_of(count * first.fans, twin, rules)
-            found = _OfTrays(scorer, unseen_error_of(twin, rules))
-        self._kept[key] = found
-        if len(self._kept) > MOST_KEPT:
-            del self._kept[next(iter(self._kept))]
-        return found
+            return _OfTrays(fan_scorer_of(count * first.fans, twin, rules), unseen_error_of(twin, rules))
+
+        return self._kept.get((first.twin.sha256, first.fans, count), build)

@@ -9,7 +9,6 @@ from collections.abc import Hashable
 from itertools import pairwise
 
 import numpy as np
-import scipy.signal  # noqa: F401  the torque balance loads it on first use: not while the first block waits
 from pydantic import Field
 
 from pipeline.runtime.decision_rules import DecisionRules
@@ -29,25 +28,20 @@ LONGEST_BRIDGE = (
     1 << 16
 )  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
 LARGEST_MOVE_S = 0.01  # times the width of the training range: a move of the command times the gap in which it was held
-NONE, GAP, STALE, WARMING_UP, OUT_OF_RANGE = (
-    np.uint8(reason)
-    for reason in (
+NONE, GAP, STALE, WARMING_UP, OUT_OF_RANGE, NO_SPEED, NO_TWIN, CLOCK_RESTARTED, STOPPED, STARTING = map(
+    np.uint8,
+    (
         InvalidReason.NONE,
         InvalidReason.GAP,
         InvalidReason.STALE,
         InvalidReason.WARMING_UP,
         InvalidReason.OUT_OF_RANGE,
-    )
-)
-NO_SPEED, NO_TWIN, CLOCK_RESTARTED, STOPPED, STARTING = (
-    np.uint8(reason)
-    for reason in (
         InvalidReason.NO_SPEED,
         InvalidReason.NO_TWIN,
         InvalidReason.CLOCK_RESTARTED,
         InvalidReason.STOPPED,
         InvalidReason.STARTING,
-    )
+    ),
 )
 OUT_OF_RANGE_COUNT = "not_predicted_out_of_range"
 HIGHEST_SPEED = 1.5  # times the top training speed: the balance is used up to there
@@ -135,8 +129,7 @@ class TrayIntegrator:
 
     def skip(self, grid: Grid) -> None:
         """Skip a block that a joint integrator has predicted; the states here are already those after it."""
-        silent = (grid.invalid_reason[-1] == GAP) | (grid.invalid_reason[-1] == STALE)
-        self._in_announced_gap, self._last_t_ns = bool(silent.all()), int(grid.t_ns[-1])
+        self._in_announced_gap, self._last_t_ns = bool(_is_silent(grid)[-1].all()), int(grid.t_ns[-1])
 
     @property
     def states(self) -> list[ColumnState]:
@@ -197,7 +190,7 @@ class TrayIntegrator:
 
     def _inputs(self, grid: Grid) -> FreeRunInputs:
         held_before = self._run.held_command
-        silent = (grid.invalid_reason == GAP) | (grid.invalid_reason == STALE)
+        silent = _is_silent(grid)
         known = ~silent & np.isfinite(grid.command)
         command, known_before_t_ns = self._run.hold(grid.t_ns, grid.command, known)
         gap_ns = grid.t_ns[:, np.newaxis] - known_before_t_ns - grid.period_ns
@@ -306,6 +299,11 @@ class TrayIntegrator:
             averaged_command=averaged_command if self._averages or self.twin.drive is not None else nothing,
             reading_missing=grid.reading_missing,
         )
+
+
+def _is_silent(grid: Grid) -> Array:
+    """(n, fans) where the line was silent."""
+    return (grid.invalid_reason == GAP) | (grid.invalid_reason == STALE)
 
 
 def _off_below(twin: TwinFile, standstill: Standstill) -> Array:

@@ -8,7 +8,7 @@ See docs/explanation/deciding.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from pipeline.runtime.decision_rules import DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
 from schemas.messages import Alarm, Array, Prediction, Score
+from schemas.side_by_side import present_columns
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_manager import AlarmContext, AlarmManager
 from scoring.alarms.alarm_text import AlarmText
@@ -122,6 +123,16 @@ class TrayScorer:
         state, events = self.decide(item, scored, stretches)
         score = score_of(item, scored, state, samples.speed_unseen)
         return score, self.finish(item, samples, scored, state, events, score)
+
+    def joint_key(self, item: Prediction) -> Hashable:
+        """Blocks of trays with equal keys can be scored in one pass (pipeline.runtime.joint_tray_scorer). None: this
+        one alone, see FanScorer.is_interval_over; or the tray has one fan, whose column NumPy adds up in another order
+        than columns side by side."""
+        is_over = self.fan_scorer.is_interval_over(item.t_ns)
+        has_steps = bool((np.diff(item.t_ns) == item.period_ns).all())
+        if is_over is None or not has_steps or self.fans == 1:
+            return None
+        return self.twin.sha256, self.fans, item.period_ns, len(item.t_ns), is_over, *present_columns(item)
 
     def finish(
         self,

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import pytest
 
 from pipeline.runtime.inbox import INBOX_SIZE
+from pipeline.runtime.joint_step import step_together
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, StageError
 from schemas.messages import Grid, Header, Health, InputPosition, Message, Raw, StageStatus
@@ -93,6 +94,32 @@ def test_what_waits_of_several_trays_is_processed_in_one_pass(config, raises):
         (TRAY_A, 3, InputPosition("raw", "feeder", 1, 2, 0)),
         (TRAY_B, 4, InputPosition("raw", "feeder", 1, 2, 0)),
     ]
+
+
+def test_a_core_finishes_its_step_when_its_messages_are_taken():
+    finished: list[str] = []
+
+    class Finishing(Passer):
+        def __init__(self, name: str) -> None:
+            super().__init__()
+            self.name = name
+
+        def admit(self, item: Any) -> Admitted:
+            return Admitted((), item, "all")
+
+        def finish(self, block: Any, made: Any) -> Sequence[Message]:
+            finished.append(self.name)
+            return ()
+
+    class Nothing:
+        def process(self, cores: Sequence[Any], blocks: Sequence[Any]) -> Sequence[Any]:
+            return blocks
+
+    steps = step_together(Nothing(), [Finishing(TRAY_A), Finishing(TRAY_B)], [raw(1), raw(2)])
+    next(steps)
+    assert finished == [TRAY_A], "what the other would save must not be ahead of what is published of it"
+    next(steps)
+    assert finished == [TRAY_A, TRAY_B]
 
 
 def test_items_a_source_delivers_while_stopping_are_processed_before_the_end(config):
