@@ -7,11 +7,13 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.bus.publisher import Publisher
 from pipeline.bus.session import Bus
 from pipeline.cli.watch.commanding import CommandSender, command_of, share_note
 from pipeline.config.models import BusConfig, TrayConfig
@@ -56,25 +58,33 @@ def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
     def session(number: int, *trays: str) -> Session:
         return Session("acquisition", f"{number}-of-2", number, f"acquisition-{number}", "board", number, trays)
 
+    def beat(session: Session, publisher: Publisher) -> None:
+        health = Health(
+            header=Header(session.producer, publisher.published, ""),
+            stage=session.stage,
+            instance=session.instance,
+            status=StageStatus.OK,
+            t_ns=1,
+            uptime_s=0.0,
+        )
+        publisher.put(encode(health))
+
     config, stop = BusConfig(endpoint=endpoint), threading.Event()
-    with Bus(config) as site, Bus(config, listens=False) as ours:
+    with Bus(config) as site, Bus(config, listens=False) as ours, ThreadPoolExecutor(1) as pool:
         site.wait_for_others(stop)
+        beating: list[tuple[Session, Publisher]] = []
         for each in (session(1, "a", "c"), session(2, "b")):
             site.declare_alive(each.key("plant"))
             site.declare_alive(alive_key("plant", each.stage, each.instance))
             key = health_key("plant", each.stage, each.instance)
-            publisher = site.publisher(key, BY_NAME["health"], type_name(Health), each.producer)
-            health = Health(
-                header=Header(each.producer, 0, ""),
-                stage=each.stage,
-                instance=each.instance,
-                status=StageStatus.OK,
-                t_ns=1,
-                uptime_s=0.0,
-            )
-            publisher.put(encode(health))
+            beating.append((each, site.publisher(key, BY_NAME["health"], type_name(Health), each.producer)))
         sender = CommandSender(ours, "plant", "c", stop)
-        sender.connect()
+        connecting = pool.submit(sender.connect)
+        while not connecting.done():  # as stages do: a health may be published before it is listened to
+            for each, publisher in beating:
+                beat(each, publisher)
+            wait([connecting], timeout=0.1)
+        connecting.result()
         answers = sender._acquisition.health()
     assert answers
     assert answers.header.producer == "acquisition-1"
