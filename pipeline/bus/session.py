@@ -31,6 +31,7 @@ from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
 from pipeline.bus.link import LEASE_MS
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
+from pipeline.bus.spool import Spool
 from pipeline.config.models import BusConfig
 from schemas.topics import Topic, largest_bytes
 
@@ -64,6 +65,8 @@ class Bus:
         self._session = _open(config, stop, listens)
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
+        self.spool: Spool | None = None
+        """where publishers that are declared from now on keep what their memory cannot; None: nowhere"""
         self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
@@ -76,7 +79,7 @@ class Bus:
 
     def publisher(self, key: str, topic: Topic, encoding: str, producer: str) -> Publisher:
         """Declare an output; `encoding` is the full protobuf name of its messages."""
-        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes)
+        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes, self.spool)
 
     def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> Callable[[], None]:
         """Call `on_message(key, payload)` for what other sessions publish, from a thread of the bus. Returns what ends
@@ -168,6 +171,8 @@ class Bus:
     def close(self) -> None:
         """Leave the bus. What was published before has left this process."""
         self._session.close()
+        if self.spool:
+            self.spool.close()
 
 
 def _answers(endpoint: str, stop: threading.Event | None) -> bool:

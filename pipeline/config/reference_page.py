@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from pipeline.config.loading import LARGEST_FILE_BYTES, top_level
-from pipeline.config.models import BusConfig, LauncherConfig, TrayConfig
+from pipeline.config.models import BusConfig, LauncherConfig, SpoolConfig, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.devices.source_kinds import SOURCE_KINDS
 from schemas.tacho import Tacho
@@ -57,7 +57,11 @@ def page() -> str:
         "What a reading is of the speed ([tachos](../explanation/tachos.md)).\n",
         _table(Tacho, but=()),
         "## `[bus]`\n",
-        _table(BusConfig, but=()),
+        _table(BusConfig, but=("spool",)),
+        "## `[bus.spool]`\n",
+        "What a process keeps on disk of what it has published, in `run_folder/spool`, for consumers that are cut off "
+        "for long ([partitions](../how-to/deployment.md#partitions)). Without this section nothing.\n",
+        _table(SpoolConfig, but=()),
         "## `[launcher]`\n",
         _table(LauncherConfig, but=()),
     ]
