@@ -28,14 +28,13 @@ import zenoh
 from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program, somebody_listens
 from pipeline.bus.errors import BusError, reason
 from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
-from pipeline.bus.link import LEASE_MS
+from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, RETRY
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
 from pipeline.bus.spool import Spool
 from pipeline.config.models import BusConfig
 from schemas.topics import Topic, largest_bytes
 
-_RETRY = '{"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}'
 _ROUTER_TIMEOUT_MS = "1000"
 _ROUTER_RETRY_S = 0.2
 MEETING_LIMIT_S = 10.0
@@ -213,10 +212,17 @@ def _open(config: BusConfig, stop: threading.Event | None, listens: bool) -> zen
     except zenoh.ZError as error:
         raise BusError(f"bus.endpoint = {config.endpoint!r} cannot be used: {reason(error)}") from error
     until_s = time.monotonic() + (MEETING_LIMIT_S if stop else 0.0)
+    attempts = 0
     while True:  # Zenoh can wait for the router itself, but then ignores Ctrl-C
+        first = attempts % len(config.endpoints)
+        endpoints = (*config.endpoints[first:], *config.endpoints[:first])  # it never gets to one after one that hangs
         try:
+            conf.insert_json5("connect/endpoints", json.dumps(endpoints))
             return zenoh.open(conf)
         except zenoh.ZError as error:
+            attempts += 1
+            if attempts < len(endpoints):
+                continue
             if time.monotonic() > until_s and accepts_connections(config.endpoint):
                 raise BusError(foreign_program(config.endpoint)) from error
             if stop is None or stop.wait(_ROUTER_RETRY_S):
@@ -228,12 +234,13 @@ def _open(config: BusConfig, stop: threading.Event | None, listens: bool) -> zen
 def _zenoh_config(config: BusConfig, listens: bool) -> zenoh.Config:
     conf = zenoh.Config()
     conf.insert_json5("mode", json.dumps(config.mode))
-    conf.insert_json5("connect/endpoints", json.dumps([config.endpoint]))
+    conf.insert_json5("connect/endpoints", json.dumps(config.endpoints))
     conf.insert_json5("connect/timeout_ms", "-1" if config.mode == "peer" else _ROUTER_TIMEOUT_MS)
     conf.insert_json5("connect/exit_on_failure", "false")
-    conf.insert_json5("connect/retry", _RETRY)
+    conf.insert_json5("connect/retry", RETRY)
     if config.mode == "client":
         conf.insert_json5("transport/link/tx/lease", LEASE_MS)
+        conf.insert_json5("transport/unicast/open_timeout", str(OPEN_TIMEOUT_MS))
     conf.insert_json5("scouting/multicast/enabled", "false")
     conf.insert_json5("transport/shared_memory/enabled", "false")
     if config.mode == "peer":
