@@ -26,7 +26,7 @@ from pipeline.devices.sample_source import MOST_FANS, SourceConfig, too_many_fan
 from pipeline.devices.serial_config import MOST_FANS_ON_LINE
 from pipeline.devices.source_kinds import parse_source
 from pipeline.errors import UsageError, UserError
-from schemas.tacho import Tachos, tacho_of_each_fan
+from schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 from schemas.topics import RESERVED_TRAY_NAMES
 from schemas.units import SpeedUnit
 
@@ -157,11 +157,24 @@ class TrayConfig(Section):
     command_min: float = Field(default=0.0, description="smallest command the device may send or be sent")
     command_max: float = Field(default=1.0, description="largest command the device may send or be sent")
     twin: Path | None = Field(default=None, description="ONNX file of the healthy twin")
-    tacho: Tachos = Field(
-        default={"kind": "instantaneous"},
-        validate_default=True,
-        description="how the speed is measured: one tacho for all fans, or a list with one for each",
+    tacho: Tachos | None = Field(
+        default=None,
+        description="how the speed is measured: one tacho for all fans, or a list with one for each; without it what "
+        "the source states to measure, or else instantaneous",
     )
+
+    @property
+    def tachos(self) -> tuple[Tacho, ...]:
+        """How the speed is measured, one for all fans or one for each."""
+        return self.tacho or self.source.stated_tachos(self.fans) or INSTANTANEOUS
+
+    @property
+    def stated_tachos(self) -> tuple[Tacho, ...]:
+        """The same where the source states what it measures, one for all fans if they agree; empty where it does not:
+        what its samples then say of themselves is no more than this file does."""
+        if self.source.stated_tachos(self.fans) is None:
+            return ()
+        return self.tachos[:1] if len(set(self.tachos)) == 1 else self.tachos
 
     @model_validator(mode="before")
     @classmethod
@@ -187,7 +200,7 @@ class TrayConfig(Section):
 
     @model_validator(mode="after")
     def _tacho_for_each_fan(self) -> Self:
-        tacho_of_each_fan(self.tacho, self.fans)
+        tacho_of_each_fan(self.tachos, self.fans)
         return self
 
     @model_validator(mode="after")
