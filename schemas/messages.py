@@ -196,7 +196,7 @@ class StatedTacho:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Raw:
-    """Samples as the device sent them. `device_clock_us` and `device_sequence` are empty if the device has none.
+    """Samples as the device sent them. A column that the device does not have is empty.
 
     tachos: what the speeds are, one for all fans or one for each; empty where the source does not state it.
     """
@@ -208,6 +208,9 @@ class Raw:
     device_sequence: Array = column("samples", np.uint32, optional=True)
     command: Array = column("samples x fans", np.float64)
     speed_rad_s: Array = column("samples x fans", np.float64)
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
     tachos: tuple[StatedTacho, ...] = ()
 
 
