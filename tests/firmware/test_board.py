@@ -65,17 +65,17 @@ def test_a_command_moves_the_pwm_and_the_sample_tells_since_when(board: FanBoard
     samples = board.run(0.1)
     changes = [i for i, sample in enumerate(samples) if sample.command != (1.0,) * FANS]
     assert 0 < changes[0] <= 2  # bytes take 2 ms, then the next sample
-    told = samples[-1].command
-    assert told == pytest.approx(wanted, abs=0.5 * STEP_OF_DUTY + 1e-9)
+    reported = samples[-1].command
+    assert reported == pytest.approx(wanted, abs=0.5 * STEP_OF_DUTY + 1e-9)
     # Fans 2 and 3 have 80 steps, and finer ones in the mean over 8 ms: 0.3 is one between.
     means = np.zeros(FANS)
     for _ in range(80):
         board.run(0.001)
         means += [fan.duty / 80 for fan in board.truth().fans]
-    assert means == pytest.approx(told, abs=1e-3)
+    assert means == pytest.approx(reported, abs=1e-3)
     board.command(0.0, NAN, 0.0, NAN)
     board.run(0.1)
-    assert [fan.duty for fan in board.truth().fans] == pytest.approx((0.0, told[1], 0.0, told[3]), abs=1 / 80)
+    assert [fan.duty for fan in board.truth().fans] == pytest.approx((0.0, reported[1], 0.0, reported[3]), abs=1 / 80)
 
 
 def test_the_pwm_has_25_khz_on_all_four_pins(board: FanBoard) -> None:
@@ -187,12 +187,12 @@ def test_what_is_no_frame_changes_nothing_and_is_counted(board: FanBoard) -> Non
     board.run(0.5)
     board.order("send", (b"\0" + encode("binary", CommandFrame((2.0,) * FANS))).hex())
     board.run(0.2)
-    told, counted = board.samples[-1].command, board.truth().counters
+    reported, counted = board.samples[-1].command, board.truth().counters
     assert counted["line_errors"] == len(good)
     assert counted["bad_value"] == 1
     assert counted["bad_crc"] + counted["bad_length"] + counted["wrong_kind"] >= 20
     assert counted["frames"] == 2  # the first, and the one whose bytes all came with framing errors, but whole
-    assert told == pytest.approx((0.9,) * FANS, abs=STEP_OF_DUTY)
+    assert reported == pytest.approx((0.9,) * FANS, abs=STEP_OF_DUTY)
 
 
 @pytest.mark.parametrize(("supply_v", "chip_v"), [(12.0, 5.0), (10.5, 5.0), (13.2, 4.6)])
