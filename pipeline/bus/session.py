@@ -37,6 +37,7 @@ from pipeline.bus.link import LEASE_MS
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
 from pipeline.bus.settings import Settings
+from pipeline.bus.spool import Spool
 from pipeline.config.models import BusConfig
 from pipeline.config.roles import READERS
 from schemas.topics import Topic, largest_bytes
@@ -84,6 +85,8 @@ class Bus:
         self._session = _open(config, self.credentials, stop, listens)
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
+        self.spool: Spool | None = None
+        """where publishers that are declared from now on keep what their memory cannot; None: nowhere"""
         self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
@@ -96,7 +99,7 @@ class Bus:
 
     def publisher(self, key: str, topic: Topic, encoding: str, producer: str) -> Publisher:
         """Declare an output; `encoding` is the full protobuf name of its messages."""
-        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes)
+        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes, self.spool)
 
     def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> Callable[[], None]:
         """Call `on_message(key, payload)` for what other sessions publish, from a thread of the bus. Returns what ends
@@ -188,6 +191,8 @@ class Bus:
     def close(self) -> None:
         """Leave the bus. What was published before has left this process."""
         self._session.close()
+        if self.spool:
+            self.spool.close()
 
 
 def credentials_of(config: BusConfig, roles: Sequence[str]) -> Credentials | None:
