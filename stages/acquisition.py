@@ -40,7 +40,8 @@ from pipeline.devices.source_kinds import build_source
 from pipeline.errors import UserError
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
-from schemas.messages import Array, Command, Raw
+from schemas.messages import Array, Command, Raw, StatedTacho
+from schemas.tacho import Tacho
 from schemas.topics import most_samples
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
@@ -85,8 +86,8 @@ def within(value: float, low: float, high: float) -> bool:
     return low - tolerance <= value <= high + tolerance
 
 
-def raw_message(block: Sequence[_Received], tray: TrayConfig) -> Raw:
-    """One message of samples that agree in their columns."""
+def raw_message(block: Sequence[_Received], tray: TrayConfig, tachos: tuple[StatedTacho, ...] = ()) -> Raw:
+    """One message of samples that agree in their columns. tachos: what their source states to measure."""
     readings = [received.reading for received in block]
     auxiliary: dict[str, Any] = {
         column.name: _float32([getattr(r, column.name) for r in readings]) for column in AUXILIARY
@@ -98,6 +99,7 @@ def raw_message(block: Sequence[_Received], tray: TrayConfig) -> Raw:
         device_sequence=_uint32(r.sequence for r in readings),
         command=np.array([r.command for r in readings], np.float64),
         speed_rad_s=np.array([r.speed for r in readings], np.float64) * RAD_S_PER_UNIT[tray.speed_unit],
+        tachos=tachos,
         **auxiliary,
     )
 
@@ -140,6 +142,9 @@ class AcquisitionCore(Core):
         self._sequence = DeviceSequence()
         self._most_samples = most_samples(tray.fans)
         """in a message, however fast a line is"""
+        self._stated_tachos = tuple(map(StatedTacho.of, tray.stated_tachos))
+        self._tachos: tuple[Tacho, ...] = ()
+        """as the device itself says"""
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
@@ -224,12 +229,25 @@ class AcquisitionCore(Core):
         messages: list[Raw] = []
         samples: list[_Received] = []
         for batch in block.batches:
+            if batch.tachos != self._tachos:
+                messages += self._message(samples)
+                samples = []
+                self._follow_device(batch.tachos)
             for received in self._samples(batch):
                 if samples and (len(samples) == self._most_samples or received.columns != samples[0].columns):
-                    messages.append(raw_message(samples, self._tray))
+                    messages += self._message(samples)
                     samples = []
                 samples.append(received)
-        return [*messages, raw_message(samples, self._tray)] if samples else messages
+        return [*messages, *self._message(samples)]
+
+    def _message(self, samples: Sequence[_Received]) -> list[Raw]:
+        return [raw_message(samples, self._tray, self._stated_tachos)] if samples else []
+
+    def _follow_device(self, tachos: tuple[Tacho, ...]) -> None:
+        """What the device itself says goes into the messages, whatever the configuration says."""
+        self._tachos = tachos
+        stated = tachos[:1] if len(set(tachos)) == 1 else tachos
+        self._stated_tachos = tuple(map(StatedTacho.of, stated or self._tray.stated_tachos))
 
     def _samples(self, batch: ReadingBatch) -> Iterator[_Received]:
         """The samples that are new and plausible; all others are counted."""

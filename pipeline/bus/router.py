@@ -36,7 +36,7 @@ def open_router(endpoint: str, others: Sequence[str] = ()) -> Iterator[None]:
         conf.insert_json5("connect/endpoints", json.dumps(list(others)))
         conf.insert_json5("connect/timeout_ms", "-1")
         conf.insert_json5("connect/exit_on_failure", "false")
-        conf.insert_json5("connect/retry", RETRY)
+        conf.insert_json5("connect/retry", json.dumps(RETRY))
         conf.insert_json5("transport/link/tx/lease", LEASE_MS)
         conf.insert_json5("transport/link/tx/queue/size/data", QUEUE_BATCHES)
         conf.insert_json5("transport/link/tx/queue/congestion_control/block/wait_before_close", LONGEST_WAIT_US)

@@ -19,6 +19,7 @@ from schemas.messages import (
     Message,
     Note,
     Output,
+    StatedTacho,
 )
 
 TIME_NS = st.integers(1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
@@ -44,6 +45,7 @@ SCALARS: dict[str, st.SearchStrategy[Any]] = {
     **dict.fromkeys(_TIMES, INT64),
     "period_ns": PERIOD_NS,
     "process_id": UINT32,
+    "pulses": UINT32,
     "lost": UINT64,
     "fan": st.integers(0, 2**31 - 1),
 }
@@ -63,9 +65,9 @@ def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
         return SCALARS[name]
     if isinstance(hint, type) and issubclass(hint, OpenEnum):
         return st.integers(0, LARGEST_ENUM_VALUE).map(hint)
-    for record in (Counter, Input, Output, Diagnosis, AwaitedInput, Note):
+    for record in (Counter, Input, Output, Diagnosis, AwaitedInput, Note, StatedTacho):
         if hint == tuple[record, ...]:
-            values = {name: SCALARS.get(name, OF_TYPE[hint]) for name, hint in other_fields(record).items()}
+            values = {name: scalar(name, hint) for name, hint in other_fields(record).items()}
             return st.lists(st.builds(record, **values), max_size=3).map(tuple)
     return OF_TYPE[hint]
 
