@@ -16,6 +16,7 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -88,6 +89,8 @@ class Spool:
             self._files.clear()
             self._bytes = 0
         shutil.rmtree(self._folder, ignore_errors=True)
+        with suppress(OSError):
+            self._folder.parent.rmdir()  # if no other process of this run folder has files there
 
     def begin(self, first: int) -> tuple[_File, BinaryIO] | None:
         """A new file; None if the disk takes none now."""
