@@ -374,6 +374,7 @@ class Runner:
             notes=[Note(tray=name, text=note) for name, parts in self._parts.items() for note in parts.core.notes()]
             if with_counts
             else (),
+            accepts=filter(None, (core.accepts() for core in cores)),
         )
         return replace(health, header=Header(self.producer, self._health_publisher.published, ""))
 

@@ -1,0 +1,119 @@
+"""What a client has published and acquisition has not confirmed: in a queue, or sent."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.topics import CATCH_UP_MESSAGES, most_samples
+
+MOST_SAMPLES, MOST_FAN_SAMPLES = 1024, 1024 * 32
+"""of one message; what waits is joined up to this"""
+MOST_SENT_MESSAGES = CATCH_UP_MESSAGES // 2
+MOST_SENT_BYTES = 8 << 20
+"""sent and not confirmed: a publisher keeps twice as much, so whatever acquisition has missed can be asked for"""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Block:
+    """Samples of one call of `publish`. Arrays: (n,), (n, fans), (n, fans); speed in rad/s.
+
+    first_number: of the first sample. line: blocks of one line have increasing times.
+    """
+
+    t_ns: NDArray[np.int64]
+    command: NDArray[np.float64]
+    speed_rad_s: NDArray[np.float64]
+    first_number: int
+    line: int
+
+
+def join_blocks(blocks: Sequence[Block]) -> Block:
+    """One block of blocks of one line that follow each other."""
+    first = blocks[0]
+    if len(blocks) == 1:
+        return first
+    return Block(
+        np.concatenate([block.t_ns for block in blocks]),
+        np.concatenate([block.command for block in blocks]),
+        np.concatenate([block.speed_rad_s for block in blocks]),
+        first.first_number,
+        first.line,
+    )
+
+
+class Outbox:
+    """Blocks that wait, and the messages that were sent. Not safe for several threads by itself."""
+
+    def __init__(self) -> None:
+        self._blocks: deque[Block] = deque()
+        self._sent: deque[tuple[int, int, int]] = deque()
+        """of each message: sequence number, samples, bytes"""
+        self._sent_bytes = 0
+        self.waiting = 0
+        """samples in the queue"""
+        self.sent = 0
+        """samples that were sent and are not confirmed"""
+        self.received = 0
+        """samples that were confirmed"""
+
+    @property
+    def samples(self) -> int:
+        """Those that are not confirmed."""
+        return self.waiting + self.sent
+
+    @property
+    def may_send(self) -> bool:
+        """Whether another message may be sent before one is confirmed."""
+        return len(self._sent) < MOST_SENT_MESSAGES and self._sent_bytes < MOST_SENT_BYTES
+
+    def add(self, block: Block) -> None:
+        """Add a block behind the others, in pieces that fit into a message."""
+        samples, fans = block.command.shape
+        most = max(1, min(MOST_SAMPLES, MOST_FAN_SAMPLES // fans, most_samples(fans)))
+        for first in range(0, samples, most):
+            rows = slice(first, first + most)
+            self._blocks.append(
+                Block(
+                    block.t_ns[rows],
+                    block.command[rows],
+                    block.speed_rad_s[rows],
+                    block.first_number + first,
+                    block.line,
+                )
+            )
+        self.waiting += samples
+
+    def take(self) -> tuple[Block, int]:
+        """The samples of the next message, and the time of the newest one that waits behind them on their line, ns.
+        There must be some."""
+        first = self._blocks.popleft()
+        taken, samples, fans = [first], len(first.t_ns), first.command.shape[1]
+        most = max(1, min(MOST_SAMPLES, MOST_FAN_SAMPLES // fans))
+        while self._blocks and self._blocks[0].line == first.line and samples + len(self._blocks[0].t_ns) <= most:
+            taken.append(self._blocks.popleft())
+            samples += len(taken[-1].t_ns)
+        self.waiting -= samples
+        behind = next((block for block in reversed(self._blocks) if block.line == first.line), taken[-1])
+        return join_blocks(taken), int(behind.t_ns[-1])
+
+    def add_sent(self, sequence: int, samples: int, size: int) -> None:
+        """A message has been sent: its sequence number, samples and bytes."""
+        self._sent.append((sequence, samples, size))
+        self._sent_bytes += size
+        self.sent += samples
+
+    def confirm(self, before: int) -> bool:
+        """All messages with sequence numbers below `before` have been received; whether any of them was not confirmed
+        yet."""
+        is_news = bool(self._sent) and self._sent[0][0] < before
+        while self._sent and self._sent[0][0] < before:
+            _, samples, size = self._sent.popleft()
+            self._sent_bytes -= size
+            self.sent -= samples
+            self.received += samples
+        return is_news
