@@ -23,7 +23,7 @@ def connect(endpoint: str = "tcp/127.0.0.1:7447", site: str = "site", **bus: Any
     """Connect to the bus of a site.
 
     endpoint: `bus.endpoint` of the configuration. site: its `site`. bus: other settings of its `[bus]`, such as
-    `mode="client"` where processes meet at `fantwin router`.
+    `mode="client"` where processes meet at `fantwin router`, and `security={"ca": ..., "certificate": ..., "key": ...}`.
 
     Raises:
         BusError: the endpoint cannot be used, or nobody answers there as fantwin does.

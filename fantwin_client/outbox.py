@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,8 @@ MOST_SENT_BYTES = 8 << 20
 class Block:
     """Samples of one call of `publish`. Arrays: (n,), (n, fans), (n, fans); speed in rad/s.
 
-    first_number: of the first sample. line: blocks of one line have increasing times.
+    first_number: of the first sample. line: blocks of one line have increasing times. others: what else was measured,
+    (n, fans), by the name of its column.
     """
 
     t_ns: NDArray[np.int64]
@@ -30,10 +31,26 @@ class Block:
     speed_rad_s: NDArray[np.float64]
     first_number: int
     line: int
+    others: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+
+    def rows(self, first: int, end: int) -> Block:
+        """The samples `first` to `end - 1`."""
+        return Block(
+            self.t_ns[first:end],
+            self.command[first:end],
+            self.speed_rad_s[first:end],
+            self.first_number + first,
+            self.line,
+            {name: values[first:end] for name, values in self.others.items()},
+        )
+
+    def goes_on_with(self, other: Block) -> bool:
+        """Whether both can be in one message."""
+        return self.line == other.line and self.others.keys() == other.others.keys()
 
 
 def join_blocks(blocks: Sequence[Block]) -> Block:
-    """One block of blocks of one line that follow each other."""
+    """One block of blocks that follow each other and go on with each other."""
     first = blocks[0]
     if len(blocks) == 1:
         return first
@@ -43,6 +60,7 @@ def join_blocks(blocks: Sequence[Block]) -> Block:
         np.concatenate([block.speed_rad_s for block in blocks]),
         first.first_number,
         first.line,
+        {name: np.concatenate([block.others[name] for block in blocks]) for name in first.others},
     )
 
 
@@ -75,17 +93,7 @@ class Outbox:
         """Add a block behind the others, in pieces that fit into a message."""
         samples, fans = block.command.shape
         most = max(1, min(MOST_SAMPLES, MOST_FAN_SAMPLES // fans, most_samples(fans)))
-        for first in range(0, samples, most):
-            rows = slice(first, first + most)
-            self._blocks.append(
-                Block(
-                    block.t_ns[rows],
-                    block.command[rows],
-                    block.speed_rad_s[rows],
-                    block.first_number + first,
-                    block.line,
-                )
-            )
+        self._blocks += [block.rows(first, first + most) for first in range(0, samples, most)]
         self.waiting += samples
 
     def take(self) -> tuple[Block, int]:
@@ -94,7 +102,7 @@ class Outbox:
         first = self._blocks.popleft()
         taken, samples, fans = [first], len(first.t_ns), first.command.shape[1]
         most = max(1, min(MOST_SAMPLES, MOST_FAN_SAMPLES // fans))
-        while self._blocks and self._blocks[0].line == first.line and samples + len(self._blocks[0].t_ns) <= most:
+        while self._blocks and first.goes_on_with(self._blocks[0]) and samples + len(self._blocks[0].t_ns) <= most:
             taken.append(self._blocks.popleft())
             samples += len(taken[-1].t_ns)
         self.waiting -= samples

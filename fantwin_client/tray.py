@@ -83,13 +83,23 @@ class Tray:
         """Number of fans of the tray, as the configuration of the site says."""
         return self._accepts.fans
 
-    def publish(self, t: Time | Sequence[Time] | NDArray[Any], command: Values, speed: Values) -> None:
+    def publish(
+        self,
+        t: Time | Sequence[Time] | NDArray[Any],
+        command: Values,
+        speed: Values,
+        *,
+        supply_voltage_v: Values | None = None,
+        current_a: Values | None = None,
+        temperature_c: Values | None = None,
+    ) -> None:
         """Publish one sample of all fans, or several.
 
         t: by the clock of the caller: seconds since 1970 as float, nanoseconds as int, or dates with a time zone; of
         one sample or of n. It need not be the clock of the site (docs/explanation/time.md), but it must go on.
         command, speed: one value for each fan, in the tray's command unit and in `speed_unit`; of n samples (n, fans).
         The command is the one applied from `t` on. A speed of NaN was not measured.
+        supply_voltage_v, current_a, temperature_c: likewise, where they are measured; one number is for all fans.
 
         It returns at once. While acquisition works but is behind, it waits for room, at most 5 s.
 
@@ -100,11 +110,20 @@ class Tray:
         times = times_ns(t)
         commands, speeds = self._by_fan(command, len(times), "command"), self._by_fan(speed, len(times), "speed")
         self._check_commands(commands)
+        given = {"supply_voltage_v": supply_voltage_v, "current_a": current_a, "temperature_c": temperature_c}
+        others = {
+            name: np.full((len(times), self.fans), values, np.float32)
+            if np.ndim(values) == 0
+            else self._by_fan(values, len(times), name).astype(np.float32)
+            for name, values in given.items()
+            if values is not None
+        }
         with self._changed:
             self._check_times(times)
             self._wait_for_room(len(times))
             self._check_times(times)  # another thread may have published meanwhile
-            self._outbox.add(Block(times, commands, speeds * self._rad_s_per_unit, self._published, self._line))
+            rad_s = speeds * self._rad_s_per_unit
+            self._outbox.add(Block(times, commands, rad_s, self._published, self._line, others))
             self._published += len(times)
             self._newest_t_ns = int(times[-1]) if len(times) else self._newest_t_ns
             self._wake()
@@ -302,6 +321,7 @@ class Tray:
                 newest_t_ns=newest_t_ns,
                 command=block.command,
                 speed_rad_s=block.speed_rad_s,
+                **block.others,
             )
         )
         with self._changed:

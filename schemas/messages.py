@@ -6,12 +6,13 @@ and types from the declarations below, so that a new field needs an entry here a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TypeAlias, get_args
 
 import numpy as np
 
 from schemas.fields import Array, OpenEnum, column, derived, time_column
+from schemas.tacho import Tacho
 
 LARGEST_PERIOD_NS = 86_400_000_000_000  # a day
 FURTHEST_T_NS = (1 << 62) - LARGEST_PERIOD_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
@@ -119,6 +120,15 @@ class StageStatus(OpenEnum):
     STOPPED = 3
 
 
+class TachoKind(OpenEnum):
+    """How a speed is measured, as schemas.tacho explains."""
+
+    INSTANTANEOUS = 0
+    COUNT = 1
+    PERIOD = 2
+    AVERAGE = 3
+
+
 @dataclass(frozen=True, slots=True)
 class InputPosition:
     """How far a stage had read its main input for one tray when it made a message.
@@ -160,9 +170,36 @@ class Header:
     input_position: InputPosition | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class StatedTacho:
+    """What a speed is, as a source states it. It is not checked: `tacho` does that."""
+
+    kind: TachoKind
+    pulses: int = 0
+    window_s: float = 0.0
+    update_s: float = 0.0
+    delay_s: float = 0.0
+    step_rad_s: float = 0.0
+
+    @classmethod
+    def of(cls, tacho: Tacho) -> StatedTacho:
+        """As it travels."""
+        values = tacho.model_dump()
+        return cls(TachoKind[values.pop("kind").upper()], **values)
+
+    @property
+    def tacho(self) -> Tacho:
+        """As the measurement model takes it. Raises ValueError where these values are no tacho of this version."""
+        names = (each.name for each in fields(self) if each.name != "kind")
+        return Tacho.model_validate({"kind": self.kind.words, **{name: getattr(self, name) for name in names}})
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Raw:
-    """Samples as the device sent them. `device_clock_us` and `device_sequence` are empty if the device has none."""
+    """Samples as the device sent them. A column that the device does not have is empty.
+
+    tachos: what the speeds are, one for all fans or one for each; empty where the source does not state it.
+    """
 
     header: Header = Header()
     fans: int
@@ -171,6 +208,10 @@ class Raw:
     device_sequence: Array = column("samples", np.uint32, optional=True)
     command: Array = column("samples x fans", np.float64)
     speed_rad_s: Array = column("samples x fans", np.float64)
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
+    tachos: tuple[StatedTacho, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -191,6 +232,9 @@ class PushedSamples:
     newest_t_ns: int = 0
     command: Array = column("samples x fans", np.float64)
     speed_rad_s: Array = column("samples x fans", np.float64)
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -4,7 +4,7 @@ Reads: topic `command` (fan commands in the tray's command unit, set-points in r
 the [[tray]] names (pipeline/devices/source_kinds.py; speed in the tray's speed unit). Where clients push the samples of
 a tray over the bus, that source is topic `reading` (time of the client in ns, command, speed in rad/s).
 Writes: topic `raw`: device clock (us, wraps), device sequence (wraps), host time of receipt (ns), command, speed
-(rad/s).
+(rad/s), and where the source measures them supply voltage (V), current (A), temperature (degrees Celsius).
 Timing: a message holds what arrives within `block_s` (pipeline/devices/sample_blocks.py), and is sent when the last of
 that has arrived.
 
@@ -18,7 +18,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -41,7 +41,9 @@ from pipeline.devices.sample_source import (
 from pipeline.devices.source_kinds import build_source
 from pipeline.errors import UserError
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
-from schemas.messages import AcceptedSamples, Array, Command, PushedSamples, Raw
+from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
+from schemas.messages import AcceptedSamples, Array, Command, PushedSamples, Raw, StatedTacho
+from schemas.tacho import Tacho
 from schemas.topics import most_samples
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
@@ -68,9 +70,16 @@ class _Received:
     t_ns: int
 
     @property
-    def columns(self) -> tuple[bool, bool]:
-        """Whether it has a clock and a sequence: the samples of one message must agree."""
-        return self.reading.clock_us is not None, self.reading.sequence is not None
+    def columns(self) -> tuple[bool, ...]:
+        """Which of the columns that may be missing it has: the samples of one message must agree."""
+        reading = self.reading
+        return (
+            reading.clock_us is not None,
+            reading.sequence is not None,
+            bool(reading.supply_voltage_v),
+            bool(reading.current_a),
+            bool(reading.temperature_c),
+        )
 
 
 def within(value: float, low: float, high: float) -> bool:
@@ -79,9 +88,12 @@ def within(value: float, low: float, high: float) -> bool:
     return low - tolerance <= value <= high + tolerance
 
 
-def raw_message(block: Sequence[_Received], tray: TrayConfig) -> Raw:
-    """One message of samples that agree in their columns."""
+def raw_message(block: Sequence[_Received], tray: TrayConfig, tachos: tuple[StatedTacho, ...] = ()) -> Raw:
+    """One message of samples that agree in their columns. tachos: what their source states to measure."""
     readings = [received.reading for received in block]
+    auxiliary: dict[str, Any] = {
+        column.name: _float32([getattr(r, column.name) for r in readings]) for column in AUXILIARY
+    }
     return Raw(
         fans=tray.fans,
         host_receive_t_ns=np.array([received.t_ns for received in block], np.int64),
@@ -89,12 +101,19 @@ def raw_message(block: Sequence[_Received], tray: TrayConfig) -> Raw:
         device_sequence=_uint32(r.sequence for r in readings),
         command=np.array([r.command for r in readings], np.float64),
         speed_rad_s=np.array([r.speed for r in readings], np.float64) * RAD_S_PER_UNIT[tray.speed_unit],
+        tachos=tachos,
+        **auxiliary,
     )
 
 
 def _uint32(values: Iterable[int | None]) -> Array:
     """A column of numbers that wrap at 2^32; empty if the samples have none."""
     return np.array([value % UINT32 for value in values if value is not None], np.uint32)
+
+
+def _float32(rows: list[tuple[float, ...]]) -> Array:
+    """A column, (samples, fans); empty if the samples have none."""
+    return np.array(rows if rows[0] else (), np.float32)
 
 
 Item: TypeAlias = BlockEvent | Command | PushedSamples
@@ -125,10 +144,15 @@ class AcquisitionCore(Core):
         self._sequence = DeviceSequence()
         self._most_samples = most_samples(tray.fans)
         """in a message, however fast a line is"""
+        self._stated_tachos = tuple(map(StatedTacho.of, tray.stated_tachos))
+        self._tachos: tuple[Tacho, ...] = ()
+        """as the device itself says"""
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
         self._quality = InputQuality(started_t_ns, config.silence_s)
+        self._auxiliary: list[AuxiliaryColumn] = []
+        """those that the source has given"""
 
     def step(self, item: Item) -> list[Raw]:
         """Handle input from the source, a change of its connection, or a command to send."""
@@ -235,12 +259,25 @@ class AcquisitionCore(Core):
         messages: list[Raw] = []
         samples: list[_Received] = []
         for batch in block.batches:
+            if batch.tachos != self._tachos:
+                messages += self._message(samples)
+                samples = []
+                self._follow_device(batch.tachos)
             for received in self._samples(batch):
                 if samples and (len(samples) == self._most_samples or received.columns != samples[0].columns):
-                    messages.append(raw_message(samples, self._tray))
+                    messages += self._message(samples)
                     samples = []
                 samples.append(received)
-        return [*messages, raw_message(samples, self._tray)] if samples else messages
+        return [*messages, *self._message(samples)]
+
+    def _message(self, samples: Sequence[_Received]) -> list[Raw]:
+        return [raw_message(samples, self._tray, self._stated_tachos)] if samples else []
+
+    def _follow_device(self, tachos: tuple[Tacho, ...]) -> None:
+        """What the device itself says goes into the messages, whatever the configuration says."""
+        self._tachos = tachos
+        stated = tachos[:1] if len(set(tachos)) == 1 else tachos
+        self._stated_tachos = tuple(map(StatedTacho.of, stated or self._tray.stated_tachos))
 
     def _samples(self, batch: ReadingBatch) -> Iterator[_Received]:
         """The samples that are new and plausible; all others are counted."""
@@ -251,6 +288,8 @@ class AcquisitionCore(Core):
         for item in batch.items:
             reading = self._plausible(item)
             if reading is not None and self._sequence.is_new(reading, self._counts):
+                if self._auxiliary or reading.supply_voltage_v or reading.current_a or reading.temperature_c:
+                    reading = self._with_plausible_columns(reading)
                 self._counts["samples"] += 1
                 yield _Received(reading, batch.received_t_ns)
 
@@ -312,6 +351,29 @@ class AcquisitionCore(Core):
         else:
             self._quality.add_valid()
         return replace(reading, speed=speeds)
+
+    def _with_plausible_columns(self, reading: Reading) -> Reading:
+        """The reading with NaN where a value beside command and speed cannot be true, or the source has left it out.
+
+        A source that gives a column in some samples only, such as a temperature once a second, has it in all.
+        """
+        unknown = (math.nan,) * self._tray.fans
+        changed: dict[str, tuple[float, ...]] = {}
+        for column in AUXILIARY:
+            values: tuple[float, ...] = getattr(reading, column.name)
+            if not values:
+                if column in self._auxiliary:
+                    changed[column.name] = unknown
+                continue
+            if column not in self._auxiliary:
+                self._auxiliary.append(column)
+            absurd = sum(not (column.is_plausible(value) or math.isnan(value)) for value in values)
+            if len(values) != self._tray.fans:
+                absurd, values = len(values), unknown
+            if absurd:
+                self._counts[f"absurd_{column.name.rpartition('_')[0]}"] += absurd
+                changed[column.name] = tuple(value if column.is_plausible(value) else math.nan for value in values)
+        return replace(reading, **changed) if changed else reading
 
     def _send(self, wanted: Command) -> None:
         """Send a command to the device; one that this tray cannot carry out is refused as a whole."""

@@ -43,7 +43,7 @@ from pipeline.devices.line_rate import (
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.sample_grid import SampleGrid
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
-from schemas.messages import Grid, Raw
+from schemas.messages import Grid, Raw, StatedTacho
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 
@@ -101,6 +101,9 @@ class ResamplerCore(Core):
         """tachos: how the speed is measured, one for all fans or one for each."""
         self._fans = fans
         self._tachos = tacho_of_each_fan(tachos, fans)
+        self._stated: tuple[StatedTacho, ...] = ()
+        """by the newest message"""
+        self._other_tachos = ""
         self._config = config
         self._decision_rules = decision_rules
         self._line = LineRate(knows_losses=decision_rules >= DecisionRules.LOSSES_OF_LINE)
@@ -123,6 +126,8 @@ class ResamplerCore(Core):
             self._counts["lost_wrong_fan_count"] += len(item.host_receive_t_ns)
             return []
         self._wrong_fans = 0
+        if item.tachos != self._stated:
+            self._stated, self._other_tachos = item.tachos, self._difference(item.tachos)
         self._newest.add(item)
         if self._grid is not None:
             return self._grid.step(item)
@@ -164,9 +169,28 @@ class ResamplerCore(Core):
         return [f"grid of {self._timing.rate_hz:g} Hz{line}; {gaps}, {share:.1f} % of the grid"]
 
     def problem(self) -> str:
-        """No samples, those of another number of fans, a line that does not fit the grid, or a host clock set back."""
+        """No samples, those of another number of fans or other tachos, a line that does not fit the grid, or a host
+        clock set back."""
         if self._wrong_fans:
             return f"raw samples of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
+        return "; ".join(filter(None, (self._other_tachos, self._problem_of_times())))
+
+    def _difference(self, stated: tuple[StatedTacho, ...]) -> str:
+        """What a message states to measure, where the configuration says otherwise."""
+        try:
+            tachos = tacho_of_each_fan([each.tacho for each in stated], self._fans) if stated else self._tachos
+        except ValueError:
+            return "raw messages state a tacho that this version does not know: use the version of their acquisition"
+        others = [fan for fan, its in enumerate(tachos) if its != self._tachos[fan]]
+        if not others:
+            return ""
+        fan, more = others[0], f" (and {len(others) - 1} more)" if len(others) > 1 else ""
+        return (
+            f"raw messages state another tacho than this configuration, of fan {fan}{more} {tachos[fan]}, not "
+            f"{self._tachos[fan]}: set tacho = {tachos[fan].as_toml} in [[tray]], or correct the source"
+        )
+
+    def _problem_of_times(self) -> str:
         if self._grid is None or self._timing is None:
             return ""
         return self._grid.problem() or self._misfit(self._timing)
@@ -218,7 +242,7 @@ def _received_earlier(message: Raw, lateness_ns: int) -> Raw:
 def build(context: Context) -> BuiltStage:
     """The core of one tray."""
     tray, rules = context.tray, context.decision_rules
-    return BuiltStage(ResamplerCore(tray.fans, context.config, tachos=tray.tacho, decision_rules=rules))
+    return BuiltStage(ResamplerCore(tray.fans, context.config, tachos=tray.tachos, decision_rules=rules))
 
 
 STAGE = Stage(

@@ -18,6 +18,7 @@ import numpy as np
 from pipeline.devices.device_clock import NS_PER_US, UINT32
 from pipeline.devices.push_config import PushConfig
 from pipeline.devices.sample_source import LinkUp, Reading, ReadingBatch, Rejected, SourceContext, SourceEvent
+from schemas.auxiliary import auxiliary_columns
 from schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, PushedSamples
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
@@ -106,7 +107,14 @@ class PushSource:
         command = message.command.tolist()
         speed = (message.speed_rad_s / self._rad_s_per_unit).tolist()
         clock_us = ((message.t_ns + NS_PER_US // 2) // NS_PER_US % UINT32).tolist()
+        others = {name: values.tolist() for name, values in auxiliary_columns(message).items()}
         return [
-            Reading(tuple(command[row]), tuple(speed[row]), clock_us[row], (message.first_number + row) % UINT32)
+            Reading(
+                tuple(command[row]),
+                tuple(speed[row]),
+                clock_us[row],
+                (message.first_number + row) % UINT32,
+                **{name: tuple(values[row]) for name, values in others.items()},
+            )
             for row in range(len(clock_us))
         ]

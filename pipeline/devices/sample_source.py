@@ -16,6 +16,8 @@ from typing import ClassVar, Protocol, TypeAlias
 
 from pydantic import BaseModel
 
+from schemas.tacho import Tacho
+
 MOST_FANS = 1024
 """of a tray: those whose samples come in one reading"""
 
@@ -32,6 +34,12 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     def most_fans(self) -> int:
         """The most fans of a tray with this source."""
         return MOST_FANS
+
+    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
+        """What readings of this source are of the speed, one for all fans or one for each; None if the kind of source
+        does not determine it. `tacho` of the [[tray]] overrides it."""
+        del fans
+        return None
 
 
 def too_many_fans(kind: str, fans: int, most: int) -> str:
@@ -66,6 +74,11 @@ class Reading:
     """device clock at the time of measurement, modulo 2^32"""
     sequence: int | None = None
     """number of the sample, modulo 2^32"""
+    supply_voltage_v: tuple[float, ...] = ()
+    """this and the following: one value per fan, NaN where it is not known; empty if the source does not measure it"""
+    current_a: tuple[float, ...] = ()
+    temperature_c: tuple[float, ...] = ()
+    """of the air"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +104,8 @@ class ReadingBatch:
     items: Sequence[Reading | Rejected]
     byte_count: int = 0
     """bytes received, where the source counts them"""
+    tachos: tuple[Tacho, ...] = ()
+    """what the device itself says that it measures, one for all fans or one for each; empty where it does not say"""
 
 
 @dataclass(frozen=True, slots=True)

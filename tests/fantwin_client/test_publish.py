@@ -44,13 +44,21 @@ def test_samples_arrive_with_their_times_numbers_and_units(endpoint: str, raws: 
         tray.publish(datetime.fromtimestamp(T_S + 0.02, UTC), command=[0.3, 0.5], speed=[1502.0, 2001.0])
         t_s = T_S + np.arange(3, 103) / 100
         tray.publish(t_s, command=np.full((100, 2), 0.4), speed=np.linspace(1503, 1602, 200).reshape(100, 2))
+        t_s = T_S + np.array([1.03, 1.04])
+        tray.publish(
+            t_s, np.full((2, 2), 0.4), np.ones((2, 2)), supply_voltage_v=12.0, current_a=[[0.5, 0.6], [0.7, 0.8]]
+        )
         losses = tray.check()
-        assert (losses.published, losses.received, losses.waiting, losses.any) == (103, 103, 0, False)
-    raws.wait_for(103)
+        assert (losses.published, losses.received, losses.waiting, losses.any) == (105, 105, 0, False)
+    raws.wait_for(105)
+    last = raws.messages[-1]
+    np.testing.assert_array_equal(last.supply_voltage_v[-2:], np.full((2, 2), 12.0))
+    np.testing.assert_allclose(last.current_a[-2:], [[0.5, 0.6], [0.7, 0.8]], rtol=1e-6)
+    assert not len(last.temperature_c) and not len(raws.messages[0].supply_voltage_v)
     clock_us = raws.column("device_clock_us").astype(np.int64)
     assert clock_us[0] == T_S * 1e6 % 2**32
     np.testing.assert_array_equal(np.diff(clock_us) % 2**32, 10_000)
-    np.testing.assert_array_equal(raws.column("device_sequence"), np.arange(103))
+    np.testing.assert_array_equal(raws.column("device_sequence"), np.arange(105))
     np.testing.assert_allclose(raws.column("speed_rad_s")[:2], np.array([[1500, np.nan], [1501, 2000]]) * RPM)
     np.testing.assert_array_equal(raws.column("command")[:3], [[0.25, 0.5], [0.25, 0.5], [0.3, 0.5]])
 

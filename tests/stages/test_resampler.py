@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import join
-from schemas.messages import Grid, Header, InvalidReason, Raw
+from schemas.messages import Grid, Header, InvalidReason, Raw, StatedTacho, TachoKind
 from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
 from stages.resampler import ResamplerConfig, ResamplerCore
@@ -475,3 +475,17 @@ def test_the_silence_before_an_orderly_stop_is_no_problem_of_the_last_health() -
     assert "no raw samples" in core.problem()
     core.close()
     assert not core.problem()
+
+
+def test_health_says_when_messages_state_another_tacho_than_the_configuration() -> None:
+    average = Tacho(kind="average", window_s=1.0, step_rad_s=0.1)
+    core = ResamplerCore(2, ResamplerConfig(rate_hz=10.0), tachos=[average])
+    message = replace(raw(at(0.0, 0.1), np.ones(2), fans=2), tachos=(StatedTacho.of(average),))
+    core.step(message)
+    assert core.problem() == ""
+    core.step(replace(message, tachos=(StatedTacho.of(average), StatedTacho(TachoKind.PERIOD, pulses=2))))
+    assert "of fan 1 period, not average over 1 s, in steps of 0.1 rad/s: set tacho = " in core.problem()
+    core.step(replace(message, tachos=(StatedTacho(TachoKind(99)),)))
+    assert "a tacho that this version does not know" in core.problem()
+    core.step(message)
+    assert core.problem() == ""

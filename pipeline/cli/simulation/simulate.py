@@ -79,9 +79,9 @@ def simulate(
         int, typer.Option(help="Random seed of the variation between fans.", rich_help_panel=_IMPERFECTIONS)
     ] = 1,
     tacho: Annotated[
-        Literal["instantaneous", "count", "period"],
+        Literal["instantaneous", "count", "average", "period"],
         typer.Option(
-            help="What a reading is: the speed now, pulses counted over a window, or the last revolution.",
+            help="What a reading is: the speed now, pulses counted or averaged over a window, or the last revolution.",
             rich_help_panel=_TACHO,
         ),
     ] = "instantaneous",
