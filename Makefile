@@ -17,7 +17,7 @@ COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --gen
 TORCH := torch==2.13.0
 BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_table measured_table onnx_speed training_race) \
 	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed stage_memory)
-SOURCES := schemas scoring pipeline simulation stages twin tests bench
+SOURCES := fantwin_client schemas scoring pipeline simulation stages twin tests bench
 
 .PHONY: demo test check selftest bench schema configuration twin lock clean
 .DEFAULT_GOAL := demo

@@ -90,8 +90,10 @@ def page() -> str:
 def _sources() -> Iterator[str]:
     for kind, row in SOURCE_KINDS.items():
         module, _, name = row.config.partition(":")
-        yield f'### `source = {{ kind = "{kind}", ... }}`\n'
-        yield _table(getattr(import_module(module), name), but=("kind",))
+        model = getattr(import_module(module), name)
+        has_keys = set(model.model_fields) > {"kind"}
+        yield f'### `source = {{ kind = "{kind}"{", ..." if has_keys else ""} }}`\n'
+        yield _table(model, but=("kind",)) if has_keys else "It has no other keys.\n"
 
 
 def _table(model: type[BaseModel], but: Iterable[str]) -> str:
