@@ -72,6 +72,16 @@ class Section(BaseModel):
         return value
 
 
+BETWEEN_ENDPOINTS = ", "
+
+
+def _joined(value: object) -> object:
+    """Several endpoints as one text; anything else as it is."""
+    if isinstance(value, list | tuple) and value and all(isinstance(each, str) for each in value):
+        return BETWEEN_ENDPOINTS.join(value)
+    return value
+
+
 ROLE_PLACE = "{role}"
 """in a path of `bus.security`: the name of the role of a process"""
 
@@ -111,8 +121,10 @@ class BusConfig(Section):
     mode: Literal["peer", "client"] = Field(
         default="peer", description="peer: processes meet without a router; client: all go through `fantwin router`"
     )
-    endpoint: str = Field(
-        default="tcp/127.0.0.1:7447", description="where peers meet, or the router's address for clients"
+    endpoint: Annotated[str, BeforeValidator(_joined)] = Field(
+        default="tcp/127.0.0.1:7447",
+        description="where peers meet, or the router's address for clients; a list of several routers: a client uses "
+        "the first that answers, and another one when that has gone",
     )
     recovery_timeout_s: float = Field(
         default=5.0, gt=0, description="how long to wait for missed messages that were requested again"
@@ -127,6 +139,17 @@ class BusConfig(Section):
         default=None,
         description="what producers keep on disk for consumers that are cut off for long; without it, nothing",
     )
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Each endpoint; `endpoint` is all of them, for people."""
+        return tuple(self.endpoint.split(BETWEEN_ENDPOINTS))
+
+    @model_validator(mode="after")
+    def _one_for_peers(self) -> Self:
+        if self.mode == "peer" and len(self.endpoints) > 1:
+            raise ValueError('peers meet at one endpoint; a list is for mode = "client"')
+        return self
 
 
 class LauncherConfig(Section):

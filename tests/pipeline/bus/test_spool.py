@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -17,7 +17,7 @@ from pipeline.bus.spool import Spool, SpooledStream
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, tray_key
 from tests.support.running_chain import eventually
-from tests.support.small_disk import SIZE_BYTES, mount, unmount
+from tests.support.small_disk import SIZE_BYTES
 
 LARGE = 100 << 20
 
@@ -131,14 +131,6 @@ def test_a_folder_that_vanishes_costs_its_messages_and_one_line(tmp_path):
     (tmp_path / "s" / "1.spool").unlink()
     assert numbers(stream.read(0, 10)) == []
     assert "cannot be read again" in spool.problem()
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    if not mount(tmp_path):
-        pytest.skip("no disk can be mounted here")
-    yield tmp_path
-    unmount(tmp_path)
 
 
 def test_a_full_disk_costs_one_line_and_what_does_not_fit_until_there_is_room(small_disk):
