@@ -25,6 +25,9 @@ SOURCE_KINDS: dict[str, SourceKind] = {
     "serial": SourceKind(
         config="pipeline.devices.serial_config:SerialConfig", source="pipeline.devices.serial_source:SerialSource"
     ),
+    "hwmon": SourceKind(
+        config="pipeline.devices.hwmon_config:HwmonConfig", source="pipeline.devices.hwmon_source:HwmonSource"
+    ),
 }
 
 
