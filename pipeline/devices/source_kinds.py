@@ -28,6 +28,9 @@ SOURCE_KINDS: dict[str, SourceKind] = {
     "push": SourceKind(
         config="pipeline.devices.push_config:PushConfig", source="pipeline.devices.push_source:PushSource"
     ),
+    "hwmon": SourceKind(
+        config="pipeline.devices.hwmon_config:HwmonConfig", source="pipeline.devices.hwmon_source:HwmonSource"
+    ),
 }
 
 
