@@ -108,4 +108,5 @@ def select(message: AnyMessage, rows: Array) -> AnyMessage:
 
 
 def _has_columns(message: Message, form: _Form) -> list[bool]:
-    return [len(getattr(message, name)) == samples_of(message) for name in form.optional]
+    samples = samples_of(message)
+    return [len(getattr(message, name)) == samples for name in form.optional]

@@ -116,6 +116,7 @@ class _PackedColumn:
 
     Attributes:
         former: name of the field with its values in older recordings; "": there is none.
+        nothing: what an optional column is where the message has none; None: it is not optional.
     """
 
     name: str
@@ -123,6 +124,7 @@ class _PackedColumn:
     dtype: np.dtype[Any]
     key: bytes
     former: str
+    nothing: Array | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +153,7 @@ def _layout(message_type: type[Message]) -> _Layout:
             column.dtype.newbyteorder("<"),
             _varint(numbers[name] << 3 | LENGTH_DELIMITED),
             former if (former := f"{FORMER}{name}") in numbers else "",
+            _nothing(column.dtype) if column.optional else None,
         )
         for name, column in declared.items()
     )
@@ -163,6 +166,12 @@ def _layout(message_type: type[Message]) -> _Layout:
         by_number={numbers[column.name]: column for column in packed},
         time=time if time in declared else None,
     )
+
+
+def _nothing(dtype: np.dtype[Any]) -> Array:
+    nothing = np.zeros(0, dtype)
+    nothing.setflags(write=False)
+    return nothing
 
 
 def _varint(value: int) -> bytes:
@@ -189,6 +198,8 @@ def encode(message: Message) -> bytes:
     with np.errstate(over="ignore"):  # beyond the range of float32 is infinite
         arrays = [np.asarray(getattr(message, column.name), dtype=column.dtype) for column in layout.columns]
     for column, values in zip(layout.columns, arrays, strict=True):
+        if not values.size and column.nothing is not None:
+            continue
         _check_shape(layout, column, values, samples, values.size if fans < 0 else fans)
         if values.size == 0:
             continue
@@ -218,7 +229,11 @@ def decode(message_type: type[AnyMessage], data: bytes) -> AnyMessage:
     fans = values.get("fans", -1)  # -1: a message without
     samples = len(getattr(proto, layout.time)) if layout.time else -1
     for column in layout.columns:
-        array = _array(layout, column, getattr(proto, column.name))
+        field = getattr(proto, column.name)
+        if column.nothing is not None and not field:
+            values[column.name] = column.nothing
+            continue
+        array = _array(layout, column, field)
         if not array.size and column.former:
             array = _array(layout, column, getattr(proto, column.former))
         if not array.size and column.declared.added_later and samples > 0:

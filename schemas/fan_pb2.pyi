@@ -187,7 +187,7 @@ class InputPosition(_message.Message):
     def __init__(self, topic: _Optional[str] = ..., producer: _Optional[str] = ..., sequence: _Optional[int] = ..., consumed_count: _Optional[int] = ..., contiguous_from: _Optional[int] = ..., from_timer: _Optional[bool] = ...) -> None: ...
 
 class Raw(_message.Message):
-    __slots__ = ("header", "fans", "host_receive_t_ns", "device_clock_us", "device_sequence", "command", "speed_rad_s")
+    __slots__ = ("header", "fans", "host_receive_t_ns", "device_clock_us", "device_sequence", "command", "speed_rad_s", "supply_voltage_v", "current_a", "temperature_c")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     HOST_RECEIVE_T_NS_FIELD_NUMBER: _ClassVar[int]
@@ -195,6 +195,9 @@ class Raw(_message.Message):
     DEVICE_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     COMMAND_FIELD_NUMBER: _ClassVar[int]
     SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     host_receive_t_ns: _containers.RepeatedScalarFieldContainer[int]
@@ -202,7 +205,10 @@ class Raw(_message.Message):
     device_sequence: _containers.RepeatedScalarFieldContainer[int]
     command: _containers.RepeatedScalarFieldContainer[float]
     speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., host_receive_t_ns: _Optional[_Iterable[int]] = ..., device_clock_us: _Optional[_Iterable[int]] = ..., device_sequence: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ...) -> None: ...
+    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
+    current_a: _containers.RepeatedScalarFieldContainer[float]
+    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., host_receive_t_ns: _Optional[_Iterable[int]] = ..., device_clock_us: _Optional[_Iterable[int]] = ..., device_sequence: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Grid(_message.Message):
     __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing")

@@ -162,7 +162,7 @@ class Header:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Raw:
-    """Samples as the device sent them. `device_clock_us` and `device_sequence` are empty if the device has none."""
+    """Samples as the device sent them. A column that the device does not have is empty."""
 
     header: Header = Header()
     fans: int
@@ -171,6 +171,9 @@ class Raw:
     device_sequence: Array = column("samples", np.uint32, optional=True)
     command: Array = column("samples x fans", np.float64)
     speed_rad_s: Array = column("samples x fans", np.float64)
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -5,6 +5,7 @@ Recorder, health, viewer and documentation derive from it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from schemas.fields import columns, time_column
@@ -30,10 +31,11 @@ KIB, MIB = 1 << 10, 1 << 20
 MOST_SAMPLES, MOST_FAN_SAMPLES = 4096, 4096 * 64
 """of a message, whatever its block: samples, and samples times fans"""
 ROOT = "fantwin"
-HEALTH_CHUNK = "health"
+HEALTH = HEALTH_CHUNK = "health"
 ALIVE_CHUNK = "alive"
 SESSION_CHUNK = "session"
-RESERVED_TRAY_NAMES = (HEALTH_CHUNK, ALIVE_CHUNK)
+RIGHTS_CHUNK = "rights"
+RESERVED_TRAY_NAMES = (HEALTH_CHUNK, ALIVE_CHUNK, SESSION_CHUNK, RIGHTS_CHUNK)
 ALL_TRAYS = "all"
 """the instance of a process that has all trays of its site"""
 
@@ -131,6 +133,11 @@ def largest_bytes(key: str) -> int:
         return max(topic.largest_bytes for topic in TOPICS)
 
 
+def makes_samples_of_samples(reads: Sequence[str], writes: Sequence[str]) -> bool:
+    """Whether whoever reads and writes these topics, the main input first, makes blocks of samples from samples."""
+    return bool(reads) and BY_NAME[reads[0]].has_samples and any(BY_NAME[name].has_samples for name in writes)
+
+
 def tray_key(site: str, tray: str, topic: str) -> str:
     """Key of a tray's topic; `*` may stand for site or tray."""
     return f"{ROOT}/{site}/{tray}/{topic}"
@@ -159,6 +166,17 @@ def alive_key(site: str, stage: str, instance: str) -> str:
 def sessions_key(site: str, stage: str = "*", instance: str = "*") -> str:
     """Pattern of the keys of the tokens that say which process runs a stage; `pipeline.runtime.sessions` makes them."""
     return f"{ROOT}/{site}/{SESSION_CHUNK}/{stage}/{instance}/**"
+
+
+def session_key(site: str, stage: str, instance: str, *parts: object) -> str:
+    """Key of the token of one session. parts: when it started, its producer, its host, its process id; and its trays,
+    where its instance does not say them."""
+    return "/".join((sessions_key(site, stage, instance).removesuffix("/**"), *map(str, parts)))
+
+
+def rights_key(site: str, role: str) -> str:
+    """Key at which a router answers what a role may do; `*` may stand for any role."""
+    return f"{ROOT}/{site}/{RIGHTS_CHUNK}/{role}"
 
 
 def sweep_key(site: str, tray: str) -> str:

@@ -14,10 +14,13 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 from typing import Literal, TypeAlias
 
 import numpy as np
 from cobs import cobs
+
+from schemas.auxiliary import AUXILIARY
 
 Protocol: TypeAlias = Literal["binary", "text"]
 End: TypeAlias = Literal["host", "device"]
@@ -26,7 +29,7 @@ DELIMITERS: dict[Protocol, bytes] = {"binary": b"\0", "text": b"\n"}
 
 VERSION = 1
 MAX_FANS = 64
-MAX_FRAME_BYTES = 4096  # of both forms; bounds the memory of a decoder
+MAX_FRAME_BYTES = 5120  # of both forms, that of 64 fans with all columns in text; bounds the memory of a decoder
 UINT32 = 1 << 32
 
 
@@ -38,12 +41,21 @@ class Sample:
         clock_us, sequence: wrap at 2^32; None if a text device has none.
         command: one value per fan, in the tray's command unit.
         speed: one value per fan, in the tray's speed unit; NaN without a tacho reading.
+        supply_voltage_v, current_a, temperature_c: one value per fan, NaN if unknown; empty if not measured.
     """
 
     clock_us: int | None
     sequence: int | None
     command: tuple[float, ...]
     speed: tuple[float, ...]
+    supply_voltage_v: tuple[float, ...] = ()
+    current_a: tuple[float, ...] = ()
+    temperature_c: tuple[float, ...] = ()
+
+    @property
+    def auxiliary(self) -> list[tuple[float, ...]]:
+        """The columns beside command and speed, in the order of `AUXILIARY`."""
+        return [getattr(self, column.name) for column in AUXILIARY]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +104,14 @@ class _FrameError(Exception):
         self.fault = Fault(kind, detail)
 
 
-# ---- binary: 0x00 COBS(version, type, [clock, sequence,] fan count, float32 ..., CRC-32) 0x00, little-endian
+# ---- binary: 0x00 COBS(version, type, [clock, sequence,] fans, [columns,] float32 ..., CRC-32) 0x00, little-endian
 
 _HEAD = struct.Struct("<BB")  # version, type
 _CLOCK_SEQUENCE = struct.Struct("<II")
 _CRC = struct.Struct("<I")
-_TYPES: dict[type[Frame], int] = {Sample: 1, CommandFrame: 2, SetPointFrame: 3}
+_SAMPLE, _COMMAND, _SET_POINT, _SAMPLE_WITH_COLUMNS = 1, 2, 3, 4
+_SAMPLES = (_SAMPLE, _SAMPLE_WITH_COLUMNS)
+_TYPES = (_SAMPLE, _COMMAND, _SET_POINT, _SAMPLE_WITH_COLUMNS)
 _SHORTEST = _HEAD.size + 1 + _CRC.size
 
 
@@ -106,29 +120,55 @@ def _float32_bytes(values: Sequence[float]) -> bytes:
 
 
 def _encode_binary(frame: Frame) -> bytes:
-    payload = _HEAD.pack(VERSION, _TYPES[type(frame)])
     if isinstance(frame, Sample):
-        pairs = [value for pair in zip(frame.command, frame.speed, strict=True) for value in pair]
-        payload += _CLOCK_SEQUENCE.pack(frame.clock_us, frame.sequence)
-        payload += bytes([len(frame.command)]) + _float32_bytes(pairs)
+        present = [column for column in frame.auxiliary if column]
+        rows = zip(frame.command, frame.speed, *present, strict=True)
+        head = _HEAD.pack(VERSION, _SAMPLE_WITH_COLUMNS if present else _SAMPLE)
+        payload = head + _CLOCK_SEQUENCE.pack(frame.clock_us, frame.sequence) + bytes([len(frame.command)])
+        if present:
+            payload += bytes([sum(1 << bit for bit, column in enumerate(frame.auxiliary) if column)])
+        payload += _float32_bytes([value for row in rows for value in row])
     else:
-        values = frame.command if isinstance(frame, CommandFrame) else frame.set_point
+        is_command = isinstance(frame, CommandFrame)
+        values = frame.command if is_command else frame.set_point
+        payload = _HEAD.pack(VERSION, _COMMAND if is_command else _SET_POINT)
         payload += bytes([len(values)]) + _float32_bytes(values)
     # A delimiter on both sides: noise on an idle line then ends before the frame and cannot spoil it.
     return b"\0" + cobs.encode(payload + _CRC.pack(zlib.crc32(payload))) + b"\0"
 
 
-def _fan_count_at(frame_type: int) -> int:
-    """Offset of the fan count in a payload; the values follow it."""
-    return _HEAD.size + (_CLOCK_SEQUENCE.size if frame_type == _TYPES[Sample] else 0)
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """Where the values of a payload are: `per_fan` of them for each of `fans`, from byte `at` on, and which columns."""
+
+    at: int
+    fans: int
+    per_fan: int
+    columns: int
+
+
+def _layout(payload: bytes) -> _Layout:
+    """The layout that the head of a payload of a known type announces.
+
+    Raises:
+        IndexError: it ends before.
+    """
+    frame_type = payload[1]
+    count_at = _HEAD.size + (_CLOCK_SEQUENCE.size if frame_type in _SAMPLES else 0)
+    fans = payload[count_at]
+    if frame_type != _SAMPLE_WITH_COLUMNS:
+        return _Layout(count_at + 1, fans, 2 if frame_type == _SAMPLE else 1, 0)
+    columns = payload[count_at + 1]
+    return _Layout(count_at + 2, fans, 2 + columns.bit_count(), columns)
 
 
 def _fits_its_length(payload: bytes) -> bool:
-    """Whether the length of a payload of a known type fits its fan count."""
-    frame_type = payload[1]
-    at = _fan_count_at(frame_type)
-    bytes_per_fan = 8 if frame_type == _TYPES[Sample] else 4
-    return len(payload) > at and len(payload) == at + 1 + bytes_per_fan * payload[at]
+    """Whether the length of a payload of a known type fits its fan count and columns."""
+    try:
+        layout = _layout(payload)
+    except IndexError:
+        return False
+    return len(payload) == layout.at + 4 * layout.per_fan * layout.fans
 
 
 def _decode_binary(piece: bytes) -> Frame:
@@ -140,7 +180,7 @@ def _decode_binary(piece: bytes) -> Frame:
         raise _FrameError(FaultKind.TRUNCATED, f"{len(data)} bytes, the shortest frame has {_SHORTEST}")
     payload, (crc,) = data[: -_CRC.size], _CRC.unpack(data[-_CRC.size :])
     version, frame_type = _HEAD.unpack_from(payload)
-    known = version == VERSION and frame_type in _TYPES.values()
+    known = version == VERSION and frame_type in _TYPES
     if crc != zlib.crc32(payload):
         if not known:
             raise _FrameError(FaultKind.GARBAGE, f"{len(data)} bytes that are not a frame")
@@ -153,17 +193,23 @@ def _decode_binary(piece: bytes) -> Frame:
         raise _FrameError(FaultKind.WRONG_TYPE, f"unknown frame type {frame_type}")
     if not _fits_its_length(payload):
         raise _FrameError(FaultKind.TRUNCATED, f"{len(data)} bytes do not fit the fan count of the frame")
-    at = _fan_count_at(frame_type)
-    values = struct.unpack_from(f"<{(len(payload) - at - 1) // 4}f", payload, at + 1)
-    if frame_type == _TYPES[CommandFrame]:
+    layout = _layout(payload)
+    values = struct.unpack_from(f"<{layout.per_fan * layout.fans}f", payload, layout.at)
+    if frame_type == _COMMAND:
         return CommandFrame(values)
-    if frame_type == _TYPES[SetPointFrame]:
+    if frame_type == _SET_POINT:
         return SetPointFrame(values)
     clock_us, sequence = _CLOCK_SEQUENCE.unpack_from(payload, _HEAD.size)
-    return Sample(clock_us, sequence, values[0::2], values[1::2])
+    if frame_type == _SAMPLE:
+        return Sample(clock_us, sequence, values[0::2], values[1::2])
+    if layout.columns >> len(AUXILIARY):
+        raise _FrameError(FaultKind.WRONG_TYPE, f"unknown columns, bits {layout.columns:#x}")
+    present = [column.name for bit, column in enumerate(AUXILIARY) if layout.columns >> bit & 1]
+    columns = {name: values[2 + place :: layout.per_fan] for place, name in enumerate(present)}
+    return Sample(clock_us, sequence, values[0 :: layout.per_fan], values[1 :: layout.per_fan], **columns)
 
 
-# ---- text: `S clock sequence command speed ...`, `C fan value`, `P fan value`, `# comment`
+# ---- text: `S clock sequence command speed ... [V value ...] [I ...] [T ...]`, `C fan value`, `P fan value`, `# text`
 
 _LETTER = re.compile(rb"[SCP]")  # begins a line and occurs nowhere else, so that a reader can find the next line
 _INTEGER = re.compile(rb"[0-9]{1,10}")
@@ -175,11 +221,23 @@ def _text_number(value: float) -> str:
     return "-" if math.isnan(value) else str(np.float32(value))
 
 
+def _text_group(values: Sequence[float]) -> list[str]:
+    """One value for all fans, or one for each."""
+    fields = [_text_number(value) for value in values]
+    return fields[:1] if fields.count(fields[0]) == len(fields) else fields
+
+
 def _encode_text(frame: Frame) -> bytes:
     if isinstance(frame, Sample):
         head = ["-" if field is None else str(field) for field in (frame.clock_us, frame.sequence)]
         pairs = [_text_number(v) for pair in zip(frame.command, frame.speed, strict=True) for v in pair]
-        return (" ".join(["S", *head, *pairs]) + "\n").encode()
+        groups = [
+            field
+            for column, values in zip(AUXILIARY, frame.auxiliary, strict=True)
+            if values
+            for field in (column.letter, *_text_group(values))
+        ]
+        return (" ".join(["S", *head, *pairs, *groups]) + "\n").encode()
     letter, values = ("C", frame.command) if isinstance(frame, CommandFrame) else ("P", frame.set_point)
     lines = [f"{letter} {fan} {_text_number(value)}\n" for fan, value in enumerate(values) if not math.isnan(value)]
     return "".join(lines).encode()
@@ -207,16 +265,39 @@ def _numbers(fields: Sequence[bytes]) -> tuple[float, ...]:
         return tuple(np.array([_number(field) for field in fields], np.float32).tolist())
 
 
+_COLUMN_OF_LETTER = {column.letter.encode(): column.name for column in AUXILIARY}
+
+
+def _split_groups(fields: list[bytes]) -> tuple[list[bytes], dict[str, tuple[float, ...]]]:
+    """The fields of a sample before its groups, and the columns of these, one value for each of its fans."""
+    starts = [place for place, field in enumerate(fields) if field in _COLUMN_OF_LETTER]
+    if not starts:
+        return fields, {}
+    columns: dict[str, tuple[float, ...]] = {}
+    fans = (starts[0] - 2) // 2
+    for start, end in pairwise((*starts, len(fields))):
+        letter, values = fields[start], _numbers(fields[start + 1 : end])
+        name = _COLUMN_OF_LETTER[letter]
+        if name in columns:
+            raise _FrameError(FaultKind.GARBAGE, f"two groups {letter.decode()} in a line")
+        if len(values) not in (1, fans):
+            detail = f"{len(values)} values after {letter.decode()}; one is needed, or one for each of {fans} fans"
+            raise _FrameError(FaultKind.TRUNCATED, detail)
+        columns[name] = values if len(values) == fans else values * fans
+    return fields[: starts[0]], columns
+
+
 def _decode_text(line: bytes, fans: int) -> Frame:
     fields = line[1:].split()
     if not line[1:2].isspace():
         raise _FrameError(FaultKind.GARBAGE, f"{line[:24]!r} is not a line of this protocol")
     if line[:1] == b"S":
+        fields, columns = _split_groups(fields)
         if len(fields) < 4 or len(fields) % 2:
             raise _FrameError(FaultKind.TRUNCATED, f"{len(fields)} fields; S needs clock, sequence and two per fan")
         clock_us, sequence = (None if field == _NONE else _integer(field) for field in fields[:2])
         values = _numbers(fields[2:])
-        return Sample(clock_us, sequence, values[0::2], values[1::2])
+        return Sample(clock_us, sequence, values[0::2], values[1::2], **columns)
     if len(fields) != 2:
         raise _FrameError(FaultKind.TRUNCATED, f"{len(fields)} fields; {line[:1].decode()} needs fan and value")
     fan, (value,) = _integer(fields[0]), _numbers(fields[1:])
@@ -242,6 +323,8 @@ def encode(protocol: Protocol, frame: Frame) -> bytes:
     if not 1 <= fans <= MAX_FANS:
         raise ValueError(f"{fans} fans; a frame carries 1 to {MAX_FANS}")
     if isinstance(frame, Sample):
+        if any(len(column) not in (0, fans) for column in frame.auxiliary):
+            raise ValueError(f"a column beside command and speed does not have {fans} values, one for each fan")
         for name, count in (("clock_us", frame.clock_us), ("sequence", frame.sequence)):
             if count is None and protocol == "binary":
                 raise ValueError(f"{name} is missing; only a text sample may omit it")

@@ -3,7 +3,7 @@
 Reads: topic `command` (fan commands in the tray's command unit, set-points in rad/s), and the source that `source` of
 the [[tray]] names (pipeline/devices/source_kinds.py; speed in the tray's speed unit).
 Writes: topic `raw`: device clock (us, wraps), device sequence (wraps), host time of receipt (ns), command, speed
-(rad/s).
+(rad/s), and where the source measures them supply voltage (V), current (A), temperature (degrees Celsius).
 Timing: a message holds what arrives within `block_s` (pipeline/devices/sample_blocks.py), and is sent when the last of
 that has arrived.
 
@@ -17,7 +17,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -39,6 +39,7 @@ from pipeline.devices.sample_source import (
 from pipeline.devices.source_kinds import build_source
 from pipeline.errors import UserError
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
+from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
 from schemas.messages import Array, Command, Raw
 from schemas.topics import most_samples
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
@@ -66,9 +67,16 @@ class _Received:
     t_ns: int
 
     @property
-    def columns(self) -> tuple[bool, bool]:
-        """Whether it has a clock and a sequence: the samples of one message must agree."""
-        return self.reading.clock_us is not None, self.reading.sequence is not None
+    def columns(self) -> tuple[bool, ...]:
+        """Which of the columns that may be missing it has: the samples of one message must agree."""
+        reading = self.reading
+        return (
+            reading.clock_us is not None,
+            reading.sequence is not None,
+            bool(reading.supply_voltage_v),
+            bool(reading.current_a),
+            bool(reading.temperature_c),
+        )
 
 
 def within(value: float, low: float, high: float) -> bool:
@@ -80,6 +88,9 @@ def within(value: float, low: float, high: float) -> bool:
 def raw_message(block: Sequence[_Received], tray: TrayConfig) -> Raw:
     """One message of samples that agree in their columns."""
     readings = [received.reading for received in block]
+    auxiliary: dict[str, Any] = {
+        column.name: _float32([getattr(r, column.name) for r in readings]) for column in AUXILIARY
+    }
     return Raw(
         fans=tray.fans,
         host_receive_t_ns=np.array([received.t_ns for received in block], np.int64),
@@ -87,12 +98,18 @@ def raw_message(block: Sequence[_Received], tray: TrayConfig) -> Raw:
         device_sequence=_uint32(r.sequence for r in readings),
         command=np.array([r.command for r in readings], np.float64),
         speed_rad_s=np.array([r.speed for r in readings], np.float64) * RAD_S_PER_UNIT[tray.speed_unit],
+        **auxiliary,
     )
 
 
 def _uint32(values: Iterable[int | None]) -> Array:
     """A column of numbers that wrap at 2^32; empty if the samples have none."""
     return np.array([value % UINT32 for value in values if value is not None], np.uint32)
+
+
+def _float32(rows: list[tuple[float, ...]]) -> Array:
+    """A column, (samples, fans); empty if the samples have none."""
+    return np.array(rows if rows[0] else (), np.float32)
 
 
 Item: TypeAlias = BlockEvent | Command
@@ -127,6 +144,8 @@ class AcquisitionCore(Core):
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
         self._quality = InputQuality(started_t_ns, config.silence_s)
+        self._auxiliary: list[AuxiliaryColumn] = []
+        """those that the source has given"""
 
     def step(self, item: Item) -> list[Raw]:
         """Handle input from the source, a change of its connection, or a command to send."""
@@ -221,6 +240,8 @@ class AcquisitionCore(Core):
         for item in batch.items:
             reading = self._plausible(item)
             if reading is not None and self._sequence.is_new(reading, self._counts):
+                if self._auxiliary or reading.supply_voltage_v or reading.current_a or reading.temperature_c:
+                    reading = self._with_plausible_columns(reading)
                 self._counts["samples"] += 1
                 yield _Received(reading, batch.received_t_ns)
 
@@ -282,6 +303,29 @@ class AcquisitionCore(Core):
         else:
             self._quality.add_valid()
         return replace(reading, speed=speeds)
+
+    def _with_plausible_columns(self, reading: Reading) -> Reading:
+        """The reading with NaN where a value beside command and speed cannot be true, or the source has left it out.
+
+        A source that gives a column in some samples only, such as a temperature once a second, has it in all.
+        """
+        unknown = (math.nan,) * self._tray.fans
+        changed: dict[str, tuple[float, ...]] = {}
+        for column in AUXILIARY:
+            values: tuple[float, ...] = getattr(reading, column.name)
+            if not values:
+                if column in self._auxiliary:
+                    changed[column.name] = unknown
+                continue
+            if column not in self._auxiliary:
+                self._auxiliary.append(column)
+            absurd = sum(not (column.is_plausible(value) or math.isnan(value)) for value in values)
+            if len(values) != self._tray.fans:
+                absurd, values = len(values), unknown
+            if absurd:
+                self._counts[f"absurd_{column.name.rpartition('_')[0]}"] += absurd
+                changed[column.name] = tuple(value if column.is_plausible(value) else math.nan for value in values)
+        return replace(reading, **changed) if changed else reading
 
     def _send(self, wanted: Command) -> None:
         """Send a command to the device; one that this tray cannot carry out is refused as a whole."""

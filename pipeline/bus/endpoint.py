@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 import socket
 
+from pipeline.bus.errors import BusError
+from pipeline.config.models import BusConfig
+
 _ADDRESS = re.compile(r"(tcp|tls|ws|udp|quic)/(\[[^\]]*\]|[^:/?#]*):(\d+)(?:[?#].*)?")
 _CONNECTING = ("tcp", "tls", "ws")
 _CONNECT_TIMEOUT_S = 1.0
@@ -58,8 +61,28 @@ def accepts_connections(endpoint: str) -> bool:
         return False
 
 
-def foreign_program(endpoint: str) -> str:
-    """One line about an endpoint that accepts connections and does not answer as fantwin."""
+def require_tls_with_security(config: BusConfig) -> None:
+    """Raises BusError if an endpoint has TLS without `bus.security`, or the other way round."""
+    scheme, _, place = config.endpoint.partition("/")
+    if config.security and scheme != "tls":
+        raise BusError(f"bus.endpoint = {config.endpoint!r}: with [bus.security] write tls/{place}")
+    if not config.security and scheme in ("tls", "quic"):
+        raise BusError(
+            f"bus.endpoint = {config.endpoint!r}: {scheme} needs certificates: a section [bus.security], see "
+            "`fantwin certs --help`"
+        )
+
+
+def foreign_program(endpoint: str, *, is_secure: bool = False) -> str:
+    """One line about an endpoint that accepts connections and does not answer as fantwin.
+
+    is_secure: with `bus.security`; the other end does not say why it refuses.
+    """
+    if is_secure:
+        return (
+            f"bus.endpoint = {endpoint!r}: what listens there is of another authority, has a certificate without this "
+            "host name, takes no TLS, or is not fantwin: see `fantwin certs show` there and here"
+        )
     return (
         f"bus.endpoint = {endpoint!r}: the program that listens there is not fantwin, or hangs, so stages cannot "
         "connect: stop it, or choose another port"

@@ -72,6 +72,31 @@ class Section(BaseModel):
         return value
 
 
+ROLE_PLACE = "{role}"
+"""in a path of `bus.security`: the name of the role of a process"""
+
+
+class SecurityConfig(Section):
+    """Mutual TLS and roles. Each process shows a certificate that says its role; `fantwin certs` makes them. Paths may
+    hold `{role}`: each process then finds those of its own role."""
+
+    ca: Path = Field(default=Path("certs/ca.pem"), description="certificate of the site's authority")
+    certificate: Path = Field(
+        default=Path("certs/{role}.pem"), description="certificate of a process; `{role}` is the name of its role"
+    )
+    key: Path = Field(
+        default=Path("certs/{role}.key"), description="private key of that certificate, readable by its owner only"
+    )
+    controllers: tuple[Name, ...] = Field(
+        default=(), description="roles of programs that command fans, as operators do, and may do nothing else"
+    )
+
+    def within(self, folder: Path) -> Self:
+        """The same with absolute paths: relative ones start at `folder`."""
+        paths = {name: folder.absolute() / getattr(self, name) for name in ("ca", "certificate", "key")}
+        return self.model_copy(update=paths)
+
+
 class BusConfig(Section):
     """How processes find one another. On one host the first process to start listens on `endpoint`, the others
     connect there and learn of each other; if it dies, the next to start takes its place."""
@@ -84,6 +109,12 @@ class BusConfig(Section):
     )
     recovery_timeout_s: float = Field(
         default=5.0, gt=0, description="how long to wait for missed messages that were requested again"
+    )
+    security: SecurityConfig | None = Field(
+        default=None, description="certificates and roles: docs/how-to/security.md; without it, none"
+    )
+    zenoh: dict[str, Any] = Field(
+        default_factory=dict, description="settings of Zenoh itself, by path; not those that fantwin sets"
     )
 
 

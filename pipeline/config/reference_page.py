@@ -14,13 +14,13 @@ from importlib import import_module
 from operator import or_
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from pipeline.config.loading import LARGEST_FILE_BYTES, top_level
-from pipeline.config.models import BusConfig, LauncherConfig, TrayConfig
+from pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.devices.source_kinds import SOURCE_KINDS
 from schemas.tacho import Tacho
@@ -57,7 +57,14 @@ def page() -> str:
         "What a reading is of the speed ([tachos](../explanation/tachos.md)).\n",
         _table(Tacho, but=()),
         "## `[bus]`\n",
-        _table(BusConfig, but=()),
+        _table(BusConfig, but=("security", "zenoh")),
+        "## `[bus.security]`\n",
+        "Certificates and roles ([security](../how-to/security.md)). Without this section there are none.\n",
+        _table(SecurityConfig, but=()),
+        "## `[bus.zenoh]`\n",
+        "Settings of Zenoh itself, passed through to every session and to the router: path = value, with the paths of "
+        'Zenoh\'s own configuration, as `"transport/unicast/max_sessions" = 5000`. Refused: what Zenoh does not know, '
+        "and what fantwin sets itself.\n",
         "## `[launcher]`\n",
         _table(LauncherConfig, but=()),
     ]
@@ -109,6 +116,8 @@ def _values(field: FieldInfo) -> str:
 def _type_words(annotation: Any) -> str:
     if get_origin(annotation) is Literal:
         return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
+    if get_origin(annotation) is Annotated:
+        return _type_words(get_args(annotation)[0])
     if get_origin(annotation) is UnionType:
         return " or ".join(_type_words(each) for each in get_args(annotation))
     if get_origin(annotation) is dict:

@@ -63,6 +63,11 @@ class Reading:
     """device clock at the time of measurement, modulo 2^32"""
     sequence: int | None = None
     """number of the sample, modulo 2^32"""
+    supply_voltage_v: tuple[float, ...] = ()
+    """this and the following: one value per fan, NaN where it is not known; empty if the source does not measure it"""
+    current_a: tuple[float, ...] = ()
+    temperature_c: tuple[float, ...] = ()
+    """of the air"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,7 +99,15 @@ class SerialSource:
 
     def _reading_of(self, found: wire.Frame | wire.Fault) -> Reading | Rejected:
         if isinstance(found, wire.Sample):
-            return Reading(found.command, found.speed, found.clock_us, found.sequence)
+            return Reading(
+                found.command,
+                found.speed,
+                found.clock_us,
+                found.sequence,
+                found.supply_voltage_v,
+                found.current_a,
+                found.temperature_c,
+            )
         assert isinstance(found, wire.Fault), "the decoder of a host gives samples and faults only"
         return Rejected(
             found.kind.value,

@@ -18,7 +18,7 @@ from pipeline.errors import UserError
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from schemas.envelope import Envelope
 from schemas.messages import Message, ScorerSnapshot
-from schemas.topics import ALL_TRAYS, BY_NAME
+from schemas.topics import ALL_TRAYS, BY_NAME, makes_samples_of_samples
 
 
 class StageConfig(Section):
@@ -259,8 +259,7 @@ class Stage:
     @property
     def makes_samples_of_samples(self) -> bool:
         """Whether it makes blocks of samples from its main input: it then reports what it has consumed."""
-        has_samples = [BY_NAME[name].has_samples for name in (*self.reads[:1], *self.writes)]
-        return bool(self.reads) and has_samples[0] and any(has_samples[1:])
+        return makes_samples_of_samples(self.reads, self.writes)
 
 
 def load_stage(name: str) -> Stage:
@@ -273,4 +272,5 @@ def load_stage(name: str) -> Stage:
     stage = row.load()
     assert isinstance(stage, Stage)
     assert stage.may_drop == row.may_drop, f"stage {name!r}: may_drop of its row is {row.may_drop}"
+    assert row.topics() == (stage.reads, stage.writes), f"stage {name!r}: its row has {row.reads} and {row.writes}"
     return stage

@@ -6,6 +6,7 @@ import itertools
 import math
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
+from schemas.auxiliary import AUXILIARY
 from schemas.wire import (
     MAX_FRAME_BYTES,
     CommandFrame,
@@ -106,7 +108,7 @@ def test_byte_by_byte_gives_the_same_even_where_a_piece_is_too_long(protocol: Pr
     whole = Decoder(protocol, 2).feed(stream)
     decoder = Decoder(protocol, 2)
     assert [item for byte in stream for item in decoder.feed(bytes([byte]))] == whole
-    assert whole == [SAMPLE, Fault(FaultKind.OVERSIZED, "more than 4096 bytes without an end"), SAMPLE, SAMPLE]
+    assert whole == [SAMPLE, Fault(FaultKind.OVERSIZED, "more than 5120 bytes without an end"), SAMPLE, SAMPLE]
 
 
 @given(noise=st.binary(max_size=200).filter(lambda b: b"\0" not in b))
@@ -154,6 +156,7 @@ def test_after_a_reset_half_a_frame_is_forgotten(protocol: Protocol) -> None:
 
 
 SAMPLE_PAYLOAD = cobs.decode(SAMPLE_BINARY.strip(b"\0"))[:-4]
+WITH_COLUMN = cobs.decode(encode("binary", replace(SAMPLE, current_a=(1.5, 2.5))).strip(b"\0"))[:-4]
 NAN, INFINITY = struct.pack("<f", math.nan), struct.pack("<f", math.inf)
 BINARY_FAULTS = {
     "garbage": (b"\0\x05helo\0", FaultKind.TRUNCATED),
@@ -166,6 +169,9 @@ BINARY_FAULTS = {
     "a frame for the device": (encode("binary", CommandFrame((0.5, 0.5))), FaultKind.WRONG_TYPE),
     "three fans": (encode("binary", Sample(1, 1, (0.5,) * 3, (1.0,) * 3)), FaultKind.WRONG_FAN_COUNT),
     "fan count and length differ": (framed(SAMPLE_PAYLOAD[:10] + b"\x03" + SAMPLE_PAYLOAD[11:]), FaultKind.TRUNCATED),
+    "a column and length differ": (framed(WITH_COLUMN[:11] + b"\x03" + WITH_COLUMN[12:]), FaultKind.TRUNCATED),
+    "an unknown column": (framed(WITH_COLUMN[:11] + b"\x08" + WITH_COLUMN[12:]), FaultKind.WRONG_TYPE),
+    "ends before its columns": (framed(WITH_COLUMN[:11]), FaultKind.TRUNCATED),
     "too long": (b"\0" + b"\x01" * (MAX_FRAME_BYTES + 1) + b"\0", FaultKind.OVERSIZED),
     "NaN command": (framed(SAMPLE_PAYLOAD[:11] + NAN + SAMPLE_PAYLOAD[15:]), FaultKind.BAD_COMMAND),
     "infinite command": (framed(SAMPLE_PAYLOAD[:11] + INFINITY + SAMPLE_PAYLOAD[15:]), FaultKind.BAD_COMMAND),
@@ -183,6 +189,11 @@ TEXT_FAULTS = {
     "python's own spelling of numbers": (b"S 1000 7 0.5 1_0 0.25 -3\n", FaultKind.BAD_NUMBER),
     "a clock of 33 bits": (b"S 4294967296 7 0.5 1 0.25 -3\n", FaultKind.BAD_NUMBER),
     "a negative sequence": (b"S 1000 -7 0.5 1 0.25 -3\n", FaultKind.BAD_NUMBER),
+    "a group of three": (b"S 1000 7 0.5 101.5 0.25 -3 V 1 2 3\n", FaultKind.TRUNCATED),
+    "an empty group": (b"S 1000 7 0.5 101.5 0.25 -3 V\n", FaultKind.TRUNCATED),
+    "a group twice": (b"S 1000 7 0.5 101.5 0.25 -3 V 1 V 1\n", FaultKind.GARBAGE),
+    "a group of an unknown letter": (b"S 1000 7 0.5 101.5 0.25 -3 Q 1\n", FaultKind.BAD_NUMBER),
+    "a group before the pairs": (b"S 1000 7 T 25\n", FaultKind.TRUNCATED),
     "NaN command": (b"S 1000 7 nan 1 0.25 -3\n", FaultKind.BAD_COMMAND),
     "no command": (b"S 1000 7 - 1 0.25 -3\n", FaultKind.BAD_COMMAND),
     "infinite command": (b"S 1000 7 0.5 1 inf -3\n", FaultKind.BAD_COMMAND),
@@ -275,3 +286,61 @@ def test_the_worked_examples_of_the_document_are_true() -> None:
     assert encode("text", CommandFrame((math.nan, 0.5))) == b"C 1 0.5\n"
     assert "S 1000000 42 0.5 100.0" in document
     assert all(f"`{kind.value}`" in document for kind in FaultKind)
+
+
+@st.composite
+def samples_with_columns(draw: st.DrawFn) -> Sample:
+    sample = draw(samples())
+    values = st.lists(READING, min_size=len(sample.command), max_size=len(sample.command)).map(tuple)
+    same_for_all = READING.map(lambda value: (value,) * len(sample.command))
+    return replace(sample, **{column.name: draw(st.just(()) | values | same_for_all) for column in AUXILIARY})
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@given(sample=samples_with_columns())
+def test_columns_beside_command_and_speed_come_back_exactly(protocol: Protocol, sample: Sample) -> None:
+    (back,) = Decoder(protocol, len(sample.command)).feed(encode(protocol, sample))
+    assert same(back, sample)
+
+
+def test_the_reference_shows_a_frame_with_columns_as_it_is() -> None:
+    sample = Sample(1_000_000, 42, (0.5,), (100.0,), (12.0,), (), (25.0,))
+    assert encode("text", sample) == b"S 1000000 42 0.5 100.0 V 12.0 T 25.0\n"
+    page = (Path(__file__).parents[2] / "docs/reference/wire-protocol.md").read_text(encoding="utf-8")
+    assert encode("binary", sample).hex(" ") in page
+    assert encode("text", sample).decode().strip() in page
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_the_longest_frame_of_64_fans_with_all_columns_fits(protocol: Protocol) -> None:
+    longest = float(np.float32(-1.1754944e-38))
+    each = tuple(longest * (1 + fan % 2) for fan in range(64))  # differ, or one value is sent for all
+    sample = Sample(2**32 - 1, 2**32 - 1, each, each, each, each, each)
+    data = encode(protocol, sample)
+    assert len(data) <= MAX_FRAME_BYTES
+    assert Decoder(protocol, 64).feed(data) == [sample]
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (b"S 1 2 0.5 100 1 0 V 12\n", {"supply_voltage_v": (12.0, 12.0)}),
+        (b"S 1 2 0.5 100 1 0 T 25 26 V 12 -\n", {"temperature_c": (25, 26), "supply_voltage_v": (12.0, math.nan)}),
+        (
+            b"S 1 2 0.5 100 1 0 I 1e-1 nan T -\n",
+            {"current_a": (0.10000000149011612, math.nan), "temperature_c": 2 * (math.nan,)},
+        ),
+    ],
+)
+def test_groups_of_a_text_line_have_one_value_for_all_fans_or_one_for_each(
+    line: bytes, expected: dict[str, tuple[float, ...]]
+) -> None:
+    (found,) = joined("text").feed(line)
+    assert same(
+        found, replace(Sample(1, 2, (0.5, 1.0), (100.0, 0.0)), **{k: tuple(map(float, v)) for k, v in expected.items()})
+    )
+
+
+def test_columns_of_other_lengths_are_not_sent() -> None:
+    with pytest.raises(ValueError, match="does not have 2 values"):
+        encode("text", replace(SAMPLE, current_a=(1.0,)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.serial_port import ReceivedBytes
 from pipeline.devices.serial_source import SerialSource
 from pipeline.runtime.stage import Context, StageError
+from schemas.codec import decode
+from schemas.codec import encode as encode_message
 from schemas.messages import Command, Raw
 from schemas.units import NS_PER_S
 from schemas.wire import CommandFrame, Decoder, Frame, Protocol, Sample, SetPointFrame, encode
@@ -463,4 +466,43 @@ def test_row_13_a_host_clock_that_is_set_is_reported_once_and_silence_still_coun
     assert "nothing received for 2 s" in core.problem(), "a silent line is reported after two seconds, not an hour"
     feed(core, [sample(2)], t_ns=host.passes(60.0))
     core.tick(host.passes(0.05))
+    assert core.problem() == ""
+
+
+def with_columns(number: int, **columns: tuple[float, ...]) -> Sample:
+    return replace(sample(number), **columns)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_columns_beside_command_and_speed_are_in_the_message_and_the_others_empty(protocol: Protocol) -> None:
+    core = make_core(protocol=protocol)
+    frame = with_columns(1, supply_voltage_v=(12.0, 11.5), temperature_c=(math.nan, 25.0))
+    raw = decode(Raw, encode_message(feed(core, [frame], protocol)[0]))
+    assert raw.supply_voltage_v.tolist() == [[12.0, 11.5]]
+    assert np.array_equal(raw.temperature_c, [[math.nan, 25.0]], equal_nan=True)
+    assert raw.temperature_c.dtype == np.float32
+    assert raw.current_a.size == 0
+
+
+def test_a_column_that_some_samples_leave_out_is_unknown_there_and_splits_no_message() -> None:
+    core = make_core()
+    frames = [sample(0), with_columns(1, temperature_c=(25.0, 26.0)), sample(2), with_columns(3, current_a=(0.1, 0.2))]
+    messages = core.step(ReceivedBytes(b"".join(encode("binary", frame) for frame in frames), S))
+    assert [len(raw.host_receive_t_ns) for raw in messages] == [1, 2, 1]
+    assert np.array_equal(messages[1].temperature_c, [[25.0, 26.0], [math.nan] * 2], equal_nan=True)
+    assert np.isnan(messages[2].temperature_c).all()
+    assert messages[2].current_a.tolist() == [[pytest.approx(0.1), pytest.approx(0.2)]]
+
+
+def test_a_value_that_cannot_be_true_is_unknown_and_counted_and_the_sample_is_kept() -> None:
+    core = make_core()
+    frame = with_columns(1, supply_voltage_v=(-1.0, 12.0), current_a=(1e9, math.inf), temperature_c=(math.nan, 300.0))
+    (raw,) = feed(core, [frame])
+    assert np.array_equal(raw.supply_voltage_v, [[math.nan, 12.0]], equal_nan=True)
+    assert np.isnan(raw.current_a).all()
+    assert np.array_equal(raw.temperature_c, [[math.nan, 300.0]], equal_nan=True)
+    assert raw.speed_rad_s.tolist() == [[100.0, 50.0]]
+    counts = core.counters()
+    assert (counts["absurd_supply_voltage"], counts["absurd_current"]) == (1, 2)
+    assert "absurd_temperature" not in counts
     assert core.problem() == ""

@@ -1,0 +1,49 @@
+"""What a source may measure beside command and speed: supply voltage, current and temperature of each fan.
+
+Each is an optional column, `samples x fans`, of `Raw` and of what is made from it. An empty column means that the
+source does not measure it, NaN that the value is not known. Whatever handles them loops over `AUXILIARY`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from schemas.fields import Array
+
+
+@dataclass(frozen=True, slots=True)
+class AuxiliaryColumn:
+    """One measured quantity beside command and speed.
+
+    Attributes:
+        name: of its field in messages and readings, and of its column in tables, with the unit.
+        letter: begins its group in a text line of the wire protocol.
+        lowest, highest: a value beyond them is not plausible, in its unit.
+        title: what people call it.
+        unit: as people read it.
+    """
+
+    name: str
+    letter: str
+    lowest: float
+    highest: float
+    title: str
+    unit: str
+
+    def is_plausible(self, value: float) -> bool:
+        """Whether a value can be true; NaN, an unknown one, cannot."""
+        return self.lowest <= value <= self.highest
+
+
+AUXILIARY = (
+    AuxiliaryColumn("supply_voltage_v", "V", 0.0, 2000.0, "supply voltage", "V"),
+    AuxiliaryColumn("current_a", "I", -1000.0, 1000.0, "current", "A"),
+    AuxiliaryColumn("temperature_c", "T", -100.0, 300.0, "temperature", "°C"),
+)
+"""in the order of their bits in a binary frame: never reorder, only append"""
+
+
+def auxiliary_columns(message: Any) -> dict[str, Array]:
+    """The columns that a message, or a record with the same names, has, by name; those that are empty are left out."""
+    return {column.name: values for column in AUXILIARY if len(values := getattr(message, column.name))}
