@@ -124,8 +124,6 @@ def _type_words(annotation: Any) -> str:
         return _type_words(get_args(annotation)[0])
     if get_origin(annotation) is Literal:
         return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
-    if get_origin(annotation) is Annotated:
-        return _type_words(get_args(annotation)[0])
     if get_origin(annotation) is UnionType:
         return " or ".join(_type_words(each) for each in get_args(annotation))
     if get_origin(annotation) is dict:
