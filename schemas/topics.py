@@ -20,6 +20,7 @@ from schemas.messages import (
     ModelCard,
     NewTwin,
     Prediction,
+    PushedSamples,
     Raw,
     Request,
     Score,
@@ -86,6 +87,7 @@ CATCH_UP_MESSAGES = 4096
 
 TOPICS: tuple[Topic, ...] = (
     Topic("raw", Raw, "as the device sends, often 100 Hz", True, 8192, 16 * MIB, "samples as the device sent them"),
+    Topic("reading", PushedSamples, "as the client sends", False, CATCH_UP_MESSAGES, 16 * MIB, "samples of a client"),
     Topic("grid", Grid, "the grid's rate over the block size", True, 8192, 16 * MIB, "samples on a uniform grid"),
     Topic("prediction", Prediction, "as grid", True, 8192, 32 * MIB, "the healthy twin beside the measurement"),
     Topic("score", Score, "as prediction", True, 8192, 64 * MIB, "scored samples, ready to draw"),

@@ -3,6 +3,8 @@
 Reads: topic `raw` (device clock us, host time of receipt ns, command, speed rad/s).
 Writes: topic `grid`: samples at absolute multiples of the period (t_ns % period_ns == 0), speed interpolated linearly,
 command held (that of the last sample at or before the grid time). The readings of a counting tacho are held, too.
+Supply voltage, current and temperature are interpolated where the samples on both sides have them, else held until the
+next sample, and unknown in gaps.
 Timing: a grid sample is published as soon as a raw sample at or after its time has arrived, in one message with the
 others that the same raw message completes. If one fan has no reading, all fans wait for its next one, at most
 `gap_limit_s`. If no samples arrive, the wait is at most `watermark_s`.

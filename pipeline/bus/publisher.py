@@ -83,6 +83,12 @@ class Publisher:
             with self._of_all.lock:
                 self._add(-len(self._kept.popleft()[1]))
 
+    def forget(self, before: int) -> None:
+        """Keep no message with a sequence number below `before`: its consumer has it."""
+        with self._of_all.lock:
+            while self._kept and self._kept[0][0] < before:
+                self._add(-len(self._kept.popleft()[1]))
+
     def _add(self, size: int) -> None:
         self._kept_bytes += size
         if not self._topic.is_rare:

@@ -90,8 +90,10 @@ def page() -> str:
 def _sources() -> Iterator[str]:
     for kind, row in SOURCE_KINDS.items():
         module, _, name = row.config.partition(":")
-        yield f'### `source = {{ kind = "{kind}", ... }}`\n'
-        yield _table(getattr(import_module(module), name), but=("kind",))
+        model = getattr(import_module(module), name)
+        has_keys = set(model.model_fields) > {"kind"}
+        yield f'### `source = {{ kind = "{kind}"{", ..." if has_keys else ""} }}`\n'
+        yield _table(model, but=("kind",)) if has_keys else "It has no other keys.\n"
 
 
 def _table(model: type[BaseModel], but: Iterable[str]) -> str:
@@ -118,10 +120,10 @@ def _values(field: FieldInfo) -> str:
 
 
 def _type_words(annotation: Any) -> str:
-    if get_origin(annotation) is Literal:
-        return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
     if get_origin(annotation) is Annotated:
         return _type_words(get_args(annotation)[0])
+    if get_origin(annotation) is Literal:
+        return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
     if get_origin(annotation) is UnionType:
         return " or ".join(_type_words(each) for each in get_args(annotation))
     if get_origin(annotation) is dict:

@@ -380,6 +380,7 @@ class Runner:
             counters=self._counters() if with_counts else {},
             now_ns=HOST_CLOCK.now_ns(),
             notes=[*self._notes()] if with_counts else (),
+            accepts=filter(None, (core.accepts() for core in cores)),
         )
         return replace(health, header=Header(self.producer, self._health_publisher.published, ""))
 

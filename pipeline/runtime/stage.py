@@ -17,7 +17,7 @@ from pipeline.config.shards import own_file
 from pipeline.errors import UserError
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from schemas.envelope import Envelope
-from schemas.messages import Message, ScorerSnapshot
+from schemas.messages import AcceptedSamples, Message, ScorerSnapshot
 from schemas.topics import ALL_TRAYS, BY_NAME, makes_samples_of_samples
 
 
@@ -105,6 +105,10 @@ class Core(Protocol):
         """The trays whose messages of the `undecoded` topics are all passed to `step`; None: all trays. Of the others
         `step` gets the newest message, about once a second. Only a core that serves all trays is asked, at every tick.
         """
+        return None
+
+    def accepts(self) -> AcceptedSamples | None:
+        """What a client may push to it; None: nothing."""
         return None
 
     def problem(self) -> str:
