@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ NETWORK = f"{PROJECT}_bus"
 BASE_IMAGE = "docker.io/library/python:3.11-slim-bookworm"
 CONFIG = "/demo/compose.toml"
 AT_WORK = ("ok", "waiting")
-_NAME_SERVER = Path("/run/containers/networks/aardvark-dns")
 _POLL_S = 0.1
 
 Status = dict[str, Any]
@@ -82,16 +81,22 @@ def cut_off(service: str, seconds: float) -> None:
     succeed("podman", "network", "connect", NETWORK, container(service))
 
 
-def fantwin(*words: str, service: str = "recorder", timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
-    """A command in the container of a service."""
+def fantwin(*words: str, service: str = "viewer", timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+    """A command in the container of a service, which has the certificate of that service only."""
     return run("podman", "exec", container(service), "fantwin", *words, timeout_s=timeout_s)
 
 
 def status() -> Status:
     """What `fantwin status` says inside a container; empty while it has no answer."""
-    let_names_be_found()
     answer = fantwin("status", "-c", CONFIG, "--json")
     return json.loads(answer.stdout) if answer.stdout.startswith("{") else {"error": answer.stderr}
+
+
+def in_new_container(script: str, volumes: Sequence[str] = ()) -> subprocess.CompletedProcess[str]:
+    """A script in a container of its own, on the network of the site, with some of its volumes."""
+    mounts = (word for volume in volumes for word in ("-v", f"{PROJECT}_{volume}"))
+    shell = ("--entrypoint", '["sh", "-euc"]', "fantwin", script)
+    return run("podman", "run", "--rm", "--network", NETWORK, *mounts, *shell)
 
 
 def is_well(seen: Status) -> bool:
@@ -124,12 +129,3 @@ def wait_until(is_so: Callable[[], bool], within_s: float, otherwise: str | Call
 def losses(seen: Status) -> dict[str, int]:
     """What each stage says it has lost, without zeros."""
     return {each["stage"]: each["lost"] for each in seen["stages"] if each.get("lost")}
-
-
-def let_names_be_found() -> None:
-    """Start podman's name server again if it hangs: aardvark-dns 1.4 does, when many containers start at once."""
-    resolve = ("podman", "exec", container("recorder"), "timeout", "2", "getent", "hosts", "router")
-    if run(*resolve).returncode != 124:
-        return
-    os.kill(int((_NAME_SERVER / "aardvark.pid").read_text()), signal.SIGKILL)
-    succeed("/usr/lib/podman/aardvark-dns", "--config", str(_NAME_SERVER), "-p", "53", "run")

@@ -3,7 +3,7 @@
 # namespaces of its own, with images, volumes and settings in FOLDER. All that it starts dies with it.
 #   in_namespaces.sh FOLDER COMMAND...
 set -euo pipefail
-folder=$(realpath "$1")
+folder=$(realpath "$1") here=$(realpath "$(dirname "$0")")
 shift
 
 cat > "$folder/containers.conf" <<CONF
@@ -11,10 +11,10 @@ cat > "$folder/containers.conf" <<CONF
 default_ulimits = ["nofile=4096:4096", "nproc=4096:4096"]
 cgroups = "disabled"
 cgroupns = "host"
-dns_options = ["timeout:1", "attempts:2"]
 [engine]
 runtime = "crun"
 cgroup_manager = "cgroupfs"
+helper_binaries_dir = ["$here/helpers", "/usr/lib/podman", "/usr/libexec/podman"]
 events_logger = "file"
 [network]
 network_backend = "netavark"
