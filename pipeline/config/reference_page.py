@@ -22,6 +22,7 @@ from pydantic.fields import FieldInfo
 from pipeline.config.loading import LARGEST_FILE_BYTES, top_level
 from pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, SpoolConfig, TrayConfig
 from pipeline.config.registry import STAGES
+from pipeline.devices.sample_source import SourceConfig
 from pipeline.devices.source_kinds import SOURCE_KINDS
 from schemas.tacho import Tacho
 
@@ -90,10 +91,37 @@ def page() -> str:
 def _sources() -> Iterator[str]:
     for kind, row in SOURCE_KINDS.items():
         module, _, name = row.config.partition(":")
-        model = getattr(import_module(module), name)
+        model: type[BaseModel] = getattr(import_module(module), name)
         has_keys = set(model.model_fields) > {"kind"}
         yield f'### `source = {{ kind = "{kind}"{", ..." if has_keys else ""} }}`\n'
         yield _table(model, but=("kind",)) if has_keys else "It has no other keys.\n"
+        yield from _tables_within(model)
+
+
+def _tables_within(model: type[BaseModel]) -> Iterator[str]:
+    """The keys of the tables that are values of keys of a source, each kind of table once."""
+    waiting, shown = [model], set[type[BaseModel]]()
+    while waiting:
+        for key, field in waiting.pop(0).model_fields.items():
+            inner = next(filter(_is_model, _plain_types(field.annotation)), None)
+            if inner is not None and inner not in shown:
+                shown.add(inner)
+                waiting.append(inner)
+                yield f"Each table such as `{key}`: {(inner.__doc__ or '').splitlines()[0]}\n"
+                yield _table(inner, but=())
+
+
+def _plain_types(annotation: Any) -> Iterator[Any]:
+    """The types that an annotation is made of."""
+    arguments = get_args(annotation)
+    for each in arguments:
+        yield from _plain_types(each)
+    if not arguments:
+        yield annotation
+
+
+def _is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
 def _table(model: type[BaseModel], but: Iterable[str]) -> str:
@@ -130,8 +158,11 @@ def _type_words(annotation: Any) -> str:
         return f"table of {_type_words(get_args(annotation)[1])}s"
     if get_origin(annotation) is tuple:
         of_one = _type_words(get_args(annotation)[0])
+        if of_one == "table":
+            return "list of tables"
         return of_one if of_one == _ELSEWHERE else f"list of {of_one}"
-    return _TYPE_WORDS.get(annotation, _ELSEWHERE)
+    is_table = _is_model(annotation) and annotation not in (SourceConfig, Tacho)
+    return "table" if is_table else _TYPE_WORDS.get(annotation, _ELSEWHERE)
 
 
 def _default(field: FieldInfo) -> str:

@@ -87,7 +87,7 @@ def discover_serial() -> Iterator[Found]:
 
 
 def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: set[str], *, writable: bool) -> Found:
-    readings = {fan: _rpm(chip, fan) for fan in chip.fans}
+    readings = {fan: _number(chip, f"fan{fan}_input") for fan in chip.fans}
     with_pwm = [fan for fan in chip.fans if fan in chip.pwms]
     turning = [fan for fan in with_pwm if readings[fan] is not None and readings[fan] != 0]
     missing = [
@@ -96,11 +96,12 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
         if fan not in chip.pwms
     ]
     missing += [f"fan{fan} cannot be read" for fan, rpm in readings.items() if rpm is None]
-    idle = [fan for fan in with_pwm if readings[fan] == 0]
-    if idle and turning:
-        fans = ", ".join(f"fan{fan}" for fan in idle)
-        missing.append(f"{fans} at 0 rpm, left out: not connected, or stopped")
-    fans = turning or idle
+    standing = [fan for fan in with_pwm if readings[fan] == 0]
+    stopped = [fan for fan in standing if _number(chip, f"pwm{fan}") == 0]
+    if turning and (unconnected := [fan for fan in standing if fan not in stopped]):
+        numbers = ", ".join(f"fan{fan}" for fan in unconnected)
+        missing.append(f"{numbers} at 0 rpm although commanded to turn, left out: not connected?")
+    fans = sorted([*turning, *stopped]) if turning else standing
     if fans and (closed := [fan for fan in fans if not os.access(chip.path / f"pwm{fan}", os.W_OK)]):
         numbers = ", ".join(f"pwm{fan}" for fan in closed)
         missing.append(f"this user may not write {numbers}: only needed for commands (writable), as root or by udev")
@@ -133,9 +134,9 @@ def _unknown(name: str) -> str:
     return f"what the readings of {name} are is not known: readings count as instantaneous unless tacho says more"
 
 
-def _rpm(chip: ChipFolder, fan: int) -> int | None:
+def _number(chip: ChipFolder, file: str) -> int | None:
     try:
-        return chip.number(f"fan{fan}_input")
+        return chip.number(file)
     except OSError:
         return None
 
