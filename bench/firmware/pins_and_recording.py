@@ -17,13 +17,13 @@ from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 from tests.support.fan_board import FANS
 from tests.support.pin_trace import read_pin_trace
 
-WINDOWS_S = (-7.0, 1.0), (-0.1, 0.45)
+AT_THE_BLOCK_S = (-0.1, 0.45)
 ON_PINS, RECORDED, TWIN, ALARM = "#1f7a3a", "#b26a00", "#0b5c8a", "#b3261e"
 RPM = RAD_S_PER_UNIT["rpm"]
 
 
 def draw(pins: Path, recording: Path, fan: int, output: Path) -> None:
-    """Write the picture of the time around the moment at which the rotor of `fan` was blocked."""
+    """Write the picture: from the first command of `fan` on, and the moment at which its rotor was blocked."""
     mpl.use("Agg")
     from matplotlib import pyplot as plt  # noqa: PLC0415
 
@@ -47,7 +47,9 @@ def draw(pins: Path, recording: Path, fan: int, output: Path) -> None:
     )
     falling_s, end_s = trace.falling_s[fan], clock_s[-1]
     on_pins = trace.speed_rad_s(fan, falling_s)
-    for (tacho, duty, shown), (begin_s, until_s) in zip(columns.T, WINDOWS_S, strict=True):
+    commanded_s = trace.duty_t_s[fan][1] - blocked_s if len(trace.duty_t_s[fan]) > 1 else -1.0
+    windows_s = ((commanded_s - 1.0, 1.0), AT_THE_BLOCK_S)
+    for (tacho, duty, shown), (begin_s, until_s) in zip(columns.T, windows_s, strict=True):
         tacho.vlines(falling_s - blocked_s, 0, 1, lw=0.5, color=ON_PINS)
         tacho.set(yticks=[])
         duty.step(
