@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from pipeline.config.loading import LARGEST_FILE_BYTES, top_level
-from pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, TrayConfig
+from pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, SpoolConfig, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.devices.source_kinds import SOURCE_KINDS
 from schemas.tacho import Tacho
@@ -57,7 +57,7 @@ def page() -> str:
         "What a reading is of the speed ([tachos](../explanation/tachos.md)).\n",
         _table(Tacho, but=()),
         "## `[bus]`\n",
-        _table(BusConfig, but=("security", "zenoh")),
+        _table(BusConfig, but=("security", "spool", "zenoh")),
         "## `[bus.security]`\n",
         "Certificates and roles ([security](../how-to/security.md)). Without this section there are none.\n",
         _table(SecurityConfig, but=()),
@@ -65,6 +65,10 @@ def page() -> str:
         "Settings of Zenoh itself, passed through to every session and to the router: path = value, with the paths of "
         'Zenoh\'s own configuration, as `"transport/unicast/max_sessions" = 5000`. Refused: what Zenoh does not know, '
         "and what fantwin sets itself.\n",
+        "## `[bus.spool]`\n",
+        "What a process keeps on disk of what it has published, in `run_folder/spool`, for consumers that are cut off "
+        "for long ([partitions](../how-to/deployment.md#partitions)). Without this section nothing.\n",
+        _table(SpoolConfig, but=()),
         "## `[launcher]`\n",
         _table(LauncherConfig, but=()),
     ]
@@ -86,8 +90,10 @@ def page() -> str:
 def _sources() -> Iterator[str]:
     for kind, row in SOURCE_KINDS.items():
         module, _, name = row.config.partition(":")
-        yield f'### `source = {{ kind = "{kind}", ... }}`\n'
-        yield _table(getattr(import_module(module), name), but=("kind",))
+        model = getattr(import_module(module), name)
+        has_keys = set(model.model_fields) > {"kind"}
+        yield f'### `source = {{ kind = "{kind}"{", ..." if has_keys else ""} }}`\n'
+        yield _table(model, but=("kind",)) if has_keys else "It has no other keys.\n"
 
 
 def _table(model: type[BaseModel], but: Iterable[str]) -> str:
@@ -114,10 +120,10 @@ def _values(field: FieldInfo) -> str:
 
 
 def _type_words(annotation: Any) -> str:
-    if get_origin(annotation) is Literal:
-        return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
     if get_origin(annotation) is Annotated:
         return _type_words(get_args(annotation)[0])
+    if get_origin(annotation) is Literal:
+        return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
     if get_origin(annotation) is UnionType:
         return " or ".join(_type_words(each) for each in get_args(annotation))
     if get_origin(annotation) is dict:

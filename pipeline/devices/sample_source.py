@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import ClassVar, Protocol, TypeAlias
 
 from pydantic import BaseModel
 
@@ -24,6 +24,9 @@ MOST_FANS = 1024
 
 class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """Base of every kind's settings, `source = { kind = "...", ... }` of a [[tray]]: frozen, unknown keys refused."""
+
+    takes_pushed: ClassVar[bool] = False
+    """whether the samples of the tray are those that clients push over the bus"""
 
     kind: str
 

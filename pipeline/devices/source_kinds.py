@@ -25,6 +25,12 @@ SOURCE_KINDS: dict[str, SourceKind] = {
     "serial": SourceKind(
         config="pipeline.devices.serial_config:SerialConfig", source="pipeline.devices.serial_source:SerialSource"
     ),
+    "push": SourceKind(
+        config="pipeline.devices.push_config:PushConfig", source="pipeline.devices.push_source:PushSource"
+    ),
+    "hwmon": SourceKind(
+        config="pipeline.devices.hwmon_config:HwmonConfig", source="pipeline.devices.hwmon_source:HwmonSource"
+    ),
 }
 
 
