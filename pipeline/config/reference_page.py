@@ -148,21 +148,22 @@ def _values(field: FieldInfo) -> str:
 
 
 def _type_words(annotation: Any) -> str:
-    if get_origin(annotation) is Annotated:
-        return _type_words(get_args(annotation)[0])
-    if get_origin(annotation) is Literal:
-        return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
-    if get_origin(annotation) is UnionType:
-        return " or ".join(_type_words(each) for each in get_args(annotation))
-    if get_origin(annotation) is dict:
-        return f"table of {_type_words(get_args(annotation)[1])}s"
-    if get_origin(annotation) is tuple:
-        of_one = _type_words(get_args(annotation)[0])
-        if of_one == "table":
-            return "list of tables"
-        return of_one if of_one == _ELSEWHERE else f"list of {of_one}"
-    is_table = _is_model(annotation) and annotation not in (SourceConfig, Tacho)
-    return "table" if is_table else _TYPE_WORDS.get(annotation, _ELSEWHERE)
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    words = _TYPE_WORDS.get(annotation, _ELSEWHERE)
+    if origin is Annotated:
+        words = _type_words(arguments[0])
+    elif origin is Literal:
+        words = " or ".join(f"`{json.dumps(value)}`" for value in arguments)
+    elif origin is UnionType:
+        words = " or ".join(map(_type_words, arguments))
+    elif origin is dict:
+        words = f"table of {_type_words(arguments[1])}s"
+    elif origin is tuple:
+        of_one = _type_words(arguments[0])
+        words = of_one if of_one == _ELSEWHERE else "list of tables" if of_one == "table" else f"list of {of_one}"
+    elif _is_model(annotation) and annotation not in (SourceConfig, Tacho):
+        words = "table"
+    return words
 
 
 def _default(field: FieldInfo) -> str:
