@@ -45,6 +45,13 @@ class ReferenceConditions:
         values = {"supply_voltage_v": self.supply_voltage_v, "temperature_c": self.temperature_c}
         return tuple(name for name, value in values.items() if value is not None)
 
+    @property
+    def in_words(self) -> str:
+        """The quantities and their reference values."""
+        supply = "" if self.supply_voltage_v is None else f"supply voltage (reference {self.supply_voltage_v:.4g} V)"
+        air = "" if self.temperature_c is None else f"temperature (reference {self.temperature_c:.3g} °C)"
+        return " and ".join(filter(None, (supply, air)))
+
     def torque_ratio(self, supply_voltage_v: Array) -> Array:
         """r: the torque of a command relative to that at the reference voltage."""
         assert self.supply_voltage_v is not None

@@ -128,6 +128,11 @@ class TwinIntegratorCore(Core):
         """docs/explanation/deciding.md explains each counter."""
         return {**self._counts, **self.tray.counters()}
 
+    def notes(self) -> list[str]:
+        """Which columns the twin needs."""
+        conditions = self._twin.card.conditions
+        return [f"twin {self._twin.card.name} allows for {conditions.in_words}"] if conditions else []
+
     def problem(self) -> str:
         """A twin that does not fit the grid it receives, or a grid whose times have gone back."""
         old = self._old_samples.problem("grid samples", "twin_integrator and scorer")

@@ -139,6 +139,8 @@ def test_a_column_that_does_not_come_is_said_and_nothing_is_judged(twin: TwinFil
     assert (prediction.invalid_reason == UNKNOWN).all()
     assert not prediction.valid.any()
     assert "needs temperature_c, which the source does not send" in core.problem()
+    (note,) = core.notes()
+    assert note.endswith("allows for supply voltage (reference 12 V) and temperature (reference 20 °C)")
 
 
 def test_a_value_that_stays_away_is_held_for_five_seconds_then_nothing_is_judged_until_it_is_back(
