@@ -87,6 +87,13 @@ class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SEVERITY_WARNING: _ClassVar[Severity]
     SEVERITY_ALARM: _ClassVar[Severity]
 
+class TachoKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    TACHO_KIND_INSTANTANEOUS: _ClassVar[TachoKind]
+    TACHO_KIND_COUNT: _ClassVar[TachoKind]
+    TACHO_KIND_PERIOD: _ClassVar[TachoKind]
+    TACHO_KIND_AVERAGE: _ClassVar[TachoKind]
+
 class StageStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     STAGE_STATUS_STARTING: _ClassVar[StageStatus]
@@ -155,6 +162,10 @@ ACTION_COMMISSION: Action
 SEVERITY_NONE: Severity
 SEVERITY_WARNING: Severity
 SEVERITY_ALARM: Severity
+TACHO_KIND_INSTANTANEOUS: TachoKind
+TACHO_KIND_COUNT: TachoKind
+TACHO_KIND_PERIOD: TachoKind
+TACHO_KIND_AVERAGE: TachoKind
 STAGE_STATUS_STARTING: StageStatus
 STAGE_STATUS_OK: StageStatus
 STAGE_STATUS_DEGRADED: StageStatus
@@ -189,7 +200,7 @@ class InputPosition(_message.Message):
     def __init__(self, topic: _Optional[str] = ..., producer: _Optional[str] = ..., sequence: _Optional[int] = ..., consumed_count: _Optional[int] = ..., contiguous_from: _Optional[int] = ..., from_timer: _Optional[bool] = ...) -> None: ...
 
 class Raw(_message.Message):
-    __slots__ = ("header", "fans", "host_receive_t_ns", "device_clock_us", "device_sequence", "command", "speed_rad_s", "supply_voltage_v", "current_a", "temperature_c")
+    __slots__ = ("header", "fans", "host_receive_t_ns", "device_clock_us", "device_sequence", "command", "speed_rad_s", "supply_voltage_v", "current_a", "temperature_c", "tachos")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     HOST_RECEIVE_T_NS_FIELD_NUMBER: _ClassVar[int]
@@ -200,6 +211,7 @@ class Raw(_message.Message):
     SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
     CURRENT_A_FIELD_NUMBER: _ClassVar[int]
     TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    TACHOS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     host_receive_t_ns: _containers.RepeatedScalarFieldContainer[int]
@@ -210,7 +222,48 @@ class Raw(_message.Message):
     supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
     current_a: _containers.RepeatedScalarFieldContainer[float]
     temperature_c: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., host_receive_t_ns: _Optional[_Iterable[int]] = ..., device_clock_us: _Optional[_Iterable[int]] = ..., device_sequence: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
+    tachos: _containers.RepeatedCompositeFieldContainer[StatedTacho]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., host_receive_t_ns: _Optional[_Iterable[int]] = ..., device_clock_us: _Optional[_Iterable[int]] = ..., device_sequence: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ..., tachos: _Optional[_Iterable[_Union[StatedTacho, _Mapping]]] = ...) -> None: ...
+
+class StatedTacho(_message.Message):
+    __slots__ = ("kind", "pulses", "window_s", "update_s", "delay_s", "step_rad_s")
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    PULSES_FIELD_NUMBER: _ClassVar[int]
+    WINDOW_S_FIELD_NUMBER: _ClassVar[int]
+    UPDATE_S_FIELD_NUMBER: _ClassVar[int]
+    DELAY_S_FIELD_NUMBER: _ClassVar[int]
+    STEP_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    kind: TachoKind
+    pulses: int
+    window_s: float
+    update_s: float
+    delay_s: float
+    step_rad_s: float
+    def __init__(self, kind: _Optional[_Union[TachoKind, str]] = ..., pulses: _Optional[int] = ..., window_s: _Optional[float] = ..., update_s: _Optional[float] = ..., delay_s: _Optional[float] = ..., step_rad_s: _Optional[float] = ...) -> None: ...
+
+class PushedSamples(_message.Message):
+    __slots__ = ("header", "fans", "t_ns", "first_number", "newest_t_ns", "command", "speed_rad_s", "supply_voltage_v", "current_a", "temperature_c")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    FIRST_NUMBER_FIELD_NUMBER: _ClassVar[int]
+    NEWEST_T_NS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_FIELD_NUMBER: _ClassVar[int]
+    SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    fans: int
+    t_ns: _containers.RepeatedScalarFieldContainer[int]
+    first_number: int
+    newest_t_ns: int
+    command: _containers.RepeatedScalarFieldContainer[float]
+    speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
+    current_a: _containers.RepeatedScalarFieldContainer[float]
+    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., first_number: _Optional[int] = ..., newest_t_ns: _Optional[int] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Grid(_message.Message):
     __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing", "supply_voltage_v", "current_a", "temperature_c")
@@ -580,8 +633,22 @@ class Note(_message.Message):
     text: str
     def __init__(self, tray: _Optional[str] = ..., text: _Optional[str] = ...) -> None: ...
 
+class AcceptedSamples(_message.Message):
+    __slots__ = ("tray", "fans", "command_min", "command_max", "speed_max_rad_s")
+    TRAY_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_MIN_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_MAX_FIELD_NUMBER: _ClassVar[int]
+    SPEED_MAX_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    tray: str
+    fans: int
+    command_min: float
+    command_max: float
+    speed_max_rad_s: float
+    def __init__(self, tray: _Optional[str] = ..., fans: _Optional[int] = ..., command_min: _Optional[float] = ..., command_max: _Optional[float] = ..., speed_max_rad_s: _Optional[float] = ...) -> None: ...
+
 class Health(_message.Message):
-    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays")
+    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays", "accepts")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STAGE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
@@ -601,6 +668,7 @@ class Health(_message.Message):
     NEWEST_OUTPUT_T_NS_FIELD_NUMBER: _ClassVar[int]
     NOTES_FIELD_NUMBER: _ClassVar[int]
     TRAYS_FIELD_NUMBER: _ClassVar[int]
+    ACCEPTS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     stage: str
     instance: str
@@ -620,4 +688,5 @@ class Health(_message.Message):
     newest_output_t_ns: int
     notes: _containers.RepeatedCompositeFieldContainer[Note]
     trays: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ...) -> None: ...
+    accepts: _containers.RepeatedCompositeFieldContainer[AcceptedSamples]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ..., accepts: _Optional[_Iterable[_Union[AcceptedSamples, _Mapping]]] = ...) -> None: ...

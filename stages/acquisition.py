@@ -1,7 +1,8 @@
 """Acquisition: the readings of a tray's source in, raw samples out; commands back to the device.
 
 Reads: topic `command` (fan commands in the tray's command unit, set-points in rad/s), and the source that `source` of
-the [[tray]] names (pipeline/devices/source_kinds.py; speed in the tray's speed unit).
+the [[tray]] names (pipeline/devices/source_kinds.py; speed in the tray's speed unit). Where clients push the samples of
+a tray over the bus, that source is topic `reading` (time of the client in ns, command, speed in rad/s).
 Writes: topic `raw`: device clock (us, wraps), device sequence (wraps), host time of receipt (ns), command, speed
 (rad/s), and where the source measures them supply voltage (V), current (A), temperature (degrees Celsius).
 Timing: a message holds what arrives within `block_s` (pipeline/devices/sample_blocks.py), and is sent when the last of
@@ -27,6 +28,7 @@ from pipeline.devices.device_clock import UINT32
 from pipeline.devices.device_sequence import DeviceSequence
 from pipeline.devices.host_clock import HOST_CLOCK, HostClock
 from pipeline.devices.input_quality import InputQuality
+from pipeline.devices.push_source import PushSource
 from pipeline.devices.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
 from pipeline.devices.sample_source import (
     LinkUp,
@@ -40,7 +42,8 @@ from pipeline.devices.source_kinds import build_source
 from pipeline.errors import UserError
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
-from schemas.messages import Array, Command, Raw
+from schemas.messages import AcceptedSamples, Array, Command, PushedSamples, Raw, StatedTacho
+from schemas.tacho import Tacho
 from schemas.topics import most_samples
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
@@ -85,8 +88,8 @@ def within(value: float, low: float, high: float) -> bool:
     return low - tolerance <= value <= high + tolerance
 
 
-def raw_message(block: Sequence[_Received], tray: TrayConfig) -> Raw:
-    """One message of samples that agree in their columns."""
+def raw_message(block: Sequence[_Received], tray: TrayConfig, tachos: tuple[StatedTacho, ...] = ()) -> Raw:
+    """One message of samples that agree in their columns. tachos: what their source states to measure."""
     readings = [received.reading for received in block]
     auxiliary: dict[str, Any] = {
         column.name: _float32([getattr(r, column.name) for r in readings]) for column in AUXILIARY
@@ -98,6 +101,7 @@ def raw_message(block: Sequence[_Received], tray: TrayConfig) -> Raw:
         device_sequence=_uint32(r.sequence for r in readings),
         command=np.array([r.command for r in readings], np.float64),
         speed_rad_s=np.array([r.speed for r in readings], np.float64) * RAD_S_PER_UNIT[tray.speed_unit],
+        tachos=tachos,
         **auxiliary,
     )
 
@@ -112,7 +116,7 @@ def _float32(rows: list[tuple[float, ...]]) -> Array:
     return np.array(rows if rows[0] else (), np.float32)
 
 
-Item: TypeAlias = BlockEvent | Command
+Item: TypeAlias = BlockEvent | Command | PushedSamples
 
 
 class AcquisitionCore(Core):
@@ -140,6 +144,9 @@ class AcquisitionCore(Core):
         self._sequence = DeviceSequence()
         self._most_samples = most_samples(tray.fans)
         """in a message, however fast a line is"""
+        self._stated_tachos = tuple(map(StatedTacho.of, tray.stated_tachos))
+        self._tachos: tuple[Tacho, ...] = ()
+        """as the device itself says"""
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
@@ -152,6 +159,19 @@ class AcquisitionCore(Core):
         if isinstance(item, Command):
             self._send(item)
             return []
+        if isinstance(item, PushedSamples):
+            return self._take_pushed(item)
+        return self._take(item)
+
+    def _take_pushed(self, item: PushedSamples) -> list[Raw]:
+        """Handle samples of a client as those of any source."""
+        if not isinstance(self._source, PushSource):
+            self._counts["refused_readings"] += len(item.t_ns)
+            return []
+        events = self._source.events(item, self._host_clock.now_ns())
+        return [raw for event in events for block in self._blocks.add(event) for raw in self._take(block)]
+
+    def _take(self, item: BlockEvent) -> list[Raw]:
         self._processed = item
         if isinstance(item, ReadingBlock):
             return self._receive(item)
@@ -196,7 +216,22 @@ class AcquisitionCore(Core):
 
     def problem(self) -> str:
         """What is wrong with the connection now, and for a minute that the host clock was set."""
-        return "; ".join(filter(None, (self._problem_of_line(), self._problem_of_host_clock())))
+        of_clients = self._source.problem(self._now_ns) if isinstance(self._source, PushSource) else ""
+        return "; ".join(filter(None, (of_clients, self._problem_of_line(), self._problem_of_host_clock())))
+
+    def accepts(self) -> AcceptedSamples | None:
+        """The ranges of the tray, where its samples are pushed."""
+        tray = self._tray
+        if not tray.source.takes_pushed:
+            return None
+        speed_max_rad_s = tray.speed_max * RAD_S_PER_UNIT[tray.speed_unit]
+        return AcceptedSamples(
+            tray=tray.name,
+            fans=tray.fans,
+            command_min=tray.command_min,
+            command_max=tray.command_max,
+            speed_max_rad_s=speed_max_rad_s,
+        )
 
     def _problem_of_host_clock(self) -> str:
         step = self._host_clock.last_step
@@ -229,12 +264,25 @@ class AcquisitionCore(Core):
         messages: list[Raw] = []
         samples: list[_Received] = []
         for batch in block.batches:
+            if batch.tachos != self._tachos:
+                messages += self._message(samples)
+                samples = []
+                self._follow_device(batch.tachos)
             for received in self._samples(batch):
                 if samples and (len(samples) == self._most_samples or received.columns != samples[0].columns):
-                    messages.append(raw_message(samples, self._tray))
+                    messages += self._message(samples)
                     samples = []
                 samples.append(received)
-        return [*messages, raw_message(samples, self._tray)] if samples else messages
+        return [*messages, *self._message(samples)]
+
+    def _message(self, samples: Sequence[_Received]) -> list[Raw]:
+        return [raw_message(samples, self._tray, self._stated_tachos)] if samples else []
+
+    def _follow_device(self, tachos: tuple[Tacho, ...]) -> None:
+        """What the device itself says goes into the messages, whatever the configuration says."""
+        self._tachos = tachos
+        stated = tachos[:1] if len(set(tachos)) == 1 else tachos
+        self._stated_tachos = tuple(map(StatedTacho.of, stated or self._tray.stated_tachos))
 
     def _samples(self, batch: ReadingBatch) -> Iterator[_Received]:
         """The samples that are new and plausible; all others are counted."""
@@ -380,12 +428,18 @@ def check(context: Context) -> list[str]:
         return [str(error)]
 
 
+def topics_read(_config: AcquisitionConfig, trays: Sequence[TrayConfig]) -> tuple[str, ...]:
+    """Samples of clients only where a tray takes them."""
+    return ("command", "reading") if any(tray.source.takes_pushed for tray in trays) else ("command",)
+
+
 STAGE = Stage(
     name="acquisition",
     about="readings of a tray's source to raw samples, and commands to its device",
-    reads=("command",),
+    reads=("command", "reading"),
     writes=("raw",),
     config=AcquisitionConfig,
     build=build,
     check=check,
+    chooses=topics_read,
 )

@@ -12,9 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import ClassVar, Protocol, TypeAlias
 
 from pydantic import BaseModel
+
+from schemas.tacho import Tacho
 
 MOST_FANS = 1024
 """of a tray: those whose samples come in one reading"""
@@ -23,12 +25,21 @@ MOST_FANS = 1024
 class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """Base of every kind's settings, `source = { kind = "...", ... }` of a [[tray]]: frozen, unknown keys refused."""
 
+    takes_pushed: ClassVar[bool] = False
+    """whether the samples of the tray are those that clients push over the bus"""
+
     kind: str
 
     @property
     def most_fans(self) -> int:
         """The most fans of a tray with this source."""
         return MOST_FANS
+
+    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
+        """What readings of this source are of the speed, one for all fans or one for each; None if the kind of source
+        does not determine it. `tacho` of the [[tray]] overrides it."""
+        del fans
+        return None
 
 
 def too_many_fans(kind: str, fans: int, most: int) -> str:
@@ -93,6 +104,8 @@ class ReadingBatch:
     items: Sequence[Reading | Rejected]
     byte_count: int = 0
     """bytes received, where the source counts them"""
+    tachos: tuple[Tacho, ...] = ()
+    """what the device itself says that it measures, one for all fans or one for each; empty where it does not say"""
 
 
 @dataclass(frozen=True, slots=True)

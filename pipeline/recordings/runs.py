@@ -107,14 +107,16 @@ def read_runs(
 
 def merged(messages: Sequence[Raw]) -> list[Raw]:
     """The same samples in as few messages as possible; the many arrays of small ones take more memory than samples."""
-    groups = groupby(messages, key=lambda raw: (raw.fans, len(raw.device_clock_us) > 0, [*auxiliary_columns(raw)]))
+    groups = groupby(
+        messages, key=lambda raw: (raw.fans, len(raw.device_clock_us) > 0, raw.tachos, [*auxiliary_columns(raw)])
+    )
     return [_one(list(group)) for _, group in groups]
 
 
 def _one(messages: Sequence[Raw]) -> Raw:
     names = ("host_receive_t_ns", "device_clock_us", "command", "speed_rad_s", *auxiliary_columns(messages[0]))
     columns = {name: np.concatenate([getattr(raw, name) for raw in messages]) for name in names}
-    return Raw(header=messages[0].header, fans=messages[0].fans, **columns)
+    return Raw(header=messages[0].header, fans=messages[0].fans, tachos=messages[0].tachos, **columns)
 
 
 def no_samples(path: Path, from_s: float, to_s: float) -> RecordingError:
@@ -143,7 +145,7 @@ def recorded_tray(
     runs = tuple(_run(path, tray, segment, start_t_ns, fans) for segment in segments)
     metadata = read_metadata(path)
     try:
-        tacho = tacho_of_each_fan(metadata.tacho(tray), messages[0].fans)
+        tacho = tacho_of_each_fan(metadata.tacho(tray, messages[0].tachos), messages[0].fans)
     except (ValueError, RecordingError) as error:
         raise RecordingError(f"{path}: {error}") from error
     chosen = tacho if fans is None else tuple(tacho[fan] for fan in fans)

@@ -52,8 +52,15 @@ def first_grid_time(t_ns: int, period_ns: int) -> int:
 class SampleGrid:
     """The grid of one tray. Samples that are dropped and gaps are counted."""
 
-    def __init__(self, tachos: Sequence[Tacho], timing: GridTiming, decision_rules: DecisionRules) -> None:
-        """tachos: one for each fan; readings that a tacho shows until the next one are held."""
+    def __init__(
+        self,
+        tachos: Sequence[Tacho],
+        timing: GridTiming,
+        decision_rules: DecisionRules,
+        link_wait_ns: int = 0,
+    ) -> None:
+        """tachos: one for each fan; readings that a tacho shows until the next one are held. link_wait_ns: how long a
+        gap is not published because its samples may still come."""
         self._fans = fans = len(tachos)
         self._is_held = np.array([tacho.held_s > 0.0 for tacho in tachos])
         self._period_ns = timing.period_ns
@@ -77,7 +84,10 @@ class SampleGrid:
         self._not_before_t_ns = NEVER_NS  # earlier samples are not accepted: the clock has restarted
         self._pending: list[Grid] = []  # not yet published
         self._in_gap = False
+        self._link_wait_ns = link_wait_ns
         self._silence_ns = 0
+        self._shown_silence_ns = 0
+        """that of the source, as far as its producer has shown that it has sent nothing"""
         self._tick_t_ns: int | None = None
         self._set_back_ns = 0  # by how much the host clock was set back, until it has caught up
         self._producer = ""
@@ -96,14 +106,19 @@ class SampleGrid:
             self._add(message, is_new=message.header.producer == self._guard.producer)
         return self._published()
 
-    def tick(self, now_ns: int) -> list[Grid]:
-        """Add up how long no samples have arrived; past the watermark, publish the grid without them."""
+    def tick(self, now_ns: int, *, is_complete: bool = True) -> list[Grid]:
+        """Add up how long no samples have arrived; past the watermark, publish the grid without them.
+
+        is_complete: all that was sent until now has arrived. Otherwise the link may be cut, and the samples be kept.
+        """
         if self._tick_t_ns is not None:
             self._silence_ns += min(max(now_ns - self._tick_t_ns, 0), LONGEST_TICK_NS)
         self._tick_t_ns = now_ns
-        if self._silence_ns < self._watermark_ns:
+        if is_complete or self._silence_ns > self._link_wait_ns:
+            self._shown_silence_ns = self._silence_ns
+        if self._shown_silence_ns < self._watermark_ns:
             return []
-        return self.publish_until(self._newest_t_ns + self._silence_ns - self._watermark_ns)
+        return self.publish_until(self._newest_t_ns + self._shown_silence_ns - self._watermark_ns)
 
     def publish_until(self, t_ns: int) -> list[Grid]:
         """Publish the grid up to `t_ns` without waiting for more samples."""
@@ -137,7 +152,7 @@ class SampleGrid:
 
     def _add(self, item: Raw, is_new: bool) -> None:
         """Add the samples of a message of the line; is_new: neither repeated nor one of an ended session."""
-        self._silence_ns = 0
+        self._silence_ns = self._shown_silence_ns = 0
         times, restarts = self._times(item, is_new)
         accepted = [k for k, t_ns in enumerate(times) if self._is_accepted(t_ns, is_new, after_restart=k in restarts)]
         if accepted:

@@ -79,7 +79,8 @@ def test_a_third_party_decodes_the_bytes(message):
             assert same(ours.ravel(), np.asarray(list(theirs), dtype=own_columns[f.name].dtype)), f.name
         elif isinstance(ours, tuple):
             for our, their in zip(ours, theirs, strict=True):
-                assert all(same(getattr(our, g.name), getattr(their, g.name)) for g in fields(our)), f.name
+                values = [(getattr(our, g.name), getattr(their, g.name)) for g in fields(our)]
+                assert all(same(mine, type(mine)(other)) for mine, other in values), f.name
         elif f.name != "header":
             assert same(ours, type(ours)(theirs)), f.name
 

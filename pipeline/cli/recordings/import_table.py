@@ -62,7 +62,7 @@ def import_table(
     temperature: TemperatureOption = None,
     tray: Annotated[str, typer.Option(help="Name of the tray in the recording.")] = "tray1",
     tacho: Annotated[
-        Literal["instantaneous", "count", "period"], typer.Option(help="How the speeds were measured.")
+        Literal["instantaneous", "count", "average", "period"], typer.Option(help="How the speeds were measured.")
     ] = "instantaneous",
     pulses: Annotated[int, typer.Option(help="Pulses of a tacho per revolution.")] = 2,
     window_s: Annotated[
@@ -108,7 +108,7 @@ def import_table(
 
 
 def _tachos(
-    kind: Literal["instantaneous", "count", "period"],
+    kind: Literal["instantaneous", "count", "average", "period"],
     pulses: int,
     windows_s: Sequence[float],
     update_s: float,
