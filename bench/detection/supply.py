@@ -4,7 +4,7 @@ Simulated dc fans under a moving command. For each seed, a hybrid twin is traine
 the same run, and calibrated on two other runs. Printed are the free-run error on another run, the false alarms of that
 run, and of runs with a fault of one fan the cause that is named first at the last diagnosis.
 
-    python -m bench.detection.supply [--seeds 3] [--seconds 300]
+    python -m bench.detection.supply [--seeds 3] [--seconds 300] [--model physical]
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ FAULTY = 1
 PER_DAY = 1.0
 """false alarms of a tray that the limits are calibrated for"""
 MEASURED: tuple[Measured, ...] = ("supply_voltage_v", "temperature_c")
-WANDERS = (0.0, 0.05)
+WANDERS = (0.05, 0.0)
 STAGES = ("resampler", "twin_integrator", "scorer")
 
 
@@ -164,6 +164,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--model", choices=("hybrid", "physical"), default="hybrid")
     arguments = parser.parse_args()
     seconds = arguments.seconds
     errors: dict[tuple[float, str], list[float]] = {}
@@ -175,7 +176,7 @@ def main() -> None:
                 training, other = (simulated(100 * seed + k, wander, seconds) for k in (1, 2))
                 for label in ("with", "without"):
                     as_known = [run if label == "with" else replace(run, auxiliary={}) for run in (training, other)]
-                    twin = train_twin(as_known[:1], [], "hybrid", name=label)
+                    twin = train_twin(as_known[:1], [], arguments.model, name=label)
                     rmse = evaluate(twin, as_known[1:]).pooled.rmse_rad_s
                     errors.setdefault((wander, label), []).append(float("nan") if rmse is None else rmse)
                     healthy = [simulated(100 * seed + k, wander, seconds) for k in (3, 4)]
@@ -193,8 +194,8 @@ def main() -> None:
                         start_t_ns = EPOCH_NS + round(start_s * NS_PER_S)
                         counts = named.setdefault((wander, label, case.name), Counter())
                         counts[cause_named(alarms, start_t_ns)] += 1
-            print(f"\n== {seed + 1} of {arguments.seeds} seeds, {seconds:g} s each")
-            _print_tables(errors, false_alarms, named, (seed + 1) * FANS * seconds / 3600)
+                print(f"\n== seed {seed} of {arguments.seeds}, so far; {seconds:g} s each")
+                _print_tables(errors, false_alarms, named, (seed + 1) * FANS * seconds / 3600)
 
 
 def _print_tables(
