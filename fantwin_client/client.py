@@ -12,6 +12,7 @@ from fantwin_client.errors import NotReceivedError
 from fantwin_client.tray import Tray
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
+from pipeline.config.roles import SOURCE
 from schemas.units import SpeedUnit
 
 _LOG = logging.getLogger(__name__)
@@ -23,14 +24,14 @@ def connect(endpoint: str = "tcp/127.0.0.1:7447", site: str = "site", **bus: Any
     """Connect to the bus of a site.
 
     endpoint: `bus.endpoint` of the configuration. site: its `site`. bus: other settings of its `[bus]`, such as
-    `mode="client"` where processes meet at `fantwin router`, and
-    `security={"ca": ..., "certificate": ..., "key": ...}`.
+    `mode="client"` where processes meet at `fantwin router`, and `security={"ca": ..., "certificate": ..., "key": ...}`
+    where it has certificates, of role `source`; relative paths start at the working directory.
 
     Raises:
         BusError: the endpoint cannot be used, or nobody answers there as fantwin does.
         pydantic.ValidationError: no such setting.
     """
-    return Client(Bus(BusConfig(endpoint=endpoint, **bus), listens=False), site)
+    return Client(Bus(BusConfig(endpoint=endpoint, **bus), listens=False, roles=(SOURCE,)), site)
 
 
 class Client:

@@ -34,9 +34,11 @@ from pipeline.devices.sample_source import (
     LinkUp,
     Reading,
     ReadingBatch,
+    ReadingLimits,
     Rejected,
     SampleSource,
     SourceContext,
+    within,
 )
 from pipeline.devices.source_kinds import build_source
 from pipeline.errors import UserError
@@ -48,7 +50,6 @@ from schemas.topics import most_samples
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
 STEP_SHOWN_NS = 60 * NS_PER_S  # how long health says that the host clock was set
-FLOAT32_TOLERANCE = 1e-6
 
 
 class AcquisitionConfig(StageConfig):
@@ -82,10 +83,9 @@ class _Received:
         )
 
 
-def within(value: float, low: float, high: float) -> bool:
-    """Whether a float32 value lies in a range given in decimals: 0.1 as float32 is not beyond 0.1."""
-    tolerance = FLOAT32_TOLERANCE * max(abs(low), abs(high))
-    return low - tolerance <= value <= high + tolerance
+def limits_of(tray: TrayConfig) -> ReadingLimits:
+    """Which readings of a tray are accepted."""
+    return ReadingLimits(tray.fans, tray.command_min, tray.command_max, tray.speed_max)
 
 
 def raw_message(block: Sequence[_Received], tray: TrayConfig, tachos: tuple[StatedTacho, ...] = ()) -> Raw:
@@ -134,6 +134,7 @@ class AcquisitionCore(Core):
         """source: takes commands. blocks: its readings. host_clock: gives the times of receipt and of ticks; its steps
         are reported."""
         self._tray = tray
+        self._limits = limits_of(tray)
         self._host_clock = host_clock
         self._seen_step = host_clock.last_step
         self._config = config
@@ -304,7 +305,7 @@ class AcquisitionCore(Core):
             self._counts["no_speed"] += 0  # shown from the first reading on
             self._quality.add_valid()
             return item
-        rejected = item if isinstance(item, Rejected) else self._why_refused(item)
+        rejected = item if isinstance(item, Rejected) else self._limits.why_refused(item)
         if rejected is None:
             assert isinstance(item, Reading)
             return self._with_plausible_speeds(item)
@@ -326,19 +327,6 @@ class AcquisitionCore(Core):
             and -tray.speed_max <= min(speed)
             and max(speed) <= tray.speed_max
         )
-
-    def _why_refused(self, reading: Reading) -> Rejected | None:
-        tray = self._tray
-        if not len(reading.command) == len(reading.speed) == tray.fans:
-            detail = f"a reading of {len(reading.speed)} fans, this tray has {tray.fans}"
-            return Rejected("wrong_fan_count", detail, is_sample=True, setting=f"fans = {tray.fans}")
-        for command in reading.command:
-            # Without its actual command a sample cannot be scored, and a command must not be invented.
-            if not within(command, tray.command_min, tray.command_max):
-                limits = f"command_min = {tray.command_min:g} to command_max = {tray.command_max:g}"
-                detail = f"command {command:g} is outside {limits}"
-                return Rejected("absurd_command", detail, is_sample=True, setting="command_min and command_max")
-        return None
 
     def _with_plausible_speeds(self, reading: Reading) -> Reading:
         speed_max = self._tray.speed_max
@@ -403,7 +391,9 @@ def build_tray_source(context: Context) -> SampleSource:
     """
     tray = context.tray
     try:
-        return build_source(tray.source, SourceContext(tray.fans, tray.speed_unit, context.folder))
+        return build_source(
+            tray.source, SourceContext(tray.fans, tray.speed_unit, context.folder, tray.name, limits_of(tray))
+        )
     except UserError as error:
         raise StageError(f"[[tray]] {tray.name}: {error}") from error
 

@@ -1,9 +1,7 @@
 """Samples that a client pushes over the bus, as a source: their times, their numbers, and whose they are.
 
 The clock of the client is treated as that of a device: it may be wrong by any time and drift, and
-pipeline/devices/device_clock.py maps it to host time. What that needs is the time at which each sample would have been
-received if the client had sent it at once. A client may send several samples together, or after a pause all that it has
-kept meanwhile; the newest sample that it had when it sent them is the one that was not kept.
+pipeline/devices/device_clock.py maps it to host time (pipeline/devices/receipt_times.py: samples that were kept).
 
 A tray has one client at a time, the last one that appeared. What an earlier one still sends is refused, until the later
 one has been silent for a while.
@@ -17,6 +15,7 @@ import numpy as np
 
 from pipeline.devices.device_clock import NS_PER_US, UINT32
 from pipeline.devices.push_config import PushConfig
+from pipeline.devices.receipt_times import ReceiptTimes
 from pipeline.devices.sample_source import LinkUp, Reading, ReadingBatch, Rejected, SourceContext, SourceEvent
 from schemas.auxiliary import auxiliary_columns
 from schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, PushedSamples
@@ -41,8 +40,7 @@ class PushSource:
         self._client = ""
         self._heard_t_ns = 0
         """when the present client was last heard"""
-        self._received_t_ns = 0
-        """of the newest sample"""
+        self._receipts = ReceiptTimes()
         self._earlier: dict[str, None] = {}
         """clients that another one has followed"""
         self._second = ""
@@ -81,18 +79,17 @@ class PushSource:
             self._begin(client)
             events.append(LinkUp())
         self._heard_t_ns = received_t_ns
-        t_ns = message.t_ns
-        if np.any(np.diff(t_ns) <= 0):
+        if np.any(np.diff(message.t_ns) <= 0):
             refused = Rejected("time_order", "sample times do not increase", is_sample=True)
             return [*events, ReadingBatch(received_t_ns, (refused,) * samples)]
         newest_t_ns = max(min(message.newest_t_ns, FURTHEST_T_NS), -FURTHEST_T_NS)
-        ages_ns = newest_t_ns - t_ns
+        ages_ns = newest_t_ns - message.t_ns
         if samples and not 0 <= int(ages_ns[-1]) <= int(ages_ns[0]) <= LARGEST_PERIOD_NS:
             refused = Rejected("absurd_age", "samples are newer than the newest, or older than a day", is_sample=True)
             return [*events, ReadingBatch(received_t_ns, (refused,) * samples)]
-        for row, reading in enumerate(self._readings(message)):
-            self._received_t_ns = max(self._received_t_ns, received_t_ns - int(ages_ns[row]))
-            events.append(ReadingBatch(self._received_t_ns, (reading,)))
+        times = self._receipts.of(received_t_ns, ages_ns.tolist())
+        for t_ns, reading in zip(times, self._readings(message), strict=True):
+            events.append(ReadingBatch(t_ns, (reading,)))
         return events
 
     def _begin(self, client: str) -> None:

@@ -108,7 +108,8 @@ def read_runs(
 def merged(messages: Sequence[Raw]) -> list[Raw]:
     """The same samples in as few messages as possible; the many arrays of small ones take more memory than samples."""
     groups = groupby(
-        messages, key=lambda raw: (raw.fans, len(raw.device_clock_us) > 0, raw.tachos, [*auxiliary_columns(raw)])
+        messages,
+        key=lambda raw: (raw.fans, len(raw.device_clock_us) > 0, raw.tachos, [*auxiliary_columns(raw)]),
     )
     return [_one(list(group)) for _, group in groups]
 

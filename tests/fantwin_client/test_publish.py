@@ -15,6 +15,7 @@ from fantwin_client import Client, CommandError, FanCountError, NoAcquisitionErr
 from fantwin_client.outbox import MOST_SENT_MESSAGES
 from fantwin_client.times import times_ns
 from schemas.topics import BY_NAME
+from stages.acquisition import AcquisitionCore, limits_of
 from tests.support.running_acquisition import SITE, TRAY, Raws, acquisition, push_config, raws_of
 from tests.support.running_chain import eventually
 
@@ -51,10 +52,11 @@ def test_samples_arrive_with_their_times_numbers_and_units(endpoint: str, raws: 
         losses = tray.check()
         assert (losses.published, losses.received, losses.waiting, losses.any) == (105, 105, 0, False)
     raws.wait_for(105)
-    last = raws.messages[-1]
-    np.testing.assert_array_equal(last.supply_voltage_v[-2:], np.full((2, 2), 12.0))
-    np.testing.assert_allclose(last.current_a[-2:], [[0.5, 0.6], [0.7, 0.8]], rtol=1e-6)
-    assert not len(last.temperature_c) and not len(raws.messages[0].supply_voltage_v)
+    measured = [message for message in raws.messages if len(message.supply_voltage_v)]
+    assert np.concatenate([message.supply_voltage_v for message in measured]).tolist() == [[12.0, 12.0]] * 2
+    current_a = np.concatenate([message.current_a for message in measured])
+    np.testing.assert_allclose(current_a, [[0.5, 0.6], [0.7, 0.8]], rtol=1e-6)
+    assert not any(len(message.temperature_c) for message in raws.messages)
     clock_us = raws.column("device_clock_us").astype(np.int64)
     assert clock_us[0] == T_S * 1e6 % 2**32
     np.testing.assert_array_equal(np.diff(clock_us) % 2**32, 10_000)
@@ -130,8 +132,12 @@ def test_what_acquisition_refuses_is_counted_by_reason_and_raised_by_check(
         tray = client.tray(TRAY, speed_unit="rpm")
         tray.publish(T_S, [0.5, 0.5], [30_000.0, 1.0])
         assert tray.check().absurd_speeds == 1, "no sample is lost by that"
-        # the limits of the tray are changed while the client has the old ones
-        running.runner._parts[TRAY].core._tray = push_config(endpoint, tmp_path, fans=3).trays[0]  # type: ignore
+        # the configuration was changed, and the client does not know it yet
+        core, accepted = running.runner._parts[TRAY].core, tray._accepts
+        assert isinstance(core, AcquisitionCore)
+        core._tray = push_config(endpoint, tmp_path, fans=3).trays[0]
+        core._limits = limits_of(core._tray)
+        core.accepts = lambda: accepted
         tray.publish(T_S + 1, [0.5, 0.5], [1.0, 1.0])
         with pytest.raises(fantwin_client.SamplesLostError, match=r"1 refused \(wrong_fan_count\)"):
             tray.check()

@@ -44,9 +44,9 @@ def record(path: Path, profiles: Sequence[Excitation], seconds_each: int) -> Pat
     return path
 
 
-def succeed(*words: object) -> None:
+def succeed(command: str, *words: object) -> None:
     """Run a command of fantwin, and show what it says."""
-    done = fantwin(*words)
+    done = fantwin(command, *words)
     print(done.stdout, end="", flush=True)
     assert done.exit_code == 0, done.output
 
