@@ -242,6 +242,7 @@ class TrayScorer:
             item.predicted_speed_rad_s * density,
             item.reading_missing,
             item.supply_voltage_v,
+            item.current_a,
         )
 
     def _feed_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:

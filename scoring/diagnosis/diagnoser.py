@@ -46,7 +46,8 @@ class _Block:
     reading_missing: Array
     """(n, fans) of bool; empty where the line does not tell"""
     supply_voltage_v: Array
-    """(n, fans); empty where it is not measured"""
+    """(n, fans), as the next; empty where it is not measured"""
+    current_a: Array
 
 
 class Diagnoser:
@@ -94,6 +95,7 @@ class Diagnoser:
         expected_rad_s: Array | float = math.nan,
         reading_missing: Array = _NOT_KNOWN,
         supply_voltage_v: Array = _NOT_MEASURED,
+        current_a: Array = _NOT_MEASURED,
     ) -> None:
         """Store a block; t_ns (n,), the others (n, fans).
 
@@ -101,7 +103,7 @@ class Diagnoser:
         healthy running from which the offset is known. expected_command: the expected healthy balance at
         this speed, apart from the offset; NaN where the speed is unknown. expected_rad_s: what a healthy fan would
         read. reading_missing: where the newest raw sample had no reading; empty where the line does not tell.
-        supply_voltage_v: empty where it is not measured.
+        supply_voltage_v, current_a: empty where it is not measured.
         """
         if period_ns != self._period_ns:
             self._blocks.clear()
@@ -120,6 +122,7 @@ class Diagnoser:
                 reading,
                 reading_missing,
                 supply_voltage_v,
+                current_a,
             )
         )
         oldest_t_ns = int(t_ns[0]) - min(round(WINDOW_S * NS_PER_S), MAX_SAMPLES * period_ns)
@@ -230,10 +233,11 @@ class Diagnoser:
         if any(len(block.reading_missing) for block in blocks):
             lacks = np.zeros(index[-1] + 1, np.bool_)
             lacks[index] = np.concatenate([_lacks(block)[:, fan] for block in blocks])[rows]
-        supply_v = None
-        if any(len(block.supply_voltage_v) for block in blocks):
-            supply_v = np.full(index[-1] + 1, np.nan)
-            supply_v[index] = np.concatenate([_supply_v(block)[:, fan] for block in blocks])[rows]
+        measured: dict[str, Array | None] = {"supply_voltage_v": None, "current_a": None}
+        for name in measured:
+            if any(len(getattr(block, name)) for block in blocks):
+                of_fan = measured[name] = np.full(index[-1] + 1, np.nan)
+                of_fan[index] = np.concatenate([_known_or_nan(block, name)[:, fan] for block in blocks])[rows]
         healthy, period_s = self._healthy[fan], self._period_ns / NS_PER_S
         std_of_one_second = healthy.sigma_command * summed_deviation(healthy.autocorrelation_time_s, period_s)
         offset_s = max(_column(blocks, "offset_s", fan, rows)[-1], period_s)
@@ -246,7 +250,7 @@ class Diagnoser:
             expected_command=expected,
             expected_rad_s=reading,
             reading_missing=lacks,
-            supply_voltage_v=supply_v,
+            **measured,
             fan_offset=float(_column(blocks, "offset_command", fan, rows)[-1]),
             fan_offset_std_error=std_of_one_second / math.sqrt(offset_s),
         )
@@ -260,8 +264,9 @@ def _lacks(block: _Block) -> Array:
     return block.reading_missing if len(block.reading_missing) else ~np.isfinite(block.speed_rad_s)
 
 
-def _supply_v(block: _Block) -> Array:
-    return block.supply_voltage_v if len(block.supply_voltage_v) else np.full(block.command.shape, np.nan)
+def _known_or_nan(block: _Block, name: str) -> Array:
+    values: Array = getattr(block, name)
+    return values if len(values) else np.full(block.command.shape, np.nan)
 
 
 def _message(cause: RankedCause) -> CauseMessage:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from schemas.tacho import Tacho
 from scoring.diagnosis.advice import Advice
+from scoring.diagnosis.current_evidence import GainOfCurrent, gain_of_current
 from scoring.diagnosis.hypotheses import CAUSES, Comparison, Explanation, FaultHypothesis, log_sum
 from scoring.diagnosis.regression_window import Array, HealthyBalance, RegressionWindow, Window
 from scoring.diagnosis.sensor_evidence import (
@@ -124,6 +125,9 @@ def diagnose(
     else:
         nothing, explanations = 0.0, []
     best = max((one.log_evidence for one in explanations), default=0.0)
+    by_current = gain_of_current(window, healthy)
+    if by_current is not None:
+        explanations = [_with_current(one, by_current) for one in explanations]
     names = [one.cause.name for one in explanations] or [cause.name for cause in CAUSES]
     logs = [one.log_evidence for one in explanations] or [0.0] * len(CAUSES)
     names += [STUCK, DROPOUT, CANNOT_TELL]
@@ -133,6 +137,9 @@ def diagnose(
     weight[-1] = 1.0 - weight[:-1].max()
     weight /= weight.sum()
     evidence: dict[str, tuple[Evidence | None, str]] = {one.cause.name: _evidence(one) for one in explanations}
+    if by_current is not None and GAIN_DOWN in evidence:
+        found, sentence = evidence[GAIN_DOWN]
+        evidence[GAIN_DOWN] = found, f"{sentence}, by the current {100 * by_current.change:+.0f} %"
     if knows_supply and GAIN_DOWN in evidence:
         found, sentence = evidence[GAIN_DOWN]
         evidence[GAIN_DOWN] = found, f"{sentence}, beyond the supply voltage, which is measured"
@@ -147,6 +154,15 @@ def diagnose(
         for name, share in zip(names, weight, strict=True)
     ]
     return Diagnosis(tuple(sorted(ranked, key=lambda cause: -cause.probability)))
+
+
+def _with_current(explanation: Explanation, by_current: GainOfCurrent) -> Explanation:
+    """Less drive with what the current says of it; the other causes leave the drive as it is."""
+    if explanation.cause.name != GAIN_DOWN:
+        return explanation
+    size_std = (explanation.high - explanation.low) / (2.0 * 1.96)
+    ratio = by_current.log_ratio(explanation.size, size_std)
+    return replace(explanation, log_evidence=explanation.log_evidence + ratio)
 
 
 def _without_supply(cause: FaultHypothesis) -> FaultHypothesis:
