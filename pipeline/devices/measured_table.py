@@ -154,7 +154,7 @@ def read_table(
     speed_rad_s = np.column_stack([column.values() for column in speeds])
     speed_rad_s *= RAD_S_PER_TABLE_UNIT[unit]
     assumed = _assumed(times.name if times and times.is_assumed else "", "" if found[0][2] else found[0][0])
-    table = _clean(path, t_ns, has_time, command_values, speed_rad_s, unit)
+    table = clean_samples(path, t_ns, has_time, command_values, speed_rad_s, unit)
     return replace(table, assumed=assumed)
 
 
@@ -244,7 +244,7 @@ def _counted_times(rows: int, period: str) -> tuple[Array, Array]:
     return np.arange(rows, dtype=np.int64) * period_ns, np.ones(rows, dtype=np.bool_)
 
 
-def _clean(path: Path, t_ns: Array, has_time: Array, command: Array, speed_rad_s: Array, unit: str) -> Table:
+def clean_samples(path: Path, t_ns: Array, has_time: Array, command: Array, speed_rad_s: Array, unit: str) -> Table:
     """Sort rows by time, hold commands, merge rows of the same time, and count all of it.
 
     A step that changes nothing copies nothing: most tables are in order and may be large.
