@@ -264,7 +264,7 @@ class PushedSamples(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., first_number: _Optional[int] = ..., newest_t_ns: _Optional[int] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Grid(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing", "supply_voltage_v", "current_a", "temperature_c")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -274,6 +274,9 @@ class Grid(_message.Message):
     VALID_FIELD_NUMBER: _ClassVar[int]
     INVALID_REASON_FIELD_NUMBER: _ClassVar[int]
     READING_MISSING_FIELD_NUMBER: _ClassVar[int]
+    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     period_ns: int
@@ -283,10 +286,13 @@ class Grid(_message.Message):
     valid: _containers.RepeatedScalarFieldContainer[bool]
     invalid_reason: _containers.RepeatedScalarFieldContainer[InvalidReason]
     reading_missing: _containers.RepeatedScalarFieldContainer[bool]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., reading_missing: _Optional[_Iterable[bool]] = ...) -> None: ...
+    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
+    current_a: _containers.RepeatedScalarFieldContainer[float]
+    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Prediction(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command", "reading_range_rad_s", "averaged_command", "reading_missing")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command", "reading_range_rad_s", "averaged_command", "reading_missing", "supply_voltage_v", "current_a", "temperature_c")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -303,6 +309,9 @@ class Prediction(_message.Message):
     READING_RANGE_RAD_S_FIELD_NUMBER: _ClassVar[int]
     AVERAGED_COMMAND_FIELD_NUMBER: _ClassVar[int]
     READING_MISSING_FIELD_NUMBER: _ClassVar[int]
+    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     period_ns: int
@@ -319,10 +328,13 @@ class Prediction(_message.Message):
     reading_range_rad_s: _containers.RepeatedScalarFieldContainer[float]
     averaged_command: _containers.RepeatedScalarFieldContainer[float]
     reading_missing: _containers.RepeatedScalarFieldContainer[bool]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ...) -> None: ...
+    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
+    current_a: _containers.RepeatedScalarFieldContainer[float]
+    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Score(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic", "former_command", "former_measured_speed_rad_s", "former_predicted_speed_rad_s", "former_band_variance", "former_smoothed_residual_rad_s", "former_torque_balance_command", "former_speed_baseline_rad_s", "former_balance_baseline_command", "former_score")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic", "supply_voltage_v", "current_a", "temperature_c", "former_command", "former_measured_speed_rad_s", "former_predicted_speed_rad_s", "former_band_variance", "former_smoothed_residual_rad_s", "former_torque_balance_command", "former_speed_baseline_rad_s", "former_balance_baseline_command", "former_score")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -340,6 +352,9 @@ class Score(_message.Message):
     BALANCE_BASELINE_COMMAND_FIELD_NUMBER: _ClassVar[int]
     SCORE_FIELD_NUMBER: _ClassVar[int]
     STATISTIC_FIELD_NUMBER: _ClassVar[int]
+    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
     FORMER_COMMAND_FIELD_NUMBER: _ClassVar[int]
     FORMER_MEASURED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
     FORMER_PREDICTED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
@@ -366,6 +381,9 @@ class Score(_message.Message):
     balance_baseline_command: _containers.RepeatedScalarFieldContainer[float]
     score: _containers.RepeatedScalarFieldContainer[float]
     statistic: _containers.RepeatedScalarFieldContainer[Statistic]
+    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
+    current_a: _containers.RepeatedScalarFieldContainer[float]
+    temperature_c: _containers.RepeatedScalarFieldContainer[float]
     former_command: _containers.RepeatedScalarFieldContainer[float]
     former_measured_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
     former_predicted_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
@@ -375,7 +393,7 @@ class Score(_message.Message):
     former_speed_baseline_rad_s: _containers.RepeatedScalarFieldContainer[float]
     former_balance_baseline_command: _containers.RepeatedScalarFieldContainer[float]
     former_score: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., former_command: _Optional[_Iterable[float]] = ..., former_measured_speed_rad_s: _Optional[_Iterable[float]] = ..., former_predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., former_band_variance: _Optional[_Iterable[float]] = ..., former_smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., former_torque_balance_command: _Optional[_Iterable[float]] = ..., former_speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., former_balance_baseline_command: _Optional[_Iterable[float]] = ..., former_score: _Optional[_Iterable[float]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ..., former_command: _Optional[_Iterable[float]] = ..., former_measured_speed_rad_s: _Optional[_Iterable[float]] = ..., former_predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., former_band_variance: _Optional[_Iterable[float]] = ..., former_smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., former_torque_balance_command: _Optional[_Iterable[float]] = ..., former_speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., former_balance_baseline_command: _Optional[_Iterable[float]] = ..., former_score: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Diagnosis(_message.Message):
     __slots__ = ("cause", "probability", "parameter", "change", "change_low", "change_high", "unit", "evidence")

@@ -251,6 +251,9 @@ class Grid:
     invalid_reason: Array = column("samples x fans", InvalidReason)
     reading_missing: Array = column("samples x fans", np.bool_, optional=True)
     """whether the newest raw sample at that time has no reading, though the speed may be known from those around it"""
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -274,6 +277,9 @@ class Prediction:
     averaged_command: Array = column("samples x fans", np.float64, optional=True)
     reading_missing: Array = column("samples x fans", np.bool_, optional=True)
     """as in Grid"""
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -301,6 +307,9 @@ class Score:
     balance_baseline_command: Array = column("samples x fans", np.float32, added_later=True)
     score: Array = column("samples x fans", np.float32, added_later=True)
     statistic: Array = column("samples x fans", Statistic, added_later=True)
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
     @derived(np.float32)
     def residual_rad_s(self) -> Array:

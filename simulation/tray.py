@@ -8,7 +8,7 @@ takes them as fast as they are computed, and the same seed gives both the same s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -126,6 +126,20 @@ class SimulatedTray:
         given = ~np.isnan(values)
         self._override = np.where(given, np.clip(values, 0.0, 1.0), self._override)
         self._set_point_rad_s = np.where(given, np.nan, self._set_point_rad_s)
+
+    def release(self, fans: NDArray[np.bool_]) -> None:
+        """Let the profile command these fans, (fans,), again."""
+        self._override = np.where(fans, np.nan, self._override)
+
+    def set_faults(self, faults: tuple[Fault, ...]) -> None:
+        """The schedule from now on: that of the settings, with faults added at its end or ended.
+
+        Raises:
+            SimulationError: such fans have no such fault, or there is no such fan.
+        """
+        settings = self.settings
+        check_schedule(faults, settings.fans, settings.duration_s, settings.fan)
+        self.settings = replace(settings, faults=faults)
 
     def set_point(self, values_rad_s: Array) -> None:
         """Start the speed loop: values (fans,) rad/s, NaN leaves a fan unchanged."""

@@ -239,7 +239,7 @@ static void in_real_time(void)
         if (ahead_s > 0.0)
             usleep(ahead_s * 1e6);
         furthest_behind_s = fmax(furthest_behind_s, -ahead_s);
-        bool is_behind = ahead_s < -SAY_BEHIND_S;
+        bool is_behind = ahead_s < (was_behind ? 0.0 : -SAY_BEHIND_S);
         if (is_behind != was_behind)
             fprintf(stderr, "simulator: at %.1f s: %s\n", board_time_s(),
                     is_behind ? "behind real time, this machine is too busy" : "in real time again");

@@ -28,6 +28,8 @@ from pipeline.config.models import (
     nearest,
 )
 from pipeline.config.registry import STAGES
+from pipeline.devices.sample_source import SourceConfig
+from pipeline.devices.source_kinds import SOURCE_KINDS, source_config
 
 LARGEST_FILE_BYTES = 1 << 20
 LONGEST_OVERRIDE = 1000
@@ -235,5 +237,7 @@ def _keys_at(model: type[BaseModel], location: Iterable[int | str]) -> list[str]
     """The keys allowed at a place in a nested model."""
     here: Any = model
     for part in location:
+        if here is SourceConfig:  # the settings of a kind, which has this key
+            here = next(model for model in map(source_config, SOURCE_KINDS) if part in model.model_fields)
         here = _plain(here.model_fields[part].annotation if isinstance(part, str) else get_args(here)[0])
     return [*here.model_fields, *getattr(here, "short_form_keys", ())]

@@ -73,8 +73,11 @@ class PolledDevice(Protocol):
         """Find it, or open a connection. Raises DeviceError."""
         ...
 
-    def read(self) -> Reading:
-        """One reading, NaN for a value that cannot be read. Raises DeviceError where there is no reading at all."""
+    def read(self) -> Reading | Rejected:
+        """One reading, NaN for a value that cannot be read; what is not to be taken for one, with the reason.
+
+        Raises DeviceError where nothing can be read.
+        """
         ...
 
     def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
@@ -192,13 +195,15 @@ class PollingSource:
         except Exception as error:  # noqa: BLE001
             self._count("failed_writes", f"it could not be left as it was found: {_reason(error)}")
 
-    def _read(self) -> Reading:
+    def _read(self) -> Reading | Rejected:
         """A reading with the time of the middle of its request."""
         began_s = time.monotonic()
         reading = self.device.read()
+        if isinstance(reading, Rejected):
+            return reading
         return replace(reading, clock_us=round((began_s + time.monotonic()) / 2.0 * 1e6) % UINT32)
 
-    def _poll_until_lost(self, first: Reading) -> str:
+    def _poll_until_lost(self, first: Reading | Rejected) -> str:
         """Deliver readings until the device is lost, or `stop` is called; returns why it is lost."""
         with self._wake:
             self._is_connected = True
@@ -253,12 +258,12 @@ class PollingSource:
         with self._wake:
             write.has_failed = bool(failure)
             write.is_done.set()
-            is_told = write.is_awaited
-        if failure and not is_told:
+            is_known = write.is_awaited
+        if failure and not is_known:
             self._count("failed_writes", failure)
 
-    def _deliver_reading(self, reading: Reading) -> None:
-        item = replace(reading, sequence=self._sequence % UINT32)
+    def _deliver_reading(self, reading: Reading | Rejected) -> None:
+        item = replace(reading, sequence=self._sequence % UINT32) if isinstance(reading, Reading) else reading
         self._sequence += 1
         self._deliver(ReadingBatch(HOST_CLOCK.now_ns(), (item,)))
 

@@ -69,6 +69,10 @@ class Core(Protocol):
         """Called about every 50 ms. `now_ns` is the host's time, or the replay's while one feeds the stage."""
         return ()
 
+    def confirm_input(self, *, is_complete: bool) -> None:
+        """Called before each `tick`: whether the producer of the main input has shown since the last one that all that
+        it has sent has been processed here. If not, the link may be cut, and what is missing may still come."""
+
     def close(self) -> Sequence[Message]:
         """Called once after the last item: return what is still held, release adapters."""
         return ()

@@ -16,6 +16,7 @@ from pipeline.runtime.free_run import FreeRun, FreeRunInputs
 from pipeline.runtime.stage import StageConfig
 from pipeline.runtime.starting_fans import StartingFans
 from pipeline.runtime.twin_file import TwinFile
+from schemas.auxiliary import auxiliary_columns
 from schemas.messages import Array, Grid, InvalidReason, Prediction
 from schemas.side_by_side import present_columns
 from schemas.standstill import Standstill
@@ -298,6 +299,7 @@ class TrayIntegrator:
             reading_range_rad_s=reading_range if self._averages else nothing,
             averaged_command=averaged_command if self._averages or self.twin.drive is not None else nothing,
             reading_missing=grid.reading_missing,
+            **auxiliary_columns(grid),
         )
 
 

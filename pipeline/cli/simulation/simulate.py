@@ -16,6 +16,8 @@ import typer
 from pydantic import ValidationError
 
 from pipeline.cli.options import JsonOption
+from pipeline.cli.simulation.simulated_hwmon import RATE_HZ, InjectedFaults, tachos_of
+from pipeline.devices.hwmon_simulator import FAULT_FILE, HwmonTree, play_hwmon
 from pipeline.devices.measured_table import read_table
 from pipeline.devices.simulated_device import PlaybackCounts, PseudoTerminal, play, wait_for_reader
 from pipeline.devices.table_device import TableDevice
@@ -40,6 +42,7 @@ _TACHO_OPTIONS = {
 }
 
 _LINE = "Serial line"
+_HWMON = "Fans of a computer instead"
 _RECORDING = "Write a recording instead"
 _FILE = "Play a measured file instead of simulating"
 _TACHO = "Tacho"
@@ -48,7 +51,9 @@ _IMPERFECTIONS = "Imperfections of real trays"
 
 def simulate(
     fans: Annotated[int, typer.Option(help="Number of fans, 1 to 64.")] = 8,
-    rate: Annotated[float, typer.Option(help="Samples per second.")] = 100.0,
+    rate: Annotated[
+        float | None, typer.Option(help="Samples per second; default 100, with --hwmon how often it serves its files.")
+    ] = None,
     fan: Annotated[
         Literal["dc", "4-pin"], typer.Option(help="Kind of fan: on a bridge, or with a PWM input of its own.")
     ] = "dc",
@@ -67,6 +72,18 @@ def simulate(
     wait: Annotated[
         bool, typer.Option("--wait-for-reader", help="Start when a program has opened the port.", rich_help_panel=_LINE)
     ] = False,
+    hwmon: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder of files to serve as a driver in /sys/class/hwmon does. Write a fault into its file `fault`.",
+            rich_help_panel=_HWMON,
+        ),
+    ] = None,
+    chip: Annotated[
+        str,
+        typer.Option(help="Name of the chip, which says how its driver measures speeds.", rich_help_panel=_HWMON),
+    ] = "nct6798",
     fault: Annotated[
         list[str] | None,
         typer.Option(metavar="KIND:fan=N,start=S,stop=S,size=X", help="Scheduled fault. Repeatable."),
@@ -178,10 +195,15 @@ def simulate(
 
     Example: fantwin simulate --link /tmp/fan-tray --fault inlet:fan=2,start=10,stop=18,size=1.6 --truth truth.json
 
+    Fans of a computer: fantwin simulate --hwmon hw --fan 4-pin --fans 3 --profile thermostat
+
     A rack: fantwin simulate --fan 4-pin --fans 4 --tacho count --window 1.0 --pulses 2 --rate 10 --profile thermostat
     """
     device: SimulatedTray | TableDevice
     tachos = INSTANTANEOUS
+    tray: SimulatedTray | None = None
+    if hwmon and (from_csv or recording or link or wait):
+        raise UsageError("--hwmon excludes --from-csv, --recording, --link and --wait-for-reader")
     if from_csv:
         if recording or fault:
             raise UsageError(
@@ -198,7 +220,9 @@ def simulate(
             _tacho(kind=tacho, pulses=pulses, window_s=one, update_s=update, delay_s=tacho_delay)
             for one in window or [0.0]
         )
-        device = _tray(
+        if hwmon and tacho == "instantaneous":
+            tachos = tachos_of(chip)
+        device = tray = _tray(
             faults=fault or [],
             tachos=tachos,
             noise_rad_s=noise,
@@ -206,7 +230,7 @@ def simulate(
             clock={"drift_ppm": drift_ppm, "start_us": clock_start_us},
             fans=fans,
             fan=fan,
-            rate_hz=rate,
+            rate_hz=rate if rate is not None else RATE_HZ if hwmon else 100.0,
             duration_s=math.inf if duration is None else duration,
             profile=profile,
             seed=seed,
@@ -215,8 +239,10 @@ def simulate(
             lost=lost,
             jitter_us=jitter_us,
         )
-        summary_of = partial(_summary_of_tray, device)
-    if recording:
+        summary_of = partial(_summary_of_tray, tray)
+    if hwmon and tray:
+        played = _serve_hwmon(tray, hwmon, chip, err=json_output)
+    elif recording:
         if duration is None or link or wait:
             raise UsageError("--recording needs --duration, and excludes --link and --wait-for-reader")
         if not math.isfinite(duration):
@@ -225,25 +251,52 @@ def simulate(
             raise UserError(f"{recording}: exists; name another file with --recording, or replace it with --force")
         epoch_ns = clock.time_ns() if epoch_ns is None else epoch_ns
         played = record(device, recording, epoch_ns, duration, speed_unit, tachos)
-        summary = summary_of(played, complete=True)
-        _save(truth, summary)
     else:
-        stop = threading.Event()
-        stop_on_signals(stop)
-        line = PseudoTerminal(link)
-        try:
-            _save(truth, summary_of(PlaybackCounts(), complete=False))
-            fans_on = "1 fan on" if device.fans == 1 else f"{device.fans} fans on"
-            typer.echo(f"{fans_on} {link or line.port}: {protocol}, speeds in {speed_unit}", err=json_output)
-            if wait:
-                wait_for_reader(line, protocol, stop)
-            on_start = partial(_save_start, truth, summary_of)
-            played = play(device, line, protocol, RAD_S_PER_UNIT[speed_unit], stop, on_start)
-            summary = summary_of(played, complete=True)
-            _save(truth, summary)
-        finally:
-            line.close()
+        _save(truth, summary_of(PlaybackCounts(), complete=False))
+        played = _serve_line(
+            device, link, protocol, speed_unit, partial(_save_start, truth, summary_of), wait=wait, err=json_output
+        )
+    summary = summary_of(played, complete=True)
+    _save(truth, summary)
     typer.echo(json.dumps(summary) if json_output else _count_text(played))
+
+
+def _serve_line(
+    device: SimulatedTray | TableDevice,
+    link: Path | None,
+    protocol: wire.Protocol,
+    speed_unit: SpeedUnit,
+    on_start: Callable[[int], None],
+    *,
+    wait: bool,
+    err: bool,
+) -> PlaybackCounts:
+    """Play the device on a pseudo-terminal. wait: for a reader. err: say on stderr where it is."""
+    stop = threading.Event()
+    stop_on_signals(stop)
+    line = PseudoTerminal(link)
+    try:
+        fans_on = "1 fan on" if device.fans == 1 else f"{device.fans} fans on"
+        typer.echo(f"{fans_on} {link or line.port}: {protocol}, speeds in {speed_unit}", err=err)
+        if wait:
+            wait_for_reader(line, protocol, stop)
+        return play(device, line, protocol, RAD_S_PER_UNIT[speed_unit], stop, on_start)
+    finally:
+        line.close()
+
+
+def _serve_hwmon(tray: SimulatedTray, root: Path, chip: str, *, err: bool) -> PlaybackCounts:
+    """Run the tray behind a tree of files until Ctrl-C. err: say where on stderr."""
+    stop = threading.Event()
+    stop_on_signals(stop)
+    tree = HwmonTree(root, chip, tray.fans)
+    try:
+        typer.echo(
+            f"{tray.fans} fans of {chip} in {root}; faults: echo tacho-stuck:fan=0 > {root / FAULT_FILE}", err=err
+        )
+        return play_hwmon(tray, tree, stop, InjectedFaults(tray, root).follow)
+    finally:
+        tree.close()
 
 
 def _tacho(**settings: Any) -> Tacho:

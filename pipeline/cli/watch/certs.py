@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import re
 import socket
@@ -207,8 +208,8 @@ def _hosts(request: _Request) -> list[str]:
 def _issued(request: _Request) -> list[Certificate]:
     """The certificates in the folder of the site, and that of its authority first."""
     security = request.security
-    pattern = security.certificate.name.replace(ROLE_PLACE, "*")
-    paths = [security.ca, *sorted(security.certificate.parent.glob(pattern))]
+    pattern = glob.escape(str(security.certificate)).replace(ROLE_PLACE, "*")
+    paths = [security.ca, *map(Path, sorted(glob.glob(pattern)))]  # noqa: PTH207  the role may be a folder
     return [read_certificate(path) for path in dict.fromkeys(paths) if path.exists()]
 
 

@@ -107,6 +107,16 @@ def test_a_renewed_certificate_keeps_its_role_and_hosts_and_has_a_new_key(path):
     assert mode(key) == 0o600
 
 
+def test_each_role_may_have_a_folder_of_its_own(path):
+    folders = 'certificate = "certs/{role}/certificate.pem"\nkey = "certs/{role}/key.pem"\ncontrollers'
+    path.write_text(CONFIG.replace("controllers", folders))
+    certs(path, "init")
+    roles = made(certs(path, "issue", "--json"))
+    assert (path.parent / "certs" / "scorer" / "certificate.pem").is_file()
+    assert sorted(made(certs(path, "renew", "--json"))) == sorted(roles)
+    assert all(role in certs(path, "show").stdout for role in roles)
+
+
 @pytest.mark.parametrize(
     ("words", "what"),
     [

@@ -21,6 +21,7 @@ from schemas.tacho import Tacho
 from stages.acquisition import STAGE
 from tests.support.toy_source import ToyConfig, ToySource
 
+KINDS = ", ".join([*SOURCE_KINDS, "toy"])
 CONFIGURATION = """
 [[tray]]
 name = "bench"
@@ -125,8 +126,8 @@ def test_doctor_asks_the_source_what_would_keep_it_from_connecting() -> None:
 @pytest.mark.parametrize(
     ("source", "words"),
     [
-        ('{ kind = "toi" }', "unknown kind 'toi'; known: serial, "),
-        ('{ kind = ["toy"] }', "unknown kind ['toy']; known: serial, "),
+        ('{ kind = "toi" }', f"unknown kind 'toi'; known: {KINDS}"),
+        ('{ kind = ["toy"] }', f"unknown kind ['toy']; known: {KINDS}"),
         ("{ port = 3 }", "write source = { kind ="),
         ('"serial"', "write source = { kind ="),
         ('{ kind = "toy" }', "'tray.0.source.speeds' is missing"),

@@ -149,7 +149,7 @@ def test_polls_that_are_late_are_left_out_and_counted_as_lost() -> None:
     assert sequences[2] is not None and sequences[2] >= 5
 
 
-def test_commands_are_written_between_polls_and_a_refusal_is_told_to_the_sender() -> None:
+def test_commands_are_written_between_polls_and_the_sender_sees_a_refusal() -> None:
     device = Device()
     source = PollingSource(device, 10.0)
     assert not source.send((0.3,), ()), "not connected"
