@@ -166,7 +166,7 @@ def read_table(
     speed_rad_s *= RAD_S_PER_TABLE_UNIT[unit]
     assumed = _assumed(times.name if times and times.is_assumed else "", "" if found[0][2] else found[0][0])
     of_all = [column.values() for columns in others.values() for column in columns * (len(speeds) // len(columns))]
-    table = _clean(path, t_ns, has_time, command_values, np.column_stack([speed_rad_s, *of_all]), unit)
+    table = clean_samples(path, t_ns, has_time, command_values, np.column_stack([speed_rad_s, *of_all]), unit)
     of_speed, *measured = np.split(table.speed_rad_s, len(others) + 1, axis=1)
     return replace(table, assumed=assumed, speed_rad_s=of_speed, auxiliary=dict(zip(others, measured, strict=True)))
 
@@ -264,7 +264,7 @@ def _counted_times(rows: int, period: str) -> tuple[Array, Array]:
     return np.arange(rows, dtype=np.int64) * period_ns, np.ones(rows, dtype=np.bool_)
 
 
-def _clean(path: Path, t_ns: Array, has_time: Array, command: Array, speed_rad_s: Array, unit: str) -> Table:
+def clean_samples(path: Path, t_ns: Array, has_time: Array, command: Array, speed_rad_s: Array, unit: str) -> Table:
     """Sort rows by time, hold commands, merge rows of the same time, and count all of it. speed_rad_s: and after the
     columns of the fans any others that may be missing, which are treated alike.
 

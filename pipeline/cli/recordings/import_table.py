@@ -1,4 +1,4 @@
-"""`fantwin import`: turns a measured table into a recording."""
+"""`fantwin import`: turns a measured table, or the log of another system, into a recording."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import typer
 from pydantic import ValidationError
 
@@ -24,9 +25,11 @@ from pipeline.config.models import NAME_PATTERN
 from pipeline.devices.measured_table import Table, read_table
 from pipeline.devices.tacho_evidence import tacho_hints
 from pipeline.errors import UsageError, UserError
+from pipeline.recordings.logs.formats import LogFormat, log_format, open_log
+from pipeline.recordings.logs.samples_of_log import read_samples
 from pipeline.recordings.reading import TACHO_KEY
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Raw
+from schemas.messages import Array, Header, Raw
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan, tachos_to_json
 from schemas.topics import RESERVED_TRAY_NAMES, tray_key
 from schemas.units import NS_PER_S
@@ -37,19 +40,30 @@ SAMPLES_PER_MESSAGE = 100
 
 def import_table(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE.csv", help="Measured table: a text file whose first line names the columns.")
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="REC.mcap", help="Recording to write.")],
-    command: Annotated[
-        list[str], typer.Option(metavar="COLUMN", help="Command column: one for all fans, or one per fan. Repeatable.")
-    ],
-    speed: Annotated[
-        list[str],
-        typer.Option(
-            metavar="COLUMN[:UNIT]",
-            help="Speed column, one per fan. Units: rpm, hz, deg/s, rad/s (default). Repeatable.",
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="A text file whose first line names the columns, or a log: ULog, Betaflight blackbox, ROS 2 bag.",
         ),
     ],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="REC.mcap", help="Recording to write.")
+    ] = None,
+    command: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="COLUMN",
+            help="Command column: one for all fans, or one per fan. Repeatable. In a log a field, or one pattern for "
+            "all fans, as 'motor[*]'.",
+        ),
+    ] = None,
+    speed: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="COLUMN[:UNIT]",
+            help="Speed column, one per fan. Units: rpm, hz, deg/s, rad/s (default); in a log also erpm. Repeatable.",
+        ),
+    ] = None,
     time: Annotated[
         str | None,
         typer.Option(metavar="COLUMN[:UNIT]", help="Time column. Units: s (default), ms, us, ns, iso (dates)."),
@@ -76,35 +90,92 @@ def import_table(
     update_s: Annotated[
         float, typer.Option("--update", metavar="S", help="Seconds between new counts. Default: the window.")
     ] = 0.0,
+    poles: Annotated[
+        int | None, typer.Option(help="Magnetic poles of the motors, for speeds in erpm of a log that does not say it.")
+    ] = None,
+    log_number: Annotated[
+        int, typer.Option("--log", metavar="N", help="Which log of a file that has several, from 1.")
+    ] = 1,
+    list_fields: Annotated[
+        bool, typer.Option("--list", help="Show the fields of a log and their rates; import nothing.")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing recording.")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Turn a measured table into a recording, the data format of training, evaluation and replay.
+    """Turn a measured table or a log into a recording, the data format of training, evaluation and replay.
 
     Irregularities (repeated times, gaps, empty cells) are counted and reported; speeds are never filled in. Tachos of
     ordinary fans count pulses: say over which time, or see the hint.
 
     Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm --tacho count --window 1 -o REC.mcap
+
+    Example: fantwin import FLIGHT.bbl --command 'motor[*]' --speed 'eRPM[*]:erpm' --poles 14 -o REC.mcap
     """
+    kind = log_format(file)
+    if list_fields:
+        _list_fields(file, kind, log_number, json_output=json_output)
+        return
+    if output is None or not command or not speed:
+        what = "-o, --command and --speed" if kind is None else "-o, --command and --speed; --list shows the fields"
+        raise UsageError(f"an import needs {what}")
     if not re.match(NAME_PATTERN, tray) or tray in RESERVED_TRAY_NAMES:
         raise UsageError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
-    tachos = _tachos(tacho, pulses, window_s or [0.0], update_s, len(speed))
     auxiliary = auxiliary_options(supply_voltage, current, temperature)
-    table = read_table(file, time, command, speed, period=period, auxiliary=auxiliary)
+    if kind is None:
+        tachos = _tachos(tacho, pulses, window_s or [0.0], update_s, len(speed))
+        table = read_table(file, time, command, speed, period=period, auxiliary=auxiliary)
+        notes = [table.assumed] if table.assumed else []
+    else:
+        if time or period:
+            raise UsageError(f"--time and --period are for tables: a {kind.title} has times")
+        if auxiliary:
+            raise UsageError("--supply-voltage, --current and --temperature are for tables: leave them out for a log")
+        table, of_log = read_samples(file, open_log(file, kind, log_number), command, speed, poles)
+        notes = list(of_log)
+        tachos = _tachos(tacho, pulses, window_s or [0.0], update_s, table.fans)
     write_table(table, output, tray, tachos)
     hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans))
     if json_output:
-        typer.echo(json.dumps(import_summary(table, output) | {"hints": hints}))
+        typer.echo(json.dumps(import_summary(table, output) | {"hints": hints, "notes": notes}))
         return
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
     period = f"{table.median_period_s * 1e3:.3g} ms apart (median)"
     typer.echo(f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period}")
-    for note in (*filter(None, [table.assumed]), *table.notes):
+    for note in (*notes, *table.notes):
         typer.echo(f"  {note}")
     for hint in hints:
         typer.echo(f"hint: {hint}; see --tacho and --window", err=True)
+
+
+def _list_fields(file: Path, kind: LogFormat | None, number: int, *, json_output: bool) -> None:
+    """Show the fields of a log, with the number of their values and their rates."""
+    if kind is None:
+        raise UsageError(f"{file}: --list is for logs; the first line of a table names its columns")
+    log = open_log(file, kind, number)
+    series = log.read(log.names)
+    if json_output:
+        rows = [
+            {"name": name, "values": len(each.values), "rate_hz": each.rate_hz, **_range(each.values)}
+            for name, each in series.items()
+        ]
+        typer.echo(json.dumps({"format": kind.title, "motor_poles": log.motor_poles, "fields": rows}))
+        return
+    width = max(map(len, log.names), default=0)
+    for name, each in series.items():
+        low, high = _range(each.values).values()
+        span = "no numbers" if low is None else f"{low:10.6g} to {high:.6g}"
+        typer.echo(f"{name:{width}}  {len(each.values):7d} values  {each.rate_hz:8.3g} Hz  {span}")
+    poles = f", {log.motor_poles} poles" if log.motor_poles else ""
+    typer.echo(f"{file}: {kind.title}, {len(log.names)} fields{poles}")
+
+
+def _range(values: Array) -> dict[str, float | None]:
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return {"lowest": None, "highest": None}
+    return {"lowest": float(known.min()), "highest": float(known.max())}
 
 
 def _tachos(

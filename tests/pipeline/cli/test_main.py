@@ -112,7 +112,7 @@ def assert_one_line(done: subprocess.CompletedProcess[str], code: int, words: Se
         ("train none.mcap -o twin.onnx", ["none.mcap", "cannot read the recording"]),
         (f"evaluate {DEMO / 'twin.onnx'} {README}", ["not a recording"]),
         ("picture none.rrd", ["none.rrd", "no such file"]),
-        ("import none.csv --time t:s --command u --speed y:rpm -o x.mcap", ["none.csv", "cannot read the table"]),
+        ("import none.csv --time t:s --command u --speed y:rpm -o x.mcap", ["none.csv", "cannot be read"]),
         ("demo -o /proc/demo", ["/proc/demo", "name another with -o"]),
     ],
 )

@@ -1,0 +1,180 @@
+"""`fantwin import` of the logs of other systems: fields by name or pattern become the samples of fans."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.recordings.logs import formats
+from pipeline.recordings.reading import read_recording
+from pipeline.recordings.runs import read_runs
+from schemas.fields import Array
+from schemas.messages import Raw
+from schemas.tacho import Tacho
+from tests.support.fantwin_command import error_of, fantwin, usage_error_of
+from tests.support.written_logs import write_blackbox, write_rosbag, write_ulog
+
+RPM = 2 * np.pi / 60
+T_S = np.arange(0, 4, 0.02)
+COMMANDS = np.column_stack([0.3 + 0.2 * np.sin(T_S), np.full(len(T_S), 0.5)])
+SPEEDS = np.rint(6000 * COMMANDS)
+
+
+def ulog(folder: Path) -> Path:
+    """Commands at 250 Hz, readings at 50 Hz of two of four outputs."""
+    path = folder / "flight.ulg"
+    fast_us = np.arange(1000, 4_000_000, 4000)
+    outputs = [(int(us), *np.interp(us / 1e6, T_S, COMMANDS[:, 0]).repeat(4)) for us in fast_us]
+    escs = [(round(t * 1e6) + 9000, *(int(r), 12.0), *(int(s), 12.1)) for t, (r, s) in zip(T_S, SPEEDS, strict=True)]
+    topics = {
+        "actuator_outputs": ("uint64_t timestamp;float[4] output;", outputs),
+        "esc_status": ("uint64_t timestamp;esc_report[2] esc;", escs),
+    }
+    write_ulog(path, topics)
+    return path
+
+
+def blackbox(folder: Path, *headers: str) -> Path:
+    """Two logs, in whole steps of the command; the electrical speed of motors with 14 poles, in hundreds a minute."""
+    path = folder / "flight.bbl"
+    first, second = (
+        [
+            (k, round(t * 1e6) + 500, *map(int, 1000 + 1000 * COMMANDS[k]), *map(int, SPEEDS[k] * more * 7 / 100))
+            for k, t in enumerate(T_S)
+        ]
+        for more in (1, 2)
+    )
+    write_blackbox(path, [first, second], *headers)
+    return path
+
+
+def samples(recording: Path) -> tuple[Array, Array, Array]:
+    raws = [entry.message for entry in read_recording(recording) if isinstance(entry.message, Raw)]
+    return (
+        np.concatenate([raw.host_receive_t_ns for raw in raws]),
+        np.concatenate([raw.command for raw in raws]),
+        np.concatenate([raw.speed_rad_s for raw in raws]) / RPM,
+    )
+
+
+def test_ulog_with_commands_held_at_the_times_of_the_readings(tmp_path: Path) -> None:
+    recording = tmp_path / "r.mcap"
+    words = ("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[{fan}].esc_rpm:rpm")
+    result = fantwin("import", ulog(tmp_path), *words, "-o", recording)
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith(f"{recording}: 200 samples of 2 fans over 4.0 s, 20 ms apart (median)")
+    assert "left out, without the other of command and speed: actuator_outputs.output[2], actuator" in result.stdout
+    assert "commands at 250 Hz, speeds at 50 Hz; each speed has the command held then" in result.stdout
+    t_ns, command, speed = samples(recording)
+    np.testing.assert_allclose(t_ns / 1e9, T_S + 0.009, atol=1e-9)
+    np.testing.assert_allclose(speed, SPEEDS, rtol=1e-12)
+    held_us = (t_ns // 1000 - 1000) // 4000 * 4000 + 1000  # the last command before the reading
+    expected = np.interp(np.minimum(held_us, 3_997_000) / 1e6, T_S, COMMANDS[:, 0])
+    np.testing.assert_allclose(command, np.column_stack([expected] * 2), rtol=1e-6)
+    assert read_runs(recording).speed_unit == "rpm"
+
+
+def test_blackbox_with_electrical_speeds_and_the_tacho_that_is_declared(tmp_path: Path) -> None:
+    path, recording = blackbox(tmp_path), tmp_path / "r.mcap"
+    words = ("--command", "motor[*]", "--speed", "eRPM[*]:erpm", "-o", recording)
+    assert "give the magnetic poles of the motor, as --poles 14" in error_of("import", path, *words)
+    assert "poles come in pairs" in usage_error_of("import", path, *words, "--poles", "13")
+    result = fantwin("import", path, *words, "--poles", 14, "--tacho", "count", "--window", "0.02")
+    assert "log 1 of 2 in the file; --log chooses another" in result.stdout
+    _, command, speed = samples(recording)
+    np.testing.assert_array_equal(command, np.floor(1000 + 1000 * COMMANDS))
+    np.testing.assert_allclose(speed, np.floor(SPEEDS * 7 / 100) * 100 / 7, rtol=1e-12)
+    assert read_runs(recording).tacho == (Tacho(kind="count", window_s=0.02),) * 2
+    fantwin("import", blackbox(tmp_path, "motor_poles:14"), *words, "--log", 2, "--force")
+    np.testing.assert_allclose(samples(recording)[2], np.floor(SPEEDS * 14 / 100) * 100 / 7, rtol=1e-12)
+    assert "--log 3: the file has logs 1 to 2" in error_of("import", path, *words, "--force", "--log", 3)
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_a_ros_bag_with_times_of_its_messages(tmp_path: Path, storage: str) -> None:
+    bag, recording = tmp_path / "bag", tmp_path / "r.mcap"
+    write_rosbag(bag, 100 + T_S, COMMANDS, SPEEDS, mcap=storage == "mcap")
+    words = ("--command", "/fans/command.data[*]", "--speed", "/fans/state.velocity[*]:rad/s", "-o", recording)
+    result = fantwin("import", bag, *words, "--json")
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.stdout)
+    assert (summary["samples"], summary["fans"]) == (200, 2)
+    assert summary["notes"] == ["/fans/command: messages without a time of their own; that of the bag is used"]
+    t_ns, command, speed = samples(recording)
+    np.testing.assert_allclose(t_ns / 1e9, 100 + T_S, atol=1e-9)
+    np.testing.assert_array_equal(command, COMMANDS)
+    np.testing.assert_allclose(speed, SPEEDS, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "title", "field", "rate_hz"),
+    [
+        (ulog, "ULog", "esc_status.esc[1].esc_rpm", 50),
+        (blackbox, "Betaflight blackbox", "eRPM[1]", 50),
+    ],
+)
+def test_the_fields_are_listed_with_their_rates(
+    tmp_path: Path, make: Callable[[Path], Path], title: str, field: str, rate_hz: float
+) -> None:
+    path = make(tmp_path)
+    listed = json.loads(fantwin("import", path, "--list", "--json").stdout)
+    assert listed["format"] == title
+    found = {each["name"]: each for each in listed["fields"]}
+    assert (found[field]["values"], found[field]["rate_hz"]) == (200, pytest.approx(rate_hz))
+    lines = fantwin("import", path, "--list").stdout.splitlines()
+    assert lines[-1].startswith(f"{path}: {title}, {len(found)} fields")
+    assert any(line.startswith(field) for line in lines)
+
+
+def test_a_mistake_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
+    path, out = ulog(tmp_path), ("-o", tmp_path / "r.mcap")
+    speed = "esc_status.esc[*].esc_rpm:rpm"
+    assert "an import needs -o, --command and --speed; --list shows the fields" in usage_error_of("import", path)
+    for words, error in (
+        (("--command", "actuator_output.output[0]", "--speed", speed), "did you mean 'actuator_outputs.output[0]'"),
+        (("--command", "motor[*]", "--speed", speed), "no field is motor[*]; --list shows them all"),
+        (("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[*].esc_voltage:V"), "unknown unit 'V'"),
+        (("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[0].esc_rpm"), "pattern for both"),
+        (("--command", "actuator_outputs.output[*]", "--speed", speed, "--speed", speed), "once each"),
+        (("--command", "actuator_outputs.output[*]", "--speed", speed, "--time", "t"), "a ULog has times"),
+    ):
+        assert error in error_of("import", path, *words, *out)
+    path.write_bytes(path.read_bytes()[:20])
+    assert "this ULog has no fields with numbers; is it damaged?" in error_of("import", path, "--list")
+    bad = tmp_path / "bad.bbl"
+    bad.write_bytes(b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n")
+    assert "no blackbox log that can be read" in error_of("import", bad, "--list")
+    (tmp_path / "bag").mkdir()
+    assert "a folder, and no ROS 2 bag" in error_of("import", tmp_path / "bag", "--list")
+    (tmp_path / "bag" / "metadata.yaml").write_text("none")
+    assert "no ROS 2 bag that can be read" in error_of("import", tmp_path / "bag", "--list")
+    assert "cannot be read: No such file" in error_of("import", tmp_path / "none.ulg", "--list")
+    assert list(tmp_path.glob("*.mcap")) == []
+
+
+def test_without_the_extra_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formats, "is_installed", lambda _module: False)
+    assert "a ULog needs pyulog; in the checkout: " in error_of("import", ulog(tmp_path), "--list")
+
+
+def test_a_log_can_be_described_and_identified(tmp_path: Path) -> None:
+    recording = tmp_path / "r.mcap"
+    t_s = np.arange(0, 20, 0.01)
+    command = np.where(t_s % 4 < 2, 0.4, 0.8)
+    speed = np.zeros(len(t_s))
+    for row in range(1, len(t_s)):  # 12 w' = 3000 u - w, roughly a small fan
+        speed[row] = speed[row - 1] + 0.01 / 0.3 * (3000 * command[row - 1] - speed[row - 1])
+    rows = [
+        (k, round(t * 1e6) + 1, *[int(1000 * command[k])] * 2, *[int(speed[k] * 7 / 100)] * 2)
+        for k, t in enumerate(t_s)
+    ]
+    write_blackbox(tmp_path / "long.bbl", [rows], "motor_poles:14")
+    words = ("--command", "motor[0]", "--speed", "eRPM[0]:erpm", "-o", recording)
+    assert fantwin("import", tmp_path / "long.bbl", *words).exit_code == 0
+    assert "made from: long.bbl" in fantwin("info", recording).stdout
+    identified = fantwin("identify", recording, "--json")
+    assert identified.exit_code == 0, identified.output
