@@ -68,6 +68,7 @@ class Host:
         for process_id in self._processes():
             os.kill(process_id, signal.SIGKILL)
         self._first.wait()
+        subprocess.run(["ip", "link", "del", self.name], check=False, stderr=subprocess.DEVNULL)  # or it goes by itself
 
     def _processes(self) -> list[int]:
         found: list[int] = []

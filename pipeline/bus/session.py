@@ -34,7 +34,7 @@ from pipeline.bus.endpoint import (
 )
 from pipeline.bus.errors import BusError, reason
 from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
-from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, RETRY
+from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
 from pipeline.bus.settings import Settings
@@ -288,6 +288,7 @@ def _zenoh_config(config: BusConfig, credentials: Credentials | None = None, *, 
         settings.set("listen/timeout_ms", 0)
         settings.set("listen/exit_on_failure", False)
         settings.set("scouting/gossip/enabled", True)
+        settings.set("transport/link/tx/queue/congestion_control/block/wait_before_close", PEER_WAIT_US)
     settings.secure(credentials)
     settings.pass_through(config.zenoh)
     return settings.config
