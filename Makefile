@@ -19,7 +19,7 @@ CONTAINERS := build/compose
 TORCH := torch==2.13.0
 BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_table measured_table onnx_speed training_race) \
 	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed stage_memory)
-SOURCES := schemas scoring pipeline simulation stages twin tests bench
+SOURCES := fantwin_client schemas scoring pipeline simulation stages twin tests bench
 
 .PHONY: demo test check selftest compose-test bench schema configuration twin lock clean
 .DEFAULT_GOAL := demo

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from schemas import codec
@@ -35,9 +36,21 @@ def decode_together(kind: type[_Kind], payloads: Sequence[bytes]) -> list[_Kind]
     if not payloads:
         return []
     try:
-        return [_decode(kind, b"".join(payloads))]
+        together = _once(_decode(kind, b"".join(payloads)), len(payloads))
     except CodecError:
-        return [_decode(kind, payload) for payload in payloads]
+        together = None
+    return [_decode(kind, payload) for payload in payloads] if together is None else [together]
+
+
+def _once(message: _Kind, payloads: int) -> _Kind | None:
+    """The message without repetitions of its tuples, which protobuf appends, too; None where they are not all equal."""
+    found: dict[str, Any] = {}
+    for name, values in vars(message).items():
+        if isinstance(values, tuple) and values:
+            found[name] = values[: len(values) // payloads]
+            if found[name] * payloads != values:
+                return None
+    return replace(message, **found) if found else message
 
 
 def _decode(kind: type[_Kind], payload: bytes) -> _Kind:

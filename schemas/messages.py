@@ -6,12 +6,13 @@ and types from the declarations below, so that a new field needs an entry here a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TypeAlias, get_args
 
 import numpy as np
 
 from schemas.fields import Array, OpenEnum, column, derived, time_column
+from schemas.tacho import Tacho
 
 LARGEST_PERIOD_NS = 86_400_000_000_000  # a day
 FURTHEST_T_NS = (1 << 62) - LARGEST_PERIOD_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
@@ -33,6 +34,7 @@ class InvalidReason(OpenEnum):
     CLOCK_RESTARTED = 8
     STOPPED = 9
     STARTING = 10
+    CONDITIONS_UNKNOWN = 11
 
 
 class FanState(OpenEnum):
@@ -119,6 +121,15 @@ class StageStatus(OpenEnum):
     STOPPED = 3
 
 
+class TachoKind(OpenEnum):
+    """How a speed is measured, as schemas.tacho explains."""
+
+    INSTANTANEOUS = 0
+    COUNT = 1
+    PERIOD = 2
+    AVERAGE = 3
+
+
 @dataclass(frozen=True, slots=True)
 class InputPosition:
     """How far a stage had read its main input for one tray when it made a message.
@@ -160,15 +171,66 @@ class Header:
     input_position: InputPosition | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class StatedTacho:
+    """What a speed is, as a source states it. It is not checked: `tacho` does that."""
+
+    kind: TachoKind
+    pulses: int = 0
+    window_s: float = 0.0
+    update_s: float = 0.0
+    delay_s: float = 0.0
+    step_rad_s: float = 0.0
+
+    @classmethod
+    def of(cls, tacho: Tacho) -> StatedTacho:
+        """As it travels."""
+        values = tacho.model_dump()
+        return cls(TachoKind[values.pop("kind").upper()], **values)
+
+    @property
+    def tacho(self) -> Tacho:
+        """As the measurement model takes it. Raises ValueError where these values are no tacho of this version."""
+        names = (each.name for each in fields(self) if each.name != "kind")
+        return Tacho.model_validate({"kind": self.kind.words, **{name: getattr(self, name) for name in names}})
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Raw:
-    """Samples as the device sent them. A column that the device does not have is empty."""
+    """Samples as the device sent them. A column that the device does not have is empty.
+
+    tachos: what the speeds are, one for all fans or one for each; empty where the source does not state it.
+    """
 
     header: Header = Header()
     fans: int
     host_receive_t_ns: Array = column("samples", np.int64, limits=RECEIVE_TIMES)
     device_clock_us: Array = column("samples", np.uint32, optional=True)
     device_sequence: Array = column("samples", np.uint32, optional=True)
+    command: Array = column("samples x fans", np.float64)
+    speed_rad_s: Array = column("samples x fans", np.float64)
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
+    tachos: tuple[StatedTacho, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PushedSamples:
+    """Samples of one tray that a client pushes, not yet checked.
+
+    Attributes:
+        t_ns: time of each sample by the clock of the client.
+        first_number: of the first sample; the client counts its samples from 0, without gaps.
+        newest_t_ns: of the newest sample the client had when it sent these: how much older than that a sample is says
+            how long the client has kept it.
+    """
+
+    header: Header = Header()
+    fans: int
+    t_ns: Array = column("samples", np.int64, limits=RECEIVE_TIMES)
+    first_number: int = 0
+    newest_t_ns: int = 0
     command: Array = column("samples x fans", np.float64)
     speed_rad_s: Array = column("samples x fans", np.float64)
     supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
@@ -190,6 +252,9 @@ class Grid:
     invalid_reason: Array = column("samples x fans", InvalidReason)
     reading_missing: Array = column("samples x fans", np.bool_, optional=True)
     """whether the newest raw sample at that time has no reading, though the speed may be known from those around it"""
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -213,6 +278,11 @@ class Prediction:
     averaged_command: Array = column("samples x fans", np.float64, optional=True)
     reading_missing: Array = column("samples x fans", np.bool_, optional=True)
     """as in Grid"""
+    air_density_ratio: Array = column("samples x fans", np.float64, optional=True)
+    """of a twin that needs the temperature: relative to its reference. Its balance is that of speeds times this"""
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -240,6 +310,9 @@ class Score:
     balance_baseline_command: Array = column("samples x fans", np.float32, added_later=True)
     score: Array = column("samples x fans", np.float32, added_later=True)
     statistic: Array = column("samples x fans", Statistic, added_later=True)
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
     @derived(np.float32)
     def residual_rad_s(self) -> Array:
@@ -455,6 +528,17 @@ class Note:
     text: str
 
 
+@dataclass(frozen=True, kw_only=True)
+class AcceptedSamples:
+    """What an acquisition accepts of the clients that push samples of a tray; commands in the tray's unit."""
+
+    tray: str
+    fans: int
+    command_min: float
+    command_max: float
+    speed_max_rad_s: float
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Health:
     """Status of a process of a stage, and what it has received, sent and lost.
@@ -483,10 +567,12 @@ class Health:
     newest_output_t_ns: int = 0
     notes: tuple[Note, ...] = ()
     trays: str = ""
+    accepts: tuple[AcceptedSamples, ...] = ()
 
 
 Message: TypeAlias = (
     Raw
+    | PushedSamples
     | Grid
     | Prediction
     | Score

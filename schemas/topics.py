@@ -20,6 +20,7 @@ from schemas.messages import (
     ModelCard,
     NewTwin,
     Prediction,
+    PushedSamples,
     Raw,
     Request,
     Score,
@@ -45,8 +46,8 @@ class Topic:
     """One topic.
 
     Attributes:
-        history: a producer keeps this many of its last messages for consumers that missed them, 80 s at 100 Hz, as far
-            as its memory allows (`pipeline.bus.publisher`).
+        history: a producer keeps this many of its last messages for consumers that begin, 80 s at 100 Hz, as far as its
+            memory allows (`pipeline.bus.publisher`).
         largest_bytes: a longer message is refused before it is decoded. The largest that any configuration makes is
             half of it or less (`most_samples`).
     """
@@ -58,10 +59,17 @@ class Topic:
     history: int
     largest_bytes: int
     about: str
+    kept_after_cut: int = 0
+    """a producer keeps so many for consumers that were cut off, if these are more than `history`"""
     is_needed_first: bool = False
     """a consumer that begins needs its last message before those of other topics"""
     is_of_session: bool = False
     """about a session of a stage: a live replay does not publish it, since that session does not run"""
+
+    @property
+    def kept(self) -> int:
+        """How many of its last messages a producer keeps, as far as its memory allows."""
+        return max(self.history, self.kept_after_cut)
 
     @property
     def has_samples(self) -> bool:
@@ -79,15 +87,20 @@ CATCH_UP_MESSAGES = 4096
 
 TOPICS: tuple[Topic, ...] = (
     Topic("raw", Raw, "as the device sends, often 100 Hz", True, 8192, 16 * MIB, "samples as the device sent them"),
+    Topic("reading", PushedSamples, "as the client sends", False, CATCH_UP_MESSAGES, 16 * MIB, "samples of a client"),
     Topic("grid", Grid, "the grid's rate over the block size", True, 8192, 16 * MIB, "samples on a uniform grid"),
     Topic("prediction", Prediction, "as grid", True, 8192, 32 * MIB, "the healthy twin beside the measurement"),
     Topic("score", Score, "as prediction", True, 8192, 64 * MIB, "scored samples, ready to draw"),
     Topic("alarm", Alarm, ON_CHANGE, True, CATCH_UP_MESSAGES, MIB, "transitions of alarms"),
     Topic("request", Request, ON_CHANGE, True, 64, 64 * KIB, "requests of operators about alarms"),
-    Topic("snapshot", ScorerSnapshot, "on change, and regularly", True, 4, 96 * MIB, "a scorer's state for a restart"),
+    Topic(
+        "snapshot", ScorerSnapshot, "on change, and regularly", True, 4, 96 * MIB, "a scorer's state for a restart", 64
+    ),
     Topic("command", Command, ON_CHANGE, True, 64, 64 * KIB, "commands and set-points for the fans"),
-    Topic("twin", ModelCard, ON_CHANGE, True, 8, 16 * MIB, "the twin in force", True),
-    Topic("new_twin", NewTwin, ON_CHANGE, False, 2, 16 * MIB, "a learned twin that is to take over", True),
+    Topic("twin", ModelCard, ON_CHANGE, True, 8, 16 * MIB, "the twin in force", is_needed_first=True),
+    Topic(
+        "new_twin", NewTwin, ON_CHANGE, False, 2, 16 * MIB, "a learned twin that is to take over", is_needed_first=True
+    ),
     Topic(
         "consumed",
         Consumed,
@@ -107,6 +120,7 @@ TOPICS: tuple[Topic, ...] = (
         16,
         2 * MIB,
         "status and losses of a stage",
+        1024,
         is_of_session=True,
     ),
 )

@@ -100,6 +100,8 @@ def simulated_tacho(settings: TachoSettings, fans: int, rng: np.random.Generator
         simulated = InstantaneousTacho(settings.noise, fans, rng)
     elif tacho.kind == "count":
         simulated = CountingTacho(tachos, settings.missing_edges, settings.double_edges, rng)
+    elif tacho.kind == "average":
+        simulated = AveragingTacho(tachos, rng)
     elif any(other.pulses != tacho.pulses for other in tachos):
         raise SimulationError("simulated tachos of kind period have equally many pulses")
     else:
@@ -189,6 +191,42 @@ class CountingTacho:
             return edges
         whole = edges.astype(np.int64)
         return edges + self._rng.binomial(whole, double) - self._rng.binomial(whole, missing)
+
+
+class AveragingTacho:
+    """Shows the mean speed over the last complete window, in whole steps, until the next one is complete."""
+
+    longest_piece_s = COUNT_PIECE_S
+
+    def __init__(self, tachos: Sequence[Tacho], rng: np.random.Generator) -> None:
+        """Fans that stand. tachos: of kind "average", one per fan."""
+        fans = len(tachos)
+        self._window_s = np.array([tacho.window_s for tacho in tachos])
+        self._update_s = np.array([tacho.held_s for tacho in tachos])
+        self._step_rad_s = np.array([tacho.step_rad_s for tacho in tachos])
+        self._end_s = self._update_s * rng.random(fans)
+        self._course: deque[tuple[float, Array]] = deque([(0.0, np.zeros(fans))])  # time, and angles turned
+        self._reading_rad_s = np.zeros(fans)
+
+    def turn(self, start_s: float, before_rad_s: Array, end_s: float, after_rad_s: Array) -> None:
+        """Follow the angles, and show the averages that end in the piece."""
+        angle_rad = 0.5 * (np.abs(before_rad_s) + np.abs(after_rad_s)) * (end_s - start_s)
+        self._course.append((end_s, self._course[-1][1] + angle_rad))
+        while len(self._course) > 2 and self._course[1][0] < end_s - self._window_s.max() - COUNT_PIECE_S:
+            self._course.popleft()
+        while (due := np.flatnonzero(self._end_s <= end_s)).size:
+            times_s = np.array([t_s for t_s, _ in self._course])
+            for fan in due.tolist():
+                turned_rad = np.array([turned[fan] for _, turned in self._course])
+                window_s, window_end_s = self._window_s[fan], self._end_s[fan]
+                began_rad, ended_rad = np.interp([window_end_s - window_s, window_end_s], times_s, turned_rad)
+                self._reading_rad_s[fan] = (ended_rad - began_rad) / window_s
+            self._end_s[due] += self._update_s[due]
+
+    def read(self) -> Array:
+        """(fans,) the last averages."""
+        step, reading = self._step_rad_s, self._reading_rad_s
+        return np.where(step > 0.0, np.rint(reading / np.where(step > 0.0, step, 1.0)) * step, reading)
 
 
 class PeriodTacho:

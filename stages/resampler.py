@@ -3,6 +3,8 @@
 Reads: topic `raw` (device clock us, host time of receipt ns, command, speed rad/s).
 Writes: topic `grid`: samples at absolute multiples of the period (t_ns % period_ns == 0), speed interpolated linearly,
 command held (that of the last sample at or before the grid time). The readings of a counting tacho are held, too.
+Supply voltage, current and temperature are interpolated where the samples on both sides have them, else held until the
+next sample, and unknown in gaps.
 Timing: a grid sample is published as soon as a raw sample at or after its time has arrived, in one message with the
 others that the same raw message completes. If one fan has no reading, all fans wait for its next one, at most
 `gap_limit_s`. If no samples arrive, the wait is at most `watermark_s`.
@@ -14,7 +16,8 @@ kept, the least delayed one says how late the first one was.
 Gaps longer than `gap_limit_s` are never bridged. Their grid samples are not valid: GAP up to `watermark_s` after the
 last raw sample, then STALE; `stale_for_s` after it the grid ends until samples arrive again. Content depends on sample
 times only. Host time, in `tick`, decides only when grid samples of a gap are published, so that a replay gives the same
-grid. See docs/explanation/time.md.
+grid. They are not published while the samples may still come because only the link to acquisition is cut. See
+docs/explanation/time.md.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ from pipeline.devices.line_rate import (
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.sample_grid import SampleGrid
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
-from schemas.messages import Grid, Raw
+from schemas.messages import Grid, Raw, StatedTacho
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 
@@ -74,6 +77,12 @@ class ResamplerConfig(StageConfig):
         gt=0,
         description="the grid ends this long after the last sample; without it 5 s, or twice watermark_s if longer",
     )
+    link_wait_s: float = Field(
+        default=900.0,
+        ge=0,
+        description="how long no gap is published while acquisition does not say that it has sent nothing: the link "
+        "may be cut, and the samples come later",
+    )
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -101,6 +110,9 @@ class ResamplerCore(Core):
         """tachos: how the speed is measured, one for all fans or one for each."""
         self._fans = fans
         self._tachos = tacho_of_each_fan(tachos, fans)
+        self._stated: tuple[StatedTacho, ...] = ()
+        """by the newest message"""
+        self._other_tachos = ""
         self._config = config
         self._decision_rules = decision_rules
         self._line = LineRate(knows_losses=decision_rules >= DecisionRules.LOSSES_OF_LINE)
@@ -110,6 +122,7 @@ class ResamplerCore(Core):
         """until the rate of the line is known"""
         self._newest = SampleTimes(ENOUGH_SAMPLES)
         self._wrong_fans = 0
+        self._input_is_complete = True
         self._counts: Counter[str] = Counter()
         self._grid: SampleGrid | None = None
         self._timing: GridTiming | None = None
@@ -123,6 +136,8 @@ class ResamplerCore(Core):
             self._counts["lost_wrong_fan_count"] += len(item.host_receive_t_ns)
             return []
         self._wrong_fans = 0
+        if item.tachos != self._stated:
+            self._stated, self._other_tachos = item.tachos, self._difference(item.tachos)
         self._newest.add(item)
         if self._grid is not None:
             return self._grid.step(item)
@@ -134,8 +149,12 @@ class ResamplerCore(Core):
         return list(self._grid_of_line()) if self._line.add(item) else []
 
     def tick(self, now_ns: int) -> list[Grid]:
-        """Past the watermark, publish the grid without samples."""
-        return self._grid.tick(now_ns) if self._grid else []
+        """Past the watermark, publish the grid without samples, unless they may still come."""
+        return self._grid.tick(now_ns, is_complete=self._input_is_complete) if self._grid else []
+
+    def confirm_input(self, *, is_complete: bool) -> None:
+        """Whether acquisition has shown since the last tick that all of its samples have arrived."""
+        self._input_is_complete = is_complete
 
     def publish_until(self, t_ns: int) -> list[Grid]:
         """Publish the grid up to `t_ns` without waiting for more samples, as a session did that then ended."""
@@ -164,9 +183,28 @@ class ResamplerCore(Core):
         return [f"grid of {self._timing.rate_hz:g} Hz{line}; {gaps}, {share:.1f} % of the grid"]
 
     def problem(self) -> str:
-        """No samples, those of another number of fans, a line that does not fit the grid, or a host clock set back."""
+        """No samples, those of another number of fans or other tachos, a line that does not fit the grid, or a host
+        clock set back."""
         if self._wrong_fans:
             return f"raw samples of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
+        return "; ".join(filter(None, (self._other_tachos, self._problem_of_times())))
+
+    def _difference(self, stated: tuple[StatedTacho, ...]) -> str:
+        """What a message states to measure, where the configuration says otherwise."""
+        try:
+            tachos = tacho_of_each_fan([each.tacho for each in stated], self._fans) if stated else self._tachos
+        except ValueError:
+            return "raw messages state a tacho that this version does not know: use the version of their acquisition"
+        others = [fan for fan, its in enumerate(tachos) if its != self._tachos[fan]]
+        if not others:
+            return ""
+        fan, more = others[0], f" (and {len(others) - 1} more)" if len(others) > 1 else ""
+        return (
+            f"raw messages state another tacho than this configuration, of fan {fan}{more} {tachos[fan]}, not "
+            f"{self._tachos[fan]}: set tacho = {tachos[fan].as_toml} in [[tray]], or correct the source"
+        )
+
+    def _problem_of_times(self) -> str:
         if self._grid is None or self._timing is None:
             return ""
         return self._grid.problem() or self._misfit(self._timing)
@@ -204,7 +242,9 @@ class ResamplerCore(Core):
         if self._line_hz is not None and is_too_slow(self._line_hz):
             config = config.model_copy(update={"gap_limit_s": config.gap_limit_s or 1.0 / rate_hz})
         self._timing = config.timing(rate_hz)
-        self._grid = SampleGrid(self._tachos, self._timing, self._decision_rules)
+        self._grid = SampleGrid(
+            self._tachos, self._timing, self._decision_rules, round(self._config.link_wait_s * NS_PER_S)
+        )
         return self._grid
 
 
@@ -218,7 +258,7 @@ def _received_earlier(message: Raw, lateness_ns: int) -> Raw:
 def build(context: Context) -> BuiltStage:
     """The core of one tray."""
     tray, rules = context.tray, context.decision_rules
-    return BuiltStage(ResamplerCore(tray.fans, context.config, tachos=tray.tacho, decision_rules=rules))
+    return BuiltStage(ResamplerCore(tray.fans, context.config, tachos=tray.tachos, decision_rules=rules))
 
 
 STAGE = Stage(

@@ -10,9 +10,10 @@ It is linear, leaves a constant as it is, and shows a ramp d + (W + H) / 2 late.
 commands are held; Q is then known exactly, whatever the steps. Before the first sample both are taken as constant,
 which is a guess: a reading that shows any of that time cannot be compared (`comparable`).
 
-A reading scatters about the expected one, however good the model, by its resolution q (the phases of the first and the
-last pulse: variance q^2 / 6) and by its age: over ages from 0 to H the mean of the window differs by H d/dt M w, and
-if it does so evenly the variance is the square of that over 12.
+A reading scatters about the expected one, however good the model, by its resolution q and by its age. The phases of
+the first and the last pulse of a count have the variance q^2 / 6, and the rounding of an average q^2 / 12. Over ages
+from 0 to H the mean of the window differs by H d/dt M w, and if it does so evenly the variance is the square of that
+over 12.
 """
 
 from collections.abc import Sequence
@@ -63,7 +64,8 @@ class Measurement:
         slope = np.divide(rise, step_s, out=np.zeros_like(rise), where=step_s > 0.0)
         slope = (np.concatenate((slope[:1], slope)) + np.concatenate((slope, slope[-1:]))) / 2.0
         of_age = np.array([each.held_s for each in self.tacho]) * slope / np.sqrt(12.0)
-        return np.hypot(of_age, np.array([each.resolution_rad_s for each in self.tacho]) / np.sqrt(6.0))
+        graded = [each.resolution_rad_s / np.sqrt(each.resolution_steps) for each in self.tacho]
+        return np.hypot(of_age, np.array(graded))
 
     @cached_property
     def _on_speeds(self) -> "_Operator":

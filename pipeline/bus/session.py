@@ -15,6 +15,7 @@ yet connected, or was restarted, can request what it missed.
 
 from __future__ import annotations
 
+import json
 import queue
 import threading
 import time
@@ -33,10 +34,11 @@ from pipeline.bus.endpoint import (
 )
 from pipeline.bus.errors import BusError, reason
 from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
-from pipeline.bus.link import LEASE_MS
+from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, RETRY
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
 from pipeline.bus.settings import Settings
+from pipeline.bus.spool import Spool
 from pipeline.config.models import BusConfig
 from pipeline.config.roles import READERS
 from schemas.topics import Topic, largest_bytes
@@ -44,7 +46,6 @@ from schemas.topics import Topic, largest_bytes
 if TYPE_CHECKING:
     from pipeline.bus.certificates import Credentials
 
-_RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 _ROUTER_TIMEOUT_MS = 1000
 _ROUTER_RETRY_S = 0.2
 MEETING_LIMIT_S = 10.0
@@ -84,6 +85,8 @@ class Bus:
         self._session = _open(config, self.credentials, stop, listens)
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
+        self.spool: Spool | None = None
+        """where publishers that are declared from now on keep what their memory cannot; None: nowhere"""
         self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
@@ -96,7 +99,7 @@ class Bus:
 
     def publisher(self, key: str, topic: Topic, encoding: str, producer: str) -> Publisher:
         """Declare an output; `encoding` is the full protobuf name of its messages."""
-        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes)
+        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes, self.spool)
 
     def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> Callable[[], None]:
         """Call `on_message(key, payload)` for what other sessions publish, from a thread of the bus. Returns what ends
@@ -188,6 +191,8 @@ class Bus:
     def close(self) -> None:
         """Leave the bus. What was published before has left this process."""
         self._session.close()
+        if self.spool:
+            self.spool.close()
 
 
 def credentials_of(config: BusConfig, roles: Sequence[str]) -> Credentials | None:
@@ -246,10 +251,17 @@ def _open(
     except zenoh.ZError as error:
         raise BusError(f"bus.endpoint = {config.endpoint!r} cannot be used: {reason(error)}") from error
     until_s = time.monotonic() + (MEETING_LIMIT_S if stop else 0.0)
+    attempts = 0
     while True:  # Zenoh can wait for the router itself, but then ignores Ctrl-C
+        first = attempts % len(config.endpoints)
+        endpoints = (*config.endpoints[first:], *config.endpoints[:first])  # it never gets to one after one that hangs
         try:
+            conf.insert_json5("connect/endpoints", json.dumps(endpoints))
             return zenoh.open(conf)
         except zenoh.ZError as error:
+            attempts += 1
+            if attempts < len(endpoints):
+                continue
             if time.monotonic() > until_s and accepts_connections(config.endpoint):
                 raise BusError(foreign_program(config.endpoint, is_secure=credentials is not None)) from error
             if stop is None or stop.wait(_ROUTER_RETRY_S):
@@ -261,12 +273,13 @@ def _open(
 def _zenoh_config(config: BusConfig, credentials: Credentials | None = None, *, listens: bool) -> zenoh.Config:
     settings = Settings()
     settings.set("mode", config.mode)
-    settings.set("connect/endpoints", [config.endpoint])
+    settings.set("connect/endpoints", list(config.endpoints))
     settings.set("connect/timeout_ms", -1 if config.mode == "peer" else _ROUTER_TIMEOUT_MS)
     settings.set("connect/exit_on_failure", False)
-    settings.set("connect/retry", _RETRY)
+    settings.set("connect/retry", RETRY)
     if config.mode == "client":
         settings.set("transport/link/tx/lease", int(LEASE_MS))
+        settings.set("transport/unicast/open_timeout", OPEN_TIMEOUT_MS)
     settings.set("scouting/multicast/enabled", False)
     settings.set("transport/shared_memory/enabled", False)
     if config.mode == "peer":

@@ -28,6 +28,7 @@ COMMANDS = {
     "wear": "watch.wear",
     "command": "watch.command",
     "sweep": "watch.sweep",
+    "discover": "watch.discover",
     "doctor": "watch.doctor",
     "selftest": "watch.selftest",
     "router": "watch.router",

@@ -11,7 +11,8 @@ import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from types import NoneType, UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
 
@@ -27,6 +28,8 @@ from pipeline.config.models import (
     nearest,
 )
 from pipeline.config.registry import STAGES
+from pipeline.devices.sample_source import SourceConfig
+from pipeline.devices.source_kinds import SOURCE_KINDS, source_config
 
 LARGEST_FILE_BYTES = 1 << 20
 LONGEST_OVERRIDE = 1000
@@ -222,9 +225,19 @@ def _shown(value: object) -> str:
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 
+def _plain(annotation: Any) -> Any:
+    """The type of a key, whatever else is said about it, and without None."""
+    if get_origin(annotation) is Annotated:
+        return _plain(get_args(annotation)[0])
+    others = [each for each in get_args(annotation) if each is not NoneType]
+    return _plain(others[0]) if get_origin(annotation) in (UnionType, Union) and len(others) == 1 else annotation
+
+
 def _keys_at(model: type[BaseModel], location: Iterable[int | str]) -> list[str]:
     """The keys allowed at a place in a nested model."""
     here: Any = model
     for part in location:
-        here = here.model_fields[part].annotation if isinstance(part, str) else get_args(here)[0]
+        if here is SourceConfig:  # the settings of a kind, which has this key
+            here = next(model for model in map(source_config, SOURCE_KINDS) if part in model.model_fields)
+        here = _plain(here.model_fields[part].annotation if isinstance(part, str) else get_args(here)[0])
     return [*here.model_fields, *getattr(here, "short_form_keys", ())]

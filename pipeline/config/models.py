@@ -26,7 +26,7 @@ from pipeline.devices.sample_source import MOST_FANS, SourceConfig, too_many_fan
 from pipeline.devices.serial_config import MOST_FANS_ON_LINE
 from pipeline.devices.source_kinds import parse_source
 from pipeline.errors import UsageError, UserError
-from schemas.tacho import Tachos, tacho_of_each_fan
+from schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 from schemas.topics import RESERVED_TRAY_NAMES
 from schemas.units import SpeedUnit
 
@@ -72,6 +72,16 @@ class Section(BaseModel):
         return value
 
 
+BETWEEN_ENDPOINTS = ", "
+
+
+def _joined(value: object) -> object:
+    """Several endpoints as one text; anything else as it is."""
+    if isinstance(value, list | tuple) and value and all(isinstance(each, str) for each in value):
+        return BETWEEN_ENDPOINTS.join(value)
+    return value
+
+
 ROLE_PLACE = "{role}"
 """in a path of `bus.security`: the name of the role of a process"""
 
@@ -97,6 +107,13 @@ class SecurityConfig(Section):
         return self.model_copy(update=paths)
 
 
+class SpoolConfig(Section):
+    """What a process keeps on disk of what it has published, in `run_folder/spool`."""
+
+    megabytes: float = Field(default=200.0, ge=1, description="the most that a process keeps on disk")
+    kept_s: float = Field(default=900.0, ge=1, description="how long a message is kept")
+
+
 class BusConfig(Section):
     """How processes find one another. On one host the first process to start listens on `endpoint`, the others
     connect there and learn of each other; if it dies, the next to start takes its place."""
@@ -104,8 +121,10 @@ class BusConfig(Section):
     mode: Literal["peer", "client"] = Field(
         default="peer", description="peer: processes meet without a router; client: all go through `fantwin router`"
     )
-    endpoint: str = Field(
-        default="tcp/127.0.0.1:7447", description="where peers meet, or the router's address for clients"
+    endpoint: Annotated[str, BeforeValidator(_joined)] = Field(
+        default="tcp/127.0.0.1:7447",
+        description="where peers meet, or the router's address for clients; a list of several routers: a client uses "
+        "the first that answers, and another one when that has gone",
     )
     recovery_timeout_s: float = Field(
         default=5.0, gt=0, description="how long to wait for missed messages that were requested again"
@@ -116,6 +135,21 @@ class BusConfig(Section):
     zenoh: dict[str, Any] = Field(
         default_factory=dict, description="settings of Zenoh itself, by path; not those that fantwin sets"
     )
+    spool: SpoolConfig | None = Field(
+        default=None,
+        description="what producers keep on disk for consumers that are cut off for long; without it, nothing",
+    )
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Each endpoint; `endpoint` is all of them, for people."""
+        return tuple(self.endpoint.split(BETWEEN_ENDPOINTS))
+
+    @model_validator(mode="after")
+    def _one_for_peers(self) -> Self:
+        if self.mode == "peer" and len(self.endpoints) > 1:
+            raise ValueError('peers meet at one endpoint; a list is for mode = "client"')
+        return self
 
 
 class LauncherConfig(Section):
@@ -188,11 +222,24 @@ class TrayConfig(Section):
     command_min: float = Field(default=0.0, description="smallest command the device may send or be sent")
     command_max: float = Field(default=1.0, description="largest command the device may send or be sent")
     twin: Path | None = Field(default=None, description="ONNX file of the healthy twin")
-    tacho: Tachos = Field(
-        default={"kind": "instantaneous"},
-        validate_default=True,
-        description="how the speed is measured: one tacho for all fans, or a list with one for each",
+    tacho: Tachos | None = Field(
+        default=None,
+        description="how the speed is measured: one tacho for all fans, or a list with one for each; without it what "
+        "the source states to measure, or else instantaneous",
     )
+
+    @property
+    def tachos(self) -> tuple[Tacho, ...]:
+        """How the speed is measured, one for all fans or one for each."""
+        return self.tacho or self.source.stated_tachos(self.fans) or INSTANTANEOUS
+
+    @property
+    def stated_tachos(self) -> tuple[Tacho, ...]:
+        """The same where the source states what it measures, one for all fans if they agree; empty where it does not:
+        what its samples then say of themselves is no more than this file does."""
+        if self.source.stated_tachos(self.fans) is None:
+            return ()
+        return self.tachos[:1] if len(set(self.tachos)) == 1 else self.tachos
 
     @model_validator(mode="before")
     @classmethod
@@ -218,7 +265,7 @@ class TrayConfig(Section):
 
     @model_validator(mode="after")
     def _tacho_for_each_fan(self) -> Self:
-        tacho_of_each_fan(self.tacho, self.fans)
+        tacho_of_each_fan(self.tachos, self.fans)
         return self
 
     @model_validator(mode="after")

@@ -66,7 +66,7 @@ STAGES: dict[str, StageRow] = {
             "stages.acquisition:STAGE",
             enabled_by="default",
             scope="tray",
-            reads=("command",),
+            reads=("command", "reading"),
             writes=("raw",),
         ),
         StageRow("resampler", "stages.resampler:STAGE", enabled_by="default", reads=("raw",), writes=("grid",)),

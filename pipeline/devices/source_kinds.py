@@ -25,6 +25,21 @@ SOURCE_KINDS: dict[str, SourceKind] = {
     "serial": SourceKind(
         config="pipeline.devices.serial_config:SerialConfig", source="pipeline.devices.serial_source:SerialSource"
     ),
+    "mqtt": SourceKind(
+        config="pipeline.devices.mqtt_config:MqttConfig", source="pipeline.devices.mqtt_source:MqttSource"
+    ),
+    "http": SourceKind(
+        config="pipeline.devices.http_config:HttpConfig", source="pipeline.devices.http_source:HttpSource"
+    ),
+    "push": SourceKind(
+        config="pipeline.devices.push_config:PushConfig", source="pipeline.devices.push_source:PushSource"
+    ),
+    "hwmon": SourceKind(
+        config="pipeline.devices.hwmon_config:HwmonConfig", source="pipeline.devices.hwmon_source:HwmonSource"
+    ),
+    "modbus": SourceKind(
+        config="pipeline.devices.modbus_config:ModbusConfig", source="pipeline.devices.modbus_source:ModbusSource"
+    ),
 }
 
 
@@ -42,11 +57,16 @@ def parse_source(values: Any) -> SourceConfig:
     kind = values["kind"]
     if not isinstance(kind, str) or kind not in SOURCE_KINDS:
         raise ValueError(f"unknown kind {kind!r}; known: {', '.join(SOURCE_KINDS)}")
-    model: type[SourceConfig] = _load(SOURCE_KINDS[kind].config)
+    model = source_config(kind)
     for key in values:
         if key not in model.model_fields:
             raise ValueError(f"unknown key {key!r} of kind {kind!r}; known: {', '.join(model.model_fields)}")
     return model.model_validate(values)
+
+
+def source_config(kind: str) -> type[SourceConfig]:
+    """The model of the settings of a kind."""
+    return _load(SOURCE_KINDS[kind].config)
 
 
 def build_source(config: SourceConfig, context: SourceContext) -> SampleSource:

@@ -105,7 +105,9 @@ def tacho_hints(t_s: Array, speed_rad_s: Array, declared: Sequence[Tacho], fans:
 
 
 def _agree(declared: Tacho, found: Tacho) -> bool:
-    if declared.kind != found.kind:
+    if declared.kind == "average" and not declared.resolution_rad_s:
+        return declared.held_s > 0.0 and math.isclose(declared.held_s, found.held_s, rel_tol=SIMILAR)
+    if declared.kind not in ("count", "average"):
         return False
     close = (math.isclose(getattr(declared, name), getattr(found, name), rel_tol=SIMILAR) for name in _SEEN)
     return all(close)

@@ -29,8 +29,8 @@ def recording_metadata(context: Context) -> tuple[dict[str, str], dict[str, byte
     for tray in context.trays:
         metadata[f"fans.{tray.name}"] = str(tray.fans)
         metadata[f"speed_unit.{tray.name}"] = tray.speed_unit
-        if tray.tacho != INSTANTANEOUS:
-            metadata[f"{TACHO_KEY}.{tray.name}"] = tachos_to_json(tray.tacho)
+        if tray.tachos != INSTANTANEOUS:
+            metadata[f"{TACHO_KEY}.{tray.name}"] = tachos_to_json(tray.tachos)
         if tray.twin is not None:
             path = context.resolve(tray.twin)
             try:

@@ -6,7 +6,7 @@ as far as possible. See docs/reference/recordings.md.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from pipeline.recordings.records import (
 )
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
+from schemas.messages import StatedTacho
 from schemas.tacho import INSTANTANEOUS, Tacho, tachos_from_json
 from schemas.topics import current_name, topic_of
 
@@ -164,17 +165,20 @@ class RecordingMetadata:
         """The topics that the recorder left out on purpose (`recorder.topics`), in the order of their table."""
         return left_out_of(self.metadata)
 
-    def tacho(self, tray: str) -> tuple[Tacho, ...]:
+    def tacho(self, tray: str, stated: Sequence[StatedTacho] = ()) -> tuple[Tacho, ...]:
         """How the speeds of a tray were measured; instantaneous where the recording does not say.
+
+        stated: by its raw messages; counts where the metadata do not say it.
 
         Raises:
             RecordingError: what it says cannot be read.
         """
         text = self.metadata.get(f"{TACHO_KEY}.{tray}")
         try:
-            return tachos_from_json(text) if text else INSTANTANEOUS
+            return tachos_from_json(text) if text else tuple(each.tacho for each in stated) or INSTANTANEOUS
         except ValueError as error:
-            raise RecordingError(f"the metadata are damaged: {TACHO_KEY}.{tray} is not a list of tachos") from error
+            where = f"metadata are damaged: {TACHO_KEY}.{tray} is" if text else "raw messages state a tacho that is"
+            raise RecordingError(f"the {where} not one of this version") from error
 
 
 def left_out_of(metadata: Mapping[str, str]) -> tuple[str, ...]:

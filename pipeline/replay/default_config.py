@@ -77,7 +77,7 @@ def default_config(
     for tray, messages in first.items():
         unit = metadata.speed_unit(tray) if metadata.speed_unit(tray) in ("rad/s", "rpm") else "rad/s"
         text += f'\n[[tray]]\nname = {json.dumps(tray)}\nfans = {messages[0].fans}\nspeed_unit = "{unit}"\n'
-        if (tacho := metadata.tacho(tray)) != INSTANTANEOUS:
+        if (tacho := metadata.tacho(tray, messages[0].tachos)) != INSTANTANEOUS:
             text += f"tacho = [{', '.join(_toml_table(its) for its in tacho)}]\n"
     return parse_config(text, path, overrides, stages)
 

@@ -152,6 +152,10 @@ class Sessions:
         """Whether this producer is a session that is alive."""
         return producer in self._written
 
+    def has_ended(self, producer: str) -> bool:
+        """Whether this producer is a session that has left: ended, or cut off."""
+        return producer in self._ended and producer not in self._written
+
     def is_stranger(self, key: str, producer: str) -> bool:
         """Whether a session publishes on this key, and this producer neither is nor was one."""
         if producer in self._written or producer in self._ended:

@@ -115,10 +115,10 @@ def learned_twin(tray: TrayConfig, name: str, content: bytes) -> TwinFile:
 
 def _with_tachos_of(tray: TrayConfig, path: Path, twin: TwinFile) -> TwinFile:
     """The same twin. Raises StageError if it was trained with other tachos than those of the tray."""
-    of_tray = tacho_of_each_fan(tray.tacho, tray.fans)
+    of_tray = tacho_of_each_fan(tray.tachos, tray.fans)
     if twin.tachos != of_tray and any(tacho.window_s > 0.0 for tacho in twin.tachos):
         raise StageError(
-            f"{path}: the twin was trained on readings by {_text(twin.tachos)}, but [[tray]] tacho is "
+            f"{path}: the twin was trained on readings by {_text(twin.tachos)}, but those of the tray are by "
             f"{_text(of_tray)}: correct tacho, or train a twin on recordings of this tray"
         )
     return twin

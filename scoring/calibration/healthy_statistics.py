@@ -192,7 +192,8 @@ class _RunScoring:
         self._rows = [rows().index(row) for row in calibrated_rows()]
         self._windows = Windows(run.fans, len(calibrated_rows()), limits.timing.on_delay_s)
         tachos = tacho_of_each_fan(run.tachos, run.fans)
-        self._count_std_rad_s = np.array([tacho.resolution_rad_s for tacho in tachos]) / math.sqrt(6.0)
+        graded = [tacho.resolution_rad_s / math.sqrt(tacho.resolution_steps) for tacho in tachos]
+        self._count_std_rad_s = np.array(graded)
         self._seconds = {source: _Means(1.0) for source in RESIDUALS}
         counts_s = COUNTS_OF_A_MEAN * max(tacho.held_s for tacho in tachos)
         self._standardised_means = {

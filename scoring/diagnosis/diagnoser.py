@@ -31,6 +31,7 @@ NEWS = 0.1  # a change of a probability that is worth a message
 
 
 _NOT_KNOWN = np.zeros(0, np.bool_)
+_NOT_MEASURED = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,8 @@ class _Block:
     expected_rad_s: Array
     reading_missing: Array
     """(n, fans) of bool; empty where the line does not tell"""
+    supply_voltage_v: Array
+    """(n, fans); empty where it is not measured"""
 
 
 class Diagnoser:
@@ -59,11 +62,12 @@ class Diagnoser:
         knows_readings: bool = True,
         knows_falls: bool = True,
         plain_words: bool = True,
+        knows_supply: bool = False,
     ) -> None:
         """advice: None only to diagnose as for recordings made before there was any; see `diagnose`. standstill: None
         where the detector of it is not used. knows_readings: False only to diagnose as for recordings made before
         causes accounted for what a tacho resolves; knows_falls: before a fan that slows down was compared with one that
-        comes to rest; plain_words: see `diagnose`.
+        comes to rest; plain_words and knows_supply: see `diagnose`.
         """
         self._healthy = healthy
         self._advice = advice
@@ -72,6 +76,7 @@ class Diagnoser:
         self._knows_readings = knows_readings
         self._knows_falls = knows_falls
         self._plain_words = plain_words
+        self._knows_supply = knows_supply
         self._blocks: deque[_Block] = deque()
         self._period_ns = 0
         self._due: dict[int, list[int]] = {}
@@ -88,6 +93,7 @@ class Diagnoser:
         expected_command: Array | float = 0.0,
         expected_rad_s: Array | float = math.nan,
         reading_missing: Array = _NOT_KNOWN,
+        supply_voltage_v: Array = _NOT_MEASURED,
     ) -> None:
         """Store a block; t_ns (n,), the others (n, fans).
 
@@ -95,6 +101,7 @@ class Diagnoser:
         healthy running from which the offset is known. expected_command: the expected healthy balance at
         this speed, apart from the offset; NaN where the speed is unknown. expected_rad_s: what a healthy fan would
         read. reading_missing: where the newest raw sample had no reading; empty where the line does not tell.
+        supply_voltage_v: empty where it is not measured.
         """
         if period_ns != self._period_ns:
             self._blocks.clear()
@@ -103,7 +110,17 @@ class Diagnoser:
             np.broadcast_to(one, offset_command.shape) for one in (offset_s, expected_command, expected_rad_s)
         )
         self._blocks.append(
-            _Block(t_ns, command, speed_rad_s, offset_command, offset_s, expected, reading, reading_missing)
+            _Block(
+                t_ns,
+                command,
+                speed_rad_s,
+                offset_command,
+                offset_s,
+                expected,
+                reading,
+                reading_missing,
+                supply_voltage_v,
+            )
         )
         oldest_t_ns = int(t_ns[0]) - min(round(WINDOW_S * NS_PER_S), MAX_SAMPLES * period_ns)
         while int(self._blocks[0].t_ns[-1]) < oldest_t_ns:
@@ -134,7 +151,14 @@ class Diagnoser:
         if window is None:
             return ()
         tacho = self._tachos[fan] if self._knows_readings else None
-        causes = diagnose(window, self._healthy[fan], self._advice, tacho, plain_words=self._plain_words).causes
+        causes = diagnose(
+            window,
+            self._healthy[fan],
+            self._advice,
+            tacho,
+            plain_words=self._plain_words,
+            knows_supply=self._knows_supply,
+        ).causes
         if self._knows_falls and self._standstill is not None:
             rest = coming_to_rest(window, self._standstill, self._healthy[fan], self._tachos[fan])
             causes = rest.beside(causes) if rest else causes
@@ -206,6 +230,10 @@ class Diagnoser:
         if any(len(block.reading_missing) for block in blocks):
             lacks = np.zeros(index[-1] + 1, np.bool_)
             lacks[index] = np.concatenate([_lacks(block)[:, fan] for block in blocks])[rows]
+        supply_v = None
+        if any(len(block.supply_voltage_v) for block in blocks):
+            supply_v = np.full(index[-1] + 1, np.nan)
+            supply_v[index] = np.concatenate([_supply_v(block)[:, fan] for block in blocks])[rows]
         healthy, period_s = self._healthy[fan], self._period_ns / NS_PER_S
         std_of_one_second = healthy.sigma_command * summed_deviation(healthy.autocorrelation_time_s, period_s)
         offset_s = max(_column(blocks, "offset_s", fan, rows)[-1], period_s)
@@ -218,6 +246,7 @@ class Diagnoser:
             expected_command=expected,
             expected_rad_s=reading,
             reading_missing=lacks,
+            supply_voltage_v=supply_v,
             fan_offset=float(_column(blocks, "offset_command", fan, rows)[-1]),
             fan_offset_std_error=std_of_one_second / math.sqrt(offset_s),
         )
@@ -229,6 +258,10 @@ def _column(blocks: Sequence[_Block], name: str, fan: int, rows: Array) -> Array
 
 def _lacks(block: _Block) -> Array:
     return block.reading_missing if len(block.reading_missing) else ~np.isfinite(block.speed_rad_s)
+
+
+def _supply_v(block: _Block) -> Array:
+    return block.supply_voltage_v if len(block.supply_voltage_v) else np.full(block.command.shape, np.nan)
 
 
 def _message(cause: RankedCause) -> CauseMessage:

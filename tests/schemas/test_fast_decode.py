@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from schemas.codec import CodecError, encode
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header, decode_together
-from schemas.messages import Header, InputPosition, Raw
+from schemas.messages import Header, InputPosition, Raw, StatedTacho, TachoKind
 from tests.support.message_strategies import same
 
 KEY = "fantwin/plant/tray1/raw"
@@ -50,3 +52,13 @@ def test_messages_that_do_not_fit_together_are_decoded_one_by_one():
     blocks = decode_together(Raw, [encode(raw(0, fans=2)), encode(raw(1, fans=3))])
     assert [block.fans for block in blocks] == [2, 3]
     assert decode_together(Raw, []) == []
+
+
+def test_what_every_message_of_a_block_states_is_stated_once_and_other_statements_are_kept_apart():
+    tachos = (StatedTacho(TachoKind.AVERAGE, window_s=1.0), StatedTacho(TachoKind.COUNT, 2, 0.5))
+    alike = [replace(raw(k), tachos=tachos) for k in range(5)]
+    (block,) = decode_together(Raw, [encode(message) for message in alike])
+    assert block.tachos == tachos and len(block.command) == 5
+    mixed = [replace(raw(0), tachos=tachos), raw(1), replace(raw(2), tachos=tachos[:1])]
+    blocks = decode_together(Raw, [encode(message) for message in mixed])
+    assert [block.tachos for block in blocks] == [tachos, (), tachos[:1]]

@@ -7,7 +7,7 @@ import pytest
 
 from schemas.tacho import Tacho
 from simulation.errors import SimulationError
-from simulation.tacho import CountingTacho, DelayedTacho, PeriodTacho, TachoSettings, simulated_tacho
+from simulation.tacho import AveragingTacho, CountingTacho, DelayedTacho, PeriodTacho, TachoSettings, simulated_tacho
 
 STEP_S = 0.01
 
@@ -18,7 +18,7 @@ def counts_of(tacho: Tacho, fans: int = 1, **errors: float) -> CountingTacho:
     )
 
 
-def readings(tacho: CountingTacho | PeriodTacho | DelayedTacho, speed_rad_s: np.ndarray) -> np.ndarray:
+def readings(tacho: AveragingTacho | CountingTacho | PeriodTacho | DelayedTacho, speed_rad_s: np.ndarray) -> np.ndarray:
     """(n, fans) readings after each step of a course (n + 1, fans)."""
     rows = []
     for step, (before, after) in enumerate(pairwise(speed_rad_s)):
@@ -112,3 +112,16 @@ def test_a_delay_shows_what_was_measured_before() -> None:
 def test_a_window_of_a_broken_number_of_updates_is_refused() -> None:
     with pytest.raises(SimulationError, match=r"not a whole number of updates of 0\.3 s; give 0\.333"):
         counts_of(Tacho(kind="count", window_s=1.0, update_s=0.3))
+
+
+def test_an_average_is_the_mean_speed_of_its_window_in_whole_steps_and_is_held() -> None:
+    tacho = Tacho(kind="average", window_s=0.25, update_s=1.0, step_rad_s=5.0)
+    speed = wandering(20.0, 1)
+    shown = readings(AveragingTacho([tacho], np.random.default_rng(3)), speed)[:, 0]
+    assert np.allclose(shown % 5.0, 0.0)
+    changes = np.flatnonzero(np.diff(shown)) + 1
+    assert np.all(np.diff(changes) % 100 == 0)
+    angle = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:, 0] + speed[:-1, 0]) * STEP_S)))
+    ends = changes[1:] + 1  # the window ends within the piece whose reading is new
+    mean = (angle[ends] - angle[ends - 25]) / 0.25
+    assert np.abs(shown[changes[1:]] - mean).max() < 2.5 + 1.5

@@ -588,4 +588,4 @@ def test_a_twin_of_another_tacho_is_refused_with_what_to_correct(tmp_path: Path)
     assert STAGE.check(_context(tmp_path, Path("twin.onnx")))
     (problem,) = STAGE.check(_context(tmp_path, Path("twin.onnx"), Tacho(kind="count", window_s=0.5)))
     assert "trained on readings by count over 1 s, 2 pulses" in problem
-    assert "[[tray]] tacho is count over 0.5 s" in problem
+    assert "those of the tray are by count over 0.5 s" in problem

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from pipeline.devices.sample_source import LinkUp, Reading, ReadingBatch, SourceConfig, SourceContext, SourceEvent
+from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
 
 
@@ -14,6 +15,10 @@ class ToyConfig(SourceConfig, frozen=True):
 
     kind: Literal["toy"] = "toy"
     speeds: tuple[float, ...]
+    average_s: float | None = None
+
+    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
+        return None if self.average_s is None else (Tacho(kind="average", window_s=self.average_s),) * fans
 
 
 class ToySource:
@@ -24,6 +29,7 @@ class ToySource:
 
     def __init__(self, config: ToyConfig, context: SourceContext) -> None:
         self._config, self._fans = config, context.fans
+        self.says: tuple[Tacho, ...] = ()
         self.sent: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
@@ -32,7 +38,7 @@ class ToySource:
             Reading((0.5,) * self._fans, (speed,) * self._fans, sequence=2 * number)
             for number, speed in enumerate(self._config.speeds)
         )
-        deliver(ReadingBatch(NS_PER_S, tuple(readings)))
+        deliver(ReadingBatch(NS_PER_S, tuple(readings), tachos=self.says))
 
     def stop(self) -> None:
         pass

@@ -8,7 +8,13 @@ from scoring.expected_reading import AveragedCommand
 from twin.measurement import Measurement
 
 SLOW = Tacho(kind="count", window_s=1.0)
-TACHOS = [SLOW, Tacho(kind="count", window_s=0.5, update_s=0.1, delay_s=0.07), Tacho(delay_s=0.3), Tacho()]
+TACHOS = [
+    SLOW,
+    Tacho(kind="count", window_s=0.5, update_s=0.1, delay_s=0.07),
+    Tacho(kind="average", window_s=0.4, update_s=1.5, step_rad_s=0.1),
+    Tacho(delay_s=0.3),
+    Tacho(),
+]
 
 
 def uneven_times(samples: int, signals: int) -> np.ndarray:
@@ -31,7 +37,7 @@ def test_the_expected_reading_is_the_mean_over_window_and_age(held: bool) -> Non
     signals = 200.0 + 50.0 * np.random.default_rng(4).standard_normal(times.shape).cumsum(axis=0)
     measurement = Measurement(times, TACHOS)
     shown = measurement.of_command(signals) if held else measurement.of_speed(signals)
-    for column, tacho in enumerate(TACHOS[:3]):
+    for column, tacho in enumerate(TACHOS[:4]):
         # Also where the window reaches before the first sample, whose value then counts as constant.
         for k in (0, 3, 15, 40, 78):
             ends = (k, k + 1) if held else (k,)

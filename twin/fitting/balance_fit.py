@@ -181,7 +181,7 @@ def _variance_of_counts(stretches: Sequence[_Stretch], fan: int) -> float:
         (tacho,) = grid.tacho
         held = max(1, round(tacho.held_s / grid.median_period_s))
         change = (speed_rad_s[held:] - speed_rad_s[:-held]) if tacho.held_s else np.zeros(1)
-        found.append(tacho.resolution_rad_s**2 / 6.0 + change**2 / 12.0)
+        found.append(tacho.resolution_rad_s**2 / tacho.resolution_steps + change**2 / 12.0)
     return float(np.nanmean(np.concatenate(found)))
 
 

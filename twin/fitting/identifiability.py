@@ -322,7 +322,8 @@ def _noise(pieces: Sequence[Run], fan: int) -> float:
 
     That of the tacho's resolution where it counts; or else, robust, of white noise with the second differences.
     """
-    if graded := pieces[0].tacho[fan].resolution_rad_s / np.sqrt(6.0):
+    tacho = pieces[0].tacho[fan]
+    if graded := tacho.resolution_rad_s / np.sqrt(tacho.resolution_steps):
         return float(graded)
     bends = np.concatenate([np.diff(piece.speed_rad_s[:, fan], 2) for piece in pieces])
     bends = bends[np.isfinite(bends)]

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from pydantic import ValidationError
 
-from pipeline.cli.options import JsonOption
+from pipeline.cli.options import (
+    CurrentOption,
+    JsonOption,
+    SupplyVoltageOption,
+    TemperatureOption,
+    auxiliary_options,
+)
+from pipeline.cli.simulation.simulated_hwmon import RATE_HZ, InjectedFaults, tachos_of
+from pipeline.devices.hwmon_simulator import FAULT_FILE, HwmonTree, play_hwmon
 from pipeline.devices.measured_table import read_table
 from pipeline.devices.simulated_device import PlaybackCounts, PseudoTerminal, play, wait_for_reader
 from pipeline.devices.table_device import TableDevice
@@ -23,6 +31,7 @@ from pipeline.errors import UsageError, UserError
 from pipeline.recordings.simulated import record
 from pipeline.runtime.signals import stop_on_signals
 from schemas import wire
+from schemas.auxiliary import AUXILIARY
 from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
@@ -40,15 +49,19 @@ _TACHO_OPTIONS = {
 }
 
 _LINE = "Serial line"
+_HWMON = "Fans of a computer instead"
 _RECORDING = "Write a recording instead"
 _FILE = "Play a measured file instead of simulating"
 _TACHO = "Tacho"
+_SURROUNDINGS = "Supply and air, of dc fans"
 _IMPERFECTIONS = "Imperfections of real trays"
 
 
 def simulate(
     fans: Annotated[int, typer.Option(help="Number of fans, 1 to 64.")] = 8,
-    rate: Annotated[float, typer.Option(help="Samples per second.")] = 100.0,
+    rate: Annotated[
+        float | None, typer.Option(help="Samples per second; default 100, with --hwmon how often it serves its files.")
+    ] = None,
     fan: Annotated[
         Literal["dc", "4-pin"], typer.Option(help="Kind of fan: on a bridge, or with a PWM input of its own.")
     ] = "dc",
@@ -67,6 +80,18 @@ def simulate(
     wait: Annotated[
         bool, typer.Option("--wait-for-reader", help="Start when a program has opened the port.", rich_help_panel=_LINE)
     ] = False,
+    hwmon: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder of files to serve as a driver in /sys/class/hwmon does. Write a fault into its file `fault`.",
+            rich_help_panel=_HWMON,
+        ),
+    ] = None,
+    chip: Annotated[
+        str,
+        typer.Option(help="Name of the chip, which says how its driver measures speeds.", rich_help_panel=_HWMON),
+    ] = "nct6798",
     fault: Annotated[
         list[str] | None,
         typer.Option(metavar="KIND:fan=N,start=S,stop=S,size=X", help="Scheduled fault. Repeatable."),
@@ -79,9 +104,9 @@ def simulate(
         int, typer.Option(help="Random seed of the variation between fans.", rich_help_panel=_IMPERFECTIONS)
     ] = 1,
     tacho: Annotated[
-        Literal["instantaneous", "count", "period"],
+        Literal["instantaneous", "count", "average", "period"],
         typer.Option(
-            help="What a reading is: the speed now, pulses counted over a window, or the last revolution.",
+            help="What a reading is: the speed now, pulses counted or averaged over a window, or the last revolution.",
             rich_help_panel=_TACHO,
         ),
     ] = "instantaneous",
@@ -123,6 +148,29 @@ def simulate(
         int,
         typer.Option(help="First reading of the device clock, which wraps at 2^32.", rich_help_panel=_IMPERFECTIONS),
     ] = 0,
+    measure: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="COLUMN",
+            help="Send this column, too: supply_voltage_v, current_a or temperature_c. Repeatable.",
+            rich_help_panel=_SURROUNDINGS,
+        ),
+    ] = None,
+    supply_wander: Annotated[
+        float,
+        typer.Option(
+            help="Wander of the supply voltage, relative standard deviation, e.g. 0.05.", rich_help_panel=_SURROUNDINGS
+        ),
+    ] = 0.0,
+    air_temperature: Annotated[
+        float, typer.Option(help="Mean temperature of the air, °C.", rich_help_panel=_SURROUNDINGS)
+    ] = 20.0,
+    air_swing: Annotated[
+        float,
+        typer.Option(
+            help="Amplitude of the temperature around it, °C, over 10 minutes.", rich_help_panel=_SURROUNDINGS
+        ),
+    ] = 0.0,
     recording: Annotated[
         Path | None,
         typer.Option(help="Recording to write, faster than real time.", rich_help_panel=_RECORDING),
@@ -166,6 +214,9 @@ def simulate(
             rich_help_panel=_FILE,
         ),
     ] = None,
+    supply_voltage: SupplyVoltageOption = None,
+    current: CurrentOption = None,
+    temperature: TemperatureOption = None,
     from_s: Annotated[
         float, typer.Option("--from", help="Start, seconds since the first row.", rich_help_panel=_FILE)
     ] = 0.0,
@@ -178,35 +229,48 @@ def simulate(
 
     Example: fantwin simulate --link /tmp/fan-tray --fault inlet:fan=2,start=10,stop=18,size=1.6 --truth truth.json
 
+    Fans of a computer: fantwin simulate --hwmon hw --fan 4-pin --fans 3 --profile thermostat
+
     A rack: fantwin simulate --fan 4-pin --fans 4 --tacho count --window 1.0 --pulses 2 --rate 10 --profile thermostat
     """
     device: SimulatedTray | TableDevice
     tachos = INSTANTANEOUS
+    tray: SimulatedTray | None = None
+    if hwmon and (from_csv or recording or link or wait):
+        raise UsageError("--hwmon excludes --from-csv, --recording, --link and --wait-for-reader")
     if from_csv:
         if recording or fault:
             raise UsageError(
                 "--from-csv plays a file unchanged: leave out --fault; instead of --recording use `fantwin import`"
             )
-        device = TableDevice(
-            read_table(from_csv, time or None, command or [], speed or [], period=period), from_s, to_s
-        )
+        auxiliary = auxiliary_options(supply_voltage, current, temperature)
+        table = read_table(from_csv, time or None, command or [], speed or [], period=period, auxiliary=auxiliary)
+        device = TableDevice(table, from_s, to_s)
         summary_of = partial(_summary_of_file, from_csv, device)
     else:
-        if time or period or command or speed:
-            raise UsageError("--time, --period, --command and --speed describe a file: name it with --from-csv FILE")
+        if time or period or command or speed or supply_voltage or current or temperature:
+            raise UsageError("--time, --period and columns describe a file: name it with --from-csv FILE")
         tachos = tuple(
             _tacho(kind=tacho, pulses=pulses, window_s=one, update_s=update, delay_s=tacho_delay)
             for one in window or [0.0]
         )
-        device = _tray(
+        if hwmon and tacho == "instantaneous":
+            tachos = tachos_of(chip)
+        device = tray = _tray(
             faults=fault or [],
             tachos=tachos,
             noise_rad_s=noise,
             shares={"missing_edges": missing_edges, "double_edges": double_edges, "missing_readings": missing},
             clock={"drift_ppm": drift_ppm, "start_us": clock_start_us},
+            surroundings={
+                "measured": _measured(measure or []),
+                "supply_wander": supply_wander,
+                "temperature_c": air_temperature,
+                "temperature_swing_c": air_swing,
+            },
             fans=fans,
             fan=fan,
-            rate_hz=rate,
+            rate_hz=rate if rate is not None else RATE_HZ if hwmon else 100.0,
             duration_s=math.inf if duration is None else duration,
             profile=profile,
             seed=seed,
@@ -215,8 +279,10 @@ def simulate(
             lost=lost,
             jitter_us=jitter_us,
         )
-        summary_of = partial(_summary_of_tray, device)
-    if recording:
+        summary_of = partial(_summary_of_tray, tray)
+    if hwmon and tray:
+        played = _serve_hwmon(tray, hwmon, chip, err=json_output)
+    elif recording:
         if duration is None or link or wait:
             raise UsageError("--recording needs --duration, and excludes --link and --wait-for-reader")
         if not math.isfinite(duration):
@@ -225,25 +291,52 @@ def simulate(
             raise UserError(f"{recording}: exists; name another file with --recording, or replace it with --force")
         epoch_ns = clock.time_ns() if epoch_ns is None else epoch_ns
         played = record(device, recording, epoch_ns, duration, speed_unit, tachos)
-        summary = summary_of(played, complete=True)
-        _save(truth, summary)
     else:
-        stop = threading.Event()
-        stop_on_signals(stop)
-        line = PseudoTerminal(link)
-        try:
-            _save(truth, summary_of(PlaybackCounts(), complete=False))
-            fans_on = "1 fan on" if device.fans == 1 else f"{device.fans} fans on"
-            typer.echo(f"{fans_on} {link or line.port}: {protocol}, speeds in {speed_unit}", err=json_output)
-            if wait:
-                wait_for_reader(line, protocol, stop)
-            on_start = partial(_save_start, truth, summary_of)
-            played = play(device, line, protocol, RAD_S_PER_UNIT[speed_unit], stop, on_start)
-            summary = summary_of(played, complete=True)
-            _save(truth, summary)
-        finally:
-            line.close()
+        _save(truth, summary_of(PlaybackCounts(), complete=False))
+        played = _serve_line(
+            device, link, protocol, speed_unit, partial(_save_start, truth, summary_of), wait=wait, err=json_output
+        )
+    summary = summary_of(played, complete=True)
+    _save(truth, summary)
     typer.echo(json.dumps(summary) if json_output else _count_text(played))
+
+
+def _serve_line(
+    device: SimulatedTray | TableDevice,
+    link: Path | None,
+    protocol: wire.Protocol,
+    speed_unit: SpeedUnit,
+    on_start: Callable[[int], None],
+    *,
+    wait: bool,
+    err: bool,
+) -> PlaybackCounts:
+    """Play the device on a pseudo-terminal. wait: for a reader. err: say on stderr where it is."""
+    stop = threading.Event()
+    stop_on_signals(stop)
+    line = PseudoTerminal(link)
+    try:
+        fans_on = "1 fan on" if device.fans == 1 else f"{device.fans} fans on"
+        typer.echo(f"{fans_on} {link or line.port}: {protocol}, speeds in {speed_unit}", err=err)
+        if wait:
+            wait_for_reader(line, protocol, stop)
+        return play(device, line, protocol, RAD_S_PER_UNIT[speed_unit], stop, on_start)
+    finally:
+        line.close()
+
+
+def _serve_hwmon(tray: SimulatedTray, root: Path, chip: str, *, err: bool) -> PlaybackCounts:
+    """Run the tray behind a tree of files until Ctrl-C. err: say where on stderr."""
+    stop = threading.Event()
+    stop_on_signals(stop)
+    tree = HwmonTree(root, chip, tray.fans)
+    try:
+        typer.echo(
+            f"{tray.fans} fans of {chip} in {root}; faults: echo tacho-stuck:fan=0 > {root / FAULT_FILE}", err=err
+        )
+        return play_hwmon(tray, tree, stop, InjectedFaults(tray, root).follow)
+    finally:
+        tree.close()
 
 
 def _tacho(**settings: Any) -> Tacho:
@@ -270,6 +363,7 @@ def _tray(
     noise_rad_s: float,
     shares: Mapping[str, float],
     clock: Mapping[str, Any],
+    surroundings: Mapping[str, Any],
     **settings: Any,
 ) -> SimulatedTray:
     """The tray with these settings; see `simulation.tray.TraySettings`.
@@ -280,15 +374,27 @@ def _tray(
     from simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
     from simulation.faults import parse_fault  # noqa: PLC0415
     from simulation.plant import DeviceClock  # noqa: PLC0415
+    from simulation.surroundings import Surroundings  # noqa: PLC0415
     from simulation.tacho import NoisyTacho, TachoSettings  # noqa: PLC0415
     from simulation.tray import SimulatedTray, TraySettings  # noqa: PLC0415
 
     measured = TachoSettings(tachos, NoisyTacho(noise_rad_s), **shares)
     try:
         schedule = tuple(map(parse_fault, faults))
-        return SimulatedTray(TraySettings(faults=schedule, tacho=measured, clock=DeviceClock(**clock), **settings))
+        around, device_clock = Surroundings(**surroundings), DeviceClock(**clock)
+        return SimulatedTray(
+            TraySettings(faults=schedule, tacho=measured, clock=device_clock, surroundings=around, **settings)
+        )
     except SimulationError as error:
         raise UsageError(str(error)) from error
+
+
+def _measured(names: list[str]) -> tuple[str, ...]:
+    known = [column.name for column in AUXILIARY]
+    for name in names:
+        if name not in known:
+            raise UsageError(f"--measure {name}: known are {', '.join(known)}")
+    return tuple(name for name in known if name in names)
 
 
 def _counts(played: PlaybackCounts) -> Summary:

@@ -199,13 +199,13 @@ def _ranges(command: Array, speed_rad_s: Array, tray: TrayConfig, twin: TrayTwin
 
 def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Finding]:
     """Whether the readings are those of the declared tachos. t_s: (n,). speed_rad_s: (n, fans)."""
-    hints = tacho_hints(t_s, speed_rad_s, tray.tacho, range(tray.fans))
+    hints = tacho_hints(t_s, speed_rad_s, tray.tachos, range(tray.fans))
     for hint in hints:
         yield False, hint
     seen = [find_tacho(t_s, readings) is not None for readings in speed_rad_s.T]
     if any(seen) and not hints:
         yield True, f"tachos of {_fans(seen)}: they read as declared"
-    if not all(seen) and (hints or "tacho" not in tray.model_fields_set):
+    if not all(seen) and (hints or (tray.tacho is None and not tray.stated_tachos)):
         unseen = _fans([not one for one in seen])
         yield (
             True,

@@ -72,7 +72,7 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(text, words):
 
 def test_a_tacho_is_one_for_all_fans_of_a_tray_or_one_for_each():
     def windows_s(text: str) -> list[float]:
-        return [tacho.window_s for tacho in parse(GOOD.replace("fans = 8", text)).tray("a").tacho]
+        return [tacho.window_s for tacho in parse(GOOD.replace("fans = 8", text)).tray("a").tachos]
 
     count = '{ kind = "count", pulses = 2, window_s = %s }'
     assert windows_s("fans = 8") == [0.0]

@@ -16,10 +16,12 @@ from pipeline.devices.sample_blocks import BlockEvent, SampleBlocks
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.source_kinds import SOURCE_KINDS, SourceKind
 from pipeline.runtime.stage import BuiltStage, Context
-from schemas.messages import Command, Raw
+from schemas.messages import Command, Raw, StatedTacho
+from schemas.tacho import Tacho
 from stages.acquisition import STAGE
 from tests.support.toy_source import ToyConfig, ToySource
 
+KINDS = ", ".join([*SOURCE_KINDS, "toy"])
 CONFIGURATION = """
 [[tray]]
 name = "bench"
@@ -79,6 +81,25 @@ def test_a_new_source_shares_range_checks_units_blocks_and_loss_counting() -> No
     assert parts.core.problem().startswith("toy: nothing received for 2 s")
 
 
+def test_what_a_source_states_to_measure_is_in_its_messages_unless_the_tray_says_otherwise() -> None:
+    def messages(text: str, says: tuple[Tacho, ...] = ()) -> list[Raw]:
+        parts, source = built(text)
+        source.says = says
+        return [each for event in events_of(parts) for each in parts.core.step(event) if isinstance(each, Raw)]
+
+    stated = CONFIGURATION.replace("speeds", "average_s = 0.5, speeds")
+    average, count = Tacho(kind="average", window_s=0.5), Tacho(kind="count", window_s=1.0)
+    (tray,) = parse_config(stated, Path("fantwin.toml")).trays
+    assert tray.tachos == (average, average)
+    assert [raw.tachos for raw in messages(stated)] == [(StatedTacho.of(average),)]
+    overridden = stated.replace("speed_unit", 'tacho = { kind = "count", window_s = 1.0 }\nspeed_unit')
+    assert parse_config(overridden, Path("fantwin.toml")).trays[0].tachos == (count,)
+    assert [raw.tachos for raw in messages(overridden)] == [(StatedTacho.of(count),)]
+    # A configuration that says it of a source that does not know is no statement of the source.
+    assert [raw.tachos for raw in messages(overridden.replace("average_s = 0.5, ", ""))] == [()]
+    assert [raw.tachos for raw in messages(stated, (count, count))] == [(StatedTacho.of(count),)]
+
+
 def test_commands_reach_a_new_source_in_the_unit_of_its_tray() -> None:
     parts, source = built()
     parts.core.step(Command(fans=2, t_ns=0, command=np.array([0.25, math.nan]), set_point_rad_s=np.array([])))
@@ -105,12 +126,12 @@ def test_doctor_asks_the_source_what_would_keep_it_from_connecting() -> None:
 @pytest.mark.parametrize(
     ("source", "words"),
     [
-        ('{ kind = "toi" }', "unknown kind 'toi'; known: serial, toy"),
-        ('{ kind = ["toy"] }', "unknown kind ['toy']; known: serial, toy"),
+        ('{ kind = "toi" }', f"unknown kind 'toi'; known: {KINDS}"),
+        ('{ kind = ["toy"] }', f"unknown kind ['toy']; known: {KINDS}"),
         ("{ port = 3 }", "write source = { kind ="),
         ('"serial"', "write source = { kind ="),
         ('{ kind = "toy" }', "'tray.0.source.speeds' is missing"),
-        ('{ kind = "toy", speed = 1 }', "unknown key 'speed' of kind 'toy'; known: kind, speeds"),
+        ('{ kind = "toy", speed = 1 }', "unknown key 'speed' of kind 'toy'; known: kind, speeds, average_s"),
         ('{ kind = "serial", baud = 0 }', "tray.0.source.baud = 0"),
     ],
 )

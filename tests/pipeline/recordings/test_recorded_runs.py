@@ -1,5 +1,6 @@
 """Recordings as runs: time, command and speed as the model maker needs them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.runs import read_runs
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Raw
+from schemas.messages import Header, Raw, StatedTacho, TachoKind
+from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.topics import tray_key
 
 START_NS = 1_800_000_000_000_000_000
@@ -97,3 +99,13 @@ def test_a_tray_that_changes_its_number_of_fans_is_an_error(tmp_path):
     times = START_NS + np.arange(3) * 10**7
     with pytest.raises(RecordingError, match="the number of fans changes from 1 to 2"):
         read_runs(record(tmp_path / "r.mcap", raw(times), raw(times + 10**9, fans=2)))
+
+
+def test_what_the_messages_state_to_measure_counts_where_the_metadata_say_nothing(tmp_path):
+    stated = Tacho(kind="average", window_s=1.0, update_s=1.5)
+    messages = [replace(raw([START_NS + k]), tachos=(StatedTacho.of(stated),)) for k in range(3)]
+    assert read_runs(record(tmp_path / "r.mcap", *messages)).tacho == (stated,)
+    assert read_runs(record(tmp_path / "r.mcap", raw([START_NS, START_NS + 1]))).tacho == INSTANTANEOUS
+    unknown = [replace(each, tachos=(StatedTacho(TachoKind(99)),)) for each in messages]
+    with pytest.raises(RecordingError, match="raw messages state a tacho that is not one of this version"):
+        read_runs(record(tmp_path / "r.mcap", *unknown))

@@ -1,0 +1,56 @@
+"""Settings of a hwmon chip: `source = { kind = "hwmon", chip = "nct6798", fans = [1, 2] }`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from pipeline.devices.hwmon_chips import chip_of
+from pipeline.devices.polling import PolledConfig
+from schemas.tacho import Tacho
+
+ROOT = Path("/sys/class/hwmon")
+
+Number = Annotated[int, Field(ge=0, le=99)]
+
+
+class HwmonConfig(PolledConfig, frozen=True):
+    """Fans of this computer, as Linux shows them. The command is pwm, 0 to 255; the speed is in rpm."""
+
+    kind: Literal["hwmon"] = "hwmon"
+    chip: str = Field(
+        min_length=1, description="`name` of the chip, for example nct6798; `fantwin discover` lists them"
+    )
+    device: str = Field(
+        default="",
+        description="end of the path of its device, where several chips have one name: numbers of hwmon change",
+    )
+    fans: tuple[Number, ...] = Field(
+        default=(),
+        description="N of fanN_input, in the order of the tray; without it 1, 2, ... as many as the tray has",
+    )
+    pwms: tuple[Number, ...] = Field(
+        default=(), description="N of pwmN that drives each fan, or one for all; without it the numbers of the fans"
+    )
+    temperatures: tuple[Number, ...] = Field(
+        default=(), description="N of tempN_input, the temperature of the air at each fan, or one for all"
+    )
+    voltages: tuple[Number, ...] = Field(
+        default=(), description="N of inN_input, the supply voltage of each fan, or one for all"
+    )
+    voltage_scale: float = Field(
+        default=1.0, gt=0, le=1000, description="by which inN_input is multiplied: that of a divider on the board"
+    )
+    currents: tuple[Number, ...] = Field(default=(), description="N of currN_input of each fan, or one for all")
+    writable: bool = Field(
+        default=False, description="whether commands are written; pwmN_enable is then set to 1, and back at the end"
+    )
+    root: Path = Field(default=ROOT, description="where the chips are")
+
+    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
+        """What the driver of the chip gives, where it is known."""
+        del fans
+        chip = chip_of(self.chip)
+        return (chip.tacho,) if chip and chip.tacho else None

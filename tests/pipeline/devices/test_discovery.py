@@ -1,0 +1,72 @@
+"""`fantwin discover`: what it finds on trees of files can be pasted as it is, and what is missing is said."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import main as command_line
+from pipeline.config.loading import load_config, parse_config
+from pipeline.devices.discovery import discover_hwmon
+from pipeline.devices.hwmon_config import HwmonConfig
+from pipeline.devices.sample_source import SourceContext
+from pipeline.devices.source_kinds import build_source
+from pipeline.errors import UserError
+from tests.support.hwmon_trees import add_chip, board
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    root = tmp_path / "hwmon"
+    add_chip(root, 0, "acpitz", "virtual/thermal", {"temp1_input": 30000})
+    board(root, 2, "i2c-1/1-002f")
+    board(root, 7, "i2c-2/2-002f")
+    add_chip(root, 8, "thinkpad", "platform/thinkpad_hwmon", {"fan1_input": 3000, "fan2_input": 3100, "pwm1": 128})
+    return root
+
+
+def test_each_chip_with_fans_is_a_tray_that_reads_what_is_there(root: Path) -> None:
+    found = list(discover_hwmon(root))
+    assert [each.tray["name"] for each in found] == ["nct6798", "nct6798-2", "thinkpad"]
+    config = parse_config("\n".join(each.toml for each in found), Path("fantwin.toml"))
+    for tray in config.trays:
+        assert isinstance(tray.source, HwmonConfig) and not tray.source.writable
+        assert build_source(tray.source, SourceContext(tray.fans, tray.speed_unit, Path())).check() == []
+    first = found[0]
+    assert first.tray["source"]["device"] == "1-002f" and first.tray["source"]["fans"] == [1, 2]
+    assert "fan3 at 0 rpm although commanded to turn, left out: not connected?" in first.missing
+    assert any(note.startswith("measures average over 0.05 s") for note in first.notes)
+    assert found[2].missing[0].startswith("fan2 has no pwm2, so its command is not known")
+    assert any("not known" in note for note in found[2].notes)
+
+
+def test_a_tree_without_fans_or_no_tree_says_what_is_missing(tmp_path: Path) -> None:
+    (none,) = discover_hwmon(tmp_path / "none")
+    assert not none.tray and none.missing[0].startswith("no such folder: this system has no hwmon")
+    add_chip(tmp_path / "hwmon", 0, "k10temp", "pci/0", {"temp1_input": 1})
+    (bare,) = discover_hwmon(tmp_path / "hwmon")
+    assert bare.missing[0].startswith("no chip with a fan; chips: k10temp; load the driver")
+
+
+def test_files_that_may_not_be_written_are_named(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda path, _mode: not str(path).endswith("pwm1"))
+    assert "this user may not write pwm1" in next(iter(discover_hwmon(root))).missing[-1]
+
+
+def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_path: Path) -> None:
+    command_line._register(["discover"] if not command_line.app.registered_commands else ["discover", "info"])
+    file = tmp_path / "fantwin.toml"
+    words = ["discover", "--root", str(root), "--json", "--write", str(file), "--writable"]
+    result = CliRunner().invoke(command_line.app, words)
+    assert result.exit_code == 0, result.output
+    shown = json.loads(result.stdout)
+    assert [each["tray"]["name"] for each in shown if each["kind"] == "hwmon"] == ["nct6798", "nct6798-2", "thinkpad"]
+    config = load_config(file)
+    assert [tray.source.kind for tray in config.trays] == ["hwmon"] * 3
+    assert all(isinstance(tray.source, HwmonConfig) and tray.source.writable for tray in config.trays)
+    again = CliRunner().invoke(command_line.app, words)
+    assert isinstance(again.exception, UserError) and "exists; name a new file" in str(again.exception)

@@ -1,0 +1,171 @@
+"""Fans behind Modbus, against pymodbus's own server with a simulated rotor behind its registers."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.config.loading import parse_config
+from pipeline.config.models import ConfigError
+from pipeline.devices import modbus_source
+from pipeline.devices.modbus_config import ModbusConfig
+from pipeline.devices.modbus_source import ModbusDevice, ModbusSource
+from pipeline.devices.polling import DeviceError
+from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, SourceContext, SourceEvent
+from pipeline.errors import UserError
+from schemas.tacho import Tacho
+from simulation.tray import SimulatedTray, TraySettings
+from tests.support.modbus_server import (
+    COMMAND,
+    CURRENT,
+    REFUSED,
+    SPEED,
+    TEMPERATURE,
+    VOLTAGE,
+    WANTED,
+    Drive,
+    modbus_server,
+)
+
+FAN: dict[str, Any] = {
+    "unit": 3,
+    "speed": {"address": SPEED, "scale": 2.0},
+    "command": {"address": COMMAND, "scale": 0.001},
+    "write": {"address": WANTED, "scale": 0.001},
+    "current": {"address": CURRENT, "type": "f32"},
+    "supply_voltage": {"address": VOLTAGE, "type": "u32", "word_order": "little", "scale": 0.001},
+    "temperature": {"address": TEMPERATURE, "type": "s16", "scale": 0.1, "offset": 30.0},
+}
+
+
+def drive() -> Drive:
+    return Drive(SimulatedTray(TraySettings(fans=1, rate_hz=100.0)))
+
+
+def config(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusConfig:
+    return ModbusConfig.model_validate(
+        {"host": "127.0.0.1", "tcp_port": port, "timeout_s": 5.0, "fan": fans or (FAN,), **settings}
+    )
+
+
+def device(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusDevice:
+    made = ModbusDevice(config(port, *fans, **settings), SourceContext(len(fans) or 1, "rpm", Path()))
+    made.connect()
+    return made
+
+
+def test_registers_of_all_types_are_read_by_one_request_and_a_command_moves_the_rotor() -> None:
+    with modbus_server({3: drive()}) as port:
+        made = device(port)
+        assert [(each.first.address, each.count) for each in made._requests] == [(SPEED, 7)]
+        first = made.read()
+        assert first.current_a == (1.5,) and first.supply_voltage_v == pytest.approx((540.25,))
+        assert first.temperature_c == pytest.approx((24.5,))
+        made.write((0.9,), ())
+        time.sleep(0.8)
+        second = made.read()
+        assert second.command == (0.9,) and second.speed[0] > first.speed[0] + 500.0
+        assert second.speed[0] % 2.0 == 0.0
+        made.disconnect()
+
+
+def test_what_is_refused_is_nan_but_the_command_must_be_there() -> None:
+    with modbus_server({3: drive()}) as port:
+        made = device(port, FAN | {"speed": {"address": REFUSED}})
+        assert math.isnan(made.read().speed[0])
+        made.disconnect()
+        made = device(port, FAN | {"command": {"address": REFUSED, "table": "input"}})
+        with pytest.raises(DeviceError, match=r"command of fan 0 cannot be read: unit 3 refuses input register 200"):
+            made.read()
+        made.disconnect()
+
+
+def test_a_command_that_the_drive_refuses_or_that_no_register_takes_is_an_error() -> None:
+    without = {key: value for key, value in FAN.items() if key != "write"}
+    with modbus_server({3: drive()}) as port:
+        made = device(port)
+        with pytest.raises(DeviceError, match=r"unit 3 refuses 1.5 for register 100 \(exception 3\)"):
+            made.write((1.5,), ())
+        with pytest.raises(DeviceError, match=r"-10 does not fit into u16 of register 100"):
+            made.write((-0.01,), ())
+        made.disconnect()
+        closed = device(port, without)
+        assert not closed.is_writable
+        closed.disconnect()
+
+
+def test_a_unit_that_does_not_answer_is_a_failed_poll_and_a_server_that_ends_is_lost() -> None:
+    slow = drive()
+    with modbus_server({3: slow}) as port:
+        made = device(port)
+        made.read()  # the first one waits for the simulation
+        made.disconnect()
+        made = device(port, timeout_s=0.1)
+        slow.delay_s = 0.5
+        with pytest.raises(DeviceError, match="unit 3 does not answer within 0.1 s; check unit and wiring"):
+            made.read()
+        slow.delay_s = 0.0
+        made.disconnect()
+    with pytest.raises(DeviceError, match="cannot be opened or reached") as caught:
+        device(port)
+    assert caught.value.is_lost
+
+
+def test_the_source_polls_and_comes_back_when_the_server_does() -> None:
+    events: list[SourceEvent] = []
+
+    def wait_for(kind: type[SourceEvent], count: int) -> None:
+        until_s = time.monotonic() + 15.0
+        while sum(isinstance(event, kind) for event in events) < count:
+            assert time.monotonic() < until_s, events[-3:]
+            time.sleep(0.01)
+
+    with modbus_server({3: drive()}) as port:
+        source = ModbusSource(config(port, period_s=0.02, timeout_s=0.2), SourceContext(1, "rpm", Path()))
+        source.start(events.append)
+        wait_for(ReadingBatch, 5)
+    wait_for(LinkDown, 1)
+    with modbus_server({3: drive()}, port):
+        wait_for(LinkUp, 2)
+        source.stop()
+    assert isinstance(events[0], LinkUp)
+    (first,) = next(event for event in events if isinstance(event, ReadingBatch)).items
+    assert isinstance(first, Reading) and first.clock_us is not None and first.sequence == 0
+
+
+def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = ModbusConfig.model_validate({"port": "/dev/ttyUSB7", "baud": 9600, "parity": "O", "fan": (FAN,)})
+    made = ModbusDevice(settings, SourceContext(1, "rpm", Path()))
+    client = made._made_client()
+    line = client.comm_params
+    assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 1)
+    assert made.check()[0].startswith("/dev/ttyUSB7: no such port")
+    with pytest.raises(DeviceError, match="/dev/ttyUSB7: cannot be opened"):
+        made.connect()
+
+
+def test_the_registers_say_what_is_measured_where_the_averaging_time_is_known() -> None:
+    tray = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "modbus", host = "drive", %s fan = [ %s ] }\n'
+    fan = "{ speed = { address = 1, scale = 2.0 }, command = { address = 2 } }"
+    (known,) = parse_config(tray % ("average_s = 0.5,", fan), Path("fantwin.toml")).trays
+    assert known.tachos == (Tacho(kind="average", window_s=0.5, step_rad_s=2.0 * math.pi / 30.0),)
+    assert parse_config(tray % ("", fan), Path("fantwin.toml")).trays[0].tachos == (Tacho(),)
+    for change, words in (
+        (("address = 1,", "adress = 1,"), r"fan.0.speed.adress'; did you mean 'address'\?"),
+        (("scale = 2.0", "scale = 0"), "scale is 0"),
+        (('host = "drive",', ""), "give either host"),
+        (("fans = 1", "fans = 2"), "carries at most 1 fans"),
+    ):
+        with pytest.raises(ConfigError, match=words) as caught:
+            parse_config((tray % ("", fan)).replace(*change), Path("fantwin.toml"))
+        assert "\n" not in str(caught.value)
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_source, "is_installed", lambda _module: False)
+    with pytest.raises(UserError, match=r"needs the extra `modbus`; in the checkout: .*\[modbus\]"):
+        ModbusSource(config(502), SourceContext(1, "rpm", Path()))
