@@ -43,7 +43,7 @@ selftest: $(VENV)/.runtime
 # exit code 77 of the first script: it cannot be done here, and it has said why
 compose-test: $(VENV)/.development
 	@tests/deploy/compose/prepare.sh $(CONTAINERS) $(BIN)/python || { [ $$? = 77 ] && exit 0; exit 1; } && \
-		OMP_NUM_THREADS=1 tests/deploy/compose/in_namespaces.sh $(CONTAINERS) \
+		OMP_NUM_THREADS=1 timeout --signal KILL 900 tests/deploy/compose/in_namespaces.sh $(CONTAINERS) \
 		$(BIN)/python -m pytest --exitfirst --capture no tests/deploy/compose
 
 bench: $(VENV)/.benches

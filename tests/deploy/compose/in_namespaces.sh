@@ -32,6 +32,8 @@ export FANTWIN_CONTAINERS=$folder PATH=$folder/podman-compose/bin:$PATH
 exec unshare -mnpf --kill-child --mount-proc bash -euc '
     mount -t tmpfs tmpfs /run
     mount -t tmpfs tmpfs /dev/shm
+    mkdir -p /var/lib/containers
+    mount -t tmpfs tmpfs /var/lib/containers
     umount /sys/fs/cgroup/unified 2>/dev/null || true
     ip link set lo up
     # what a run that was killed has left in the folder; a container goes after those that depend on it
