@@ -142,6 +142,10 @@ def _type_words(annotation: Any) -> str:
         return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
     if get_origin(annotation) is UnionType:
         return " or ".join(_type_words(each) for each in get_args(annotation))
+    return _collection_words(annotation)
+
+
+def _collection_words(annotation: Any) -> str:
     if get_origin(annotation) is dict:
         return f"table of {_type_words(get_args(annotation)[1])}s"
     if get_origin(annotation) is tuple:
