@@ -4,6 +4,7 @@ WORKDIR /app
 COPY requirements.lock ./
 RUN pip install --no-cache-dir --require-hashes -r requirements.lock
 COPY pyproject.toml README.md LICENSE ./
+COPY fantwin_client fantwin_client
 COPY schemas schemas
 COPY scoring scoring
 COPY pipeline pipeline

@@ -9,8 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.fields import Array
-
 
 @dataclass(frozen=True, slots=True)
 class AuxiliaryColumn:
@@ -44,6 +42,9 @@ AUXILIARY = (
 """in the order of their bits in a binary frame: never reorder, only append"""
 
 
-def auxiliary_columns(message: Any) -> dict[str, Array]:
-    """The columns that a message, or a record with the same names, has, by name; those that are empty are left out."""
+def auxiliary_columns(message: Any) -> dict[str, Any]:
+    """The columns that a message, or a record with the same names, has, by name; those that are empty are left out.
+
+    They are arrays, `samples x fans`: `Any`, so that a message can be made with `**auxiliary_columns(other)`.
+    """
     return {column.name: values for column in AUXILIARY if len(values := getattr(message, column.name))}

@@ -8,6 +8,7 @@ with `fan.proto`.
 from __future__ import annotations
 
 from collections.abc import Collection
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, is_dataclass
 from functools import cache
 from types import NoneType
@@ -137,6 +138,8 @@ class _Layout:
     columns: tuple[_PackedColumn, ...]
     by_number: dict[int, _PackedColumn]
     """the columns by the numbers of their fields"""
+    required: frozenset[str]
+    """names of the columns that are not optional"""
     time: str | None
     """name of the column of sample times; None for a message about one moment"""
 
@@ -164,6 +167,7 @@ def _layout(message_type: type[Message]) -> _Layout:
         record=_record(message_type),
         columns=packed,
         by_number={numbers[column.name]: column for column in packed},
+        required=frozenset(column.name for column in packed if column.nothing is None),
         time=time if time in declared else None,
     )
 
@@ -298,11 +302,12 @@ class _OtherFormError(Exception):
     """A message of another encoder or an earlier version, which only `decode` can read."""
 
 
-def _views(layout: _Layout, data: bytes, names: Collection[str | None]) -> tuple[Any, dict[str, Array]]:
+def _views(layout: _Layout, data: bytes, names: AbstractSet[str | None]) -> tuple[Any, dict[str, Array]]:
     """The fields that are no columns, parsed, and the named columns by name, flat, as they lie in `data`.
 
     Raises:
-        _OtherFormError: a column is missing, in several pieces, or not packed as `encode` does it.
+        _OtherFormError: a column that is not optional is missing; one is in several pieces, or not packed as `encode`
+            does it.
         CodecError: the rest cannot be parsed, or a value is out of its limits.
         WireError: these are no fields.
     """
@@ -316,7 +321,7 @@ def _views(layout: _Layout, data: bytes, names: Collection[str | None]) -> tuple
             raise _OtherFormError
         elif column.name in names:
             arrays[column.name] = _view(layout, column, data, field)
-    if len(arrays) < len(names):
+    if len(arrays) < len(names) and not layout.required.isdisjoint(names - arrays.keys()):
         raise _OtherFormError
     try:
         return layout.proto.FromString(b"".join(others)), arrays

@@ -20,6 +20,7 @@ class InvalidReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     INVALID_REASON_CLOCK_RESTARTED: _ClassVar[InvalidReason]
     INVALID_REASON_STOPPED: _ClassVar[InvalidReason]
     INVALID_REASON_STARTING: _ClassVar[InvalidReason]
+    INVALID_REASON_CONDITIONS_UNKNOWN: _ClassVar[InvalidReason]
 
 class FanState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -110,6 +111,7 @@ INVALID_REASON_NO_TWIN: InvalidReason
 INVALID_REASON_CLOCK_RESTARTED: InvalidReason
 INVALID_REASON_STOPPED: InvalidReason
 INVALID_REASON_STARTING: InvalidReason
+INVALID_REASON_CONDITIONS_UNKNOWN: InvalidReason
 FAN_STATE_UNKNOWN: FanState
 FAN_STATE_NORMAL: FanState
 FAN_STATE_SUSPECT: FanState
@@ -239,8 +241,32 @@ class StatedTacho(_message.Message):
     step_rad_s: float
     def __init__(self, kind: _Optional[_Union[TachoKind, str]] = ..., pulses: _Optional[int] = ..., window_s: _Optional[float] = ..., update_s: _Optional[float] = ..., delay_s: _Optional[float] = ..., step_rad_s: _Optional[float] = ...) -> None: ...
 
+class PushedSamples(_message.Message):
+    __slots__ = ("header", "fans", "t_ns", "first_number", "newest_t_ns", "command", "speed_rad_s", "supply_voltage_v", "current_a", "temperature_c")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    FIRST_NUMBER_FIELD_NUMBER: _ClassVar[int]
+    NEWEST_T_NS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_FIELD_NUMBER: _ClassVar[int]
+    SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    fans: int
+    t_ns: _containers.RepeatedScalarFieldContainer[int]
+    first_number: int
+    newest_t_ns: int
+    command: _containers.RepeatedScalarFieldContainer[float]
+    speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
+    current_a: _containers.RepeatedScalarFieldContainer[float]
+    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., first_number: _Optional[int] = ..., newest_t_ns: _Optional[int] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
+
 class Grid(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing", "supply_voltage_v", "current_a", "temperature_c")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -250,6 +276,9 @@ class Grid(_message.Message):
     VALID_FIELD_NUMBER: _ClassVar[int]
     INVALID_REASON_FIELD_NUMBER: _ClassVar[int]
     READING_MISSING_FIELD_NUMBER: _ClassVar[int]
+    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     period_ns: int
@@ -259,10 +288,13 @@ class Grid(_message.Message):
     valid: _containers.RepeatedScalarFieldContainer[bool]
     invalid_reason: _containers.RepeatedScalarFieldContainer[InvalidReason]
     reading_missing: _containers.RepeatedScalarFieldContainer[bool]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., reading_missing: _Optional[_Iterable[bool]] = ...) -> None: ...
+    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
+    current_a: _containers.RepeatedScalarFieldContainer[float]
+    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Prediction(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command", "reading_range_rad_s", "averaged_command", "reading_missing")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command", "reading_range_rad_s", "averaged_command", "reading_missing", "air_density_ratio", "supply_voltage_v", "current_a", "temperature_c")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -279,6 +311,10 @@ class Prediction(_message.Message):
     READING_RANGE_RAD_S_FIELD_NUMBER: _ClassVar[int]
     AVERAGED_COMMAND_FIELD_NUMBER: _ClassVar[int]
     READING_MISSING_FIELD_NUMBER: _ClassVar[int]
+    AIR_DENSITY_RATIO_FIELD_NUMBER: _ClassVar[int]
+    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     period_ns: int
@@ -295,10 +331,14 @@ class Prediction(_message.Message):
     reading_range_rad_s: _containers.RepeatedScalarFieldContainer[float]
     averaged_command: _containers.RepeatedScalarFieldContainer[float]
     reading_missing: _containers.RepeatedScalarFieldContainer[bool]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ...) -> None: ...
+    air_density_ratio: _containers.RepeatedScalarFieldContainer[float]
+    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
+    current_a: _containers.RepeatedScalarFieldContainer[float]
+    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., air_density_ratio: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Score(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic", "former_command", "former_measured_speed_rad_s", "former_predicted_speed_rad_s", "former_band_variance", "former_smoothed_residual_rad_s", "former_torque_balance_command", "former_speed_baseline_rad_s", "former_balance_baseline_command", "former_score")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic", "supply_voltage_v", "current_a", "temperature_c", "former_command", "former_measured_speed_rad_s", "former_predicted_speed_rad_s", "former_band_variance", "former_smoothed_residual_rad_s", "former_torque_balance_command", "former_speed_baseline_rad_s", "former_balance_baseline_command", "former_score")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -316,6 +356,9 @@ class Score(_message.Message):
     BALANCE_BASELINE_COMMAND_FIELD_NUMBER: _ClassVar[int]
     SCORE_FIELD_NUMBER: _ClassVar[int]
     STATISTIC_FIELD_NUMBER: _ClassVar[int]
+    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
     FORMER_COMMAND_FIELD_NUMBER: _ClassVar[int]
     FORMER_MEASURED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
     FORMER_PREDICTED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
@@ -342,6 +385,9 @@ class Score(_message.Message):
     balance_baseline_command: _containers.RepeatedScalarFieldContainer[float]
     score: _containers.RepeatedScalarFieldContainer[float]
     statistic: _containers.RepeatedScalarFieldContainer[Statistic]
+    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
+    current_a: _containers.RepeatedScalarFieldContainer[float]
+    temperature_c: _containers.RepeatedScalarFieldContainer[float]
     former_command: _containers.RepeatedScalarFieldContainer[float]
     former_measured_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
     former_predicted_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
@@ -351,7 +397,7 @@ class Score(_message.Message):
     former_speed_baseline_rad_s: _containers.RepeatedScalarFieldContainer[float]
     former_balance_baseline_command: _containers.RepeatedScalarFieldContainer[float]
     former_score: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., former_command: _Optional[_Iterable[float]] = ..., former_measured_speed_rad_s: _Optional[_Iterable[float]] = ..., former_predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., former_band_variance: _Optional[_Iterable[float]] = ..., former_smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., former_torque_balance_command: _Optional[_Iterable[float]] = ..., former_speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., former_balance_baseline_command: _Optional[_Iterable[float]] = ..., former_score: _Optional[_Iterable[float]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ..., former_command: _Optional[_Iterable[float]] = ..., former_measured_speed_rad_s: _Optional[_Iterable[float]] = ..., former_predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., former_band_variance: _Optional[_Iterable[float]] = ..., former_smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., former_torque_balance_command: _Optional[_Iterable[float]] = ..., former_speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., former_balance_baseline_command: _Optional[_Iterable[float]] = ..., former_score: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Diagnosis(_message.Message):
     __slots__ = ("cause", "probability", "parameter", "change", "change_low", "change_high", "unit", "evidence")
@@ -587,8 +633,22 @@ class Note(_message.Message):
     text: str
     def __init__(self, tray: _Optional[str] = ..., text: _Optional[str] = ...) -> None: ...
 
+class AcceptedSamples(_message.Message):
+    __slots__ = ("tray", "fans", "command_min", "command_max", "speed_max_rad_s")
+    TRAY_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_MIN_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_MAX_FIELD_NUMBER: _ClassVar[int]
+    SPEED_MAX_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    tray: str
+    fans: int
+    command_min: float
+    command_max: float
+    speed_max_rad_s: float
+    def __init__(self, tray: _Optional[str] = ..., fans: _Optional[int] = ..., command_min: _Optional[float] = ..., command_max: _Optional[float] = ..., speed_max_rad_s: _Optional[float] = ...) -> None: ...
+
 class Health(_message.Message):
-    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays")
+    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays", "accepts")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STAGE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
@@ -608,6 +668,7 @@ class Health(_message.Message):
     NEWEST_OUTPUT_T_NS_FIELD_NUMBER: _ClassVar[int]
     NOTES_FIELD_NUMBER: _ClassVar[int]
     TRAYS_FIELD_NUMBER: _ClassVar[int]
+    ACCEPTS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     stage: str
     instance: str
@@ -627,4 +688,5 @@ class Health(_message.Message):
     newest_output_t_ns: int
     notes: _containers.RepeatedCompositeFieldContainer[Note]
     trays: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ...) -> None: ...
+    accepts: _containers.RepeatedCompositeFieldContainer[AcceptedSamples]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ..., accepts: _Optional[_Iterable[_Union[AcceptedSamples, _Mapping]]] = ...) -> None: ...

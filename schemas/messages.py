@@ -34,6 +34,7 @@ class InvalidReason(OpenEnum):
     CLOCK_RESTARTED = 8
     STOPPED = 9
     STARTING = 10
+    CONDITIONS_UNKNOWN = 11
 
 
 class FanState(OpenEnum):
@@ -215,6 +216,29 @@ class Raw:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class PushedSamples:
+    """Samples of one tray that a client pushes, not yet checked.
+
+    Attributes:
+        t_ns: time of each sample by the clock of the client.
+        first_number: of the first sample; the client counts its samples from 0, without gaps.
+        newest_t_ns: of the newest sample the client had when it sent these: how much older than that a sample is says
+            how long the client has kept it.
+    """
+
+    header: Header = Header()
+    fans: int
+    t_ns: Array = column("samples", np.int64, limits=RECEIVE_TIMES)
+    first_number: int = 0
+    newest_t_ns: int = 0
+    command: Array = column("samples x fans", np.float64)
+    speed_rad_s: Array = column("samples x fans", np.float64)
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Grid:
     """Samples on a uniform time grid: command held, speed interpolated."""
 
@@ -228,6 +252,9 @@ class Grid:
     invalid_reason: Array = column("samples x fans", InvalidReason)
     reading_missing: Array = column("samples x fans", np.bool_, optional=True)
     """whether the newest raw sample at that time has no reading, though the speed may be known from those around it"""
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -251,6 +278,11 @@ class Prediction:
     averaged_command: Array = column("samples x fans", np.float64, optional=True)
     reading_missing: Array = column("samples x fans", np.bool_, optional=True)
     """as in Grid"""
+    air_density_ratio: Array = column("samples x fans", np.float64, optional=True)
+    """of a twin that needs the temperature: relative to its reference. Its balance is that of speeds times this"""
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -278,6 +310,9 @@ class Score:
     balance_baseline_command: Array = column("samples x fans", np.float32, added_later=True)
     score: Array = column("samples x fans", np.float32, added_later=True)
     statistic: Array = column("samples x fans", Statistic, added_later=True)
+    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
+    current_a: Array = column("samples x fans", np.float32, optional=True)
+    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
     @derived(np.float32)
     def residual_rad_s(self) -> Array:
@@ -493,6 +528,17 @@ class Note:
     text: str
 
 
+@dataclass(frozen=True, kw_only=True)
+class AcceptedSamples:
+    """What an acquisition accepts of the clients that push samples of a tray; commands in the tray's unit."""
+
+    tray: str
+    fans: int
+    command_min: float
+    command_max: float
+    speed_max_rad_s: float
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Health:
     """Status of a process of a stage, and what it has received, sent and lost.
@@ -521,10 +567,12 @@ class Health:
     newest_output_t_ns: int = 0
     notes: tuple[Note, ...] = ()
     trays: str = ""
+    accepts: tuple[AcceptedSamples, ...] = ()
 
 
 Message: TypeAlias = (
     Raw
+    | PushedSamples
     | Grid
     | Prediction
     | Score

@@ -5,6 +5,7 @@ Recorder, health, viewer and documentation derive from it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from schemas.fields import columns, time_column
@@ -19,6 +20,7 @@ from schemas.messages import (
     ModelCard,
     NewTwin,
     Prediction,
+    PushedSamples,
     Raw,
     Request,
     Score,
@@ -30,10 +32,11 @@ KIB, MIB = 1 << 10, 1 << 20
 MOST_SAMPLES, MOST_FAN_SAMPLES = 4096, 4096 * 64
 """of a message, whatever its block: samples, and samples times fans"""
 ROOT = "fantwin"
-HEALTH_CHUNK = "health"
+HEALTH = HEALTH_CHUNK = "health"
 ALIVE_CHUNK = "alive"
 SESSION_CHUNK = "session"
-RESERVED_TRAY_NAMES = (HEALTH_CHUNK, ALIVE_CHUNK)
+RIGHTS_CHUNK = "rights"
+RESERVED_TRAY_NAMES = (HEALTH_CHUNK, ALIVE_CHUNK, SESSION_CHUNK, RIGHTS_CHUNK)
 ALL_TRAYS = "all"
 """the instance of a process that has all trays of its site"""
 
@@ -43,8 +46,8 @@ class Topic:
     """One topic.
 
     Attributes:
-        history: a producer keeps this many of its last messages for consumers that missed them, 80 s at 100 Hz, as far
-            as its memory allows (`pipeline.bus.publisher`).
+        history: a producer keeps this many of its last messages for consumers that begin, 80 s at 100 Hz, as far as its
+            memory allows (`pipeline.bus.publisher`).
         largest_bytes: a longer message is refused before it is decoded. The largest that any configuration makes is
             half of it or less (`most_samples`).
     """
@@ -56,10 +59,17 @@ class Topic:
     history: int
     largest_bytes: int
     about: str
+    kept_after_cut: int = 0
+    """a producer keeps so many for consumers that were cut off, if these are more than `history`"""
     is_needed_first: bool = False
     """a consumer that begins needs its last message before those of other topics"""
     is_of_session: bool = False
     """about a session of a stage: a live replay does not publish it, since that session does not run"""
+
+    @property
+    def kept(self) -> int:
+        """How many of its last messages a producer keeps, as far as its memory allows."""
+        return max(self.history, self.kept_after_cut)
 
     @property
     def has_samples(self) -> bool:
@@ -77,15 +87,20 @@ CATCH_UP_MESSAGES = 4096
 
 TOPICS: tuple[Topic, ...] = (
     Topic("raw", Raw, "as the device sends, often 100 Hz", True, 8192, 16 * MIB, "samples as the device sent them"),
+    Topic("reading", PushedSamples, "as the client sends", False, CATCH_UP_MESSAGES, 16 * MIB, "samples of a client"),
     Topic("grid", Grid, "the grid's rate over the block size", True, 8192, 16 * MIB, "samples on a uniform grid"),
     Topic("prediction", Prediction, "as grid", True, 8192, 32 * MIB, "the healthy twin beside the measurement"),
     Topic("score", Score, "as prediction", True, 8192, 64 * MIB, "scored samples, ready to draw"),
     Topic("alarm", Alarm, ON_CHANGE, True, CATCH_UP_MESSAGES, MIB, "transitions of alarms"),
     Topic("request", Request, ON_CHANGE, True, 64, 64 * KIB, "requests of operators about alarms"),
-    Topic("snapshot", ScorerSnapshot, "on change, and regularly", True, 4, 96 * MIB, "a scorer's state for a restart"),
+    Topic(
+        "snapshot", ScorerSnapshot, "on change, and regularly", True, 4, 96 * MIB, "a scorer's state for a restart", 64
+    ),
     Topic("command", Command, ON_CHANGE, True, 64, 64 * KIB, "commands and set-points for the fans"),
-    Topic("twin", ModelCard, ON_CHANGE, True, 8, 16 * MIB, "the twin in force", True),
-    Topic("new_twin", NewTwin, ON_CHANGE, False, 2, 16 * MIB, "a learned twin that is to take over", True),
+    Topic("twin", ModelCard, ON_CHANGE, True, 8, 16 * MIB, "the twin in force", is_needed_first=True),
+    Topic(
+        "new_twin", NewTwin, ON_CHANGE, False, 2, 16 * MIB, "a learned twin that is to take over", is_needed_first=True
+    ),
     Topic(
         "consumed",
         Consumed,
@@ -105,6 +120,7 @@ TOPICS: tuple[Topic, ...] = (
         16,
         2 * MIB,
         "status and losses of a stage",
+        1024,
         is_of_session=True,
     ),
 )
@@ -129,6 +145,11 @@ def largest_bytes(key: str) -> int:
         return topic_of(key).largest_bytes
     except KeyError:
         return max(topic.largest_bytes for topic in TOPICS)
+
+
+def makes_samples_of_samples(reads: Sequence[str], writes: Sequence[str]) -> bool:
+    """Whether whoever reads and writes these topics, the main input first, makes blocks of samples from samples."""
+    return bool(reads) and BY_NAME[reads[0]].has_samples and any(BY_NAME[name].has_samples for name in writes)
 
 
 def tray_key(site: str, tray: str, topic: str) -> str:
@@ -159,6 +180,17 @@ def alive_key(site: str, stage: str, instance: str) -> str:
 def sessions_key(site: str, stage: str = "*", instance: str = "*") -> str:
     """Pattern of the keys of the tokens that say which process runs a stage; `pipeline.runtime.sessions` makes them."""
     return f"{ROOT}/{site}/{SESSION_CHUNK}/{stage}/{instance}/**"
+
+
+def session_key(site: str, stage: str, instance: str, *parts: object) -> str:
+    """Key of the token of one session. parts: when it started, its producer, its host, its process id; and its trays,
+    where its instance does not say them."""
+    return "/".join((sessions_key(site, stage, instance).removesuffix("/**"), *map(str, parts)))
+
+
+def rights_key(site: str, role: str) -> str:
+    """Key at which a router answers what a role may do; `*` may stand for any role."""
+    return f"{ROOT}/{site}/{RIGHTS_CHUNK}/{role}"
 
 
 def sweep_key(site: str, tray: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from schemas.auxiliary import auxiliary_columns
 from schemas.messages import Array, FanState, InvalidReason, Prediction, Score
 from scoring.scored_block import ScoredBlock
 
@@ -44,6 +45,7 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array)
         balance_baseline_command=scored.balance_baseline * item.torque_balance_sigma_command,
         score=scored.score,
         statistic=scored.statistic,
+        **auxiliary_columns(item),
     )
 
 
@@ -68,4 +70,5 @@ def unscored(item: Prediction) -> Score:
         balance_baseline_command=unknown,
         score=unknown,
         statistic=np.zeros(unknown.shape, np.uint8),
+        **auxiliary_columns(item),
     )

@@ -1,7 +1,8 @@
 """Acquisition: the readings of a tray's source in, raw samples out; commands back to the device.
 
 Reads: topic `command` (fan commands in the tray's command unit, set-points in rad/s), and the source that `source` of
-the [[tray]] names (pipeline/devices/source_kinds.py; speed in the tray's speed unit).
+the [[tray]] names (pipeline/devices/source_kinds.py; speed in the tray's speed unit). Where clients push the samples of
+a tray over the bus, that source is topic `reading` (time of the client in ns, command, speed in rad/s).
 Writes: topic `raw`: device clock (us, wraps), device sequence (wraps), host time of receipt (ns), command, speed
 (rad/s), and where the source measures them supply voltage (V), current (A), temperature (degrees Celsius).
 Timing: a message holds what arrives within `block_s` (pipeline/devices/sample_blocks.py), and is sent when the last of
@@ -27,26 +28,28 @@ from pipeline.devices.device_clock import UINT32
 from pipeline.devices.device_sequence import DeviceSequence
 from pipeline.devices.host_clock import HOST_CLOCK, HostClock
 from pipeline.devices.input_quality import InputQuality
+from pipeline.devices.push_source import PushSource
 from pipeline.devices.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
 from pipeline.devices.sample_source import (
     LinkUp,
     Reading,
     ReadingBatch,
+    ReadingLimits,
     Rejected,
     SampleSource,
     SourceContext,
+    within,
 )
 from pipeline.devices.source_kinds import build_source
 from pipeline.errors import UserError
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
-from schemas.messages import Array, Command, Raw, StatedTacho
+from schemas.messages import AcceptedSamples, Array, Command, PushedSamples, Raw, StatedTacho
 from schemas.tacho import Tacho
 from schemas.topics import most_samples
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
 STEP_SHOWN_NS = 60 * NS_PER_S  # how long health says that the host clock was set
-FLOAT32_TOLERANCE = 1e-6
 
 
 class AcquisitionConfig(StageConfig):
@@ -80,10 +83,9 @@ class _Received:
         )
 
 
-def within(value: float, low: float, high: float) -> bool:
-    """Whether a float32 value lies in a range given in decimals: 0.1 as float32 is not beyond 0.1."""
-    tolerance = FLOAT32_TOLERANCE * max(abs(low), abs(high))
-    return low - tolerance <= value <= high + tolerance
+def limits_of(tray: TrayConfig) -> ReadingLimits:
+    """Which readings of a tray are accepted."""
+    return ReadingLimits(tray.fans, tray.command_min, tray.command_max, tray.speed_max)
 
 
 def raw_message(block: Sequence[_Received], tray: TrayConfig, tachos: tuple[StatedTacho, ...] = ()) -> Raw:
@@ -114,7 +116,7 @@ def _float32(rows: list[tuple[float, ...]]) -> Array:
     return np.array(rows if rows[0] else (), np.float32)
 
 
-Item: TypeAlias = BlockEvent | Command
+Item: TypeAlias = BlockEvent | Command | PushedSamples
 
 
 class AcquisitionCore(Core):
@@ -132,6 +134,7 @@ class AcquisitionCore(Core):
         """source: takes commands. blocks: its readings. host_clock: gives the times of receipt and of ticks; its steps
         are reported."""
         self._tray = tray
+        self._limits = limits_of(tray)
         self._host_clock = host_clock
         self._seen_step = host_clock.last_step
         self._config = config
@@ -157,6 +160,19 @@ class AcquisitionCore(Core):
         if isinstance(item, Command):
             self._send(item)
             return []
+        if isinstance(item, PushedSamples):
+            return self._take_pushed(item)
+        return self._take(item)
+
+    def _take_pushed(self, item: PushedSamples) -> list[Raw]:
+        """Handle samples of a client as those of any source."""
+        if not isinstance(self._source, PushSource):
+            self._counts["refused_readings"] += len(item.t_ns)
+            return []
+        events = self._source.events(item, self._host_clock.now_ns())
+        return [raw for event in events for block in self._blocks.add(event) for raw in self._take(block)]
+
+    def _take(self, item: BlockEvent) -> list[Raw]:
         self._processed = item
         if isinstance(item, ReadingBlock):
             return self._receive(item)
@@ -189,6 +205,11 @@ class AcquisitionCore(Core):
         lost_refused = self._counts["lost_refused"] + self._sequence.refused
         return {**self._counts, **({"lost_refused": lost_refused} if lost_refused else {}), **steps}
 
+    def notes(self) -> list[str]:
+        """What the source measures beside command and speed."""
+        also = ", ".join(column.title for column in AUXILIARY if column in self._auxiliary)
+        return [f"the source measures {also}, too"] if also else []
+
     def samples_in(self, item: Item) -> int:
         """The readings in a block."""
         batches = item.batches if isinstance(item, ReadingBlock) else ()
@@ -196,7 +217,22 @@ class AcquisitionCore(Core):
 
     def problem(self) -> str:
         """What is wrong with the connection now, and for a minute that the host clock was set."""
-        return "; ".join(filter(None, (self._problem_of_line(), self._problem_of_host_clock())))
+        of_clients = self._source.problem(self._now_ns) if isinstance(self._source, PushSource) else ""
+        return "; ".join(filter(None, (of_clients, self._problem_of_line(), self._problem_of_host_clock())))
+
+    def accepts(self) -> AcceptedSamples | None:
+        """The ranges of the tray, where its samples are pushed."""
+        tray = self._tray
+        if not tray.source.takes_pushed:
+            return None
+        speed_max_rad_s = tray.speed_max * RAD_S_PER_UNIT[tray.speed_unit]
+        return AcceptedSamples(
+            tray=tray.name,
+            fans=tray.fans,
+            command_min=tray.command_min,
+            command_max=tray.command_max,
+            speed_max_rad_s=speed_max_rad_s,
+        )
 
     def _problem_of_host_clock(self) -> str:
         step = self._host_clock.last_step
@@ -269,7 +305,7 @@ class AcquisitionCore(Core):
             self._counts["no_speed"] += 0  # shown from the first reading on
             self._quality.add_valid()
             return item
-        rejected = item if isinstance(item, Rejected) else self._why_refused(item)
+        rejected = item if isinstance(item, Rejected) else self._limits.why_refused(item)
         if rejected is None:
             assert isinstance(item, Reading)
             return self._with_plausible_speeds(item)
@@ -291,19 +327,6 @@ class AcquisitionCore(Core):
             and -tray.speed_max <= min(speed)
             and max(speed) <= tray.speed_max
         )
-
-    def _why_refused(self, reading: Reading) -> Rejected | None:
-        tray = self._tray
-        if not len(reading.command) == len(reading.speed) == tray.fans:
-            detail = f"a reading of {len(reading.speed)} fans, this tray has {tray.fans}"
-            return Rejected("wrong_fan_count", detail, is_sample=True, setting=f"fans = {tray.fans}")
-        for command in reading.command:
-            # Without its actual command a sample cannot be scored, and a command must not be invented.
-            if not within(command, tray.command_min, tray.command_max):
-                limits = f"command_min = {tray.command_min:g} to command_max = {tray.command_max:g}"
-                detail = f"command {command:g} is outside {limits}"
-                return Rejected("absurd_command", detail, is_sample=True, setting="command_min and command_max")
-        return None
 
     def _with_plausible_speeds(self, reading: Reading) -> Reading:
         speed_max = self._tray.speed_max
@@ -368,7 +391,9 @@ def build_tray_source(context: Context) -> SampleSource:
     """
     tray = context.tray
     try:
-        return build_source(tray.source, SourceContext(tray.fans, tray.speed_unit, context.folder))
+        return build_source(
+            tray.source, SourceContext(tray.fans, tray.speed_unit, context.folder, tray.name, limits_of(tray))
+        )
     except UserError as error:
         raise StageError(f"[[tray]] {tray.name}: {error}") from error
 
@@ -393,12 +418,18 @@ def check(context: Context) -> list[str]:
         return [str(error)]
 
 
+def topics_read(_config: AcquisitionConfig, trays: Sequence[TrayConfig]) -> tuple[str, ...]:
+    """Samples of clients only where a tray takes them."""
+    return ("command", "reading") if any(tray.source.takes_pushed for tray in trays) else ("command",)
+
+
 STAGE = Stage(
     name="acquisition",
     about="readings of a tray's source to raw samples, and commands to its device",
-    reads=("command",),
+    reads=("command", "reading"),
     writes=("raw",),
     config=AcquisitionConfig,
     build=build,
     check=check,
+    chooses=topics_read,
 )

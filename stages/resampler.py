@@ -3,6 +3,8 @@
 Reads: topic `raw` (device clock us, host time of receipt ns, command, speed rad/s).
 Writes: topic `grid`: samples at absolute multiples of the period (t_ns % period_ns == 0), speed interpolated linearly,
 command held (that of the last sample at or before the grid time). The readings of a counting tacho are held, too.
+Supply voltage, current and temperature are interpolated where the samples on both sides have them, else held until the
+next sample, and unknown in gaps.
 Timing: a grid sample is published as soon as a raw sample at or after its time has arrived, in one message with the
 others that the same raw message completes. If one fan has no reading, all fans wait for its next one, at most
 `gap_limit_s`. If no samples arrive, the wait is at most `watermark_s`.
@@ -14,7 +16,8 @@ kept, the least delayed one says how late the first one was.
 Gaps longer than `gap_limit_s` are never bridged. Their grid samples are not valid: GAP up to `watermark_s` after the
 last raw sample, then STALE; `stale_for_s` after it the grid ends until samples arrive again. Content depends on sample
 times only. Host time, in `tick`, decides only when grid samples of a gap are published, so that a replay gives the same
-grid. See docs/explanation/time.md.
+grid. They are not published while the samples may still come because only the link to acquisition is cut. See
+docs/explanation/time.md.
 """
 
 from __future__ import annotations
@@ -74,6 +77,12 @@ class ResamplerConfig(StageConfig):
         gt=0,
         description="the grid ends this long after the last sample; without it 5 s, or twice watermark_s if longer",
     )
+    link_wait_s: float = Field(
+        default=900.0,
+        ge=0,
+        description="how long no gap is published while acquisition does not say that it has sent nothing: the link "
+        "may be cut, and the samples come later",
+    )
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -113,6 +122,7 @@ class ResamplerCore(Core):
         """until the rate of the line is known"""
         self._newest = SampleTimes(ENOUGH_SAMPLES)
         self._wrong_fans = 0
+        self._input_is_complete = True
         self._counts: Counter[str] = Counter()
         self._grid: SampleGrid | None = None
         self._timing: GridTiming | None = None
@@ -139,8 +149,12 @@ class ResamplerCore(Core):
         return list(self._grid_of_line()) if self._line.add(item) else []
 
     def tick(self, now_ns: int) -> list[Grid]:
-        """Past the watermark, publish the grid without samples."""
-        return self._grid.tick(now_ns) if self._grid else []
+        """Past the watermark, publish the grid without samples, unless they may still come."""
+        return self._grid.tick(now_ns, is_complete=self._input_is_complete) if self._grid else []
+
+    def confirm_input(self, *, is_complete: bool) -> None:
+        """Whether acquisition has shown since the last tick that all of its samples have arrived."""
+        self._input_is_complete = is_complete
 
     def publish_until(self, t_ns: int) -> list[Grid]:
         """Publish the grid up to `t_ns` without waiting for more samples, as a session did that then ended."""
@@ -228,7 +242,9 @@ class ResamplerCore(Core):
         if self._line_hz is not None and is_too_slow(self._line_hz):
             config = config.model_copy(update={"gap_limit_s": config.gap_limit_s or 1.0 / rate_hz})
         self._timing = config.timing(rate_hz)
-        self._grid = SampleGrid(self._tachos, self._timing, self._decision_rules)
+        self._grid = SampleGrid(
+            self._tachos, self._timing, self._decision_rules, round(self._config.link_wait_s * NS_PER_S)
+        )
         return self._grid
 
 

@@ -27,7 +27,19 @@ RETIRED_IDENTIFIERS = (  # plain English in a sentence, a private word as the na
     *("Account", "Cause", "Distance", "Line", "Running", "FAR", "LEAST", "MORE", "WILD", "PATIENCE"),
     *("usual", "quiet", "worth", "carried", "doubt", "meet"),
 )
-FOLDERS = ("schemas", "scoring", "pipeline", "simulation", "stages", "twin", "bench", "tests", "docs", "README.md")
+FOLDERS = (
+    "fantwin_client",
+    "schemas",
+    "scoring",
+    "pipeline",
+    "simulation",
+    "stages",
+    "twin",
+    "bench",
+    "tests",
+    "docs",
+    "README.md",
+)
 KEPT = {
     "tests/test_vocabulary.py",  # lists them
 }

@@ -1,9 +1,12 @@
-"""What can be wrong with an endpoint before any process uses it."""
+"""What can be wrong with an endpoint, or several, before any process uses it."""
 
 from __future__ import annotations
 
 import re
 import socket
+
+from pipeline.bus.errors import BusError
+from pipeline.config.models import BETWEEN_ENDPOINTS, BusConfig
 
 _ADDRESS = re.compile(r"(tcp|tls|ws|udp|quic)/(\[[^\]]*\]|[^:/?#]*):(\d+)(?:[?#].*)?")
 _CONNECTING = ("tcp", "tls", "ws")
@@ -15,6 +18,23 @@ def endpoint_problem(endpoint: str) -> str:
 
     A host that does not resolve now may do so later, as that of a container that has not started yet.
     """
+    return next(filter(None, map(_problem, endpoint.split(BETWEEN_ENDPOINTS))), "")
+
+
+def somebody_listens(endpoint: str) -> bool:
+    """Whether the port is taken on this host; also true for an address of another host.
+
+    It binds and does not connect: the other end would take a connection for a peer.
+    """
+    return any(map(_is_taken, _addresses(endpoint)))
+
+
+def accepts_connections(endpoint: str) -> bool:
+    """Whether a program accepts connections there, whatever it is."""
+    return any(map(_accepts, _addresses(endpoint)))
+
+
+def _problem(endpoint: str) -> str:
     match = _ADDRESS.fullmatch(endpoint)
     if match is None:
         return ""
@@ -28,14 +48,13 @@ def endpoint_problem(endpoint: str) -> str:
     return ""
 
 
-def somebody_listens(endpoint: str) -> bool:
-    """Whether the port is taken on this host; also true for an address of another host.
+def _addresses(endpoint: str) -> list[re.Match[str]]:
+    """Those of the endpoints at which a program can be connected to."""
+    found = filter(None, map(_ADDRESS.fullmatch, endpoint.split(BETWEEN_ENDPOINTS)))
+    return [match for match in found if match[1] in _CONNECTING]
 
-    It binds and does not connect: the other end would take a connection for a peer.
-    """
-    match = _ADDRESS.fullmatch(endpoint)
-    if match is None or match[1] not in _CONNECTING:
-        return False
+
+def _is_taken(match: re.Match[str]) -> bool:
     for family, kind, protocol, _, address in _resolved(match):
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -46,11 +65,7 @@ def somebody_listens(endpoint: str) -> bool:
     return False
 
 
-def accepts_connections(endpoint: str) -> bool:
-    """Whether a program accepts connections there, whatever it is."""
-    match = _ADDRESS.fullmatch(endpoint)
-    if match is None or match[1] not in _CONNECTING:
-        return False
+def _accepts(match: re.Match[str]) -> bool:
     try:
         with socket.create_connection((match[2].strip("[]"), int(match[3])), _CONNECT_TIMEOUT_S):
             return True
@@ -58,8 +73,29 @@ def accepts_connections(endpoint: str) -> bool:
         return False
 
 
-def foreign_program(endpoint: str) -> str:
-    """One line about an endpoint that accepts connections and does not answer as fantwin."""
+def require_tls_with_security(config: BusConfig) -> None:
+    """Raises BusError if an endpoint has TLS without `bus.security`, or the other way round."""
+    for endpoint in config.endpoints:
+        scheme, _, place = endpoint.partition("/")
+        if config.security and scheme != "tls":
+            raise BusError(f"bus.endpoint = {endpoint!r}: with [bus.security] write tls/{place}")
+        if not config.security and scheme in ("tls", "quic"):
+            raise BusError(
+                f"bus.endpoint = {endpoint!r}: {scheme} needs certificates: a section [bus.security], see "
+                "`fantwin certs --help`"
+            )
+
+
+def foreign_program(endpoint: str, *, is_secure: bool = False) -> str:
+    """One line about an endpoint that accepts connections and does not answer as fantwin.
+
+    is_secure: with `bus.security`; the other end does not say why it refuses.
+    """
+    if is_secure:
+        return (
+            f"bus.endpoint = {endpoint!r}: what listens there is of another authority, has a certificate without this "
+            "host name, takes no TLS, or is not fantwin: see `fantwin certs show` there and here"
+        )
     return (
         f"bus.endpoint = {endpoint!r}: the program that listens there is not fantwin, or hangs, so stages cannot "
         "connect: stop it, or choose another port"

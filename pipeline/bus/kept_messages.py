@@ -17,6 +17,11 @@ from schemas.topics import largest_bytes
 _KEPT = "/kept/"
 
 
+def kept_key(key: str, kept_by: str) -> str:
+    """Where a producer answers for what others published on `key`; `kept_by` may be `*`."""
+    return f"{key}{_KEPT}{kept_by}"
+
+
 @dataclass(frozen=True, slots=True)
 class KeptQuery:
     """Somebody asks for the last message on `key`."""
@@ -29,7 +34,7 @@ class KeptQuery:
         """Send the message; None: there is none."""
         with self._query:
             if payload is not None:
-                self._query.reply(f"{self.key}{_KEPT}{self._kept_by}", payload)
+                self._query.reply(kept_key(self.key, self._kept_by), payload)
 
 
 def answer_for_kept(
@@ -44,7 +49,7 @@ def answer_for_kept(
         on_query(KeptQuery(str(query.key_expr).partition(_KEPT)[0], kept_by, query))
 
     handler = zenoh.handlers.Callback(receive, indirect=False)
-    return session.declare_queryable(f"{key_expression}{_KEPT}{kept_by}", handler)
+    return session.declare_queryable(kept_key(key_expression, kept_by), handler)
 
 
 def ask_for_kept(session: zenoh.Session, key: str, timeout_s: float) -> tuple[list[bytes], bool]:
@@ -52,7 +57,7 @@ def ask_for_kept(session: zenoh.Session, key: str, timeout_s: float) -> tuple[li
     found: list[bytes] = []
     have_answered = True
     replies = session.get(
-        f"{key}{_KEPT}*",
+        kept_key(key, "*"),
         target=zenoh.QueryTarget.ALL,
         timeout=timeout_s,
         consolidation=zenoh.ConsolidationMode.NONE,

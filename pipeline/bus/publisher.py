@@ -1,14 +1,22 @@
-"""Publishing with recovery: a publisher keeps its last messages and answers requests for those that were missed."""
+"""Publishing with recovery: a publisher keeps its last messages and answers requests for those that were missed. What
+its memory cannot keep it keeps on disk, where the configuration says so."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from itertools import islice
+from itertools import chain, islice
 
 import zenoh
 
-from pipeline.bus.recovery import LAST_SEQUENCE, number_in, recovery_key
+from pipeline.bus.recovery import (
+    LAST_SEQUENCE,
+    MOST_RECOVERED_BYTES,
+    MOST_RECOVERED_MESSAGES,
+    number_in,
+    recovery_key,
+)
+from pipeline.bus.spool import Spool
 from schemas.topics import Topic
 
 KEPT_BYTES = 16 << 20
@@ -29,7 +37,14 @@ class Publisher:
     """One output: publishes bytes on a key, and keeps the last ones for consumers that missed them."""
 
     def __init__(
-        self, session: zenoh.Session, key: str, topic: Topic, encoding: str, producer: str, kept_bytes: KeptBytes
+        self,
+        session: zenoh.Session,
+        key: str,
+        topic: Topic,
+        encoding: str,
+        producer: str,
+        kept_bytes: KeptBytes,
+        spool: Spool | None = None,
     ) -> None:
         self.key = key
         self.published = 0
@@ -37,6 +52,7 @@ class Publisher:
         self._kept: deque[tuple[int, bytes]] = deque()
         self._kept_bytes = 0
         self._of_all = kept_bytes
+        self._spooled = spool.stream() if spool and topic.recorded else None
         self._publisher = session.declare_publisher(
             key,
             encoding=f"application/protobuf;{encoding}",
@@ -51,10 +67,27 @@ class Publisher:
         with self._of_all.lock:
             self._kept.append((self.published, payload))
             self._add(len(payload))
-            while self._kept and self._keeps_too_much():
-                self._add(-len(self._kept.popleft()[1]))
             self.published += 1
         self._publisher.put(payload)
+        self._keep_no_more()
+
+    def _keep_no_more(self) -> None:
+        """Drop what is too much from memory, once it is on disk."""
+        while True:
+            with self._of_all.lock:
+                if not self._keeps_too_much():
+                    return
+                sequence, oldest = self._kept[0]
+            if self._spooled:
+                self._spooled.add(sequence, oldest)  # without the lock: a slow disk holds up no other publisher
+            with self._of_all.lock:
+                self._add(-len(self._kept.popleft()[1]))
+
+    def forget(self, before: int) -> None:
+        """Keep no message with a sequence number below `before`: its consumer has it."""
+        with self._of_all.lock:
+            while self._kept and self._kept[0][0] < before:
+                self._add(-len(self._kept.popleft()[1]))
 
     def _add(self, size: int) -> None:
         self._kept_bytes += size
@@ -62,23 +95,35 @@ class Publisher:
             self._of_all.total += size
 
     def _keeps_too_much(self) -> bool:
-        if len(self._kept) > self._topic.history:
+        if len(self._kept) > self._topic.kept:
             return True
         is_full = self._kept_bytes > KEPT_BYTES
         is_full |= self._of_all.total > KEPT_BYTES_OF_ALL and not self._topic.is_rare
         return is_full and len(self._kept) > 1  # the newest is kept, however large it is
 
     def _answer(self, query: zenoh.Query) -> None:
-        """Answer with what is kept of a range, and at the end with the number of published messages."""
+        """Answer with what is kept of a range, and at the end with the number of published messages.
+
+        A consumer that begins asks for the newest ones only. If more is kept than a consumer takes in one answer, that
+        number is left out: the consumer then asks for the rest.
+        """
         first, last, newest = (number_in(query.parameters.get(name) or "") for name in ("first", "last", "newest"))
-        first, last, newest = first or 0, LAST_SEQUENCE if last is None else last, newest or self._topic.history
+        first, last = first or 0, LAST_SEQUENCE if last is None else last
         with self._of_all.lock:
             published = self.published
             oldest = published - len(self._kept)  # sequence numbers have no gaps
-            first, end = max(first, oldest, min(last + 1, published) - newest), min(last + 1, published)
-            wanted = [payload for _, payload in islice(self._kept, first - oldest, max(first, end) - oldest)]
+            end = min(last + 1, published)
+            if newest:
+                first = max(first, end - min(newest, self._topic.history))
+            begin = max(first, oldest)
+            in_memory = [payload for _, payload in islice(self._kept, begin - oldest, max(begin, end) - oldest)]
+        on_disk = self._spooled.read(first, min(end, oldest)) if self._spooled and first < oldest else ()
+        messages, size = 0, 0
         with query:
-            for payload in wanted:
+            for payload in chain(on_disk, in_memory):
+                messages, size = messages + 1, size + len(payload)
+                if messages > MOST_RECOVERED_MESSAGES or (size > MOST_RECOVERED_BYTES and messages > 1):
+                    return
                 query.reply(self._recovery_key, payload)
             if query.parameters.get("count"):  # earlier versions do not ask, and would take it for a message
                 query.reply(self._recovery_key, b"", attachment=str(published).encode())

@@ -19,23 +19,34 @@ import json
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import zenoh
 
-from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program, somebody_listens
+from pipeline.bus.endpoint import (
+    accepts_connections,
+    endpoint_problem,
+    foreign_program,
+    require_tls_with_security,
+    somebody_listens,
+)
 from pipeline.bus.errors import BusError, reason
 from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
-from pipeline.bus.link import LEASE_MS
+from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, RETRY
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
+from pipeline.bus.settings import Settings
+from pipeline.bus.spool import Spool
 from pipeline.config.models import BusConfig
+from pipeline.config.roles import READERS
 from schemas.topics import Topic, largest_bytes
 
-_RETRY = '{"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}'
-_ROUTER_TIMEOUT_MS = "1000"
+if TYPE_CHECKING:
+    from pipeline.bus.certificates import Credentials
+
+_ROUTER_TIMEOUT_MS = 1000
 _ROUTER_RETRY_S = 0.2
 MEETING_LIMIT_S = 10.0
 """by then a process that listens at the endpoint has answered, however busy the machine"""
@@ -45,25 +56,37 @@ _MEETING_POLL_S = 0.01
 class Bus:
     """One session on the bus."""
 
-    def __init__(self, config: BusConfig, stop: threading.Event | None = None, *, listens: bool = True) -> None:
+    def __init__(
+        self,
+        config: BusConfig,
+        stop: threading.Event | None = None,
+        *,
+        listens: bool = True,
+        roles: Sequence[str] = READERS,
+    ) -> None:
         """Open a session. Peers need no other process. A client needs its router; with `stop` it waits for the router
         until `stop` is set.
 
         listens: whether to listen on the endpoint if no process does; not for a command that connects only briefly.
+        roles: with `bus.security`, the certificate of the first of these that has one here is shown.
 
         Raises:
-            BusError: the endpoint cannot be used, or a client's router is not there.
+            BusError: the endpoint or a certificate cannot be used, or a client's router is not there.
         """
         self._config = config
         problem = endpoint_problem(config.endpoint) if config.mode == "peer" else ""
         if problem:
             raise BusError(problem)
+        self.credentials = credentials_of(config, roles)
+        """what this session shows; None: without `bus.security`"""
         self.came_second = somebody_listens(config.endpoint)
         """Whether another process listened before: discovering the others takes a moment."""
-        self._has_answered = config.mode == "client" or (self.came_second and _answers(config.endpoint, stop))
-        self._session = _open(config, stop, listens)
+        self._has_answered = config.mode == "client" or (self.came_second and _answers(config, self.credentials, stop))
+        self._session = _open(config, self.credentials, stop, listens)
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
+        self.spool: Spool | None = None
+        """where publishers that are declared from now on keep what their memory cannot; None: nowhere"""
         self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
@@ -76,7 +99,7 @@ class Bus:
 
     def publisher(self, key: str, topic: Topic, encoding: str, producer: str) -> Publisher:
         """Declare an output; `encoding` is the full protobuf name of its messages."""
-        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes)
+        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes, self.spool)
 
     def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> Callable[[], None]:
         """Call `on_message(key, payload)` for what other sessions publish, from a thread of the bus. Returns what ends
@@ -168,17 +191,33 @@ class Bus:
     def close(self) -> None:
         """Leave the bus. What was published before has left this process."""
         self._session.close()
+        if self.spool:
+            self.spool.close()
 
 
-def _answers(endpoint: str, stop: threading.Event | None) -> bool:
+def credentials_of(config: BusConfig, roles: Sequence[str]) -> Credentials | None:
+    """The checked files of the first of these roles that has a certificate here; None without `bus.security`.
+
+    Raises:
+        BusError: one cannot be used, or the endpoint does not fit.
+    """
+    require_tls_with_security(config)
+    if config.security is None:
+        return None
+    from pipeline.bus.certificates import checked_credentials  # noqa: PLC0415  takes 0.1 s, which most do without
+
+    return checked_credentials(config.security, roles)
+
+
+def _answers(config: BusConfig, credentials: Credentials | None, stop: threading.Event | None) -> bool:
     """Whether a process of fantwin listens at the endpoint of a peer; False if nobody does, or `stop` is set.
 
     Raises:
         BusError: a program listens there and does not answer.
     """
-    if not accepts_connections(endpoint):
+    if not accepts_connections(config.endpoint):
         return False
-    conf = _client_config(endpoint)
+    conf = _short_lived_config(config, credentials)
     until_s = time.monotonic() + MEETING_LIMIT_S
     while True:
         try:
@@ -186,56 +225,69 @@ def _answers(endpoint: str, stop: threading.Event | None) -> bool:
             return True
         except zenoh.ZError as error:
             if time.monotonic() > until_s:
-                raise BusError(foreign_program(endpoint)) from error
+                raise BusError(foreign_program(config.endpoint, is_secure=credentials is not None)) from error
             if stop is not None and stop.is_set():
                 return False
 
 
-def _client_config(endpoint: str) -> zenoh.Config:
-    conf = zenoh.Config()
-    conf.insert_json5("mode", '"client"')
-    conf.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    conf.insert_json5("connect/timeout_ms", _ROUTER_TIMEOUT_MS)
-    conf.insert_json5("scouting/multicast/enabled", "false")
-    return conf
+def _short_lived_config(config: BusConfig, credentials: Credentials | None) -> zenoh.Config:
+    """Of a client that only sees whether anybody answers."""
+    settings = Settings()
+    settings.set("mode", "client")
+    settings.set("connect/endpoints", [config.endpoint])
+    settings.set("connect/timeout_ms", _ROUTER_TIMEOUT_MS)
+    settings.set("scouting/multicast/enabled", False)
+    settings.secure(credentials)
+    return settings.config
 
 
-def _open(config: BusConfig, stop: threading.Event | None, listens: bool) -> zenoh.Session:
+def _open(
+    config: BusConfig, credentials: Credentials | None, stop: threading.Event | None, listens: bool
+) -> zenoh.Session:
     try:
-        conf = _zenoh_config(config, listens)
+        conf = _zenoh_config(config, credentials, listens=listens)
         if config.mode == "peer":
             return zenoh.open(conf)
     except zenoh.ZError as error:
         raise BusError(f"bus.endpoint = {config.endpoint!r} cannot be used: {reason(error)}") from error
     until_s = time.monotonic() + (MEETING_LIMIT_S if stop else 0.0)
+    attempts = 0
     while True:  # Zenoh can wait for the router itself, but then ignores Ctrl-C
+        first = attempts % len(config.endpoints)
+        endpoints = (*config.endpoints[first:], *config.endpoints[:first])  # it never gets to one after one that hangs
         try:
+            conf.insert_json5("connect/endpoints", json.dumps(endpoints))
             return zenoh.open(conf)
         except zenoh.ZError as error:
+            attempts += 1
+            if attempts < len(endpoints):
+                continue
             if time.monotonic() > until_s and accepts_connections(config.endpoint):
-                raise BusError(foreign_program(config.endpoint)) from error
+                raise BusError(foreign_program(config.endpoint, is_secure=credentials is not None)) from error
             if stop is None or stop.wait(_ROUTER_RETRY_S):
                 raise BusError(
                     f"bus.endpoint = {config.endpoint!r}: no router answers: {reason(error)}; start `fantwin router`"
                 ) from error
 
 
-def _zenoh_config(config: BusConfig, listens: bool) -> zenoh.Config:
-    conf = zenoh.Config()
-    conf.insert_json5("mode", json.dumps(config.mode))
-    conf.insert_json5("connect/endpoints", json.dumps([config.endpoint]))
-    conf.insert_json5("connect/timeout_ms", "-1" if config.mode == "peer" else _ROUTER_TIMEOUT_MS)
-    conf.insert_json5("connect/exit_on_failure", "false")
-    conf.insert_json5("connect/retry", _RETRY)
+def _zenoh_config(config: BusConfig, credentials: Credentials | None = None, *, listens: bool) -> zenoh.Config:
+    settings = Settings()
+    settings.set("mode", config.mode)
+    settings.set("connect/endpoints", list(config.endpoints))
+    settings.set("connect/timeout_ms", -1 if config.mode == "peer" else _ROUTER_TIMEOUT_MS)
+    settings.set("connect/exit_on_failure", False)
+    settings.set("connect/retry", RETRY)
     if config.mode == "client":
-        conf.insert_json5("transport/link/tx/lease", LEASE_MS)
-    conf.insert_json5("scouting/multicast/enabled", "false")
-    conf.insert_json5("transport/shared_memory/enabled", "false")
+        settings.set("transport/link/tx/lease", int(LEASE_MS))
+        settings.set("transport/unicast/open_timeout", OPEN_TIMEOUT_MS)
+    settings.set("scouting/multicast/enabled", False)
+    settings.set("transport/shared_memory/enabled", False)
     if config.mode == "peer":
         host = config.endpoint.rsplit(":", 1)[0]
-        endpoints = [*([config.endpoint] if listens else []), f"{host}:0"]
-        conf.insert_json5("listen/endpoints", json.dumps(endpoints))
-        conf.insert_json5("listen/timeout_ms", "0")
-        conf.insert_json5("listen/exit_on_failure", "false")
-        conf.insert_json5("scouting/gossip/enabled", "true")
-    return conf
+        settings.set("listen/endpoints", [*([config.endpoint] if listens else []), f"{host}:0"])
+        settings.set("listen/timeout_ms", 0)
+        settings.set("listen/exit_on_failure", False)
+        settings.set("scouting/gossip/enabled", True)
+    settings.secure(credentials)
+    settings.pass_through(config.zenoh)
+    return settings.config

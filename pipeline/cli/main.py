@@ -32,6 +32,7 @@ COMMANDS = {
     "doctor": "watch.doctor",
     "selftest": "watch.selftest",
     "router": "watch.router",
+    "certs": "watch.certs",
     "replay": "recordings.replay",
     "info": "recordings.info",
     "recover": "recordings.recover",

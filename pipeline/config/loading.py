@@ -129,12 +129,16 @@ def _checked(
         overrides=overrides,
         site=file.site,
         run_folder=Path(os.path.normpath(folder / file.run_folder)),
-        bus=file.bus,
+        bus=_with_paths_within(file.bus, folder),
         launcher=file.launcher,
         trays=file.tray,
         stages=enabled,
         sections=sections,
     )
+
+
+def _with_paths_within(bus: BusConfig, folder: Path) -> BusConfig:
+    return bus.model_copy(update={"security": bus.security.within(folder)}) if bus.security else bus
 
 
 def _require_trays_for_shards(launcher: LauncherConfig, trays: int, path: Path) -> None:

@@ -72,6 +72,48 @@ class Section(BaseModel):
         return value
 
 
+BETWEEN_ENDPOINTS = ", "
+
+
+def _joined(value: object) -> object:
+    """Several endpoints as one text; anything else as it is."""
+    if isinstance(value, list | tuple) and value and all(isinstance(each, str) for each in value):
+        return BETWEEN_ENDPOINTS.join(value)
+    return value
+
+
+ROLE_PLACE = "{role}"
+"""in a path of `bus.security`: the name of the role of a process"""
+
+
+class SecurityConfig(Section):
+    """Mutual TLS and roles. Each process shows a certificate that says its role; `fantwin certs` makes them. Paths may
+    hold `{role}`: each process then finds those of its own role."""
+
+    ca: Path = Field(default=Path("certs/ca.pem"), description="certificate of the site's authority")
+    certificate: Path = Field(
+        default=Path("certs/{role}.pem"), description="certificate of a process; `{role}` is the name of its role"
+    )
+    key: Path = Field(
+        default=Path("certs/{role}.key"), description="private key of that certificate, readable by its owner only"
+    )
+    controllers: tuple[Name, ...] = Field(
+        default=(), description="roles of programs that command fans, as operators do, and may do nothing else"
+    )
+
+    def within(self, folder: Path) -> Self:
+        """The same with absolute paths: relative ones start at `folder`."""
+        paths = {name: folder.absolute() / getattr(self, name) for name in ("ca", "certificate", "key")}
+        return self.model_copy(update=paths)
+
+
+class SpoolConfig(Section):
+    """What a process keeps on disk of what it has published, in `run_folder/spool`."""
+
+    megabytes: float = Field(default=200.0, ge=1, description="the most that a process keeps on disk")
+    kept_s: float = Field(default=900.0, ge=1, description="how long a message is kept")
+
+
 class BusConfig(Section):
     """How processes find one another. On one host the first process to start listens on `endpoint`, the others
     connect there and learn of each other; if it dies, the next to start takes its place."""
@@ -79,12 +121,35 @@ class BusConfig(Section):
     mode: Literal["peer", "client"] = Field(
         default="peer", description="peer: processes meet without a router; client: all go through `fantwin router`"
     )
-    endpoint: str = Field(
-        default="tcp/127.0.0.1:7447", description="where peers meet, or the router's address for clients"
+    endpoint: Annotated[str, BeforeValidator(_joined)] = Field(
+        default="tcp/127.0.0.1:7447",
+        description="where peers meet, or the router's address for clients; a list of several routers: a client uses "
+        "the first that answers, and another one when that has gone",
     )
     recovery_timeout_s: float = Field(
         default=5.0, gt=0, description="how long to wait for missed messages that were requested again"
     )
+    security: SecurityConfig | None = Field(
+        default=None, description="certificates and roles: docs/how-to/security.md; without it, none"
+    )
+    zenoh: dict[str, Any] = Field(
+        default_factory=dict, description="settings of Zenoh itself, by path; not those that fantwin sets"
+    )
+    spool: SpoolConfig | None = Field(
+        default=None,
+        description="what producers keep on disk for consumers that are cut off for long; without it, nothing",
+    )
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Each endpoint; `endpoint` is all of them, for people."""
+        return tuple(self.endpoint.split(BETWEEN_ENDPOINTS))
+
+    @model_validator(mode="after")
+    def _one_for_peers(self) -> Self:
+        if self.mode == "peer" and len(self.endpoints) > 1:
+            raise ValueError('peers meet at one endpoint; a list is for mode = "client"')
+        return self
 
 
 class LauncherConfig(Section):

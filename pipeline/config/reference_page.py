@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from pipeline.config.loading import LARGEST_FILE_BYTES, top_level
-from pipeline.config.models import BusConfig, LauncherConfig, TrayConfig
+from pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, SpoolConfig, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.devices.sample_source import SourceConfig
 from pipeline.devices.source_kinds import SOURCE_KINDS
@@ -58,7 +58,18 @@ def page() -> str:
         "What a reading is of the speed ([tachos](../explanation/tachos.md)).\n",
         _table(Tacho, but=()),
         "## `[bus]`\n",
-        _table(BusConfig, but=()),
+        _table(BusConfig, but=("security", "spool", "zenoh")),
+        "## `[bus.security]`\n",
+        "Certificates and roles ([security](../how-to/security.md)). Without this section there are none.\n",
+        _table(SecurityConfig, but=()),
+        "## `[bus.zenoh]`\n",
+        "Settings of Zenoh itself, passed through to every session and to the router: path = value, with the paths of "
+        'Zenoh\'s own configuration, as `"transport/unicast/max_sessions" = 5000`. Refused: what Zenoh does not know, '
+        "and what fantwin sets itself.\n",
+        "## `[bus.spool]`\n",
+        "What a process keeps on disk of what it has published, in `run_folder/spool`, for consumers that are cut off "
+        "for long ([partitions](../how-to/deployment.md#partitions)). Without this section nothing.\n",
+        _table(SpoolConfig, but=()),
         "## `[launcher]`\n",
         _table(LauncherConfig, but=()),
     ]
@@ -80,9 +91,10 @@ def page() -> str:
 def _sources() -> Iterator[str]:
     for kind, row in SOURCE_KINDS.items():
         module, _, name = row.config.partition(":")
-        yield f'### `source = {{ kind = "{kind}", ... }}`\n'
         model: type[BaseModel] = getattr(import_module(module), name)
-        yield _table(model, but=("kind",))
+        has_keys = set(model.model_fields) > {"kind"}
+        yield f'### `source = {{ kind = "{kind}"{", ..." if has_keys else ""} }}`\n'
+        yield _table(model, but=("kind",)) if has_keys else "It has no other keys.\n"
         yield from _tables_within(model)
 
 
@@ -136,25 +148,22 @@ def _values(field: FieldInfo) -> str:
 
 
 def _type_words(annotation: Any) -> str:
-    if get_origin(annotation) is Annotated:
-        return _type_words(get_args(annotation)[0])
-    if get_origin(annotation) is Literal:
-        return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
-    if get_origin(annotation) is UnionType:
-        return " or ".join(_type_words(each) for each in get_args(annotation))
-    return _collection_words(annotation)
-
-
-def _collection_words(annotation: Any) -> str:
-    if get_origin(annotation) is dict:
-        return f"table of {_type_words(get_args(annotation)[1])}s"
-    if get_origin(annotation) is tuple:
-        of_one = _type_words(get_args(annotation)[0])
-        if of_one == "table":
-            return "list of tables"
-        return of_one if of_one == _ELSEWHERE else f"list of {of_one}"
-    is_table = _is_model(annotation) and annotation not in (SourceConfig, Tacho)
-    return "table" if is_table else _TYPE_WORDS.get(annotation, _ELSEWHERE)
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    words = _TYPE_WORDS.get(annotation, _ELSEWHERE)
+    if origin is Annotated:
+        words = _type_words(arguments[0])
+    elif origin is Literal:
+        words = " or ".join(f"`{json.dumps(value)}`" for value in arguments)
+    elif origin is UnionType:
+        words = " or ".join(map(_type_words, arguments))
+    elif origin is dict:
+        words = f"table of {_type_words(arguments[1])}s"
+    elif origin is tuple:
+        of_one = _type_words(arguments[0])
+        words = of_one if of_one == _ELSEWHERE else "list of tables" if of_one == "table" else f"list of {of_one}"
+    elif _is_model(annotation) and annotation not in (SourceConfig, Tacho):
+        words = "table"
+    return words
 
 
 def _default(field: FieldInfo) -> str:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Literal
 
+from schemas.topics import TOPICS
+
 
 @dataclass(frozen=True)
 class StageRow:
@@ -24,6 +26,7 @@ class StageRow:
             with a process for each tray may have a device.
         has_common_shards: a `launcher.shards` that is one number for all stages applies to it.
         may_drop: that of its declaration, for those who count losses and would wait long for its imports.
+        reads, writes: those of its declaration, for those who must not import it; None: its declaration is asked.
         keeps: topics whose last message about each of its trays it keeps for others, also when the producer has gone.
         needs_twin: it cannot start unless every tray has a twin, or learns one.
     """
@@ -34,6 +37,8 @@ class StageRow:
     scope: Literal["site", "tray"] = "site"
     has_common_shards: bool = True
     may_drop: bool = False
+    reads: tuple[str, ...] | None = None
+    writes: tuple[str, ...] | None = None
     keeps: tuple[str, ...] = ()
     needs_twin: bool = False
 
@@ -42,6 +47,13 @@ class StageRow:
         module, _, attribute = self.declaration.partition(":")
         return getattr(import_module(module), attribute)
 
+    def topics(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """What it reads and what it writes; imports the stage only if its row does not say so."""
+        if self.reads is None or self.writes is None:
+            stage = self.load()
+            return stage.reads, stage.writes
+        return self.reads, self.writes
+
 
 LEARNER = "learner"
 """the stage that gives a tray its twin"""
@@ -49,12 +61,55 @@ RECORDER = "recorder"
 STAGES: dict[str, StageRow] = {
     row.name: row
     for row in (
-        StageRow("acquisition", "stages.acquisition:STAGE", enabled_by="default", scope="tray"),
-        StageRow("resampler", "stages.resampler:STAGE", enabled_by="default"),
-        StageRow(LEARNER, "stages.learner:STAGE", enabled_by="tray without twin", may_drop=True),
-        StageRow("twin_integrator", "stages.twin_integrator:STAGE", enabled_by="default", needs_twin=True),
-        StageRow("scorer", "stages.scorer:STAGE", enabled_by="default", needs_twin=True),
-        StageRow(RECORDER, "stages.recorder:STAGE", enabled_by="default", keeps=("snapshot",)),
-        StageRow("viewer", "stages.viewer:STAGE", enabled_by="default", has_common_shards=False, may_drop=True),
+        StageRow(
+            "acquisition",
+            "stages.acquisition:STAGE",
+            enabled_by="default",
+            scope="tray",
+            reads=("command", "reading"),
+            writes=("raw",),
+        ),
+        StageRow("resampler", "stages.resampler:STAGE", enabled_by="default", reads=("raw",), writes=("grid",)),
+        StageRow(
+            LEARNER,
+            "stages.learner:STAGE",
+            enabled_by="tray without twin",
+            may_drop=True,
+            reads=("raw", "score", "request"),
+            writes=("new_twin",),
+        ),
+        StageRow(
+            "twin_integrator",
+            "stages.twin_integrator:STAGE",
+            enabled_by="default",
+            needs_twin=True,
+            reads=("grid", "new_twin"),
+            writes=("prediction", "twin"),
+        ),
+        StageRow(
+            "scorer",
+            "stages.scorer:STAGE",
+            enabled_by="default",
+            needs_twin=True,
+            reads=("prediction", "request", "twin"),
+            writes=("score", "alarm", "snapshot"),
+        ),
+        StageRow(
+            RECORDER,
+            "stages.recorder:STAGE",
+            enabled_by="default",
+            reads=tuple(topic.name for topic in TOPICS if topic.recorded),
+            writes=(),
+            keeps=("snapshot",),
+        ),
+        StageRow(
+            "viewer",
+            "stages.viewer:STAGE",
+            enabled_by="default",
+            has_common_shards=False,
+            may_drop=True,
+            reads=("score", "alarm", "twin", "health"),
+            writes=(),
+        ),
     )
 }

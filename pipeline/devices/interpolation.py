@@ -12,23 +12,32 @@ NEVER_NS = -(1 << 62)
 
 
 class Samples(NamedTuple):
-    """Raw samples by strictly rising time. t_ns: (n,). command, speed_rad_s: (n, fans)."""
+    """Raw samples by strictly rising time. t_ns: (n,). command, speed_rad_s: (n, fans).
+
+    auxiliary: (n, columns, fans), the columns of `AUXILIARY`, NaN where a value is not known; (n, 0, fans) if the
+    source measures nothing beside command and speed.
+    """
 
     t_ns: Array
     command: Array
     speed_rad_s: Array
+    auxiliary: Array
 
-    def extended(self, t_ns: Array, command: Array, speed_rad_s: Array) -> Samples:
+    def extended(self, later: Samples) -> Samples:
         """These samples and later ones."""
+        before = self.auxiliary
+        if before.shape[1] < later.auxiliary.shape[1]:
+            before = np.full((len(self.t_ns), *later.auxiliary.shape[1:]), np.nan)
         return Samples(
-            np.concatenate((self.t_ns, t_ns)),
-            np.concatenate((self.command, command)),
-            np.concatenate((self.speed_rad_s, speed_rad_s)),
+            np.concatenate((self.t_ns, later.t_ns)),
+            np.concatenate((self.command, later.command)),
+            np.concatenate((self.speed_rad_s, later.speed_rad_s)),
+            np.concatenate((before, later.auxiliary)),
         )
 
-    def rows(self, wanted: slice) -> Samples:
+    def rows(self, wanted: slice | list[int]) -> Samples:
         """The samples in these rows."""
-        return Samples(self.t_ns[wanted], self.command[wanted], self.speed_rad_s[wanted])
+        return Samples(self.t_ns[wanted], self.command[wanted], self.speed_rad_s[wanted], self.auxiliary[wanted])
 
 
 def all_true(mask: Array) -> bool:
@@ -48,6 +57,19 @@ def interpolate_samples(t_ns: Array, at: Array, samples: Samples, is_held: Array
     share = np.where(is_held, 0.0, (since_ns / np.maximum(span_ns, 1))[:, np.newaxis])
     between = here + share * (samples.speed_rad_s.take(after, axis=0, mode="clip") - here)
     return np.where((since_ns == 0)[:, np.newaxis], here, between)
+
+
+def interpolate_auxiliary(t_ns: Array, at: Array, samples: Samples) -> Array:
+    """(n, columns, fans) values at t_ns (n,): linear between two samples that have one, else that of the one before.
+
+    at: (n,), index of the last sample at or before each time.
+    """
+    here_t_ns, here = samples.t_ns.take(at), samples.auxiliary.take(at, axis=0)
+    after = samples.auxiliary.take(at + 1, axis=0, mode="clip")
+    span_ns = samples.t_ns.take(at + 1, mode="clip") - here_t_ns
+    share = ((t_ns - here_t_ns) / np.maximum(span_ns, 1))[:, np.newaxis, np.newaxis]
+    between = here + share * (after - here)
+    return np.where(np.isfinite(between), between, here)
 
 
 class LastReadings:

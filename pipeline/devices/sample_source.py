@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import ClassVar, Protocol, TypeAlias
 
 from pydantic import BaseModel
 
@@ -24,6 +24,9 @@ MOST_FANS = 1024
 
 class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """Base of every kind's settings, `source = { kind = "...", ... }` of a [[tray]]: frozen, unknown keys refused."""
+
+    takes_pushed: ClassVar[bool] = False
+    """whether the samples of the tray are those that clients push over the bus"""
 
     kind: str
 
@@ -44,6 +47,42 @@ def too_many_fans(kind: str, fans: int, most: int) -> str:
     return f"fans = {fans}: a {kind} source carries at most {most} fans; make several trays of them"
 
 
+FLOAT32_TOLERANCE = 1e-6
+
+
+def within(value: float, low: float, high: float) -> bool:
+    """Whether a float32 value lies in a range given in decimals: 0.1 as float32 is not beyond 0.1."""
+    tolerance = FLOAT32_TOLERANCE * max(abs(low), abs(high))
+    return low - tolerance <= value <= high + tolerance
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingLimits:
+    """What a reading of a tray must be to be accepted; commands in the tray's unit, speeds in its speed unit."""
+
+    fans: int
+    command_min: float
+    command_max: float
+    speed_max: float
+
+    def why_refused(self, reading: Reading) -> Rejected | None:
+        """Why a reading cannot be used; None: it can, maybe without some speeds."""
+        if not len(reading.command) == len(reading.speed) == self.fans:
+            detail = f"a reading of {len(reading.speed)} fans, this tray has {self.fans}"
+            return Rejected("wrong_fan_count", detail, is_sample=True, setting=f"fans = {self.fans}")
+        for command in reading.command:
+            # Without its actual command a sample cannot be scored, and a command must not be invented.
+            if not within(command, self.command_min, self.command_max):
+                limits = f"command_min = {self.command_min:g} to command_max = {self.command_max:g}"
+                detail = f"command {command:g} is outside {limits}"
+                return Rejected("absurd_command", detail, is_sample=True, setting="command_min and command_max")
+        return None
+
+    def absurd_speeds(self, reading: Reading) -> int:
+        """How many speeds are beyond the largest one: acquisition takes them for missing."""
+        return sum(abs(speed) > self.speed_max for speed in reading.speed)
+
+
 @dataclass(frozen=True, slots=True)
 class SourceContext:
     """What a source has to know of its tray."""
@@ -53,6 +92,10 @@ class SourceContext:
     """unit of `Reading.speed`: rad/s or rpm"""
     folder: Path
     """relative paths of the configuration start here"""
+    tray: str = ""
+    """its name"""
+    limits: ReadingLimits | None = None
+    """which readings acquisition accepts, for a source that says so to whoever sends them; None: not known"""
 
 
 @dataclass(frozen=True, slots=True)

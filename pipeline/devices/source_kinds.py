@@ -25,6 +25,15 @@ SOURCE_KINDS: dict[str, SourceKind] = {
     "serial": SourceKind(
         config="pipeline.devices.serial_config:SerialConfig", source="pipeline.devices.serial_source:SerialSource"
     ),
+    "mqtt": SourceKind(
+        config="pipeline.devices.mqtt_config:MqttConfig", source="pipeline.devices.mqtt_source:MqttSource"
+    ),
+    "http": SourceKind(
+        config="pipeline.devices.http_config:HttpConfig", source="pipeline.devices.http_source:HttpSource"
+    ),
+    "push": SourceKind(
+        config="pipeline.devices.push_config:PushConfig", source="pipeline.devices.push_source:PushSource"
+    ),
     "hwmon": SourceKind(
         config="pipeline.devices.hwmon_config:HwmonConfig", source="pipeline.devices.hwmon_source:HwmonSource"
     ),

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
+from pipeline.config.roles import role_names
 from pipeline.config.shards import Shard
 from pipeline.runtime.kept_snapshots import KeptSnapshots, keeps_snapshots
 from pipeline.runtime.second_owner import refuse_second
@@ -28,7 +29,7 @@ def build_and_join(
 
     def bus() -> Bus:
         if not joined:
-            joined.append(Bus(config.bus, stop))
+            joined.append(Bus(config.bus, stop, roles=role_names(stage.name, shard)))
         return joined[0]
 
     def refuse_others() -> None:

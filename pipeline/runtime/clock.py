@@ -83,6 +83,10 @@ class StageClock:
         last = self._time_of(tray)
         return last.clock.t_ns if last else self._host_ns()
 
+    def is_of_replay(self, tray: str) -> bool:
+        """Whether the time of a tray is that of a replay."""
+        return self._time_of(tray) is not None
+
     def now_ns(self, tray: str, t_ns: int) -> int | None:
         """The time against which the age of a sample of t_ns is measured. None where an age has no meaning: in a replay
         that is paused or runs as fast as it can, and of its last samples once it has left."""

@@ -47,6 +47,10 @@ class DueMessages:
         for waiting in self._waiting.values():
             yield from waiting
 
+    def has(self, tray: str) -> bool:
+        """Whether a message of a tray with a core of its own waits."""
+        return tray in self._waiting
+
     def add(self, envelopes: Iterable[Envelope]) -> None:
         """Messages that are in sequence now."""
         for envelope in envelopes:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from schemas.messages import AwaitedInput, Counter, Health, Input, Note, Output, StageStatus
+from schemas.messages import AcceptedSamples, AwaitedInput, Counter, Health, Input, Note, Output, StageStatus
 from schemas.streams import stage_losses
 from schemas.units import NS_PER_S
 
@@ -74,6 +74,7 @@ class HealthBuilder:
         counters: Mapping[str, int],
         now_ns: int,
         notes: Iterable[Note] = (),
+        accepts: Iterable[AcceptedSamples] = (),
     ) -> Health:
         """The health message as of now."""
         problem = "; ".join(filter(None, problems))
@@ -106,4 +107,5 @@ class HealthBuilder:
             newest_output_t_ns=self._newest_output_t_ns,
             notes=tuple(notes),
             trays=self._trays,
+            accepts=tuple(accepts),
         )

@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Core, StageError
 from pipeline.runtime.twin_file import TwinFile, learned_twin
+from schemas.auxiliary import auxiliary_columns
 from schemas.blocks import cut, select
 from schemas.messages import Array, Grid, InvalidReason, Message, NewTwin, Prediction
 
@@ -131,4 +132,5 @@ def _without_twin(grid: Grid) -> Prediction:
         torque_balance_command=unknown,
         torque_balance_sigma_command=sigma,
         reading_missing=grid.reading_missing,
+        **auxiliary_columns(grid),
     )

@@ -22,6 +22,7 @@ from pipeline.runtime.peers import Peers
 from pipeline.runtime.recovery import Recovery
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.sessions import Sessions
+from pipeline.runtime.silences import Silences
 from pipeline.runtime.stage import Stage
 from pipeline.runtime.subscriptions import Subscriptions
 from schemas.codec import CodecError
@@ -74,6 +75,9 @@ class Receiver:
         )
         self._newest = NewestMessages(bus, inbox)
         self.peers = Peers(self._subscriptions.keys)
+        self._silences = Silences(
+            {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}
+        )
 
     def start(self, *, follows_clock: bool) -> None:
         """Subscribe to health, to who is there and, if it follows them, to the clocks of the trays."""
@@ -125,6 +129,17 @@ class Receiver:
     def awaits_more(self) -> bool:
         """Whether something that other stages have sent, or say at their end, is still to come."""
         return self.peers.awaits_last_health() or self.tracker.is_waiting
+
+    def ask_again(self) -> None:
+        """Send again the requests that were not answered, as they become due."""
+        self._recovery.send_due()
+
+    def is_complete(self, tray: str) -> bool:
+        """Whether the producer of a tray's main input has shown, since this was last asked, that all that it has sent
+        has been processed; a replay shows it by its clock."""
+        if self._due.has(tray):
+            return False
+        return self._silences.take(tray) or self._clock.is_of_replay(tray)
 
     def take(self, item: FromBus | Recovered | Newest | Liveness) -> None:
         """Take an item of the inbox."""
@@ -196,6 +211,7 @@ class Receiver:
             self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
         self._sessions.add_health(health, self._subscriptions.keys)
         self._due.add(self.tracker.reconcile(health, self.current_keys))
+        self._silences.add_health(health, self.tracker.has_all_of)
         if "health" in self._stage.reads and self._concerns(envelope):
             self._due.add(self.tracker.accept(envelope))
 

@@ -41,6 +41,8 @@ class Recovery:
         self._running: dict[Request, RecoveryRequest] = {}
         self._queue: deque[tuple[Request, float]] = deque()
         """with the time at which each was asked"""
+        self._later: deque[Request] = deque()
+        """requests that are not to be sent yet"""
         self._asked_again_s: dict[tuple[str, str], float] = {}
         """by key and producer, of those that did not answer"""
         self._catching_up: deque[str] = deque()
@@ -65,7 +67,10 @@ class Recovery:
         """Request messages. None: the answer will be in the inbox. Otherwise no request is sent."""
         if self._only_rare and not topic_of(request.key).is_rare:
             return Found(was_asked=False)
-        if self._now_s() < self._asked_again_s.get((request.key, request.producer), 0.0):
+        if request.not_before_s > self._now_s() and len(self._later) < MOST_QUEUED:
+            self._later.append(request)
+            return None
+        if not request.not_before_s and self._now_s() < self._asked_again_s.get((request.key, request.producer), 0.0):
             return Found()
         if len(self._running) < MOST_AT_A_TIME:
             self._send(request, self._timeout_s)
@@ -74,6 +79,13 @@ class Recovery:
         else:
             return Found()
         return None
+
+    def send_due(self) -> None:
+        """Send the requests that have waited until their time."""
+        for _ in range(len(self._later)):
+            request = self._later.popleft()
+            if self.ask(request) is not None:
+                self._inbox.put_at_once(Recovered(request, Answer()))
 
     def finish(self, item: Recovered) -> None:
         """An answer has been taken from the inbox and processed: go on with the next request."""

@@ -17,6 +17,7 @@ from dataclasses import replace
 from itertools import chain
 
 from pipeline.bus.kept_messages import KeptQuery
+from pipeline.bus.spool import Spool
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.config.shards import Shard, chosen_shard
@@ -91,6 +92,9 @@ class Runner:
         self._sessions = Sessions()
         self._session = Session.of_this_process(stage.name, shard, started_t_ns, self.producer)
         self._bus, self._parts = build_and_join(stage, config, shard, self._session, stop)
+        if config.bus.spool:
+            folder = config.run_folder / "spool" / f"{stage.name}-{shard.name}"
+            self._bus.spool = Spool(folder, round(config.bus.spool.megabytes * 1e6), config.bus.spool.kept_s)
         before = {key: payload for parts in self._parts.values() for key, payload in parts.kept.items()}
         self._kept = KeptForOthers(
             self._bus, config.site, STAGES[stage.name].keeps, self.producer, before, self._inbox.put
@@ -230,7 +234,9 @@ class Runner:
                 next_tick = now + TICK_S
                 for name, parts in self._parts.items():
                     now_ns = self._clock.tick_ns(name)
+                    parts.core.confirm_input(is_complete=self._receiver.is_complete(name))
                     self._steps.call(name, lambda core=parts.core, now_ns=now_ns: core.tick(now_ns), from_timer=True)
+                self._receiver.ask_again()
                 if self.stage.undecoded:
                     self._follow()
                 news = False
@@ -263,6 +269,7 @@ class Runner:
             if left is None and sources.wait(0) and not self._receiver.awaits_more:
                 left = self._inbox.waiting()
                 continue
+            self._receiver.ask_again()
             item = self._inbox.get(TICK_S)
             if item is not None:
                 self._handle(item)
@@ -365,17 +372,23 @@ class Runner:
                 self._ending.problem,
                 self._sessions.problem(),
                 self._tracker.problem(),
+                self._bus.spool.problem() if self._bus.spool else "",
                 *(core.problem() for core in cores),
             ],
             inputs=self._tracker.inputs(self._unsaved(cores)) if with_counts else (),
             outputs=self._outputs.counts() if with_counts else (),
             counters=self._counters() if with_counts else {},
             now_ns=HOST_CLOCK.now_ns(),
-            notes=[Note(tray=name, text=note) for name, parts in self._parts.items() for note in parts.core.notes()]
-            if with_counts
-            else (),
+            notes=[*self._notes()] if with_counts else (),
+            accepts=filter(None, (core.accepts() for core in cores)),
         )
         return replace(health, header=Header(self.producer, self._health_publisher.published, ""))
+
+    def _notes(self) -> Iterator[Note]:
+        for name, parts in self._parts.items():
+            yield from (Note(tray=name, text=note) for note in parts.core.notes())
+        if self._bus.spool and (note := self._bus.spool.note()):
+            yield Note(tray="", text=note)
 
     def _publish_health(self, status: StageStatus) -> Health:
         health = self._build_health(status)

@@ -8,18 +8,29 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from itertools import groupby
+from typing import Any
 
 import numpy as np
 
 from pipeline.devices.device_clock import UINT32, DeviceClock
 from pipeline.devices.device_sequence import LARGEST_GAP
-from pipeline.devices.interpolation import NEVER_NS, LastReadings, Samples, all_true, interpolate_samples
+from pipeline.devices.interpolation import (
+    NEVER_NS,
+    LastReadings,
+    Samples,
+    all_true,
+    interpolate_auxiliary,
+    interpolate_samples,
+)
 from pipeline.devices.line_guard import LineGuard
 from pipeline.devices.line_rate import GridTiming
 from pipeline.runtime.clock import is_of_replay
 from pipeline.runtime.decision_rules import DecisionRules
+from schemas.auxiliary import AUXILIARY, auxiliary_columns
 from schemas.blocks import cut, join
 from schemas.messages import Array, Grid, InvalidReason, Raw
+from schemas.side_by_side import present_columns
 from schemas.tacho import Tacho
 from schemas.topics import most_samples
 from schemas.units import NS_PER_S
@@ -41,8 +52,15 @@ def first_grid_time(t_ns: int, period_ns: int) -> int:
 class SampleGrid:
     """The grid of one tray. Samples that are dropped and gaps are counted."""
 
-    def __init__(self, tachos: Sequence[Tacho], timing: GridTiming, decision_rules: DecisionRules) -> None:
-        """tachos: one for each fan; readings that a tacho shows until the next one are held."""
+    def __init__(
+        self,
+        tachos: Sequence[Tacho],
+        timing: GridTiming,
+        decision_rules: DecisionRules,
+        link_wait_ns: int = 0,
+    ) -> None:
+        """tachos: one for each fan; readings that a tacho shows until the next one are held. link_wait_ns: how long a
+        gap is not published because its samples may still come."""
         self._fans = fans = len(tachos)
         self._is_held = np.array([tacho.held_s > 0.0 for tacho in tachos])
         self._period_ns = timing.period_ns
@@ -57,13 +75,19 @@ class SampleGrid:
         self._guard = LineGuard(self._clock, self._period_ns) if knows_time else None
         self._last_readings = LastReadings(fans, self._gap_limit_ns, self._is_held)
         # The last raw sample at or before the next grid time, and all later ones.
-        self._held = Samples(np.zeros(0, np.int64), np.zeros((0, fans)), np.zeros((0, fans)))
+        nothing = np.zeros((0, fans))
+        self._held = Samples(np.zeros(0, np.int64), nothing, nothing, np.zeros((0, 0, fans)))
+        self._auxiliary: dict[str, int] = {}
+        """the columns beside command and speed that the source has given, and their places in the samples"""
         self._newest_t_ns = NEVER_NS
         self._next_t_ns = NEVER_NS
         self._not_before_t_ns = NEVER_NS  # earlier samples are not accepted: the clock has restarted
         self._pending: list[Grid] = []  # not yet published
         self._in_gap = False
+        self._link_wait_ns = link_wait_ns
         self._silence_ns = 0
+        self._shown_silence_ns = 0
+        """that of the source, as far as its producer has shown that it has sent nothing"""
         self._tick_t_ns: int | None = None
         self._set_back_ns = 0  # by how much the host clock was set back, until it has caught up
         self._producer = ""
@@ -82,14 +106,19 @@ class SampleGrid:
             self._add(message, is_new=message.header.producer == self._guard.producer)
         return self._published()
 
-    def tick(self, now_ns: int) -> list[Grid]:
-        """Add up how long no samples have arrived; past the watermark, publish the grid without them."""
+    def tick(self, now_ns: int, *, is_complete: bool = True) -> list[Grid]:
+        """Add up how long no samples have arrived; past the watermark, publish the grid without them.
+
+        is_complete: all that was sent until now has arrived. Otherwise the link may be cut, and the samples be kept.
+        """
         if self._tick_t_ns is not None:
             self._silence_ns += min(max(now_ns - self._tick_t_ns, 0), LONGEST_TICK_NS)
         self._tick_t_ns = now_ns
-        if self._silence_ns < self._watermark_ns:
+        if is_complete or self._silence_ns > self._link_wait_ns:
+            self._shown_silence_ns = self._silence_ns
+        if self._shown_silence_ns < self._watermark_ns:
             return []
-        return self.publish_until(self._newest_t_ns + self._silence_ns - self._watermark_ns)
+        return self.publish_until(self._newest_t_ns + self._shown_silence_ns - self._watermark_ns)
 
     def publish_until(self, t_ns: int) -> list[Grid]:
         """Publish the grid up to `t_ns` without waiting for more samples."""
@@ -123,15 +152,22 @@ class SampleGrid:
 
     def _add(self, item: Raw, is_new: bool) -> None:
         """Add the samples of a message of the line; is_new: neither repeated nor one of an ended session."""
-        self._silence_ns = 0
+        self._silence_ns = self._shown_silence_ns = 0
         times, restarts = self._times(item, is_new)
         accepted = [k for k, t_ns in enumerate(times) if self._is_accepted(t_ns, is_new, after_restart=k in restarts)]
         if accepted:
-            t_ns, command, speed = np.array(times, np.int64), item.command, item.speed_rad_s
-            if len(accepted) < len(times):
-                t_ns, command, speed = t_ns[accepted], command[accepted], speed[accepted]
-            self._held = self._held.extended(t_ns, command, speed)
+            samples = Samples(np.array(times, np.int64), item.command, item.speed_rad_s, self._auxiliary_of(item))
+            self._held = self._held.extended(samples if len(accepted) == len(times) else samples.rows(accepted))
             self._fill(self._newest_t_ns, final=False)
+
+    def _auxiliary_of(self, item: Raw) -> Array:
+        """The columns of a message beside command and speed, as Samples has them."""
+        given = auxiliary_columns(item)
+        self._auxiliary |= {column.name: place for place, column in enumerate(AUXILIARY) if column.name in given}
+        values = np.full((len(item.command), len(AUXILIARY) if self._auxiliary else 0, self._fans), np.nan)
+        for name, column in given.items():
+            values[:, self._auxiliary[name]] = column
+        return values
 
     def _is_repeated(self, item: Raw) -> bool:
         """Whether the bus has delivered a message of the present producer again."""
@@ -254,7 +290,8 @@ class SampleGrid:
                 t_ns, at, speed = t_ns[known], at[known], speed[known]
         if len(t_ns):
             self._in_gap = False
-            self._append(t_ns, samples.command.take(at, axis=0), speed, NO_SPEED, ~has.take(at, axis=0))
+            auxiliary = interpolate_auxiliary(t_ns, at, samples) if self._auxiliary else samples.auxiliary
+            self._append(t_ns, samples.command.take(at, axis=0), speed, NO_SPEED, ~has.take(at, axis=0), auxiliary)
         return not waits
 
     def _fill_gap(self, until_t_ns: int) -> None:
@@ -264,7 +301,8 @@ class SampleGrid:
         reason = np.where(t_ns - self._held.t_ns[0] <= self._watermark_ns, GAP, STALE)
         self._count_gap(len(t_ns))
         command, nothing = np.broadcast_to(self._held.command[0], shape), np.zeros(shape, np.bool_)
-        self._append(t_ns, command, np.full(shape, np.nan), reason[:, np.newaxis], nothing)
+        auxiliary = np.full((len(t_ns), len(AUXILIARY), self._fans), np.nan)
+        self._append(t_ns, command, np.full(shape, np.nan), reason[:, np.newaxis], nothing, auxiliary)
 
     def _count_gap(self, samples: int) -> None:
         self._counts["gaps"] += not self._in_gap
@@ -275,7 +313,13 @@ class SampleGrid:
         return np.arange(self._next_t_ns, until_t_ns + 1, self._period_ns)
 
     def _append(
-        self, t_ns: Array, command: Array, speed: Array, reason: Array | np.uint8, reading_missing: Array
+        self,
+        t_ns: Array,
+        command: Array,
+        speed: Array,
+        reason: Array | np.uint8,
+        reading_missing: Array,
+        auxiliary: Array,
     ) -> None:
         """Append grid samples, at least one; `reason` is the invalid_reason of those without a speed."""
         valid = np.isfinite(speed)
@@ -285,6 +329,9 @@ class SampleGrid:
         while self._restarts_t_ns and t_ns[-1] >= self._restarts_t_ns[0]:
             first = t_ns.searchsorted(self._restarts_t_ns.popleft())
             valid[first], invalid_reason[first] = False, CLOCK_RESTARTED
+        columns: dict[str, Any] = {
+            name: auxiliary[:, place].astype(np.float32) for name, place in self._auxiliary.items()
+        }
         grid = Grid(
             fans=self._fans,
             period_ns=self._period_ns,
@@ -294,6 +341,7 @@ class SampleGrid:
             valid=valid,
             invalid_reason=invalid_reason,
             reading_missing=reading_missing if self._marks_missing else np.zeros(0, np.bool_),
+            **columns,
         )
         self._pending.append(grid)
         self._counts["grid_samples"] += len(t_ns)
@@ -302,9 +350,15 @@ class SampleGrid:
     def _published(self) -> list[Grid]:
         if not self._pending:
             return []
-        grid, self._pending = join(self._pending), []
-        rows = len(grid.t_ns)
-        most = most_samples(self._fans)
-        if rows <= most:  # those of a long gap are published at once
-            return [grid]
-        return [cut(grid, first, min(first + most, rows)) for first in range(0, rows, most)]
+        # Those before a source has given a column for the first time do not have it.
+        grids = [join([*group]) for _, group in groupby(self._pending, key=present_columns)]
+        self._pending = []
+        most = most_samples(self._fans)  # those of a long gap are published at once
+        return [piece for grid in grids for piece in _cut(grid, most)]
+
+
+def _cut(grid: Grid, most: int) -> list[Grid]:
+    rows = len(grid.t_ns)
+    if rows <= most:
+        return [grid]
+    return [cut(grid, first, min(first + most, rows)) for first in range(0, rows, most)]

@@ -26,6 +26,10 @@ MOST_HELD_BYTES = 64 << 20
 """of one stream. Beyond either limit it goes on without the messages that were requested."""
 MOST_PER_S = 100_000
 """no producer publishes more messages a second on one key"""
+PATIENCE_S, PATIENCE_WITH_ENDED_S = 30.0, 5.0
+"""how long a stage that is there, or has just left, is asked again while it does not answer: a link that has healed
+works in one direction first, or loses packets"""
+ASKED_AGAIN_AFTER_S = 0.5
 REFUSAL_SHOWN_S = 60.0
 """how long health names what was refused"""
 
@@ -55,8 +59,9 @@ class SequenceTracker:
     it is passed to `answer`.
 
     The first message seen of a stream need not be its first. Earlier messages that the producer still keeps are asked
-    for; those it no longer keeps are history, not a loss. If a stage that is alive does not answer, what it may have
-    kept counts as missing. From then on every gap is either recovered or counted.
+    for; those it no longer keeps are history, not a loss. A stage that does not answer, or not completely, is asked
+    again for a while; then what it may have kept counts as missing. From then on every gap is either recovered or
+    counted.
 
     A number beyond the next is believed if the producer confirms that it has published so many messages. If it does not
     answer, the number is believed if it can have published so many since it was last heard. Otherwise the message is
@@ -112,12 +117,19 @@ class SequenceTracker:
                 stream.heard_s = self._now_s()
         return due
 
+    def has_all_of(self, id: StreamId, published: int) -> bool:
+        """Whether all messages of a stream up to this number have arrived, or are known to be lost."""
+        stream = self._streams.get(*id)
+        return published == 0 or (
+            stream is not None and stream.waiting is None and (stream.next_sequence or 0) >= published
+        )
+
     def answer(self, request: Request, found: Found) -> list[Envelope]:
         """The messages to process now that a request has been answered."""
         stream = self._streams.get(request.key, request.producer)
         if stream is None or stream.waiting is None or stream.waiting.request is not request:
             return []  # the stream went on without the answer
-        return self._go_on(stream, stream.waiting, found)
+        return self._go_on(stream, stream.waiting, found, may_ask_again=True)
 
     def believes(self, health: Health) -> bool:
         """Whether its producer can have published what a health says. If not, the health is counted as refused."""
@@ -185,12 +197,29 @@ class SequenceTracker:
         """Request what is missing before `until`."""
         first = stream.next_sequence if stream.next_sequence is not None else max(0, until - CATCH_UP_MESSAGES)
         request = Request(stream.key, stream.producer, first, until - 1)
-        stream.waiting = waiting = Waiting(request, until, shown_by)
+        stream.waiting = waiting = Waiting(request, until, shown_by, self._now_s())
         found = self._ask(request)
         return [] if found is None else self._go_on(stream, waiting, found)
 
-    def _go_on(self, stream: Stream, waiting: Waiting, found: Found) -> list[Envelope]:
-        """Process what was found, then what was held."""
+    def _ask_again(self, stream: Stream, waiting: Waiting, *, is_at_once: bool) -> list[Envelope]:
+        """Request the rest of what was requested."""
+        before, now_s = waiting.request, self._now_s()
+        first = max(before.first, stream.next_sequence or 0)
+        again_s = 0.0 if is_at_once else now_s + ASKED_AGAIN_AFTER_S
+        waiting.request = Request(stream.key, stream.producer, first, before.last, again_s)
+        if is_at_once:
+            waiting.since_s = now_s
+        stream.waiting = waiting
+        found = self._ask(waiting.request)
+        return [] if found is None else self._go_on(stream, waiting, found)
+
+    def _patience_s(self, stream: Stream) -> float:
+        if self._sessions.is_alive(stream.producer):
+            return PATIENCE_S
+        return PATIENCE_WITH_ENDED_S if self._sessions.has_ended(stream.producer) else 0.0
+
+    def _go_on(self, stream: Stream, waiting: Waiting, found: Found, *, may_ask_again: bool = False) -> list[Envelope]:
+        """Process what was found, then what was held; or ask for the rest, if the answer was not complete."""
         stream.waiting = None
         due: list[Envelope] = []
         for envelope in sorted(found.envelopes, key=lambda each: each.header.sequence):
@@ -200,6 +229,10 @@ class SequenceTracker:
             if header.sequence >= waiting.request.first and not stream.is_duplicate(header.sequence):
                 stream.accept(header.sequence)
                 due.append(envelope)
+        is_incomplete = found.was_asked and found.published is None and stream.next_sequence != waiting.until
+        is_patient = bool(due) or self._now_s() - waiting.since_s < self._patience_s(stream)
+        if may_ask_again and is_incomplete and is_patient:
+            return due + self._ask_again(stream, waiting, is_at_once=bool(due))
         if self._is_believed(stream, waiting, found.published):
             if stream.next_sequence is None and self._owes_answer(stream, found):
                 stream.next_sequence = waiting.request.first

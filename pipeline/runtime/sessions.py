@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from pipeline.config.shards import Shard
 from schemas.messages import Health
-from schemas.topics import ALL_TRAYS, SESSION_CHUNK, health_key, sessions_key, stage_label
+from schemas.topics import ALL_TRAYS, SESSION_CHUNK, health_key, session_key, stage_label
 
 MOST_SESSIONS = 4096
 _BETWEEN_TRAYS = "+"
@@ -69,8 +69,8 @@ class Session:
 
     def key(self, site: str) -> str:
         """The key of its token."""
-        prefix = sessions_key(site, self.stage, self.instance).removesuffix("/**")
-        own = f"{prefix}/{self.started_t_ns}/{self.producer}/{self.host}/{self.process_id}"
+        parts = (self.started_t_ns, self.producer, self.host, self.process_id)
+        own = session_key(site, self.stage, self.instance, *parts)
         is_named = not self.trays or (self.trays == (self.instance,) and self.instance != ALL_TRAYS)
         return own if is_named else f"{own}/{_BETWEEN_TRAYS.join(self.trays)}"
 
@@ -151,6 +151,10 @@ class Sessions:
     def is_alive(self, producer: str) -> bool:
         """Whether this producer is a session that is alive."""
         return producer in self._written
+
+    def has_ended(self, producer: str) -> bool:
+        """Whether this producer is a session that has left: ended, or cut off."""
+        return producer in self._ended and producer not in self._written
 
     def is_stranger(self, key: str, producer: str) -> bool:
         """Whether a session publishes on this key, and this producer neither is nor was one."""

@@ -17,8 +17,8 @@ from pipeline.config.shards import own_file
 from pipeline.errors import UserError
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from schemas.envelope import Envelope
-from schemas.messages import Message, ScorerSnapshot
-from schemas.topics import ALL_TRAYS, BY_NAME
+from schemas.messages import AcceptedSamples, Message, ScorerSnapshot
+from schemas.topics import ALL_TRAYS, BY_NAME, makes_samples_of_samples
 
 
 class StageConfig(Section):
@@ -69,6 +69,10 @@ class Core(Protocol):
         """Called about every 50 ms. `now_ns` is the host's time, or the replay's while one feeds the stage."""
         return ()
 
+    def confirm_input(self, *, is_complete: bool) -> None:
+        """Called before each `tick`: whether the producer of the main input has shown since the last one that all that
+        it has sent has been processed here. If not, the link may be cut, and what is missing may still come."""
+
     def close(self) -> Sequence[Message]:
         """Called once after the last item: return what is still held, release adapters."""
         return ()
@@ -101,6 +105,10 @@ class Core(Protocol):
         """The trays whose messages of the `undecoded` topics are all passed to `step`; None: all trays. Of the others
         `step` gets the newest message, about once a second. Only a core that serves all trays is asked, at every tick.
         """
+        return None
+
+    def accepts(self) -> AcceptedSamples | None:
+        """What a client may push to it; None: nothing."""
         return None
 
     def problem(self) -> str:
@@ -259,8 +267,7 @@ class Stage:
     @property
     def makes_samples_of_samples(self) -> bool:
         """Whether it makes blocks of samples from its main input: it then reports what it has consumed."""
-        has_samples = [BY_NAME[name].has_samples for name in (*self.reads[:1], *self.writes)]
-        return bool(self.reads) and has_samples[0] and any(has_samples[1:])
+        return makes_samples_of_samples(self.reads, self.writes)
 
 
 def load_stage(name: str) -> Stage:
@@ -273,4 +280,5 @@ def load_stage(name: str) -> Stage:
     stage = row.load()
     assert isinstance(stage, Stage)
     assert stage.may_drop == row.may_drop, f"stage {name!r}: may_drop of its row is {row.may_drop}"
+    assert row.topics() == (stage.reads, stage.writes), f"stage {name!r}: its row has {row.reads} and {row.writes}"
     return stage

@@ -23,12 +23,16 @@ SILENT_S = 60.0
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Request:
-    """Messages `first..last` of a producer on a key are missing; producer `*`: those of all producers."""
+    """Messages `first..last` of a producer on a key are missing; producer `*`: those of all producers.
+
+    not_before_s: when it is sent, monotonic; 0: at once.
+    """
 
     key: str
     producer: str
     first: int
     last: int
+    not_before_s: float = 0.0
 
 
 @dataclass(slots=True)
@@ -37,12 +41,14 @@ class Waiting:
 
     Attributes:
         shown_by: the message that showed the gap; None: a health did.
+        since_s: when the first of these messages were asked for, or the last ones came, monotonic.
         held: what has arrived since.
     """
 
     request: Request
     until: int
     shown_by: Envelope | None
+    since_s: float
     held: deque[Envelope] = field(default_factory=deque)
     held_bytes: int = 0
 

@@ -489,3 +489,46 @@ def test_health_says_when_messages_state_another_tacho_than_the_configuration() 
     assert "a tacho that this version does not know" in core.problem()
     core.step(message)
     assert core.problem() == ""
+
+
+def silent_for(core: ResamplerCore, seconds: float, *, is_complete: bool, from_s: float = 1.0) -> list[Grid]:
+    made: list[Grid] = []
+    for tick in range(round(seconds * 20)):
+        core.confirm_input(is_complete=is_complete)
+        made += core.tick(at(from_s + tick * 0.05).item())
+    return made
+
+
+def test_row_16_a_gap_of_the_link_is_no_gap_of_the_samples():
+    times_s = np.arange(0.0, 60.0, 0.01)
+    before, later = times_s[:100], times_s[100:]
+    cut, whole = (ResamplerCore(1, FIXED) for _ in range(2))
+    grids = [*cut.step(raw(at(*before), before)), *silent_for(cut, 50.0, is_complete=False)]
+    assert "no raw samples for more than 0.5 s" in cut.problem()
+    grids += [*cut.step(raw(at(*later), later)), *cut.close()]
+    should = joined([*whole.step(raw(at(*times_s), times_s)), *whole.close()])
+    found = joined(grids)
+    assert np.array_equal(found.t_ns, should.t_ns)
+    assert np.array_equal(found.speed_rad_s, should.speed_rad_s)
+    assert found.valid.all()
+    assert cut.counters().get("lost_too_late", 0) == 0
+
+
+def test_row_16_a_gap_is_published_once_acquisition_shows_that_it_has_sent_nothing():
+    core = ResamplerCore(1, FIXED)
+    core.step(raw(at(*np.arange(0.0, 1.0, 0.01)), np.ones(100)))
+    assert silent_for(core, 3.0, is_complete=False) == []
+    core.confirm_input(is_complete=True)
+    found = joined(core.tick(at(4.0).item()))
+    assert not found.valid.any()
+    assert found.t_ns[-1] == at(3.49), "up to the watermark before the time at which it is shown"
+    assert silent_for(core, 2.0, is_complete=False, from_s=4.0) == []
+
+
+def test_row_16_a_gap_is_published_when_the_link_has_been_in_doubt_for_too_long():
+    core = ResamplerCore(1, ResamplerConfig(rate_hz=100.0, link_wait_s=20.0))
+    core.step(raw(at(*np.arange(0.0, 1.0, 0.01)), np.ones(100)))
+    assert silent_for(core, 19.0, is_complete=False) == []
+    found = joined(silent_for(core, 3.0, is_complete=False, from_s=20.0))
+    assert found.t_ns[-1] == at(0.99) + 5 * NS_PER_S, "the grid ends after stale_for_s"
+    assert not found.valid.any()

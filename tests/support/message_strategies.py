@@ -10,6 +10,7 @@ from schemas.fields import LARGEST_ENUM_VALUE, Column, OpenEnum, columns, other_
 from schemas.messages import (
     FURTHEST_T_NS,
     LARGEST_PERIOD_NS,
+    AcceptedSamples,
     AwaitedInput,
     Counter,
     Diagnosis,
@@ -40,11 +41,13 @@ _TIMES = (
     "newest_output_t_ns",
     "first_sample_t_ns",
     "first_t_ns",
+    "newest_t_ns",
 )
 SCALARS: dict[str, st.SearchStrategy[Any]] = {
     **dict.fromkeys(_TIMES, INT64),
     "period_ns": PERIOD_NS,
     "process_id": UINT32,
+    "fans": UINT32,
     "pulses": UINT32,
     "lost": UINT64,
     "fan": st.integers(0, 2**31 - 1),
@@ -65,7 +68,7 @@ def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
         return SCALARS[name]
     if isinstance(hint, type) and issubclass(hint, OpenEnum):
         return st.integers(0, LARGEST_ENUM_VALUE).map(hint)
-    for record in (Counter, Input, Output, Diagnosis, AwaitedInput, Note, StatedTacho):
+    for record in (Counter, Input, Output, Diagnosis, AwaitedInput, Note, AcceptedSamples, StatedTacho):
         if hint == tuple[record, ...]:
             values = {name: scalar(name, hint) for name, hint in other_fields(record).items()}
             return st.lists(st.builds(record, **values), max_size=3).map(tuple)

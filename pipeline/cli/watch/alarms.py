@@ -23,6 +23,7 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.cli.watch.request import ask
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
+from pipeline.config.roles import OPERATOR
 from pipeline.errors import UsageError, UserError
 from pipeline.launch.judged_fans import JudgedChanges, JudgedFans, Unjudged
 from pipeline.launch.processes import process_list
@@ -115,7 +116,7 @@ def alarms(
         comment=comment,
     )
     stop_on_signals(stop)
-    with Bus(settings.bus, stop, listens=False) as bus:
+    with Bus(settings.bus, stop, listens=False, roles=(OPERATOR,)) as bus:
         watcher = SiteWatcher(bus, settings.site)
         wait_for_stages(bus, watcher, settings, stop, tray=name)
         fans = set(range(settings.tray(name).fans)) if number < 0 else {number}

@@ -14,18 +14,15 @@ import numpy as np
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UsageError, UserError
-from pipeline.runtime.sessions import Session, Sessions
-from schemas.codec import CodecError, decode, encode, type_name
+from pipeline.runtime.tray_acquisition import TrayAcquisition
+from schemas.codec import encode, type_name
 from schemas.messages import Command, Header, Health
-from schemas.topics import BY_NAME, alive_key, health_key, sessions_key, tray_key
+from schemas.topics import BY_NAME, tray_key
 from schemas.units import RAD_S_PER_UNIT
 
 _T = TypeVar("_T")
 _ANSWER_S = 5.0  # acquisition answers within a quarter of a second, on a busy host within one or two
 _POLL_S = 0.01
-STAGE = "acquisition"
-MOST_SESSIONS = 64
-"""so many last healths are kept"""
 LARGEST_SHARE = 2.0
 """a tray whose commands go further does not count them as shares of 1"""
 
@@ -85,7 +82,7 @@ class CommandSender:
     """Sends commands to one tray."""
 
     def __init__(self, bus: Bus, site: str, tray: str, stop: threading.Event) -> None:
-        self._acquisition = _Acquisition(bus, site, tray)
+        self._acquisition = TrayAcquisition(bus, site, tray)
         self._tray = tray
         self.stop = stop
         self._producer = f"command-{tray}-{secrets.token_hex(4)}"
@@ -100,7 +97,7 @@ class CommandSender:
         Raises:
             UserError: there is none.
         """
-        self._acquisition.watch_health(self._wait(self._acquisition.at_work))
+        self._wait(self._acquisition.watch_health)
         self._before = self._wait(self._acquisition.health)
 
     def send(self, message: Command) -> None:
@@ -131,66 +128,6 @@ class CommandSender:
             if time.monotonic() > until_s or self.stop.wait(_POLL_S):
                 raise UserError(f"no acquisition of tray {self._tray} received the command: is `fantwin up` running?")
         return found
-
-
-class _Acquisition:
-    """The acquisition of one tray, as it shows itself on the bus: its tokens, and its last health.
-
-    Only this much is watched, and little is imported: a command is to be answered at once.
-    """
-
-    def __init__(self, bus: Bus, site: str, tray: str) -> None:
-        self._bus = bus
-        self._site = site
-        self._tray = tray
-        self._lock = threading.Lock()
-        self._sessions = Sessions()
-        self._tokens: set[str] = set()
-        """of stages that are at work"""
-        self._healths: dict[str, Health] = {}
-        """by producer, in the order heard"""
-        bus.watch_alive(alive_key(site, STAGE, "*"), self._on_token)
-        bus.watch_alive(sessions_key(site, STAGE), self._on_session)
-
-    def at_work(self) -> Session | None:
-        """The session that has the tray, once it is at work."""
-        with self._lock:
-            session = self._sessions.owner(STAGE, self._tray)
-            is_there = session is not None and alive_key(self._site, STAGE, session.instance) in self._tokens
-            return session if is_there else None
-
-    def watch_health(self, session: Session) -> None:
-        """Listen to the health of a process, also after it was restarted; fetch the last one."""
-        key = health_key(self._site, STAGE, session.instance)
-        self._bus.subscribe(key, self._on_health)
-        for its_key, payload in self._bus.recover(key):
-            self._on_health(its_key, payload)
-
-    def health(self) -> Health | None:
-        """The last health of the session that has the tray and is at work."""
-        session = self.at_work()
-        with self._lock:
-            return self._healths.get(session.producer) if session else None
-
-    def _on_token(self, key: str, alive: bool) -> None:
-        with self._lock:
-            (self._tokens.add if alive else self._tokens.discard)(key)
-
-    def _on_session(self, key: str, alive: bool) -> None:
-        with self._lock:
-            self._sessions.update(key, alive)
-
-    def _on_health(self, _key: str, payload: bytes) -> None:
-        try:
-            health = decode(Health, payload)
-        except CodecError:
-            return
-        with self._lock:
-            before = self._healths.pop(health.header.producer, None)
-            is_older = before is not None and before.header.sequence > health.header.sequence
-            self._healths[health.header.producer] = before if before and is_older else health
-            if len(self._healths) > MOST_SESSIONS:
-                del self._healths[next(iter(self._healths))]
 
 
 def _not_sent(health: Health) -> int:

@@ -19,6 +19,7 @@ from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of
 from pipeline.cli.watch.excitation import Excitation, Observed, StoppedError
 from pipeline.config.loading import load_config
 from pipeline.config.models import TrayConfig
+from pipeline.config.roles import OPERATOR
 from pipeline.errors import UsageError, UserError
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
@@ -65,7 +66,7 @@ def sweep(
         if not json_output:
             typer.echo(line)
 
-    with Bus(settings.bus, stop, listens=False) as bus:
+    with Bus(settings.bus, stop, listens=False, roles=(OPERATOR,)) as bus:
         line = _BusLine(bus, settings.site, chosen, stop)
         before = line.connect()
         key = sweep_key(settings.site, chosen.name)

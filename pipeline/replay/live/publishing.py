@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
+from pipeline.config.roles import REPLAY
 from pipeline.errors import UserError
 from pipeline.replay.live.keyboard import Key
 from pipeline.replay.live.listeners import Listeners, conflict, made_by_stages
@@ -73,7 +74,7 @@ def publish(
     topics = playback.topics
     recorded_topics = [topic for topic in topics if BY_NAME[topic].recorded]
     outcome = Outcome(config.site)
-    with Bus(config.bus, stop) as bus:
+    with Bus(config.bus, stop, roles=(REPLAY,)) as bus:
         listeners = Listeners(bus, config.site)
 
         def refuse_conflicts() -> None:

@@ -194,3 +194,63 @@ def test_each_message_comes_once_and_in_order_and_the_counts_add_up(arriving, ke
         (line,) = tracker.inputs()
         assert line.received == len(out)
         assert line.missing == line.next_sequence - out[0] - len(out)
+
+
+class SlowProducer:
+    """Takes requests and answers none; `now_s` is the time."""
+
+    def __init__(self) -> None:
+        self.asked: list[Request] = []
+        self.now_s = 0.0
+
+    def ask(self, request: Request) -> None:
+        self.asked.append(request)
+
+
+def tracker_of_session(slow: SlowProducer, *, alive: bool) -> SequenceTracker:
+    sessions = Sessions()
+    token = Session("s", "all", 1, "p", "host", 1).key("site")
+    sessions.update(token, alive=True)
+    tracker = SequenceTracker(slow.ask, lambda: slow.now_s, sessions)
+    assert sequences(tracker.accept(packet(0))) == [0]
+    sessions.update(token, alive=alive)
+    return tracker
+
+
+@pytest.mark.parametrize(("alive", "patience_s"), [(True, 30.0), (False, 5.0)])
+def test_row_16_a_stage_that_does_not_answer_is_asked_again_for_a_while(alive: bool, patience_s: float):
+    """A link that has healed may lose the first requests, and a stage whose token has gone may be cut off."""
+    slow = SlowProducer()
+    tracker = tracker_of_session(slow, alive=alive)
+    assert tracker.accept(packet(4)) == []
+    while slow.now_s < patience_s:
+        assert tracker.answer(slow.asked[-1], Found()) == []
+        assert (slow.asked[-1].first, slow.asked[-1].last) == (1, 3)
+        slow.now_s += 1.0
+        assert slow.asked[-1].not_before_s <= slow.now_s
+    assert sequences(tracker.answer(slow.asked[-1], Found([packet(2)], published=6))) == [2, 4]
+    assert tracker.inputs()[0].missing == 2
+
+
+def test_row_16_what_a_stage_does_not_answer_for_long_is_lost_and_the_stream_goes_on():
+    slow = SlowProducer()
+    tracker = tracker_of_session(slow, alive=True)
+    assert tracker.accept(packet(4)) == []
+    slow.now_s = 30.0
+    assert sequences(tracker.answer(slow.asked[-1], Found())) == [4]
+    assert tracker.inputs()[0].missing == 3
+    assert len(slow.asked) == 1
+
+
+def test_row_16_the_rest_of_an_answer_that_was_not_complete_is_asked_for_at_once():
+    slow = SlowProducer()
+    tracker = tracker_of_session(slow, alive=True)
+    assert tracker.accept(packet(100)) == []
+    slow.now_s = 1000.0
+    assert sequences(tracker.answer(slow.asked[-1], Found([packet(n) for n in range(1, 40)]))) == [*range(1, 40)]
+    assert (slow.asked[-1].first, slow.asked[-1].last, slow.asked[-1].not_before_s) == (40, 99, 0.0)
+    assert tracker.accept(packet(101)) == []
+    assert sequences(tracker.answer(slow.asked[-1], Found([packet(n) for n in range(40, 100)], 102))) == [
+        *range(40, 102)
+    ]
+    assert tracker.inputs()[0].missing == 0

@@ -1,0 +1,52 @@
+"""Times as programs have them, to nanoseconds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fantwin_client.errors import TimeOrderError
+from schemas.messages import FURTHEST_T_NS
+from schemas.units import NS_PER_S
+
+Time: TypeAlias = "float | int | datetime | np.datetime64"
+_UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def times_ns(t: Time | Sequence[Time] | NDArray[Any]) -> NDArray[np.int64]:
+    """(n,) times in ns: one, or as many as there are in a sequence.
+
+    t: floats are seconds, integers are nanoseconds, both since 1970; or dates, which must have a time zone
+    (`numpy.datetime64` is UTC).
+
+    Raises:
+        TimeOrderError: it is no time, or beyond the year 2116.
+    """
+    if isinstance(t, datetime):
+        t = [t]
+    if isinstance(t, Sequence) and t and isinstance(t[0], datetime):
+        return np.array([_date_ns(each) for each in t], np.int64)
+    values = np.atleast_1d(np.asarray(t))
+    if values.dtype.kind == "M":
+        if np.isnat(values).any():
+            raise TimeOrderError("t has a date that is not a time (NaT)")
+        return values.astype("datetime64[ns]").astype(np.int64)
+    if values.dtype.kind not in "iuf" or values.ndim != 1:
+        raise TimeOrderError(f"t = {t!r}: give seconds as float, nanoseconds as int, or dates")
+    ns = values.astype(np.float64) * (NS_PER_S if values.dtype.kind == "f" else 1)
+    if not np.all(np.abs(ns) < FURTHEST_T_NS):  # NaN is not
+        raise TimeOrderError(f"t = {values[~(np.abs(ns) < FURTHEST_T_NS)][0]}: no time, or beyond the year 2116")
+    if values.dtype.kind != "f":
+        return values.astype(np.int64)
+    whole = np.floor(values)
+    return whole.astype(np.int64) * NS_PER_S + np.rint((values - whole) * NS_PER_S).astype(np.int64)
+
+
+def _date_ns(date: Any) -> int:
+    if not isinstance(date, datetime) or date.tzinfo is None:
+        raise TimeOrderError(f"t = {date!r}: a date without a time zone: use for example datetime.now(UTC)")
+    return (date - _UNIX_EPOCH) // timedelta(microseconds=1) * 1000

@@ -1,0 +1,267 @@
+"""`fantwin certs`: a site's authority, and the certificates of its processes and people."""
+
+from __future__ import annotations
+
+import glob
+import json
+import re
+import socket
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from cryptography.hazmat.primitives.serialization import Encoding
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.bus.authority import LONGEST_ROLE, Authority, write_file, write_pair
+from pipeline.bus.certificates import Certificate, in_words, of_role, read_certificate
+from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from pipeline.config.loading import load_config
+from pipeline.config.models import ROLE_PLACE, Config, SecurityConfig, nearest
+from pipeline.config.roles import default_roles, roles_of
+from pipeline.errors import UsageError, UserError
+
+_AUTHORITY_DAYS, _DAYS = 3653, 397
+_HERE = ("localhost", "127.0.0.1", "::1")
+_EVERYWHERE = ("0.0.0.0", "::", "*")
+_HOST = re.compile(r"[a-z]+/(\[[^\]]*\]|[^:/?#]*):\d+.*")
+
+
+class Action(StrEnum):
+    """The actions, as they are typed."""
+
+    INIT = "init"
+    ISSUE = "issue"
+    RENEW = "renew"
+    SHOW = "show"
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What was typed, beside the action."""
+
+    config: Config
+    security: SecurityConfig
+    authority: Path
+    roles: Sequence[str]
+    hosts: Sequence[str]
+    days: int | None
+    replace: bool
+
+
+def certs(
+    action: Annotated[Action, typer.Argument(metavar="ACTION", help=f"{', '.join(Action)}.")],
+    roles: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[ROLE]...", help="Roles: a stage, operator, viewer, router, source; see --help."),
+    ] = None,
+    config: ConfigOption = DEFAULT_CONFIG,
+    authority: Annotated[
+        Path, typer.Option(help="Folder of the authority and its key; relative to the configuration.")
+    ] = Path("authority"),
+    tray: Annotated[
+        list[str] | None, typer.Option("--tray", metavar="NAME", help="Only for this tray. Repeatable.")
+    ] = None,
+    host: Annotated[
+        list[str] | None,
+        typer.Option("--host", metavar="NAME", help="A name or address at which its owner listens. Repeatable."),
+    ] = None,
+    days: Annotated[
+        int | None,
+        typer.Option(min=1, max=36_500, help=f"How long it is valid; {_DAYS}, of an authority {_AUTHORITY_DAYS}."),
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace what exists.")] = False,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Make and show certificates of a site: who may do what on its bus (docs/how-to/security.md).
+
+    init makes the site's authority. issue makes the certificate of a role, or all that the site needs and has not;
+    renew makes new ones for the same roles and hosts; show says what there is, for whom, until when.
+
+    A role is a stage, operator (commands and requests), viewer (looks), router, source (gives readings), replay, or a
+    controller named in bus.security. With --tray it is for one tray only: its name is then as acquisition.tray1.
+    Files are where bus.security says: certs/ROLE.pem and certs/ROLE.key. Give a host what its own processes need, and
+    keep the folder of the authority elsewhere: whoever has its key is everybody.
+
+    Exit code 1 if show finds one that cannot be used.
+
+    Example: fantwin certs init -c fantwin.toml
+
+    Example: fantwin certs issue -c fantwin.toml --host plant-router.example
+
+    Example: fantwin certs issue acquisition --tray tray1 -c fantwin.toml
+
+    Example: fantwin certs show -c fantwin.toml
+    """
+    settings = load_config(config, overrides or (), stages=())
+    security = settings.bus.security or SecurityConfig().within(settings.folder)
+    wanted = _with_trays(settings, roles or [], tray or [])
+    request = _Request(settings, security, settings.folder / authority, wanted, host or (), days, replace)
+    if action is Action.SHOW:
+        _show(request, json_output=json_output)
+        return
+    if action is Action.INIT and (roles or tray):
+        raise UsageError("init takes no role: it makes the authority; `fantwin certs issue` makes certificates")
+    made, kept = {Action.INIT: _init, Action.ISSUE: _issue, Action.RENEW: _renew}[action](request)
+    if json_output:
+        typer.echo(json.dumps({"made": [_as_json(each) for each in made], "kept": [str(path) for path in kept]}))
+        return
+    for each in made:
+        what = "authority" if each.is_authority else f"certificate of {each.role}"
+        typer.echo(f"{_shown(each.path)}: {what}, until {in_words(each.not_after)}")
+    for path in kept:
+        typer.echo(f"{_shown(path)}: exists, left as it is")
+    if action is not Action.RENEW:
+        _say_what_is_next(request, action)
+
+
+def _with_trays(config: Config, roles: Sequence[str], trays: Sequence[str]) -> list[str]:
+    """The roles asked for, each for these trays only if any are given.
+
+    Raises:
+        UsageError: there is no such role or tray.
+    """
+    if trays and not roles:
+        raise UsageError("--tray needs a role: which?")
+    asked = [f"{role}.{config.tray(name).name}" for role in roles for name in trays] if trays else list(roles)
+    known = roles_of(config)
+    for role in asked:
+        if role not in known:
+            of_all = [name for name in known if "." not in name]
+            raise UsageError(f"no role called {role!r}{nearest(role, list(known) if '.' in role else of_all)}")
+        if len(role) > LONGEST_ROLE:
+            raise UsageError(f"role {role!r} has more than {LONGEST_ROLE} characters: give its tray a shorter name")
+    return asked
+
+
+def _init(request: _Request) -> tuple[list[Certificate], list[Path]]:
+    ca = request.security.ca
+    if not request.replace and ca.exists():
+        raise UserError(f"{ca} exists: --replace makes a new authority, and all certificates must be issued again")
+    made = Authority.new(request.config.site, timedelta(days=request.days or _AUTHORITY_DAYS))
+    made.write(request.authority, replace=request.replace)
+    write_file(ca, made.certificate.public_bytes(Encoding.PEM), is_private=False)
+    return [read_certificate(request.authority / "ca.pem"), read_certificate(ca)], []
+
+
+def _issue(request: _Request) -> tuple[list[Certificate], list[Path]]:
+    wanted = list(request.roles) or default_roles(request.config)
+    kept: list[Path] = []
+    if not request.roles and not request.replace:
+        kept = [path for role in wanted if (path := of_role(request.security.certificate, role)).exists()]
+        wanted = [role for role in wanted if not of_role(request.security.certificate, role).exists()]
+    made = [_make(request, role, _hosts(request), replace=request.replace) for role in wanted]
+    return made, kept
+
+
+def _renew(request: _Request) -> tuple[list[Certificate], list[Path]]:
+    if request.roles:
+        old = [read_certificate(of_role(request.security.certificate, role)) for role in request.roles]
+    else:
+        old = [each for each in _issued(request) if not each.is_authority]
+    if not old:
+        raise UserError(f"{request.security.certificate.parent}: no certificates: `fantwin certs issue` makes them")
+    lifetimes = [(each.not_after - each.not_before).days for each in old]
+    made = [
+        _make(request, each.role, (*each.hosts, *request.hosts), days=days, replace=True)
+        for each, days in zip(old, lifetimes, strict=True)
+    ]
+    return made, []
+
+
+def _make(
+    request: _Request, role: str, hosts: Iterable[str], *, days: int | None = None, replace: bool = False
+) -> Certificate:
+    security = request.security
+    if ROLE_PLACE not in str(security.certificate) and len(request.roles) != 1:
+        raise UsageError(f"{security.certificate}: name the one role of this file, or write {ROLE_PLACE} into its path")
+    authority = Authority.read(request.authority)
+    if authority.certificate.public_bytes(Encoding.PEM) != _content(security.ca):
+        raise UserError(f"{security.ca} is of another authority than {request.authority}: use those of one site")
+    signed, key = authority.issue(role, list(dict.fromkeys(hosts)), timedelta(days=request.days or days or _DAYS))
+    certificate = of_role(security.certificate, role)
+    write_pair(certificate, of_role(security.key, role), signed, key, replace=replace)
+    return read_certificate(certificate)
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}: `fantwin certs init` makes it") from error
+
+
+def _hosts(request: _Request) -> list[str]:
+    match = _HOST.fullmatch(request.config.bus.endpoint)
+    of_endpoint = [match[1].strip("[]")] if match else []
+    names = [*_HERE, socket.gethostname(), *of_endpoint, *request.hosts]
+    return [name for name in dict.fromkeys(names) if name and name not in _EVERYWHERE]
+
+
+def _issued(request: _Request) -> list[Certificate]:
+    """The certificates in the folder of the site, and that of its authority first."""
+    security = request.security
+    pattern = glob.escape(str(security.certificate)).replace(ROLE_PLACE, "*")
+    paths = [security.ca, *map(Path, sorted(glob.glob(pattern)))]  # noqa: PTH207  the role may be a folder
+    return [read_certificate(path) for path in dict.fromkeys(paths) if path.exists()]
+
+
+def _show(request: _Request, *, json_output: bool) -> None:
+    if request.roles:
+        found = [read_certificate(of_role(request.security.certificate, role)) for role in request.roles]
+    else:
+        found = _issued(request)
+    if not found:
+        raise UserError(f"{request.security.certificate.parent}: no certificates: `fantwin certs init` begins")
+    now, roles = datetime.now(UTC), roles_of(request.config)
+    if json_output:
+        typer.echo(json.dumps([_as_json(each) for each in found]))
+    else:
+        table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        columns = ("role", "until", "days", "used by", *(["hosts"] if request.roles else []))
+        for column in columns:
+            table.add_column(column, overflow="fold")
+        for each in found:
+            known = roles.get(each.role)
+            about = "authority of the site" if each.is_authority else known.about if known else "no role of this site"
+            row = (each.role, f"{each.not_after:%Y-%m-%d}", str((each.not_after - now).days), about)
+            table.add_row(*row, *([" ".join(each.hosts)] if request.roles else []))
+        Console().print(table)
+        for each in found:
+            if warning := each.warning(now):
+                typer.echo(warning)
+    if any(each.time_problem(now) for each in found):
+        raise typer.Exit(1)
+
+
+def _shown(path: Path) -> Path:
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def _as_json(each: Certificate) -> dict[str, object]:
+    return {
+        "role": each.role,
+        "file": str(each.path),
+        "hosts": list(each.hosts),
+        "from": each.not_before.isoformat(),
+        "until": each.not_after.isoformat(),
+        "is_authority": each.is_authority,
+        "warning": each.warning(datetime.now(UTC)),
+    }
+
+
+def _say_what_is_next(request: _Request, action: Action) -> None:
+    config = request.config
+    if action is Action.INIT:
+        typer.echo(f"next: fantwin certs issue -c {config.path}")
+    elif config.bus.security is None:
+        place = config.bus.endpoint.partition("/")[2]
+        typer.echo(f'next: write into {config.path}: endpoint = "tls/{place}" in [bus], and a section [bus.security]')

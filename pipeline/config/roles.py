@@ -1,0 +1,119 @@
+"""Who may do what on the bus: the roles of a site, made from the registry of stages and the table of topics.
+
+A role is the common name of a certificate. There is one for each stage; of a stage also one for each tray alone, as
+`acquisition.tray1`, and for each shard of the configuration, as `scorer.2-of-8`. Beside stages there are people and
+programs: `operator`, `viewer` (also the stage), `source`, `replay`, `router`, and the controllers that the
+configuration names. Nothing here names a stage: a new one has its role with its row in the registry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from pipeline.config.models import Config
+from pipeline.config.registry import STAGES
+from pipeline.config.shards import Shard, shard_of, shards_of
+from schemas.topics import ALL_TRAYS, BY_NAME, TOPICS, makes_samples_of_samples
+
+OPERATOR, VIEWER, SOURCE, REPLAY, ROUTER = "operator", "viewer", "source", "replay", "router"
+READERS = (VIEWER, OPERATOR)
+"""roles of a command that only looks, the one with the fewest rights first"""
+OPERATED = ("command", "request")
+"""topics of people, and of programs that act for them"""
+PUSHED = ("reading",)
+"""topics of sources outside the site"""
+REPORTS = "consumed"
+
+
+@dataclass(frozen=True)
+class Role:
+    """What the owner of a certificate may do.
+
+    Attributes:
+        name: the common name of the certificate.
+        about: one line for people.
+        stage: the stage it may run; empty: none.
+        instances: names of processes of that stage; none: all.
+        trays: those it is limited to; none: all.
+        writes, reads, keeps: topics. Whoever writes a topic also answers for what was missed of it; whoever reads it
+            may ask.
+        moves_fans: it may show that it moves the commands of a tray.
+        is_router: it may pass on all messages of all.
+    """
+
+    name: str
+    about: str
+    stage: str = ""
+    instances: tuple[str, ...] = ()
+    trays: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()
+    keeps: tuple[str, ...] = ()
+    moves_fans: bool = False
+    is_router: bool = False
+
+
+def roles_of(config: Config) -> dict[str, Role]:
+    """All roles of a site, by name."""
+    return {role.name: role for role in (*_roles_of_stages(config), *_roles_of_others(config))}
+
+
+def role_names(stage: str, shard: Shard) -> tuple[str, ...]:
+    """The roles that a process of a stage may have, the one with the fewest rights first."""
+    limited = f"{stage}.{shard.name}"
+    return (limited, stage) if shard.name != ALL_TRAYS else (stage,)
+
+
+def default_roles(config: Config) -> list[str]:
+    """The roles that a site needs: its stages, its router, people who look and people who act."""
+    return list(dict.fromkeys((*config.stages, ROUTER, OPERATOR, VIEWER)))
+
+
+def _roles_of_stages(config: Config) -> Iterator[Role]:
+    for stage in STAGES:
+        yield _of_stage(stage, stage, (), ())
+        for shard in _limited(stage, config):
+            instances = (shard.name, ALL_TRAYS) if len(config.trays) == 1 else (shard.name,)
+            yield _of_stage(f"{stage}.{shard.name}", stage, instances, shard.trays)
+
+
+def _limited(stage: str, config: Config) -> Iterable[Shard]:
+    names = [tray.name for tray in config.trays]
+    found = [*(shard_of(stage, [name], names) for name in names), *shards_of(stage, config)]
+    if len(names) == 1:
+        found.append(Shard(names[0], tuple(names)))
+    return {shard.name: shard for shard in found if shard.name != ALL_TRAYS}.values()
+
+
+def _of_stage(name: str, stage: str, instances: tuple[str, ...], trays: tuple[str, ...]) -> Role:
+    reads, writes = STAGES[stage].topics()
+    if makes_samples_of_samples(reads, writes):
+        writes = (*writes, REPORTS)
+    of = f" of {', '.join(trays)}" if trays else ""
+    everything = tuple(topic.name for topic in TOPICS)
+    return Role(
+        name,
+        "people who look, and the stage viewer" if name == VIEWER else f"stage {stage}{of}",
+        stage=stage,
+        instances=instances,
+        trays=trays,
+        writes=writes,
+        reads=everything if name == VIEWER else (*reads, "clock"),
+        keeps=STAGES[stage].keeps,
+    )
+
+
+def _roles_of_others(config: Config) -> Iterator[Role]:
+    everything = tuple(topic.name for topic in TOPICS)
+    yield Role(OPERATOR, "people who act: commands, requests", writes=OPERATED, reads=everything, moves_fans=True)
+    security = config.bus.security
+    for name in security.controllers if security else ():
+        yield Role(name, "a program that commands fans", writes=OPERATED, reads=everything, moves_fans=True)
+    pushed = tuple(name for name in PUSHED if name in BY_NAME)
+    for tray in (None, *(tray.name for tray in config.trays)):
+        name, of = (f"{SOURCE}.{tray}", f" of {tray}") if tray else (SOURCE, "")
+        yield Role(name, f"a program that has readings{of}", trays=(tray,) if tray else (), writes=pushed)
+    replayed = tuple(topic.name for topic in TOPICS if not topic.is_of_session)
+    yield Role(REPLAY, "a replay of a recording onto the bus", stage=REPLAY, writes=replayed, reads=everything)
+    yield Role(ROUTER, "a router: passes on what its clients may do", is_router=True)

@@ -1,0 +1,44 @@
+"""Settings of samples that come by HTTP: `source = { kind = "http", port = 8765 }`."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from pipeline.devices.sample_source import SourceConfig
+
+
+class HttpConfig(SourceConfig, frozen=True):
+    """An HTTP server for one tray, in its acquisition: docs/how-to/sources.md, docs/reference/json-samples.md."""
+
+    kind: Literal["http"] = "http"
+    host: str = Field(
+        default="127.0.0.1", min_length=1, description="address it listens on; beyond loopback it needs token_file"
+    )
+    port: int = Field(default=8765, ge=1, le=65535, description="its port, another one for each tray")
+    token_file: Path | None = Field(
+        default=None, description="file with a token in its first line, that its owner only may read; clients send it"
+    )
+    certificate: Path | None = Field(default=None, description="certificate of the server, for https")
+    key: Path | None = Field(default=None, description="its private key")
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only this host can reach it."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+    @model_validator(mode="after")
+    def _is_protected(self) -> Self:
+        if not self.is_local and self.token_file is None:
+            raise ValueError(
+                f"host = {self.host!r} can be reached from other hosts: give token_file, with a token of yours"
+            )
+        if bool(self.certificate) != bool(self.key):
+            raise ValueError("give certificate and key, or neither")
+        return self

@@ -1,0 +1,93 @@
+"""Settings of samples from an MQTT broker: `source = { kind = "mqtt", host = "broker", topic = "plant/tray1" }`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from pipeline.devices.sample_source import SourceConfig
+
+FAN = "{fan}"
+"""stands for the number of a fan in a topic"""
+
+
+class MqttConfig(SourceConfig, frozen=True):
+    """A broker, and the topics that have the samples: JSON on one topic, or a number for each fan on topics of its own
+    (docs/how-to/sources.md)."""
+
+    kind: Literal["mqtt"] = "mqtt"
+    host: str = Field(min_length=1, description="name or address of the broker")
+    port: int = Field(default=1883, ge=1, le=65535, description="its port; 8883 is usual with TLS")
+    topic: str = Field(default="", description="topic of samples in JSON; + and # may stand for parts of it")
+    speed_topic: str = Field(
+        default="", description="instead: topic of the speed of a fan, a number; `{fan}` stands for the fan's number"
+    )
+    command_topic: str = Field(default="", description="with speed_topic: topic of the command of a fan, a number")
+    first_fan: int = Field(default=0, ge=0, description="number of the first fan in topics with `{fan}`")
+    send_topic: str = Field(
+        default="",
+        description="commands of `fantwin command` go there, as JSON; with `{fan}` as a number for each fan; without "
+        "it commands are refused",
+    )
+    qos: Literal[0, 1, 2] = Field(default=1, description="quality of service of subscriptions and commands")
+    client_id: str = Field(
+        default="", description="given: the broker keeps messages for this client while acquisition is away"
+    )
+    keepalive_s: int = Field(default=30, ge=5, le=3600, description="the broker hears of this client at least so often")
+    username: str = Field(default="", description="user of the broker")
+    password_file: Path | None = Field(
+        default=None, description="file with the password in its first line; its owner only may read it"
+    )
+    password_env: str = Field(default="", description="instead: the variable of the environment that has the password")
+    tls: bool = Field(
+        default=False, description="whether the connection is encrypted and the broker has to prove itself"
+    )
+    ca: Path | None = Field(default=None, description="authority of the broker's certificate; without it the system's")
+    certificate: Path | None = Field(default=None, description="certificate of this client, if the broker asks for one")
+    key: Path | None = Field(default=None, description="its private key")
+
+    @property
+    def has_values(self) -> bool:
+        """Whether each topic has a number of one fan."""
+        return bool(self.speed_topic)
+
+    @property
+    def patterns(self) -> tuple[str, ...]:
+        """The topics as the configuration has them."""
+        return (self.speed_topic, self.command_topic) if self.has_values else (self.topic,)
+
+    def of_fan(self, topic: str, fan: int) -> str:
+        """The topic of a fan of the tray, counted from 0."""
+        return topic.replace(FAN, str(self.first_fan + fan))
+
+    @model_validator(mode="after")
+    def _topics_fit(self) -> Self:
+        if bool(self.topic) == bool(self.speed_topic or self.command_topic):
+            raise ValueError("give topic, for samples in JSON, or speed_topic and command_topic, for numbers")
+        if bool(self.speed_topic) != bool(self.command_topic):
+            raise ValueError("give speed_topic and command_topic: without the commands nothing can be judged")
+        for name in ("speed_topic", "command_topic") if self.has_values else ():
+            topic = getattr(self, name)
+            if FAN not in topic or "+" in topic or "#" in topic:
+                raise ValueError(
+                    f"{name} needs {{fan}} for the number of the fan, as in plant/fan{{fan}}/rpm, and no + or #"
+                )
+        if self.has_values and self.speed_topic == self.command_topic:
+            raise ValueError("speed_topic and command_topic are the same")
+        if "+" in self.send_topic or "#" in self.send_topic:
+            raise ValueError("send_topic: commands go to one topic, without + and #")
+        return self
+
+    @model_validator(mode="after")
+    def _secrets_fit(self) -> Self:
+        if self.password_file and self.password_env:
+            raise ValueError("give password_file or password_env, not both")
+        if (self.password_file or self.password_env) and not self.username:
+            raise ValueError("a password needs username")
+        if not self.tls and (self.ca or self.certificate or self.key):
+            raise ValueError("ca, certificate and key need tls = true")
+        if bool(self.certificate) != bool(self.key):
+            raise ValueError("give certificate and key, or neither")
+        return self

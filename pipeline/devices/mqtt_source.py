@@ -1,0 +1,259 @@
+"""Samples from an MQTT broker, and commands back to it.
+
+All runs in the thread of paho's client, which also connects again when the broker was away. While acquisition is
+behind, that thread waits, so that the broker keeps what comes (with QoS 1 or 2). What the broker had retained is no new
+sample: it is counted and left out, but for the commands of fans, which hold until the next one.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import ssl
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from pipeline.devices.fan_values import FanValues
+from pipeline.devices.host_clock import HOST_CLOCK
+from pipeline.devices.json_samples import JsonSamplesError, batches_of, parse_samples
+from pipeline.devices.mqtt_config import FAN, MqttConfig
+from pipeline.devices.receipt_times import ReceiptTimes
+from pipeline.devices.sample_source import (
+    LinkDown,
+    LinkUp,
+    Reading,
+    ReadingBatch,
+    Rejected,
+    SourceContext,
+    SourceEvent,
+)
+from pipeline.devices.secret_file import read_secret, secret_of_environment
+from pipeline.errors import UserError
+from pipeline.optional_dependencies import how_to_install, is_installed
+
+if TYPE_CHECKING:
+    from paho.mqtt.client import Client, MQTTMessage
+
+RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 1, 10
+ANSWER_S = 5.0
+"""for a check"""
+MOST_RECENT = 64
+"""messages by which one that the broker sends again is recognised"""
+LONGEST_NUMBER = 40
+"""characters"""
+
+
+class MqttSource:
+    """A `SampleSource`."""
+
+    def __init__(self, config: MqttConfig, context: SourceContext) -> None:
+        """Nothing is connected yet.
+
+        Raises:
+            UserError: the extra is not installed, or a password or certificate cannot be read.
+        """
+        if not is_installed("paho"):
+            raise UserError(f"source mqtt needs paho-mqtt; {how_to_install('mqtt')}")
+        self._config = config
+        self._deliver: Callable[[SourceEvent], None] = lambda _event: None
+        self._receipts = ReceiptTimes()
+        self._values = FanValues(context.fans)
+        self._topics = {
+            config.of_fan(pattern, fan): (fan, pattern == config.speed_topic)
+            for pattern in config.patterns
+            for fan in range(context.fans if config.has_values else 1)
+        }
+        """what is subscribed to; of numbers, which fan a topic is of, and whether it is its speed"""
+        self._recent: deque[tuple[str, bytes]] = deque(maxlen=MOST_RECENT)
+        self._is_up = False
+        self._is_refused = False
+        """by the broker, which ends the connection next"""
+        self._stopping = False
+        self._client = self._new_client(context)
+
+    @property
+    def name(self) -> str:
+        """The broker and the topics."""
+        return f"mqtt {self._config.host}:{self._config.port} {' and '.join(self._config.patterns)}"
+
+    @property
+    def settings_to_check(self) -> str:
+        """What may differ from what is published."""
+        names = ("speed_topic", "command_topic") if self._config.has_values else ("topic",)
+        return ", ".join(f"{name} = {getattr(self._config, name)!r}" for name in names)
+
+    def start(self, deliver: Callable[[SourceEvent], None]) -> None:
+        """Connect in a thread of its own, again and again where it fails."""
+        self._deliver = deliver
+        self._client.connect_async(self._config.host, self._config.port, keepalive=self._config.keepalive_s)
+        self._client.loop_start()
+
+    def stop(self) -> None:
+        """Leave the broker."""
+        self._stopping = True
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
+        """Publish a command, if the configuration has a topic for it and the broker is there. Set-points only go as
+        JSON."""
+        topic = self._config.send_topic
+        if not topic or not self._is_up:
+            return False
+        if FAN not in topic:
+            given = {"command": command, "set_point": set_point}
+            values = {name: [None if math.isnan(x) else x for x in each] for name, each in given.items() if each}
+            return self._publish(topic, json.dumps(values))
+        if not all(map(math.isnan, set_point)):
+            return False
+        return all(
+            self._publish(self._config.of_fan(topic, fan), f"{value:.9g}")
+            for fan, value in enumerate(command)
+            if not math.isnan(value)
+        )
+
+    def check(self) -> list[str]:
+        """Whether the broker answers and accepts this client."""
+        problems: list[str] = []
+        client, has_answered = self._client, threading.Event()
+
+        def on_connect(_client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+            if reason.is_failure:
+                problems.append(f"{self.name}: the broker refuses: {reason}; check username and password")
+            has_answered.set()
+
+        client.on_connect = on_connect
+        client.on_connect_fail = client.on_disconnect = None
+        try:
+            client.connect(self._config.host, self._config.port, keepalive=self._config.keepalive_s)
+        except OSError as error:  # errors of TLS are such, too
+            return [f"{self.name}: cannot be reached: {error.strerror or error}; check host and port"]
+        client.loop_start()
+        if not has_answered.wait(ANSWER_S):
+            problems.append(f"{self.name}: what listens there does not answer as a broker; check host, port and tls")
+        client.disconnect()
+        client.loop_stop()
+        return problems
+
+    def _new_client(self, context: SourceContext) -> Client:
+        from paho.mqtt import client as paho  # noqa: PLC0415  an extra
+        from paho.mqtt.enums import CallbackAPIVersion  # noqa: PLC0415
+
+        config = self._config
+        client = paho.Client(
+            CallbackAPIVersion.VERSION2,
+            config.client_id,
+            clean_session=not config.client_id,
+            protocol=paho.MQTTv311,
+        )
+        client.reconnect_delay_set(RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S)
+        if config.username:
+            password = None
+            if config.password_file:
+                password = read_secret(context.folder / config.password_file)
+            elif config.password_env:
+                password = secret_of_environment(config.password_env)
+            client.username_pw_set(config.username, password)
+        if config.tls:
+            ca, certificate, key = (
+                None if path is None else str(context.folder / path)
+                for path in (config.ca, config.certificate, config.key)
+            )
+            try:
+                client.tls_set(ca, certificate, key)
+            except (OSError, ssl.SSLError, ValueError) as error:
+                raise UserError(f"a certificate of source mqtt cannot be used: {error}") from error
+        client.on_connect = self._on_connect
+        client.on_connect_fail = self._on_connect_fail
+        client.on_disconnect = self._on_disconnect
+        client.on_subscribe = self._on_subscribe
+        client.on_message = self._on_message
+        return client
+
+    def _publish(self, topic: str, text: str) -> bool:
+        return self._client.publish(topic, text, qos=self._config.qos).rc == 0
+
+    def _down(self, reason: str) -> None:
+        self._is_up = False
+        if not self._stopping:
+            self._deliver(LinkDown(reason))
+
+    def _on_connect(self, client: Client, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        if reason.is_failure:
+            self._is_refused = True
+            self._down(f"the broker refuses this client: {reason}; check username and password")
+            return
+        client.subscribe([(topic, self._config.qos) for topic in self._topics])
+
+    def _on_subscribe(self, _client: Any, _data: Any, _mid: Any, reasons: Any, _properties: Any) -> None:
+        refused = [str(reason) for reason in reasons if reason.is_failure]
+        if refused:
+            self._down(f"the broker refuses the subscription: {refused[0]}; check the rights of this user")
+            return
+        self._is_up = True
+        self._deliver(LinkUp())
+
+    def _on_connect_fail(self, _client: Any, _data: Any) -> None:
+        self._down("the broker cannot be reached; check host and port, and whether it runs")
+
+    def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        if not self._is_refused:
+            self._down(f"the connection to the broker ended: {reason}; it is opened again")
+        self._is_refused = False
+
+    def _on_message(self, _client: Any, _data: Any, message: MQTTMessage) -> None:
+        received_t_ns = HOST_CLOCK.now_ns()
+        for batch in self.batches(message.topic, bytes(message.payload), received_t_ns, message.retain, message.dup):
+            self._deliver(batch)
+
+    def batches(
+        self, topic: str, payload: bytes, received_t_ns: int, is_retained: bool = False, is_again: bool = False
+    ) -> list[ReadingBatch]:
+        """What a message has. is_retained: the broker had kept it. is_again: the broker may have sent it before."""
+        if self._config.has_values:
+            items = self._items_of_value(topic, payload, is_retained)
+            return [ReadingBatch(received_t_ns, tuple(items), len(payload))]
+        if is_retained:
+            return [_refused(received_t_ns, payload, Rejected("retained", "a sample of before", harmless=True))]
+        if is_again and (topic, payload) in self._recent:
+            return [_refused(received_t_ns, payload, Rejected("repeated", "sent twice by the broker", harmless=True))]
+        self._recent.append((topic, payload))
+        try:
+            found = parse_samples(payload)
+        except JsonSamplesError as error:
+            return [_refused(received_t_ns, payload, Rejected("malformed", str(error), is_sample=True))]
+        return batches_of(found, received_t_ns, self._receipts, len(payload))
+
+    def _items_of_value(self, topic: str, payload: bytes, is_retained: bool) -> list[Reading | Rejected]:
+        value = _number(payload)
+        if value is None:
+            return [Rejected("malformed", f"{topic} has {payload[:LONGEST_NUMBER]!r}, which is no number")]
+        fan, is_speed = self._topics[topic]
+        if not is_speed:
+            ended = self._values.set_command(fan, value)
+            return [ended] if ended else []
+        if is_retained:
+            return [Rejected("retained", "a speed of before", harmless=True)]
+        readings = self._values.set_speed(fan, value)
+        if not readings and self._values.lacks_commands:
+            return [Rejected("no_command", "the command of a fan is not known yet", harmless=True)]
+        return list(readings)
+
+
+def _refused(received_t_ns: int, payload: bytes, rejected: Rejected) -> ReadingBatch:
+    return ReadingBatch(received_t_ns, (rejected,), len(payload))
+
+
+def _number(payload: bytes) -> float | None:
+    """The number that a payload has; NaN where it says that there is none, None where it is no number."""
+    text = payload[: LONGEST_NUMBER + 1].decode(errors="replace").strip()
+    if len(text) > LONGEST_NUMBER:
+        return None
+    if text.lower() in ("", "null", "nan", "none"):
+        return math.nan
+    try:
+        return float(text)
+    except ValueError:
+        return None

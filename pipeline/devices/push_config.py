@@ -1,0 +1,15 @@
+"""Settings of a tray whose samples clients push over the bus: `source = { kind = "push" }`."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pipeline.devices.sample_source import SourceConfig
+
+
+class PushConfig(SourceConfig, frozen=True):
+    """Samples come from a program that uses `fantwin_client`, or publishes topic `reading` itself."""
+
+    takes_pushed: ClassVar[bool] = True
+
+    kind: Literal["push"] = "push"

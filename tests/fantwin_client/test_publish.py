@@ -1,0 +1,219 @@
+"""A client publishes samples: each arrives once, or an error or a count says why not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fantwin_client
+from fantwin_client import Client, CommandError, FanCountError, NoAcquisitionError, NotKeptError, TimeOrderError
+from fantwin_client.outbox import MOST_SENT_MESSAGES
+from fantwin_client.times import times_ns
+from schemas.topics import BY_NAME
+from stages.acquisition import AcquisitionCore, limits_of
+from tests.support.running_acquisition import SITE, TRAY, Raws, acquisition, push_config, raws_of
+from tests.support.running_chain import eventually
+
+RPM = 2 * np.pi / 60
+T_S = 1_790_000_000.0
+
+
+@pytest.fixture
+def raws(endpoint: str) -> Iterator[Raws]:
+    with raws_of(endpoint) as raws:
+        yield raws
+
+
+@pytest.fixture
+def client(endpoint: str, raws: Raws) -> Iterator[Client]:
+    client = fantwin_client.connect(endpoint, site=SITE)
+    yield client
+    client.close(timeout_s=0.5)
+
+
+def test_samples_arrive_with_their_times_numbers_and_units(endpoint: str, raws: Raws, tmp_path: Path) -> None:
+    with acquisition(push_config(endpoint, tmp_path)), fantwin_client.connect(endpoint, site=SITE) as client:
+        tray = client.tray(TRAY, speed_unit="rpm")
+        assert tray.fans == 2
+        tray.publish(T_S, command=[0.25, 0.5], speed=[1500.0, np.nan])
+        tray.publish(round((T_S + 0.01) * 1e9), command=[0.25, 0.5], speed=[1501.0, 2000.0])
+        tray.publish(datetime.fromtimestamp(T_S + 0.02, UTC), command=[0.3, 0.5], speed=[1502.0, 2001.0])
+        t_s = T_S + np.arange(3, 103) / 100
+        tray.publish(t_s, command=np.full((100, 2), 0.4), speed=np.linspace(1503, 1602, 200).reshape(100, 2))
+        t_s = T_S + np.array([1.03, 1.04])
+        tray.publish(
+            t_s, np.full((2, 2), 0.4), np.ones((2, 2)), supply_voltage_v=12.0, current_a=[[0.5, 0.6], [0.7, 0.8]]
+        )
+        losses = tray.check()
+        assert (losses.published, losses.received, losses.waiting, losses.any) == (105, 105, 0, False)
+    raws.wait_for(105)
+    measured = [message for message in raws.messages if len(message.supply_voltage_v)]
+    assert np.concatenate([message.supply_voltage_v for message in measured]).tolist() == [[12.0, 12.0]] * 2
+    current_a = np.concatenate([message.current_a for message in measured])
+    np.testing.assert_allclose(current_a, [[0.5, 0.6], [0.7, 0.8]], rtol=1e-6)
+    assert not any(len(message.temperature_c) for message in raws.messages)
+    clock_us = raws.column("device_clock_us").astype(np.int64)
+    assert clock_us[0] == T_S * 1e6 % 2**32
+    np.testing.assert_array_equal(np.diff(clock_us) % 2**32, 10_000)
+    np.testing.assert_array_equal(raws.column("device_sequence"), np.arange(105))
+    np.testing.assert_allclose(raws.column("speed_rad_s")[:2], np.array([[1500, np.nan], [1501, 2000]]) * RPM)
+    np.testing.assert_array_equal(raws.column("command")[:3], [[0.25, 0.5], [0.25, 0.5], [0.3, 0.5]])
+
+
+def test_samples_that_are_sent_together_count_as_received_one_after_another(
+    endpoint: str, client: Client, raws: Raws, tmp_path: Path
+) -> None:
+    with acquisition(push_config(endpoint, tmp_path)):
+        tray = client.tray(TRAY)
+        before_ns = time.time_ns()
+        tray.publish(T_S + np.arange(3000) / 100, np.full((3000, 2), 0.5), np.full((3000, 2), 100.0))
+        tray.check()
+        raws.wait_for(3000)
+        after_ns = time.time_ns()
+    received_ns = raws.column("host_receive_t_ns")
+    assert before_ns <= received_ns[-1] <= after_ns, "the newest was received now"
+    steps_ns = np.diff(received_ns)
+    assert steps_ns.min() >= 0
+    # between messages the time that sending took is added
+    assert np.mean(np.abs(steps_ns - 10_000_000) < 1000) > 0.99
+    assert received_ns[-1] - received_ns[0] == pytest.approx(29.99e9, abs=after_ns - before_ns)
+
+
+def test_what_cannot_be_a_sample_of_the_tray_is_refused_at_once(
+    endpoint: str, client: Client, raws: Raws, tmp_path: Path
+) -> None:
+    with acquisition(push_config(endpoint, tmp_path)):
+        tray = client.tray(TRAY)
+        tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])
+        with pytest.raises(FanCountError, match=r"command has shape \(3,\); 1 samples of 2 fans have shape \(1, 2\)"):
+            tray.publish(T_S + 1, [0.5] * 3, [1.0] * 3)
+        with pytest.raises(FanCountError, match="speed has shape"):
+            tray.publish(T_S + 1, [0.5] * 2, [1.0])
+        with pytest.raises(CommandError, match="command nan of fan 1, sample 0"):
+            tray.publish(T_S + 1, [0.5, np.nan], [1.0, 1.0])
+        with pytest.raises(CommandError, match="within command_min = 0 to command_max = 1"):
+            tray.publish(T_S + 1, [1.5, 0.5], [1.0, 1.0])
+        tray.publish(T_S + 1, np.array([1.0, 0.1], np.float32), [1.0, 1.0])
+        for t in (T_S, T_S + 1, [T_S + 2, T_S + 2]):
+            with pytest.raises(TimeOrderError, match="times must increase"):
+                tray.publish(t, np.full((np.size(t), 2), 0.5), np.full((np.size(t), 2), 1.0))
+        for t, words in (
+            (datetime(2026, 1, 1), "without a time zone"),
+            (np.nan, "no time"),
+            (1e12, "2116"),
+            ("now", "give seconds"),
+        ):
+            with pytest.raises(TimeOrderError, match=words):
+                tray.publish(t, [0.5, 0.5], [1.0, 1.0])  # type: ignore[arg-type]
+        tray.restart_time()
+        tray.publish(T_S - 100, [0.5, 0.5], [1.0, 1.0])
+        assert tray.check().received == 3
+
+
+def test_without_such_a_tray_one_line_says_so(endpoint: str, client: Client, raws: Raws, tmp_path: Path) -> None:
+    with pytest.raises(NoAcquisitionError, match="no acquisition of tray tray1 of site plant is at work"):
+        client.tray(TRAY, timeout_s=0.1)
+    with (
+        acquisition(push_config(endpoint, tmp_path, source='{ kind = "serial", port = "no" }')),
+        pytest.raises(NoAcquisitionError, match='takes no pushed samples: write source = { kind = "push" }'),
+    ):
+        client.tray(TRAY)
+
+
+def test_what_acquisition_refuses_is_counted_by_reason_and_raised_by_check(
+    endpoint: str, client: Client, raws: Raws, tmp_path: Path
+) -> None:
+    with acquisition(push_config(endpoint, tmp_path)) as running:
+        tray = client.tray(TRAY, speed_unit="rpm")
+        tray.publish(T_S, [0.5, 0.5], [30_000.0, 1.0])
+        assert tray.check().absurd_speeds == 1, "no sample is lost by that"
+        # the configuration was changed, and the client does not know it yet
+        core, accepted = running.runner._parts[TRAY].core, tray._accepts
+        assert isinstance(core, AcquisitionCore)
+        core._tray = push_config(endpoint, tmp_path, fans=3).trays[0]
+        core._limits = limits_of(core._tray)
+        core.accepts = lambda: accepted
+        tray.publish(T_S + 1, [0.5, 0.5], [1.0, 1.0])
+        with pytest.raises(fantwin_client.SamplesLostError, match=r"1 refused \(wrong_fan_count\)"):
+            tray.check()
+        assert tray.losses().lost in ({}, {"on_line": 0})
+        assert tray.check().refused == {"wrong_fan_count": 1}, "an old loss is not raised twice"
+
+
+def test_an_acquisition_that_is_restarted_gets_what_was_published_meanwhile(
+    endpoint: str, client: Client, raws: Raws, tmp_path: Path
+) -> None:
+    config = push_config(endpoint, tmp_path)
+    with acquisition(config):
+        tray = client.tray(TRAY, kept_samples=100)
+        for number in range(10):
+            tray.publish(T_S + number / 1000, [0.5, 0.5], [1.0, 1.0])
+        tray.check()
+        raws.wait_for(10)
+    for number in range(10, 110):
+        tray.publish(T_S + number / 1000, [0.5, 0.5], [1.0, 1.0])
+    assert (tray.losses().received, tray.losses().waiting) == (10, 100)
+    with pytest.raises(NotKeptError, match="100 are kept at most: acquisition is gone.*; 1 samples were not taken"):
+        tray.publish(T_S + 11, [0.5, 0.5], [1.0, 1.0])
+    with pytest.raises(fantwin_client.NotReceivedError, match="has not received 100 of 110 samples"):
+        tray.check(timeout_s=0)
+    with acquisition(config):
+        tray.wait_received(10)
+        raws.wait_for(110)
+        assert tray.losses().not_kept == 1
+        with pytest.raises(fantwin_client.SamplesLostError, match="1 not kept"):
+            tray.check()
+    np.testing.assert_array_equal(raws.column("device_sequence"), np.arange(110))
+    # kept samples are not late: they count as received when they would have been, had they been sent at once
+    np.testing.assert_allclose(np.diff(raws.column("host_receive_t_ns"))[10:], 1e6, atol=2000)
+
+
+def test_messages_that_acquisition_missed_are_fetched_by_it(
+    endpoint: str, client: Client, raws: Raws, tmp_path: Path
+) -> None:
+    with acquisition(push_config(endpoint, tmp_path)):
+        tray = client.tray(TRAY)
+        tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])
+        tray.check()
+        real, dropped = tray._publisher._publisher, []
+        tray._publisher._publisher = type("Dropping", (), {"put": dropped.append})()  # type: ignore[assignment]
+        for number in range(1, 5):
+            tray.publish(T_S + number, [0.5, 0.5], [1.0, 1.0])
+        eventually(lambda: dropped and not tray._outbox.waiting, "they are sent in vain")
+        tray._publisher._publisher = real
+        losses = tray.check(10)
+        assert (losses.received, losses.any) == (5, False)
+        raws.wait_for(5)
+    np.testing.assert_array_equal(raws.column("device_sequence"), np.arange(5))
+
+
+def test_no_more_is_sent_than_can_be_asked_for_again() -> None:
+    assert BY_NAME["reading"].history >= 2 * MOST_SENT_MESSAGES
+
+
+def test_the_client_that_came_last_has_the_tray(endpoint: str, client: Client, raws: Raws, tmp_path: Path) -> None:
+    with acquisition(push_config(endpoint, tmp_path)), fantwin_client.connect(endpoint, SITE) as other:
+        first, second = client.tray(TRAY), other.tray(TRAY)
+        first.publish(T_S, [0.1, 0.1], [1.0, 1.0])
+        first.check()
+        second.publish(T_S, [0.2, 0.2], [1.0, 1.0])
+        second.check()
+        first.publish(T_S + 1, [0.1, 0.1], [1.0, 1.0])
+        with pytest.raises(fantwin_client.SamplesLostError, match=r"1 refused \(second_client\); two clients push"):
+            first.check()
+        raws.wait_for(2)
+    assert raws.column("command").tolist() == [[0.1, 0.1], [0.2, 0.2]]
+
+
+def test_a_date_in_summer_time_is_the_moment_it_names() -> None:
+    moment = datetime(2026, 7, 1, 14, tzinfo=UTC)
+    zone = timedelta(hours=2)
+    assert times_ns(moment) == times_ns(np.datetime64("2026-07-01T14:00"))
+    assert times_ns([moment, moment + zone]).tolist() == [1782914400000000000, 1782921600000000000]
+    assert times_ns(1.5).tolist() == [1_500_000_000]
+    assert times_ns(1_790_000_000.123456) == pytest.approx(1_790_000_000_123_456_000, abs=300)

@@ -1,0 +1,119 @@
+"""From the pins to an alarm: the firmware in its simulator, in real time, on a serial line to the whole chain.
+
+A rotor is blocked. The trace of the pins is the truth: what was recorded must be what was on them, and the delay of the
+alarm counts from the moment at which the trace shows the block.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.recordings.reading import read_recording
+from schemas.messages import Alarm, Array, Raw, Transition
+from schemas.units import NS_PER_S
+from tests.support.fan_board import FANS
+from tests.support.firmware_build import FIRMWARE, firmware_file, simulator_file
+from tests.support.make_board_twin import BOARD_TWIN
+from tests.support.pin_trace import PinTrace, read_pin_trace
+from tests.support.running_chain import DEADLINE_S, SITE, Chain, eventually, fantwin, published, view_of
+
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
+
+FAN, DUTY = 2, 0.7
+LONGEST_DELAY_S = 1.5
+
+
+class SimulatedBoard:
+    """The simulator in real time, its serial line behind a link."""
+
+    def __init__(self, link: Path, trace: Path) -> None:
+        words = [str(simulator_file()), str(firmware_file()), "--link", str(link), "--vcd", str(trace)]
+        self.process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+    def order(self, line: str) -> None:
+        assert self.process.stdin and self.process.stdout
+        self.process.stdin.write(f"{line}\n".encode())
+        self.process.stdin.flush()
+        assert self.process.stdout.readline() == b"ok\n"
+
+    def end(self) -> str:
+        """Switch off; returns what the simulator said of its pace."""
+        self.process.terminate()
+        return self.process.communicate(timeout=DEADLINE_S)[1].decode()
+
+
+@pytest.fixture
+def board(tmp_path: Path) -> Iterator[SimulatedBoard]:
+    board = SimulatedBoard(tmp_path / "tray", tmp_path / "pins.vcd")
+    try:
+        yield board
+    finally:
+        board.process.kill()
+
+
+@pytest.fixture
+def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
+    settings = (f"site='{SITE}'", f"tray.0.twin='{BOARD_TWIN}'")
+    quick = ("scorer.baseline_s=2", "twin_integrator.warm_up_s=2")
+    chain = Chain(tmp_path, endpoint, *settings, *quick, viewer=False, configuration=FIRMWARE / "fantwin.toml")
+    try:
+        yield chain
+    finally:
+        chain.close()
+
+
+def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: Chain, tmp_path: Path) -> None:
+    up = chain.start_up()
+    with chain.watcher() as watcher:
+        eventually(lambda: published(view_of(watcher, "scorer")) > 0, "scores flow")
+        moved = fantwin(*chain.words("command"), "--fan", FAN, DUTY)
+        assert moved.returncode == 0, moved.stderr
+        scored = published(view_of(watcher, "scorer"))
+        eventually(lambda: published(view_of(watcher, "scorer")) > scored + 250, "the baseline is complete")
+        board.order(f"block {FAN}")
+        eventually(watcher.alarms, "an alarm is raised")
+    assert up.end() == 0
+    outcome = up.output()
+    pace = board.end()
+    trace = read_pin_trace(tmp_path / "pins.vcd", FANS)
+    messages = [envelope.message for path in chain.recordings() for envelope in read_recording(path)]
+    raws = [message for message in messages if isinstance(message, Raw)]
+    alarms = [message for message in messages if isinstance(message, Alarm)]
+
+    assert not any(outcome["lost"].values()), outcome
+    clock_s = np.concatenate([raw.device_clock_us for raw in raws]) / 1e6
+    check_that_the_pins_were_recorded(trace, clock_s, raws)
+    raised = [alarm for alarm in alarms if alarm.transition == Transition.RAISED]
+    assert {alarm.fan for alarm in raised} == {FAN}, [alarm.message for alarm in raised]
+    received_s = np.concatenate([raw.host_receive_t_ns for raw in raws]) / NS_PER_S
+    blocked_s = trace.blocked_s[FAN][0]
+    # By the clock of the board, which a busy machine may let fall behind the host's.
+    delay_s = np.interp(raised[0].t_ns / NS_PER_S, received_s, clock_s) - blocked_s
+    assert 0.0 < delay_s < LONGEST_DELAY_S, pace
+    print(f"blocked at {blocked_s:.3f} s of the trace, alarm {delay_s:.3f} s later; {pace}")
+
+
+def check_that_the_pins_were_recorded(trace: PinTrace, clock_s: Array, raws: list[Raw]) -> None:
+    """Each recorded speed is that of the edges on the pin, each command the duty, and the supply is there."""
+    command, speed_rad_s, supply_v = (
+        np.concatenate([getattr(raw, column) for raw in raws])
+        for column in ("command", "speed_rad_s", "supply_voltage_v")
+    )
+    assert np.abs(supply_v - 11.85).max() < 0.02 * 12.0
+    assert command[-1, FAN] == pytest.approx(DUTY, abs=1 / 640)
+    for fan in range(FANS):
+        # A pulse counts after 100 us without noise, and at the moment of a sample one may just be on its way.
+        on_pins = np.stack([trace.speed_rad_s(fan, clock_s - late_s) for late_s in (0.0, 150e-6)])
+        turns = np.isfinite(on_pins).all(axis=0) & (speed_rad_s[:, fan] > 0.0)
+        if fan == FAN:
+            turns &= clock_s < trace.blocked_s[fan][0]
+        assert turns.sum() > 200
+        errors = np.abs(speed_rad_s[:, fan] / on_pins - 1.0).min(axis=0)[turns]
+        assert errors.max() < 2e-3, fan
+        # The pin follows the sample by less than a millisecond; one step in 80 shows as a mean over eight of these.
+        assert np.abs(command[:, fan] - trace.duty_at(fan, clock_s + 3e-3)).max() < 1 / 80 + 1e-3, fan

@@ -1,0 +1,308 @@
+"""The firmware's parts without hardware: they agree with schemas/wire.py, and measure what they should."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import zlib
+from ctypes import byref, c_uint8
+
+import pytest
+from cobs import cobs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.wire import CommandFrame, Decoder, Sample, SetPointFrame, encode
+from tests.support.firmware_build import parts_library
+from tests.support.firmware_parts import (
+    BAD_CRC,
+    BAD_LENGTH,
+    BAD_VALUE,
+    COMMAND,
+    FANS,
+    NOTHING,
+    PULSES,
+    PWM_STEPS,
+    SAMPLE_LINE_BYTES,
+    SET_POINT,
+    WRONG_KIND,
+    Fan,
+    Host,
+    Receiver,
+    SampleStruct,
+    TachoStruct,
+    Values,
+    firmware_parts,
+)
+
+SPEED_MAX_RPM, GLITCH_US, STANDING_US, RATE_HZ, HOST_SILENCE_S = 20000.0, 100, 500_000, 50, 60
+UINT32 = 1 << 32
+
+
+@pytest.fixture(scope="module")
+def parts() -> ctypes.CDLL:
+    return firmware_parts(parts_library())
+
+
+def octets(data: bytes, room: int = 0) -> ctypes.Array[c_uint8]:
+    return (c_uint8 * max(len(data), room)).from_buffer_copy(data.ljust(room, b"\0"))
+
+
+# ---- frames
+
+float32 = st.floats(width=32, allow_nan=True, allow_infinity=True)
+duty = st.one_of(st.just(math.nan), st.floats(0.0, 1.0, width=32))
+rpm = st.one_of(st.just(math.nan), st.floats(0.0, SPEED_MAX_RPM, width=32))
+
+
+def of_each_fan(values: st.SearchStrategy[float]) -> st.SearchStrategy[tuple[float, ...]]:
+    return st.lists(values, min_size=FANS, max_size=FANS).map(tuple)
+
+
+@given(data=st.binary(max_size=253))
+def test_stuffed_bytes_are_those_of_cobs(parts: ctypes.CDLL, data: bytes) -> None:
+    out = (c_uint8 * (len(data) + 2))()
+    length = parts.cobs_encode(octets(data, 1), len(data), out)
+    assert bytes(out[:length]) == cobs.encode(data)
+
+
+@given(piece=st.one_of(st.binary(min_size=1, max_size=60), st.binary(max_size=200).map(cobs.encode)))
+def test_a_piece_is_unstuffed_or_refused_as_cobs_does(parts: ctypes.CDLL, piece: bytes) -> None:
+    inside = octets(piece)
+    length = parts.cobs_decode(inside, len(piece))
+    try:
+        expected = cobs.decode(piece)
+    except cobs.DecodeError:
+        assert length == -1
+    else:
+        assert bytes(inside[:length]) == expected
+
+
+@given(data=st.binary(max_size=200))
+def test_the_checksum_is_that_of_zlib(parts: ctypes.CDLL, data: bytes) -> None:
+    assert parts.crc32(octets(data, 1), len(data)) == zlib.crc32(data)
+
+
+@given(
+    clock=st.integers(0, UINT32 - 1),
+    sequence=st.integers(0, UINT32 - 1),
+    command=of_each_fan(st.floats(0.0, 1.0, width=32)),
+    speed=of_each_fan(rpm),
+    supply=st.one_of(st.just(math.nan), st.floats(0.0, 30.0, width=32)),
+)
+def test_the_host_reads_the_sample_that_was_written(
+    parts: ctypes.CDLL,
+    clock: int,
+    sequence: int,
+    command: tuple[float, ...],
+    speed: tuple[float, ...],
+    supply: float,
+) -> None:
+    sample = SampleStruct(clock, sequence, Values(*command), Values(*speed), supply)
+    line = (c_uint8 * SAMPLE_LINE_BYTES)()
+    length = parts.sample_encode(byref(sample), line)
+    (read,) = Decoder("binary", FANS).feed(bytes(line[:length]))
+    assert isinstance(read, Sample)
+    assert (read.clock_us, read.sequence, read.command) == (clock, sequence, command)
+    assert read.speed == pytest.approx(speed, abs=0, nan_ok=True)
+    assert read.supply_voltage_v == pytest.approx((supply,) * FANS, abs=0, nan_ok=True)
+
+
+def received(parts: ctypes.CDLL, data: bytes) -> list[tuple[int, tuple[float, ...]]]:
+    """What the firmware makes of a stream: kinds, and the values of frames."""
+    receiver, values, found = Receiver(), Values(), []
+    for byte in data:
+        kind = parts.receiver_take(byref(receiver), byte, values)
+        if kind != NOTHING:
+            found.append((kind, tuple(values) if kind in (COMMAND, SET_POINT) else ()))
+    return found
+
+
+@st.composite
+def damaged_streams(draw: st.DrawFn) -> bytes:
+    """Frames for this board and for others, whole and damaged, with noise between them."""
+    stream = b""
+    for _ in range(draw(st.integers(1, 6))):
+        fans = draw(st.sampled_from((FANS, FANS, FANS, 1, 8)))
+        values = tuple(draw(st.lists(st.one_of(duty, float32), min_size=fans, max_size=fans)))
+        frame = draw(st.sampled_from((CommandFrame, SetPointFrame)))(values)
+        piece = bytearray(encode("binary", frame))
+        for at in draw(st.lists(st.integers(0, len(piece) - 1), max_size=2)):
+            piece[at] ^= 1 << draw(st.integers(0, 7))
+        stream += bytes(piece[draw(st.sampled_from((0, 0, 0, 3))) :]) + draw(st.binary(max_size=4))
+    return stream + b"\0"
+
+
+@given(stream=damaged_streams())
+def test_the_firmware_takes_those_frames_that_the_protocol_takes(parts: ctypes.CDLL, stream: bytes) -> None:
+    expected = []
+    for frame in Decoder("binary", FANS, "device").feed(stream):
+        if isinstance(frame, CommandFrame) and all(math.isnan(v) or 0.0 <= v <= 1.0 for v in frame.command):
+            expected.append((COMMAND, frame.command))
+        if isinstance(frame, SetPointFrame) and all(
+            math.isnan(v) or 0.0 <= v <= SPEED_MAX_RPM for v in frame.set_point
+        ):
+            expected.append((SET_POINT, frame.set_point))
+    taken = [item for item in received(parts, stream) if item[0] in (COMMAND, SET_POINT)]
+    assert [kind for kind, _ in taken] == [kind for kind, _ in expected]
+    for (_, values), (_, wanted) in zip(taken, expected, strict=True):
+        assert values == pytest.approx(wanted, abs=0, nan_ok=True)
+
+
+def test_what_is_no_frame_for_this_board_is_named(parts: ctypes.CDLL) -> None:
+    good = encode("binary", CommandFrame((0.5,) * FANS))
+    wrong_crc = good[:-3] + bytes([good[-3] ^ 1]) + good[-2:]
+    sample = encode("binary", Sample(1, 1, (0.5,), (1.0,)))
+    one_fan = encode("binary", CommandFrame((0.5,)))
+    too_much = encode("binary", CommandFrame((0.5, 0.5, 1.01, 0.5)))
+    infinite = encode("binary", SetPointFrame((math.inf,) * FANS))
+    pieces = (good, wrong_crc, sample, one_fan, too_much, infinite, b"\5\1\0", b"\1" * 500 + b"\0", good)
+    kinds = [kind for kind, _ in received(parts, b"".join(pieces))]
+    refused = [BAD_CRC, WRONG_KIND, WRONG_KIND, BAD_VALUE, BAD_VALUE, BAD_LENGTH, BAD_LENGTH]
+    assert kinds == [COMMAND, *refused, COMMAND]
+
+
+# ---- tachos
+
+
+class Turning:
+    """A tacho that is shown the pulses of a turning fan, from any time of the clock on."""
+
+    def __init__(self, parts: ctypes.CDLL, start_us: int = 0) -> None:
+        self._parts = parts
+        self.tacho = TachoStruct()
+        self.now_us = start_us
+        parts.tacho_start(byref(self.tacho), True, start_us % UINT32)
+
+    def edge(self, level: bool, after_us: float) -> None:
+        self.now_us += round(after_us)
+        self._parts.tacho_edge(byref(self.tacho), level, self.now_us % UINT32)
+
+    def turn(self, pulses: int, period_us: float, glitch_us: int = 0) -> None:
+        """Even pulses; with glitches after each edge, and in the middle of each level."""
+        for _ in range(pulses):
+            for level in (False, True):
+                self.edge(level, period_us / 2 - 2 * (100 + glitch_us) * (glitch_us > 0))
+                for _ in range(2 * (glitch_us > 0)):
+                    self.edge(not level, 100)
+                    self.edge(level, glitch_us)
+
+    def read(self, after_us: int = 0) -> float:
+        self.now_us += after_us
+        self._parts.tacho_settle(byref(self.tacho), self.now_us % UINT32)
+        return self._parts.tacho_period_rpm(byref(self.tacho), self.now_us % UINT32)
+
+
+@pytest.mark.parametrize("speed_rpm", [300.0, 2200.0, 9000.0, 15000.0])
+@pytest.mark.parametrize("start_us", [0, UINT32 - 100_000])
+def test_the_speed_of_a_revolution_is_exact_to_a_microsecond(
+    parts: ctypes.CDLL, speed_rpm: float, start_us: int
+) -> None:
+    fan = Turning(parts, start_us)
+    assert math.isnan(fan.read())
+    revolution_us = 60e6 / speed_rpm
+    fan.turn(40, revolution_us / PULSES)
+    assert fan.read(GLITCH_US) == pytest.approx(speed_rpm, rel=2.0 / revolution_us)
+
+
+def test_uneven_pulses_do_not_show(parts: ctypes.CDLL) -> None:
+    fan, readings = Turning(parts), []
+    for to_next_us in (9_000, 11_000) * 10:
+        fan.edge(False, to_next_us - 5_000)
+        fan.edge(True, 5_000 - GLITCH_US)
+        readings.append(fan.read(GLITCH_US))
+    assert readings[3:] == pytest.approx([3000.0] * 17)
+
+
+@pytest.mark.parametrize("glitch_us", [1, 20, GLITCH_US - 1])
+def test_short_pulses_move_nothing(parts: ctypes.CDLL, glitch_us: int) -> None:
+    fan = Turning(parts)
+    fan.turn(20, 10_000, glitch_us)
+    assert fan.tacho.pulses == 20
+    assert fan.tacho.glitches == 20 * 2 * 2
+    assert 3000.0 * 0.9 < fan.read(GLITCH_US) <= 3000.0 * 1.1
+
+
+def test_a_pulse_that_fails_to_come_lowers_the_speed_and_standstill_is_zero(parts: ctypes.CDLL) -> None:
+    fan = Turning(parts)
+    fan.turn(20, 10_000)
+    in_half_a_pulse = 5_000 + 10_000 * 0.45
+    assert fan.read(round(in_half_a_pulse) - 5_000) == pytest.approx(3000.0)
+    assert fan.read(10_500) == pytest.approx(60e6 / 2 / 20_000, rel=1e-3)
+    assert fan.read(100_000) == pytest.approx(60e6 / 2 / 120_000, rel=1e-3)
+    assert fan.read(STANDING_US) == 0.0
+    for _ in range(50):  # past the wrap of the clock it stays at rest
+        assert fan.read(100_000_000) == 0.0
+    fan.turn(PULSES + 1, 10_000)
+    assert fan.read(GLITCH_US) == pytest.approx(3000.0)
+
+
+def test_a_fan_that_never_turns_is_known_to_stand_after_the_time(parts: ctypes.CDLL) -> None:
+    fan = Turning(parts)
+    assert math.isnan(fan.read(STANDING_US))
+    assert fan.read(1) == 0.0
+
+
+def test_a_count_over_a_second_has_the_resolution_of_its_pulses(parts: ctypes.CDLL) -> None:
+    assert [parts.tacho_count_rpm(pulses) for pulses in (0, 1, 73)] == pytest.approx([0.0, 30.0, 2190.0])
+
+
+# ---- what a fan is to do
+
+
+def test_a_fan_starts_at_full_speed_and_takes_a_duty(parts: ctypes.CDLL) -> None:
+    fan = Fan()
+    parts.fan_start(byref(fan))
+    assert parts.fan_level(byref(fan)) == PWM_STEPS
+    for value, level in ((0.0, 0), (0.5, 320), (1.0, 640), (1 / 640, 1)):
+        parts.fan_set_duty(byref(fan), value)
+        parts.fan_step(byref(fan), 100.0)
+        assert parts.fan_level(byref(fan)) == level
+
+
+@pytest.mark.parametrize(("full_rpm", "constant_s"), [(9000.0, 0.8), (2200.0, 1.0), (5000.0, 0.3)])
+def test_the_speed_loop_reaches_its_set_point_without_a_large_overshoot(
+    parts: ctypes.CDLL, full_rpm: float, constant_s: float
+) -> None:
+    fan, speed, highest = Fan(), full_rpm, 0.0
+    parts.fan_start(byref(fan))
+    for share in (0.4, 0.8):
+        parts.fan_set_speed(byref(fan), share * full_rpm, speed)
+        for _ in range(30 * RATE_HZ):
+            parts.fan_step(byref(fan), speed)
+            speed += (full_rpm * parts.fan_level(byref(fan)) / PWM_STEPS - speed) / constant_s / RATE_HZ
+            highest = max(highest, speed)
+        assert speed == pytest.approx(share * full_rpm, rel=0.01)
+        highest = speed if share == 0.4 else highest
+    assert highest < 0.9 * full_rpm
+
+
+def test_the_speed_loop_ends_at_full_speed_if_the_fan_does_not_turn_or_is_not_seen(parts: ctypes.CDLL) -> None:
+    fan = Fan()
+    parts.fan_set_duty(byref(fan), 0.2)
+    parts.fan_set_speed(byref(fan), 3000.0, 0.0)
+    for _ in range(10 * RATE_HZ):
+        parts.fan_step(byref(fan), 0.0)
+    assert fan.duty == 1.0
+    parts.fan_set_speed(byref(fan), 0.0, 0.0)
+    parts.fan_step(byref(fan), 0.0)
+    assert fan.duty == 0.0
+    parts.fan_step(byref(fan), math.nan)
+    assert fan.duty == 1.0
+
+
+def test_silence_counts_from_the_last_command_and_only_after_one(parts: ctypes.CDLL) -> None:
+    host, patience = Host(), HOST_SILENCE_S * RATE_HZ
+    assert not any(parts.host_falls_silent(byref(host)) for _ in range(2 * patience))
+    parts.host_commanded(byref(host))
+    assert not any(parts.host_falls_silent(byref(host)) for _ in range(patience - 1))
+    parts.host_commanded(byref(host))
+    assert [parts.host_falls_silent(byref(host)) for _ in range(patience)] == [False] * (patience - 1) + [True]
+    assert not any(parts.host_falls_silent(byref(host)) for _ in range(2 * patience))
+
+
+def test_the_supply_is_independent_of_the_reference(parts: ctypes.CDLL) -> None:
+    for chip_v in (4.5, 5.0, 5.3):
+        pin, bandgap = (round(volts / chip_v * 1024) for volts in (12.0 * 10 / 43, 1.1))
+        assert parts.supply_volts(6 * pin, 6 * bandgap) == pytest.approx(12.0, rel=0.005)
+    assert math.isnan(parts.supply_volts(100, 0))

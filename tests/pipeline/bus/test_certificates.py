@@ -1,0 +1,157 @@
+"""Files of `bus.security`: what cannot be used is refused in one line that says which file and why."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from pipeline.bus.authority import CLOCK_SKEW, Authority
+from pipeline.bus.certificates import Credentials, checked_credentials, read_certificate
+from pipeline.bus.errors import BusError
+from pipeline.bus.session import Bus, _zenoh_config
+from pipeline.config.models import BusConfig
+from tests.support.site_certificates import DAY, SiteCertificates
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> SiteCertificates:
+    made = SiteCertificates(tmp_path)
+    made.issue("scorer")
+    return made
+
+
+def checked(site: SiteCertificates, *roles: str) -> Credentials:
+    return checked_credentials(site.security, roles or ("scorer",))
+
+
+def test_good_files_are_taken_and_say_their_role(site):
+    found = checked(site)
+    assert (found.role, found.own.hosts, found.warning()) == ("scorer", ("localhost", "127.0.0.1"), "")
+    assert found.own.issuer == found.authority.role == "fantwin site"
+    assert found.authority.is_authority
+    assert not found.own.is_authority
+
+
+def test_the_first_role_that_has_a_certificate_is_shown(site):
+    assert checked(site, "scorer.tray1", "scorer").role == "scorer"
+    site.issue("scorer.tray1")
+    assert checked(site, "scorer.tray1", "scorer").role == "scorer.tray1"
+
+
+def lose(name: str) -> Callable[[SiteCertificates], object]:
+    return lambda site: (site.folder / name).unlink()
+
+
+def break_file(name: str) -> Callable[[SiteCertificates], object]:
+    return lambda site: (site.folder / name).write_text("nonsense")
+
+
+def other_authority(site: SiteCertificates) -> None:
+    site.issue("scorer", authority=Authority.new("site", DAY))
+
+
+def other_key(site: SiteCertificates) -> None:
+    site.issue("viewer")
+    (site.folder / "viewer.key").replace(site.folder / "scorer.key")
+
+
+def readable(mode: int) -> Callable[[SiteCertificates], object]:
+    return lambda site: (site.folder / "scorer.key").chmod(mode)
+
+
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [
+        (lose("ca.pem"), ["ca.pem", "No such file"]),
+        (lose("scorer.pem"), ["scorer.pem", "No such file", "certs issue"]),
+        (lose("scorer.key"), ["scorer.key", "No such file"]),
+        (break_file("ca.pem"), ["ca.pem", "no certificate"]),
+        (break_file("scorer.pem"), ["scorer.pem", "no certificate"]),
+        (break_file("scorer.key"), ["scorer.key", "no private key"]),
+        (readable(0o640), ["scorer.key", "others may read", "chmod 600"]),
+        (readable(0o604), ["scorer.key", "others may read", "chmod 600"]),
+        (other_key, ["scorer.key", "does not match", "scorer.pem"]),
+        (other_authority, ["scorer.pem", "not signed by", "ca.pem"]),
+        (lambda site: site.issue("scorer", lifetime=-timedelta(minutes=1)), ["scorer.pem", "expired on", "renew"]),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(site, harm, words):
+    harm(site)
+    with pytest.raises(BusError) as refused:
+        checked(site)
+    assert "\n" not in str(refused.value)
+    assert all(word in str(refused.value) for word in words), str(refused.value)
+
+
+def test_a_key_of_root_may_be_read_by_the_group_of_its_user_as_a_cluster_mounts_it(site, monkeypatch):
+    key = site.folder / "scorer.key"
+    if key.stat().st_uid != 0:
+        pytest.skip("only root has files of root")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    key.chmod(0o440)
+    assert checked(site).role == "scorer"
+    key.chmod(0o444)
+    with pytest.raises(BusError, match="others may read"):
+        checked(site)
+
+
+def test_a_certificate_is_not_valid_before_its_time_and_warned_of_before_its_end(site):
+    own = read_certificate(site.folder / "scorer.pem")
+    made = own.not_before + CLOCK_SKEW
+    assert abs(made - datetime.now(UTC)) < timedelta(minutes=1)
+    assert "not valid before" in own.time_problem(own.not_before - timedelta(seconds=1))
+    assert own.warning(made) == own.warning(own.not_after - 0.21 * (own.not_after - own.not_before)) == ""
+    assert "expires in 24 hours" in own.warning(own.not_after - DAY)
+    assert "renew scorer" in own.warning(own.not_after - DAY)
+    assert "expired on" in own.warning(own.not_after)
+
+
+def test_a_long_lifetime_is_warned_of_thirty_days_before_its_end(tmp_path):
+    site = SiteCertificates(tmp_path, Authority.new("site", 800 * DAY))
+    site.issue("scorer", lifetime=400 * DAY)
+    own = read_certificate(tmp_path / "scorer.pem")
+    assert own.warning(own.not_after - 31 * DAY) == ""
+    assert "expires in 29 days" in own.warning(own.not_after - 29 * DAY)
+
+
+def test_no_certificate_outlives_its_authority(site):
+    site.issue("scorer", lifetime=1000 * DAY)
+    found = checked(site)
+    assert timedelta() <= found.authority.not_after - found.own.not_after < timedelta(seconds=5)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "is_secure", "words"),
+    [("tcp", True, "with [bus.security] write tls/127.0.0.1:1"), ("tls", False, "tls needs certificates")],
+)
+def test_tls_and_certificates_go_together(site, scheme, is_secure, words):
+    config = BusConfig(endpoint=f"{scheme}/127.0.0.1:1", security=site.security if is_secure else None)
+    with pytest.raises(BusError) as refused:
+        Bus(config, roles=("scorer",))
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"transport/unicast/no_such": 1}, ["'transport/unicast/no_such'", "no setting of this name"]),
+        ({"transport": {"unicast": {"max_sessions": "many"}}}, ["transport/unicast/max_sessions", "does not take"]),
+        ({"connect/endpoints": []}, ["fantwin sets 'connect/endpoints' itself"]),
+        ({"listen": {"endpoints": []}}, ["fantwin sets 'listen/endpoints' itself"]),
+        ({"scouting": {"multicast": {"enabled": True}}}, ["fantwin sets 'scouting/multicast/enabled' itself"]),
+    ],
+)
+def test_settings_of_zenoh_that_cannot_be_passed_through_are_one_line(endpoint, settings, words):
+    with pytest.raises(BusError) as refused:
+        Bus(BusConfig(endpoint=endpoint, zenoh=settings))
+    assert "\n" not in str(refused.value)
+    assert all(word in str(refused.value) for word in words), str(refused.value)
+
+
+def test_settings_of_zenoh_are_passed_through(endpoint):
+    config = _zenoh_config(BusConfig(zenoh={"transport/unicast/max_sessions": 7}), listens=False)
+    assert config.get_json("transport/unicast/max_sessions") == "7"

@@ -1,0 +1,152 @@
+"""`fantwin certs`: an authority and certificates in a few commands; nothing is lost by a second one."""
+
+from __future__ import annotations
+
+import json
+import stat
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from pipeline.bus.certificates import checked_credentials
+from pipeline.cli import main as command_line
+from pipeline.config.loading import load_config
+from pipeline.config.roles import roles_of
+from pipeline.errors import UserError
+from tests.support.site_certificates import SiteCertificates
+
+CONFIG = """
+site = "plant"
+[bus]
+mode = "client"
+endpoint = "tls/router.example:7447"
+[bus.security]
+controllers = ["dcim"]
+[[tray]]
+name = "tray1"
+fans = 4
+twin = "twin.onnx"
+[[tray]]
+name = "tray2"
+fans = 4
+twin = "twin.onnx"
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _the_command() -> None:
+    if "certs" not in {command.name for command in command_line.app.registered_commands}:
+        command_line._register(["certs", "router"])
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    file = tmp_path / "fantwin.toml"
+    file.write_text(CONFIG)
+    return file
+
+
+def certs(path: Path, *words: str) -> Result:
+    return CliRunner().invoke(command_line.app, ["certs", *words, "-c", str(path)], env={"COLUMNS": "200"})
+
+
+def made(result: Result) -> list[str]:
+    assert result.exit_code == 0, result.exception
+    return [each["role"] for each in json.loads(result.stdout)["made"]]
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_from_nothing_to_certificates_that_every_process_can_use(path):
+    assert certs(path, "init").exit_code == 0
+    roles = made(certs(path, "issue", "--json"))
+    assert {"acquisition", "scorer", "recorder", "router", "operator", "viewer"} <= set(roles)
+    security = load_config(path, stages=()).bus.security
+    assert security
+    for role in roles:
+        credentials = checked_credentials(security, (role,))
+        assert credentials.role == role
+        assert {"localhost", "127.0.0.1", "router.example"} <= set(credentials.own.hosts)
+        assert mode(credentials.key) == 0o600
+    authority = path.parent / "authority"
+    assert (mode(authority), mode(authority / "ca.key")) == (0o700, 0o600)
+    assert not (path.parent / "certs" / "ca.key").exists()
+    result = certs(path, "show")
+    assert result.exit_code == 0
+    assert all(role in result.stdout for role in roles)
+
+
+def test_nothing_is_replaced_without_being_asked(path):
+    certs(path, "init")
+    certs(path, "issue")
+    key, authority = path.parent / "certs" / "scorer.key", path.parent / "authority" / "ca.key"
+    before = key.read_bytes(), authority.read_bytes()
+    for words in (["init"], ["issue", "scorer"]):
+        result = certs(path, *words)
+        assert isinstance(result.exception, UserError)
+        assert "--replace" in str(result.exception)
+    assert made(certs(path, "issue", "--json")) == []
+    assert (key.read_bytes(), authority.read_bytes()) == before
+    assert made(certs(path, "issue", "scorer", "--replace", "--json")) == ["scorer"]
+    assert key.read_bytes() != before[0]
+
+
+def test_a_renewed_certificate_keeps_its_role_and_hosts_and_has_a_new_key(path):
+    certs(path, "init")
+    certs(path, "issue", "acquisition", "--tray", "tray2", "--host", "press.example", "--days", "7")
+    key = path.parent / "certs" / "acquisition.tray2.key"
+    before = key.read_bytes()
+    result = json.loads(certs(path, "renew", "--json").stdout)["made"]
+    assert [each["role"] for each in result] == ["acquisition.tray2"]
+    assert "press.example" in result[0]["hosts"]
+    assert key.read_bytes() != before
+    assert mode(key) == 0o600
+
+
+def test_each_role_may_have_a_folder_of_its_own(path):
+    folders = 'certificate = "certs/{role}/certificate.pem"\nkey = "certs/{role}/key.pem"\ncontrollers'
+    path.write_text(CONFIG.replace("controllers", folders))
+    certs(path, "init")
+    roles = made(certs(path, "issue", "--json"))
+    assert (path.parent / "certs" / "scorer" / "certificate.pem").is_file()
+    assert sorted(made(certs(path, "renew", "--json"))) == sorted(roles)
+    assert all(role in certs(path, "show").stdout for role in roles)
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["issue", "skorer"], "did you mean 'scorer'"),
+        (["issue", "scorer.tray9"], "no role called 'scorer.tray9'"),
+        (["issue", "scorer", "--tray", "tray9"], "no tray called 'tray9'"),
+        (["issue", "--tray", "tray1"], "--tray needs a role"),
+        (["init", "scorer"], "init takes no role"),
+        (["issue", "scorer"], "no authority here"),
+        (["show"], "no certificates"),
+        (["renew"], "no certificates"),
+    ],
+)
+def test_mistakes_are_one_line(path, words, what):
+    result = certs(path, *words)
+    assert isinstance(result.exception, UserError)
+    assert what in str(result.exception)
+    assert "\n" not in str(result.exception)
+
+
+def test_an_expired_certificate_is_shown_and_ends_the_command_with_1(path):
+    SiteCertificates(path.parent / "certs").issue("viewer", lifetime=-timedelta(minutes=1))
+    result = certs(path, "show")
+    assert result.exit_code == 1
+    assert "viewer.pem: expired on" in result.stdout
+
+
+def test_roles_of_a_site_are_its_stages_people_programs_and_one_for_each_tray(path):
+    roles = roles_of(load_config(path, stages=()))
+    assert {"dcim", "operator", "viewer", "source", "source.tray1", "router", "replay", "scorer.tray2"} <= set(roles)
+    assert roles["acquisition.tray1"].trays == ("tray1",)
+    assert roles["acquisition"].writes == ("raw",)
+    assert roles["dcim"].writes == ("command", "request")

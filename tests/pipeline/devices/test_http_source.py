@@ -1,0 +1,199 @@
+"""Samples over HTTP: each request says what became of its samples."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import ssl
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.client import HTTPConnection, HTTPSConnection
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trustme
+from pydantic import ValidationError
+
+from pipeline.devices import http_source
+from pipeline.devices.http_config import HttpConfig
+from pipeline.devices.http_source import MOST_WAITING, HttpSource
+from pipeline.devices.json_samples import LARGEST_BYTES
+from pipeline.devices.sample_source import (
+    LinkDown,
+    LinkUp,
+    Reading,
+    ReadingBatch,
+    ReadingLimits,
+    SourceContext,
+    SourceEvent,
+)
+from pipeline.errors import UserError
+from tests.support.mqtt_broker import free_port
+from tests.support.running_acquisition import Raws, acquisition, push_config, raws_of
+from tests.support.running_chain import eventually
+
+SAMPLE = {"t": 1.0, "command": [0.5, 0.5], "speed": [100, 200]}
+PATH = "/v1/trays/tray1"
+DOCUMENT = Path(__file__).parents[3] / "docs" / "how-to" / "sources.md"
+
+
+def source_of(folder: Path = Path(), **settings: Any) -> HttpSource:
+    config = HttpConfig.model_validate({"port": free_port(), **settings})
+    limits = ReadingLimits(2, 0.0, 1.0, 5000.0)
+    return HttpSource(config, SourceContext(2, "rpm", folder, "tray1", limits))
+
+
+@contextmanager
+def running(source: HttpSource, deliver: Any = None) -> Iterator[list[SourceEvent]]:
+    events: list[SourceEvent] = []
+    source.start(deliver or events.append)
+    if deliver is None:
+        eventually(lambda: events, "it listens, or not")
+    yield events
+    source.stop()
+
+
+def ask(source: HttpSource, body: Any = None, path: str = "", **headers: str) -> tuple[int, dict[str, Any], Any]:
+    """Status, answer and headers of a request: GET without a body, else POST of it as JSON."""
+    connection = HTTPConnection("127.0.0.1", source._config.port, timeout=20)
+    text = body if isinstance(body, bytes) or body is None else json.dumps(body)
+    connection.request(
+        "GET" if body is None else "POST", path or PATH + ("" if body is None else "/samples"), text, headers
+    )
+    answer = connection.getresponse()
+    content = answer.read()
+    connection.close()
+    is_json = answer.headers.get("content-type") == "application/json"
+    return answer.status, json.loads(content) if is_json else {}, answer.headers
+
+
+def test_an_answer_says_what_became_of_each_sample() -> None:
+    source = source_of()
+    wrong = [SAMPLE | {"command": [2, 0]}, SAMPLE | {"speed": [1]}, {"speed": 1}]
+    with running(source) as events:
+        assert ask(source, SAMPLE)[:2] == (200, {"accepted": 1, "refused": 0})
+        status, answer, _ = ask(source, [SAMPLE, *wrong, {"command": [0, 0], "speed": [9000, 1]}])
+        assert (status, answer["accepted"], answer["refused"], answer["speeds_beyond_speed_max"]) == (200, 2, 3, 1)
+        assert [(each["sample"], each["kind"]) for each in answer["reasons"]] == [
+            (1, "time_order"),
+            (2, "time_order"),
+            (3, "malformed"),
+        ]
+        status, answer, _ = ask(source, wrong[0])
+        assert (status, answer["accepted"], answer["reasons"][0]["kind"]) == (422, 0, "absurd_command")
+        assert "command 2 is outside command_min = 0 to command_max = 1" in answer["reasons"][0]["reason"]
+        assert ask(source, wrong[1])[1]["reasons"][0]["kind"] == "wrong_fan_count"
+        counts = ask(source)[1]
+        assert (counts["accepted"], counts["refused"], counts["turned_away"]) == (3, 5, 0)
+        assert (counts["tray"], counts["fans"], counts["speed_unit"]) == ("tray1", 2, "rpm")
+        eventually(lambda: len(events) == 9, "all are delivered, so that acquisition counts them, too")
+    assert isinstance(events[0], LinkUp)
+    assert isinstance(events[1], ReadingBatch) and isinstance(events[1].items[0], Reading)
+
+
+def test_what_is_no_request_for_this_tray_is_refused() -> None:
+    source = source_of()
+    with running(source):
+        assert ask(source, b'{"t": 1')[0] == 400
+        assert ask(source, b" " * (LARGEST_BYTES + 1))[0] == 413
+        assert ask(source, SAMPLE, path="/v1/trays/tray2/samples")[0] == 404
+        assert ask(source, path=f"{PATH}/samples")[0] == 405
+
+
+def test_an_acquisition_that_is_behind_turns_samples_away_and_says_so() -> None:
+    source, may_go_on, delivered = source_of(), threading.Event(), []
+
+    def deliver(event: SourceEvent) -> None:
+        assert may_go_on.wait(20)
+        delivered.append(event)
+
+    with running(source, deliver):
+        eventually(lambda: source._server and source._server.started, "it listens")
+        samples = [{"command": [0, 0], "speed": [1, 1]}] * (MOST_WAITING // 2)
+        assert [ask(source, samples)[0] for _ in range(2)] == [200, 200]
+        status, answer, headers = ask(source, SAMPLE)
+        assert (status, answer, headers["Retry-After"]) == (429, {"error": "acquisition is behind", "accepted": 0}, "1")
+        assert ask(source)[1]["turned_away"] == 1
+        may_go_on.set()
+        eventually(lambda: ask(source, SAMPLE)[0] == 200, "there is room again")
+        eventually(lambda: len(delivered) == 2 + MOST_WAITING, "what was accepted is delivered")
+
+
+def test_a_token_is_asked_for(tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text("secret\n")
+    with pytest.raises(UserError, match="others may read it"):
+        source_of(tmp_path, token_file="token")
+    token.chmod(0o600)
+    source = source_of(tmp_path, token_file="token", host="0.0.0.0")
+    with running(source):
+        assert ask(source, SAMPLE)[0] == ask(source)[0] == 401
+        assert ask(source, SAMPLE, Authorization="Bearer wrong")[0] == 401
+        assert ask(source, SAMPLE, Authorization="Bearer secret")[0] == 200
+
+
+def test_beyond_loopback_a_token_is_required() -> None:
+    with pytest.raises(ValidationError, match="can be reached from other hosts: give token_file"):
+        HttpConfig(host="0.0.0.0")
+    with pytest.raises(ValidationError, match="can be reached"):
+        HttpConfig(host="board.plant")
+    assert HttpConfig(host="::1").is_local and HttpConfig(host="localhost").is_local
+
+
+def test_a_port_that_is_taken_is_reported_and_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http_source, "RETRY_S", 0.05)
+    source = source_of()
+    with socket.create_server(("127.0.0.1", source._config.port)):
+        (problem,) = source.check()
+        source_events: list[SourceEvent] = []
+        source.start(source_events.append)
+        eventually(lambda: source_events, "it says so")
+    assert f"cannot listen on 127.0.0.1:{source._config.port}: Address already in use" in problem
+    assert source_events[0] == LinkDown(problem)
+    eventually(lambda: isinstance(source_events[-1], LinkUp), "it listens once the port is free")
+    source.stop()
+
+
+def test_https(tmp_path: Path) -> None:
+    authority = trustme.CA()
+    issued = authority.issue_cert("127.0.0.1")
+    issued.cert_chain_pems[0].write_to_path(str(tmp_path / "server.pem"))
+    issued.private_key_pem.write_to_path(str(tmp_path / "server.key"))
+    source = source_of(tmp_path, certificate="server.pem", key="server.key")
+    with running(source):
+        context = ssl.create_default_context()
+        authority.configure_trust(context)
+        connection = HTTPSConnection("127.0.0.1", source._config.port, context=context, timeout=20)
+        connection.request("POST", f"{PATH}/samples", json.dumps(SAMPLE))
+        assert connection.getresponse().status == 200
+        connection.close()
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http_source, "is_installed", lambda _module: False)
+    with pytest.raises(UserError, match=r"source http needs starlette and uvicorn; in the checkout: .*\[http\]"):
+        source_of()
+
+
+@pytest.fixture
+def raws(endpoint: str) -> Iterator[Raws]:
+    with raws_of(endpoint) as raws:
+        yield raws
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="needs curl")
+def test_the_example_of_the_document_puts_a_sample_on_the_bus(endpoint: str, raws: Raws, tmp_path: Path) -> None:
+    example = DOCUMENT.read_text().split("    curl", 1)[1].split("\n\n")[0]
+    port = free_port()
+    config = push_config(endpoint, tmp_path, source=f'{{ kind = "http", port = {port} }}')
+    with acquisition(config) as running:
+        eventually(lambda: running.counter("line_up"), "it listens")
+        words = f"curl --silent{example}".replace("8765", str(port))
+        done = subprocess.run(["sh", "-c", words], capture_output=True, text=True, check=True)
+        assert json.loads(done.stdout) == {"accepted": 1, "refused": 0}
+        raws.wait_for(1)
+    assert raws.column("command").tolist() == [[0.4, 0.6]]

@@ -1,0 +1,252 @@
+"""Samples from a real MQTT broker: JSON and single numbers, restarts of the broker, commands, users and TLS."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import paho.mqtt.client as paho
+import pytest
+import trustme
+from paho.mqtt.enums import CallbackAPIVersion
+from pwdlib import PasswordHash
+from pwdlib.hashers.argon2 import Argon2Hasher
+from pydantic import ValidationError
+
+from pipeline.devices import mqtt_source
+from pipeline.devices.fan_values import FanValues
+from pipeline.devices.mqtt_config import MqttConfig
+from pipeline.devices.mqtt_source import MqttSource
+from pipeline.devices.sample_source import (
+    LinkDown,
+    LinkUp,
+    Reading,
+    ReadingBatch,
+    Rejected,
+    SourceContext,
+    SourceEvent,
+)
+from pipeline.errors import UserError
+from tests.support.mqtt_broker import MqttBroker, free_port
+from tests.support.running_chain import eventually
+
+SAMPLE = '{"t": 1.0, "command": [0.5, 0.5], "speed": [100, 200]}'
+NUMBERS = {"speed_topic": "plant/fan{fan}/rpm", "command_topic": "plant/fan{fan}/pwm", "first_fan": 1}
+
+
+@pytest.fixture(scope="module")
+def broker() -> Iterator[MqttBroker]:
+    broker = MqttBroker()
+    broker.start()
+    yield broker
+    broker.close()
+
+
+@pytest.fixture
+def publish(broker: MqttBroker) -> Iterator[Callable[..., None]]:
+    client = paho.Client(CallbackAPIVersion.VERSION2)
+    client.connect("127.0.0.1", broker.port)
+    client.loop_start()
+    yield lambda topic, text, retain=False: client.publish(topic, text, 1, retain).wait_for_publish(10)
+    client.disconnect()
+    client.loop_stop()
+
+
+def source_of(port: int, folder: Path = Path(), **settings: Any) -> MqttSource:
+    config = MqttConfig.model_validate({"host": "127.0.0.1", "port": port} | (settings or {"topic": "plant/tray1"}))
+    return MqttSource(config, SourceContext(2, "rpm", folder))
+
+
+class Events(list[SourceEvent]):
+    """What a source has delivered."""
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        return [event for event in self if isinstance(event, kind)]
+
+    @property
+    def items(self) -> list[Reading | Rejected]:
+        return [item for batch in self.of(ReadingBatch) for item in batch.items]
+
+
+@contextmanager
+def running(source: MqttSource) -> Iterator[Events]:
+    events = Events()
+    source.start(events.append)
+    eventually(lambda: events, "it is connected, or not")
+    yield events
+    source.stop()
+
+
+def test_json_samples_arrive_and_what_is_none_is_refused(broker: MqttBroker, publish: Callable[..., None]) -> None:
+    publish("plant/tray1", SAMPLE, retain=True)
+    with running(source_of(broker.port)) as events:
+        for text in (SAMPLE, '{"t": 1.0', '{"command": [1]}'):
+            publish("plant/tray1", text)
+        eventually(lambda: len(events.items) == 4, "all have arrived")
+    assert isinstance(events[0], LinkUp)
+    retained, reading, broken, incomplete = events.items
+    assert isinstance(retained, Rejected) and (retained.kind, retained.harmless) == ("retained", True)
+    assert isinstance(reading, Reading) and (reading.speed, reading.clock_us) == ((100.0, 200.0), 1_000_000)
+    assert isinstance(broken, Rejected) and broken.kind == "malformed" and "no JSON" in broken.detail
+    assert isinstance(incomplete, Rejected) and incomplete.detail == "'speed' is missing"
+    publish("plant/tray1", "", retain=True)
+
+
+def test_a_message_that_the_broker_sends_again_is_left_out(broker: MqttBroker) -> None:
+    source = source_of(broker.port)
+    items = [
+        item
+        for is_again in (False, True, False)
+        for batch in source.batches("plant/tray1", SAMPLE.encode(), 0, is_again=is_again)
+        for item in batch.items
+    ]
+    assert [getattr(item, "kind", "reading") for item in items] == ["reading", "repeated", "reading"]
+
+
+def test_numbers_of_single_fans_become_readings_of_the_tray(broker: MqttBroker, publish: Callable[..., None]) -> None:
+    publish("plant/fan1/pwm", "0.4", retain=True)
+    publish("plant/fan2/rpm", "900", retain=True)
+    with running(source_of(broker.port, **NUMBERS)) as events:
+        publish("plant/fan1/rpm", "1000")  # the command of fan 2 is not known yet
+        publish("plant/fan2/pwm", "0.6")
+        for fan, rpm in ((1, "1001"), (2, "2000"), (1, "1002"), (1, "1003"), (2, "2001"), (2, "fast")):
+            publish(f"plant/fan{fan}/rpm", rpm)
+        eventually(lambda: getattr(events.items[-1], "kind", "") == "malformed" if events.items else False, "all came")
+    readings = [item for item in events.items if isinstance(item, Reading)]
+    assert [reading.command for reading in readings] == [(0.4, 0.6)] * 3
+    speeds = [tuple("-" if math.isnan(v) else f"{v:g}" for v in reading.speed) for reading in readings]
+    assert speeds == [("1001", "2000"), ("1002", "-"), ("1003", "2001")]
+    kinds = [item.kind for item in events.items if isinstance(item, Rejected)]
+    assert kinds == ["retained", "no_command", "malformed"]
+    publish("plant/fan1/pwm", "", retain=True)
+    publish("plant/fan2/rpm", "", retain=True)
+
+
+def test_a_changed_command_ends_the_reading_that_waits() -> None:
+    values = FanValues(2)
+    values.set_command(0, 0.5)
+    assert values.set_speed(1, 20.0) == []
+    assert values.lacks_commands and values.set_command(1, 0.5) is None
+    assert values.set_speed(0, 10.0) == []
+    ended = values.set_command(0, 0.7)
+    assert ended is not None and ended.command == (0.5, 0.5) and ended.speed[0] == 10.0
+    assert values.set_command(0, 0.7) is None, "the same again changes nothing"
+
+
+def test_a_broker_that_is_restarted_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt_source, "RECONNECT_DELAY_MAX_S", 1)
+    broker = MqttBroker()
+    broker.start()
+    with running(source_of(broker.port)) as events:
+        broker.stop()
+        eventually(lambda: events.of(LinkDown), "it is gone")
+        broker.start()
+        eventually(lambda: len(events.of(LinkUp)) == 2, "it is back")
+        client = paho.Client(CallbackAPIVersion.VERSION2)
+        client.connect("127.0.0.1", broker.port)
+        client.loop_start()
+        client.publish("plant/tray1", SAMPLE, qos=1).wait_for_publish(10)
+        client.disconnect()
+        client.loop_stop()
+        eventually(lambda: len(events.items) == 1, "samples come again")
+    assert "ended" in events.of(LinkDown)[0].reason
+    broker.close()
+
+
+@pytest.mark.parametrize(
+    ("topic", "expected"),
+    [
+        ("out", [("out", {"command": [0.5, None]})]),
+        ("out/{fan}", [("out/0", 0.5)]),
+    ],
+)
+def test_commands_are_published(broker: MqttBroker, topic: str, expected: list[tuple[str, Any]]) -> None:
+    heard: list[tuple[str, Any]] = []
+    client = paho.Client(CallbackAPIVersion.VERSION2)
+    client.on_message = lambda _c, _d, message: heard.append((message.topic, json.loads(message.payload)))
+    subscribed: list[int] = []
+    client.on_subscribe = lambda *_rest: subscribed.append(1)
+    client.connect("127.0.0.1", broker.port)
+    client.subscribe("out/#")
+    client.loop_start()
+    eventually(lambda: subscribed, "it listens")
+    source = source_of(broker.port, topic="plant/tray1", send_topic=topic)
+    assert not source.send((0.5, math.nan), ()), "it is not connected"
+    with running(source):
+        assert source.send((0.5, math.nan), ())
+        assert source.send((), (100.0, 200.0)) == ("{fan}" not in topic)
+        eventually(lambda: heard, "it is heard")
+    assert heard[:1] == expected
+    client.disconnect()
+    client.loop_stop()
+    assert not source_of(broker.port).send((0.5, 0.5), ()), "without a topic for them"
+
+
+def test_a_user_and_a_broker_that_proves_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    authority = trustme.CA()
+    authority.cert_pem.write_to_path(str(tmp_path / "ca.pem"))
+    authority.issue_cert("127.0.0.1").private_key_and_cert_chain_pem.write_to_path(str(tmp_path / "server.pem"))
+    (tmp_path / "users").write_text(f"plant:{PasswordHash((Argon2Hasher(1, 8, 1),)).hash('secret')}\n")
+    plugin = {"amqtt.plugins.authentication.FileAuthPlugin": {"password_file": str(tmp_path / "users")}}
+    server = str(tmp_path / "server.pem")
+    broker = MqttBroker(plugin, ssl=True, certfile=server, keyfile=server)
+    broker.start()
+    settings = {"topic": "a", "tls": True, "ca": "ca.pem", "username": "plant"}
+    monkeypatch.setenv("PLANT_PASSWORD", "secret")
+    assert source_of(broker.port, tmp_path, **settings, password_env="PLANT_PASSWORD").check() == []
+    password = tmp_path / "password"
+    password.write_text("wrong\n")
+    password.chmod(0o600)
+    with running(source_of(broker.port, tmp_path, **settings, password_file="password")) as events:
+        eventually(lambda: len(events) > 1, "it is tried again")
+        assert all("the broker refuses this client: " in event.reason for event in events.of(LinkDown))
+    (problem,) = source_of(broker.port, tmp_path, **settings, password_file="password").check()
+    assert "check username and password" in problem
+    (problem,) = source_of(broker.port, tmp_path, topic="a", tls=True).check()
+    assert "certificate verify failed" in problem or "CERTIFICATE_VERIFY_FAILED" in problem
+    password.chmod(0o644)
+    with pytest.raises(UserError, match="others may read it: chmod 600"):
+        source_of(broker.port, tmp_path, **settings, password_file="password")
+    with pytest.raises(UserError, match="the environment has no OTHER"):
+        source_of(broker.port, tmp_path, **settings, password_env="OTHER")
+    with pytest.raises(UserError, match="a certificate of source mqtt cannot be used"):
+        source_of(broker.port, tmp_path, topic="a", tls=True, ca="none.pem")
+    broker.close()
+
+
+def test_a_broker_that_is_not_there_is_one_line() -> None:
+    port = free_port()
+    (problem,) = source_of(port).check()
+    assert problem == f"mqtt 127.0.0.1:{port} plant/tray1: cannot be reached: Connection refused; check host and port"
+    with running(source_of(port)) as events:
+        assert events == [LinkDown("the broker cannot be reached; check host and port, and whether it runs")]
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt_source, "is_installed", lambda _module: False)
+    with pytest.raises(UserError, match=r"source mqtt needs paho-mqtt; in the checkout: .*\[mqtt\]"):
+        source_of(1883)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({}, "give topic"),
+        ({"topic": "a", "speed_topic": "b/{fan}"}, "give topic"),
+        ({"speed_topic": "b/{fan}"}, "give speed_topic and command_topic"),
+        ({"speed_topic": "b/rpm", "command_topic": "b/{fan}"}, "speed_topic needs {fan}"),
+        ({"speed_topic": "b/{fan}", "command_topic": "b/{fan}"}, "are the same"),
+        ({"topic": "a", "send_topic": "b/#"}, "without + and #"),
+        ({"topic": "a", "password_env": "X"}, "a password needs username"),
+        ({"topic": "a", "username": "u", "password_env": "X", "password_file": "y"}, "not both"),
+        ({"topic": "a", "ca": "x"}, "need tls = true"),
+        ({"topic": "a", "tls": True, "key": "x"}, "give certificate and key"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words.replace("{", r"\{").replace("+", r"\+")):
+        MqttConfig.model_validate({"host": "broker", **settings})

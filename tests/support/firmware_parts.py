@@ -1,0 +1,89 @@
+"""The parts of the firmware that need no hardware, callable: what firmware/src declares, with types."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import POINTER, Structure, c_bool, c_float, c_int, c_int16, c_uint8, c_uint16, c_uint32
+from pathlib import Path
+
+FANS = 4
+PULSES = 2
+PWM_STEPS = 640
+SAMPLE_LINE_BYTES = 11 + 1 + 4 * FANS * 3 + 4 + 3
+NOTHING, COMMAND, SET_POINT, BAD_LENGTH, BAD_CRC, WRONG_KIND, BAD_VALUE = range(7)
+Values = c_float * FANS
+
+
+class SampleStruct(Structure):
+    """sample_t of frame.h."""
+
+    _fields_ = (
+        ("clock_us", c_uint32),
+        ("sequence", c_uint32),
+        ("command", Values),
+        ("speed_rpm", Values),
+        ("supply_v", c_float),
+    )
+
+
+class Receiver(Structure):
+    """receiver_t of frame.h."""
+
+    _fields_ = (("piece", c_uint8 * (3 + 4 * FANS + 4 + 1)), ("length", c_uint8), ("is_too_long", c_bool))
+
+
+class TachoStruct(Structure):
+    """tacho_t of tacho.h."""
+
+    _fields_ = (
+        ("edge_us", c_uint32 * (PULSES + 1)),
+        ("level_since_us", c_uint32),
+        ("pulses", c_uint16),
+        ("glitches", c_uint16),
+        ("newest", c_uint8),
+        ("known", c_uint8),
+        ("level", c_bool),
+        ("settled_level", c_bool),
+        ("has_stood", c_bool),
+    )
+
+
+class Fan(Structure):
+    """fan_t of fan.h."""
+
+    _fields_ = (("duty", c_float), ("set_point_rpm", c_float), ("integral", c_float), ("holds_speed", c_bool))
+
+
+class Host(Structure):
+    """host_t of fan.h."""
+
+    _fields_ = (("silent_samples", c_uint32), ("has_commanded", c_bool))
+
+
+def firmware_parts(library: Path) -> ctypes.CDLL:
+    """The functions of firmware/src, with the types of their headers."""
+    parts = ctypes.CDLL(str(library))
+    tacho, fan, host, octets = POINTER(TachoStruct), POINTER(Fan), POINTER(Host), POINTER(c_uint8)
+    for name, result, arguments in (
+        ("cobs_encode", c_uint8, (octets, c_uint8, octets)),
+        ("cobs_decode", c_int16, (octets, c_uint8)),
+        ("crc32", c_uint32, (octets, c_uint8)),
+        ("sample_encode", c_uint8, (POINTER(SampleStruct), octets)),
+        ("receiver_take", c_int, (POINTER(Receiver), c_uint8, POINTER(c_float))),
+        ("tacho_start", None, (tacho, c_bool, c_uint32)),
+        ("tacho_edge", None, (tacho, c_bool, c_uint32)),
+        ("tacho_settle", None, (tacho, c_uint32)),
+        ("tacho_period_rpm", c_float, (tacho, c_uint32)),
+        ("tacho_count_rpm", c_float, (c_uint16,)),
+        ("fan_start", None, (fan,)),
+        ("fan_set_duty", None, (fan, c_float)),
+        ("fan_set_speed", None, (fan, c_float, c_float)),
+        ("fan_step", None, (fan, c_float)),
+        ("fan_level", c_uint16, (fan,)),
+        ("host_commanded", None, (host,)),
+        ("host_falls_silent", c_bool, (host,)),
+        ("supply_volts", c_float, (c_uint16, c_uint16)),
+    ):
+        function = getattr(parts, name)
+        function.restype, function.argtypes = result, arguments
+    return parts

@@ -1,0 +1,104 @@
+"""Acquisitions in threads of this process, and what they publish."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.bus.session import Bus
+from pipeline.config.loading import parse_config
+from pipeline.config.models import BusConfig, Config
+from pipeline.config.shards import chosen_shard
+from pipeline.runtime.runner import Runner
+from schemas.codec import decode
+from schemas.fields import Array
+from schemas.messages import Health, Raw
+from schemas.topics import tray_key
+from stages.acquisition import STAGE
+from tests.support.running_chain import eventually
+
+SITE, TRAY = "plant", "tray1"
+
+
+def push_config(
+    endpoint: str, folder: Path, fans: int = 2, source: str = '{ kind = "push" }', more: str = ""
+) -> Config:
+    """A site of one tray."""
+    text = f"""
+site = "{SITE}"
+run_folder = "{folder}"
+[bus]
+endpoint = "{endpoint}"
+[launcher]
+stages = ["acquisition"]
+[[tray]]
+name = "{TRAY}"
+fans = {fans}
+speed_unit = "rpm"
+speed_max = 20000
+source = {source}
+{more}
+"""
+    return parse_config(text, folder / "fantwin.toml")
+
+
+class RunningAcquisition:
+    """One session of acquisition."""
+
+    def __init__(self, config: Config) -> None:
+        self._stop = threading.Event()
+        self.runner = Runner(STAGE, config, chosen_shard("acquisition", config), self._stop, self._on_health)
+        self.healths: list[Health] = []
+        self._thread = threading.Thread(target=self.runner.run)
+        self._thread.start()
+
+    def _on_health(self, health: Health) -> None:
+        self.healths.append(health)
+
+    def counter(self, name: str) -> int:
+        """As of the last health."""
+        counters = self.healths[-1].counters if self.healths else ()
+        return next((counter.value for counter in counters if counter.name == name), 0)
+
+    def end(self) -> None:
+        self._stop.set()
+        self._thread.join(20)
+
+
+class Raws:
+    """The raw samples that are published, as long as the bus is open."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.messages: list[Raw] = []
+        bus.subscribe(tray_key(SITE, TRAY, "raw"), lambda _key, payload: self.messages.append(decode(Raw, payload)))
+
+    def column(self, name: str) -> Array:
+        return np.concatenate([getattr(message, name) for message in self.messages])
+
+    @property
+    def count(self) -> int:
+        return sum(len(message.host_receive_t_ns) for message in self.messages)
+
+    def wait_for(self, samples: int) -> None:
+        eventually(lambda: self.count >= samples, f"{samples} samples are published")
+
+
+@contextmanager
+def raws_of(endpoint: str) -> Iterator[Raws]:
+    """What a site at this endpoint publishes. It listens there, so that acquisitions come and go."""
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        yield Raws(bus)
+
+
+@contextmanager
+def acquisition(config: Config) -> Iterator[RunningAcquisition]:
+    """A session of acquisition that ends with the block."""
+    running = RunningAcquisition(config)
+    try:
+        yield running
+    finally:
+        running.end()

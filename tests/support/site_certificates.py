@@ -1,0 +1,33 @@
+"""Certificates of a site for tests: an authority, and what it signs."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from pathlib import Path
+
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from pipeline.bus.authority import Authority, write_file, write_pair
+from pipeline.config.models import SecurityConfig
+
+HOSTS = ("localhost", "127.0.0.1")
+DAY = timedelta(days=1)
+
+
+class SiteCertificates:
+    """A folder with an authority's certificate, and certificates by role."""
+
+    def __init__(self, folder: Path, authority: Authority | None = None) -> None:
+        self.folder = folder
+        self.authority = authority or Authority.new("site", 10 * DAY)
+        write_file(folder / "ca.pem", self.authority.certificate.public_bytes(Encoding.PEM), is_private=False)
+        self.security = SecurityConfig(
+            ca=folder / "ca.pem", certificate=folder / "{role}.pem", key=folder / "{role}.key"
+        )
+
+    def issue(self, *roles: str, lifetime: timedelta = 5 * DAY, authority: Authority | None = None) -> None:
+        """Make the certificates of these roles."""
+        for role in roles:
+            signed, key = (authority or self.authority).issue(role, HOSTS, lifetime)
+            files = self.folder / f"{role}.pem", self.folder / f"{role}.key"
+            write_pair(*files, signed, key, replace=True)

@@ -1,0 +1,106 @@
+"""Acquisition and its router lose each other for longer than a lease: nothing is lost, and the alarm comes.
+
+A fan has its fault while the link is cut. Afterwards the samples are fetched, judged as if nothing had happened, and
+recorded.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.bus.link import LEASE_MS
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from pipeline.launch.site_watcher import SiteWatcher
+from pipeline.recordings.reading import read_recording
+from schemas.messages import Alarm, Grid, Transition
+from tests.support.running_chain import SITE, TRAY, Chain, RunningCommand, eventually, fantwin, published, view_of
+from tests.support.tcp_relay import TcpRelay
+
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
+
+FAULTY = 2
+BEFORE_S, FAULT = 10.0, f"inlet:fan={FAULTY},start=14,stop=16,size=2.5"
+CUT_S = int(LEASE_MS) / 1000 + 3.0
+"""the whole fault lies in it"""
+STEP_NS = 10_000_000
+CLIENTS = ("bus.mode='client'", "scorer.baseline_s=2", "twin_integrator.warm_up_s=2")
+JUDGES = ["resampler", "twin_integrator", "scorer", "recorder"]
+
+
+class Site:
+    """The chain behind a router, and acquisition behind a relay, under a launcher of its own as on another host."""
+
+    def __init__(self, folder: Path, endpoint: str) -> None:
+        self.router = RunningCommand(["router", "--listen", endpoint])
+        self.relay = TcpRelay(endpoint)
+        self.judges = self._chain(folder / "judges", endpoint, JUDGES)
+        self.source = self._chain(folder / "source", self.relay.endpoint, ["acquisition"])
+
+    def close(self) -> None:
+        self.judges.close()
+        self.source.close()
+        self.relay.close()
+        self.router.kill()
+
+    def _chain(self, folder: Path, endpoint: str, stages: list[str]) -> Chain:
+        folder.mkdir()
+        return Chain(folder, endpoint, *CLIENTS, f"launcher.stages={json.dumps(stages)}", viewer=False)
+
+
+@pytest.fixture
+def site(tmp_path: Path, endpoint: str) -> Iterator[Site]:
+    site = Site(tmp_path, endpoint)
+    try:
+        yield site
+    finally:
+        site.close()
+
+
+def grids(site: Site) -> list[Grid]:
+    messages = [entry.message for path in site.judges.recordings() for entry in read_recording(path, ("grid",))]
+    return [message for message in messages if isinstance(message, Grid)]
+
+
+def alarms(site: Site) -> list[Alarm]:
+    messages = [entry.message for path in site.judges.recordings() for entry in read_recording(path, ("alarm",))]
+    return [message for message in messages if isinstance(message, Alarm)]
+
+
+def test_row_16_a_cut_that_hides_a_whole_fault_loses_nothing_and_no_alarm(site):
+    judges = site.judges.start_up()
+    with Bus(BusConfig(mode="client", endpoint=site.judges.endpoint), threading.Event()) as bus:
+        watcher = SiteWatcher(bus, SITE)
+        eventually(lambda: len(watcher.alive()) == len(JUDGES), "the stages that judge are at work")
+        device = site.source.start_tray("--fault", FAULT)
+        source = site.source.start_up()
+        eventually(lambda: published(view_of(watcher, "scorer")) > BEFORE_S * 20, "the first seconds are scored")
+        site.relay.cut()
+        threading.Event().wait(CUT_S)
+        assert not [line for line in judges.lines if "ALARM" in line], "nobody has seen the fault"
+        site.relay.heal()
+        judges.line_with(f"ALARM  {TRAY}  fan {FAULTY}")
+        judges.line_with(f"cleared  {TRAY}  fan {FAULTY}")
+    assert device.end() == 0
+    sent = device.output()["samples_sent"]
+    for up in (source, judges):
+        assert up.end() == 0, up.lines[-10:]
+        assert not any(up.output()["lost"].values())
+    found = grids(site)
+    times = np.concatenate([grid.t_ns for grid in found])
+    assert np.array_equal(times, np.arange(times[0], times[-1] + 1, STEP_NS))
+    valid = np.concatenate([grid.valid.all(axis=1) for grid in found])
+    last = np.flatnonzero(valid)[-1]
+    assert valid[:last].all(), "the samples came late, and were judged: the only gap is after the device has ended"
+    assert last >= sent - 5
+    transitions = [alarm.transition for alarm in alarms(site) if alarm.fan == FAULTY]
+    assert (transitions[0], transitions[-1]) == (Transition.RAISED, Transition.CLEARED)
+    assert transitions.count(Transition.RAISED) == 1
+    verified = fantwin("replay", "--offline", "--verify", *site.judges.recordings())
+    assert verified.returncode == 0, verified.stdout + verified.stderr
