@@ -40,6 +40,9 @@ SOURCE_KINDS: dict[str, SourceKind] = {
     "modbus": SourceKind(
         config="pipeline.devices.modbus_config:ModbusConfig", source="pipeline.devices.modbus_source:ModbusSource"
     ),
+    "redfish": SourceKind(
+        config="pipeline.devices.redfish_config:RedfishConfig", source="pipeline.devices.redfish_source:RedfishSource"
+    ),
 }
 
 

@@ -1,0 +1,70 @@
+"""Settings of a baseboard controller: `source = { kind = "redfish", url = "https://bmc1" }`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+from urllib.parse import urlsplit
+
+from pydantic import Field, field_validator
+
+from pipeline.devices.polling import SLOWEST_S, PolledConfig
+from schemas.tacho import LONGEST_WINDOW_S, Tacho
+
+USER_VARIABLE, PASSWORD_VARIABLE = "FANTWIN_REDFISH_USER", "FANTWIN_REDFISH_PASSWORD"
+
+
+class RedfishConfig(PolledConfig, frozen=True):
+    """Fans of a server by its baseboard controller. The extra `redfish` of the installation is needed."""
+
+    kind: Literal["redfish"] = "redfish"
+    period_s: float = Field(default=1.0, gt=0, le=SLOWEST_S, description="time between two readings")
+    url: str = Field(description="of the controller, for example https://bmc1; without user and password")
+    chassis: str = Field(default="", description="Id of the chassis; needed where the controller has several")
+    fans: tuple[str, ...] = Field(
+        default=(), description="names or ids of the fans, in the order of the tray; without it all, as they are listed"
+    )
+    command: str = Field(
+        default="/SpeedPercent/Reading",
+        pattern="^/",
+        description="where the command is in the object of a fan (JSON pointer), in the unit of the tray",
+    )
+    temperature: str = Field(
+        default="",
+        description="name of the sensor of the air (Thermal), or key of TemperatureSummaryCelsius (ThermalSubsystem)",
+    )
+    credentials: Path | None = Field(
+        default=None,
+        description=f"file of two lines, user and password, that only its owner may read; without it the environment, "
+        f"{USER_VARIABLE} and {PASSWORD_VARIABLE}",
+    )
+    verify: bool = Field(default=True, description="whether the certificate of the controller is checked")
+    ca: Path | None = Field(default=None, description="certificate of the authority that signed that of the controller")
+    timeout_s: float = Field(default=5.0, gt=0, le=60, description="for the answer to one request")
+    average_s: float | None = Field(
+        default=None,
+        gt=0,
+        le=LONGEST_WINDOW_S,
+        description="over how long the controller measures a speed; without it, what it measures is not known",
+    )
+    update_s: float = Field(
+        default=0.0, ge=0, le=LONGEST_WINDOW_S, description="time between new speeds; default: average_s"
+    )
+    delay_s: float = Field(default=0.0, ge=0, le=LONGEST_WINDOW_S, description="how old a new speed is")
+
+    @field_validator("url")
+    @classmethod
+    def _plain_address(cls, value: str) -> str:
+        parts = urlsplit(value)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise ValueError("write the address of the controller, for example https://bmc1")
+        if parts.username is not None:
+            raise ValueError("a configuration is recorded: put user and password into the file of `credentials`")
+        return value
+
+    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
+        """The mean over average_s."""
+        del fans
+        if self.average_s is None:
+            return None
+        return (Tacho(kind="average", window_s=self.average_s, update_s=self.update_s, delay_s=self.delay_s),)
