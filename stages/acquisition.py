@@ -413,7 +413,8 @@ def build(context: Context) -> BuiltStage:
 def check(context: Context) -> list[str]:
     """What would keep the source from connecting."""
     try:
-        return build_tray_source(context).check()
+        source = build_tray_source(context)
+        return [] if context.is_running and context.tray.source.takes_port else source.check()
     except StageError as error:
         return [str(error)]
 

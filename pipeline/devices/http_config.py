@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -13,6 +13,8 @@ from pipeline.devices.sample_source import SourceConfig
 
 class HttpConfig(SourceConfig, frozen=True):
     """An HTTP server for one tray, in its acquisition: docs/how-to/sources.md, docs/reference/json-samples.md."""
+
+    takes_port: ClassVar[bool] = True
 
     kind: Literal["http"] = "http"
     host: str = Field(

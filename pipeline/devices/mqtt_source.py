@@ -71,7 +71,8 @@ class MqttSource:
         self._is_refused = False
         """by the broker, which ends the connection next"""
         self._stopping = False
-        self._client = self._new_client(context)
+        self._context = context
+        self._client = self._new_client(config.client_id)
 
     @property
     def name(self) -> str:
@@ -117,7 +118,8 @@ class MqttSource:
     def check(self) -> list[str]:
         """Whether the broker answers and accepts this client."""
         problems: list[str] = []
-        client, has_answered = self._client, threading.Event()
+        # with an id of its own: the broker ends the connection of another client with the same one
+        client, has_answered = self._new_client(""), threading.Event()
 
         def on_connect(_client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
             if reason.is_failure:
@@ -137,15 +139,15 @@ class MqttSource:
         client.loop_stop()
         return problems
 
-    def _new_client(self, context: SourceContext) -> Client:
+    def _new_client(self, client_id: str) -> Client:
         from paho.mqtt import client as paho  # noqa: PLC0415  an extra
         from paho.mqtt.enums import CallbackAPIVersion  # noqa: PLC0415
 
-        config = self._config
+        config, context = self._config, self._context
         client = paho.Client(
             CallbackAPIVersion.VERSION2,
-            config.client_id,
-            clean_session=not config.client_id,
+            client_id,
+            clean_session=not client_id,
             protocol=paho.MQTTv311,
         )
         client.reconnect_delay_set(RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S)

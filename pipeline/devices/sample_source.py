@@ -28,6 +28,9 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     takes_pushed: ClassVar[bool] = False
     """whether the samples of the tray are those that clients push over the bus"""
 
+    takes_port: ClassVar[bool] = False
+    """whether the source takes something that only one process can have, so that a check fails while it runs"""
+
     kind: str
 
     @property

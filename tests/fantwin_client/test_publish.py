@@ -18,6 +18,7 @@ from schemas.topics import BY_NAME
 from stages.acquisition import AcquisitionCore, limits_of
 from tests.support.running_acquisition import SITE, TRAY, Raws, acquisition, push_config, raws_of
 from tests.support.running_chain import eventually
+from tests.support.site_certificates import SiteCertificates
 
 RPM = 2 * np.pi / 60
 T_S = 1_790_000_000.0
@@ -217,3 +218,16 @@ def test_a_date_in_summer_time_is_the_moment_it_names() -> None:
     assert times_ns([moment, moment + zone]).tolist() == [1782914400000000000, 1782921600000000000]
     assert times_ns(1.5).tolist() == [1_500_000_000]
     assert times_ns(1_790_000_000.123456) == pytest.approx(1_790_000_000_123_456_000, abs=300)
+
+
+def test_with_certificates_a_source_publishes(endpoint: str, tmp_path: Path) -> None:
+    certificates = SiteCertificates(tmp_path)
+    certificates.issue("acquisition", "source")
+    endpoint = endpoint.replace("tcp/", "tls/")
+    security = certificates.security.model_dump(exclude={"controllers"})
+    lines = "\n".join(f'{name} = "{path}"' for name, path in security.items())
+    config = push_config(endpoint, tmp_path, more=f"[bus.security]\n{lines}\n")
+    with acquisition(config), fantwin_client.connect(endpoint, SITE, security=security) as client:
+        tray = client.tray(TRAY)
+        tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])
+        assert tray.check(10).received == 1

@@ -10,6 +10,7 @@ import subprocess
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from http.client import HTTPConnection, HTTPSConnection
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,8 @@ from pipeline.devices.sample_source import (
     SourceEvent,
 )
 from pipeline.errors import UserError
+from pipeline.runtime.stage import Context
+from stages.acquisition import STAGE
 from tests.support.mqtt_broker import free_port
 from tests.support.running_acquisition import Raws, acquisition, push_config, raws_of
 from tests.support.running_chain import eventually
@@ -156,6 +159,16 @@ def test_a_port_that_is_taken_is_reported_and_tried_again(monkeypatch: pytest.Mo
     assert source_events[0] == LinkDown(problem)
     eventually(lambda: isinstance(source_events[-1], LinkUp), "it listens once the port is free")
     source.stop()
+
+
+def test_a_check_does_not_mind_the_port_that_its_own_acquisition_has(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        config = push_config("tcp/127.0.0.1:7447", tmp_path, source=f'{{ kind = "http", port = {port} }}')
+        section = config.sections["acquisition"]
+        context = Context("plant", config.trays, section, tmp_path, tmp_path, started_t_ns=0)
+        assert len(STAGE.check(context)) == 1
+        assert STAGE.check(replace(context, is_running=True)) == []
 
 
 def test_https(tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -195,7 +197,7 @@ def test_a_user_and_a_broker_that_proves_itself(tmp_path: Path, monkeypatch: pyt
     server = str(tmp_path / "server.pem")
     broker = MqttBroker(plugin, ssl=True, certfile=server, keyfile=server)
     broker.start()
-    settings = {"topic": "a", "tls": True, "ca": "ca.pem", "username": "plant"}
+    settings: dict[str, Any] = {"topic": "a", "tls": True, "ca": "ca.pem", "username": "plant"}
     monkeypatch.setenv("PLANT_PASSWORD", "secret")
     assert source_of(broker.port, tmp_path, **settings, password_env="PLANT_PASSWORD").check() == []
     password = tmp_path / "password"
@@ -250,3 +252,28 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.Mon
 def test_settings_that_do_not_fit_are_refused(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ValidationError, match=words.replace("{", r"\{").replace("+", r"\+")):
         MqttConfig.model_validate({"host": "broker", **settings})
+
+
+@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="needs mosquitto: amqtt forgets a client that has left")
+def test_with_a_client_id_the_broker_keeps_messages_while_acquisition_is_away(tmp_path: Path) -> None:
+    port = free_port()
+    (tmp_path / "mosquitto.conf").write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
+    process = subprocess.Popen(["mosquitto", "-c", tmp_path / "mosquitto.conf"], stderr=subprocess.DEVNULL)
+    try:
+        settings: dict[str, Any] = {"topic": "plant/kept", "client_id": "fantwin-tray1"}
+        eventually(lambda: source_of(port, **settings).check() == [], "the broker answers")
+        with running(source_of(port, **settings)) as events:
+            assert isinstance(events[0], LinkUp)
+        client = paho.Client(CallbackAPIVersion.VERSION2)
+        client.connect("127.0.0.1", port)
+        client.loop_start()
+        for number in range(3):
+            client.publish("plant/kept", SAMPLE.replace("1.0", f"{number}.0"), 1).wait_for_publish(10)
+        client.disconnect()
+        client.loop_stop()
+        with running(source_of(port, **settings)) as events:
+            eventually(lambda: len(events.items) == 3, "what was published meanwhile comes")
+        assert [item.clock_us for item in events.items if isinstance(item, Reading)] == [0, 1_000_000, 2_000_000]
+    finally:
+        process.terminate()
+        process.wait()
