@@ -306,8 +306,8 @@ def _views(layout: _Layout, data: bytes, names: AbstractSet[str | None]) -> tupl
     """The fields that are no columns, parsed, and the named columns by name, flat, as they lie in `data`.
 
     Raises:
-        _OtherFormError: a column that is not optional is missing, or one is in several pieces, or not packed as
-            `encode` does it.
+        _OtherFormError: a column that is not optional is missing; one is in several pieces, or not packed as `encode`
+            does it.
         CodecError: the rest cannot be parsed, or a value is out of its limits.
         WireError: these are no fields.
     """

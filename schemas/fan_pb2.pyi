@@ -20,6 +20,7 @@ class InvalidReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     INVALID_REASON_CLOCK_RESTARTED: _ClassVar[InvalidReason]
     INVALID_REASON_STOPPED: _ClassVar[InvalidReason]
     INVALID_REASON_STARTING: _ClassVar[InvalidReason]
+    INVALID_REASON_CONDITIONS_UNKNOWN: _ClassVar[InvalidReason]
 
 class FanState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -110,6 +111,7 @@ INVALID_REASON_NO_TWIN: InvalidReason
 INVALID_REASON_CLOCK_RESTARTED: InvalidReason
 INVALID_REASON_STOPPED: InvalidReason
 INVALID_REASON_STARTING: InvalidReason
+INVALID_REASON_CONDITIONS_UNKNOWN: InvalidReason
 FAN_STATE_UNKNOWN: FanState
 FAN_STATE_NORMAL: FanState
 FAN_STATE_SUSPECT: FanState
@@ -292,7 +294,7 @@ class Grid(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Prediction(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command", "reading_range_rad_s", "averaged_command", "reading_missing", "supply_voltage_v", "current_a", "temperature_c")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command", "reading_range_rad_s", "averaged_command", "reading_missing", "air_density_ratio", "supply_voltage_v", "current_a", "temperature_c")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -309,6 +311,7 @@ class Prediction(_message.Message):
     READING_RANGE_RAD_S_FIELD_NUMBER: _ClassVar[int]
     AVERAGED_COMMAND_FIELD_NUMBER: _ClassVar[int]
     READING_MISSING_FIELD_NUMBER: _ClassVar[int]
+    AIR_DENSITY_RATIO_FIELD_NUMBER: _ClassVar[int]
     SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
     CURRENT_A_FIELD_NUMBER: _ClassVar[int]
     TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
@@ -328,10 +331,11 @@ class Prediction(_message.Message):
     reading_range_rad_s: _containers.RepeatedScalarFieldContainer[float]
     averaged_command: _containers.RepeatedScalarFieldContainer[float]
     reading_missing: _containers.RepeatedScalarFieldContainer[bool]
+    air_density_ratio: _containers.RepeatedScalarFieldContainer[float]
     supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
     current_a: _containers.RepeatedScalarFieldContainer[float]
     temperature_c: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., air_density_ratio: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Score(_message.Message):
     __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic", "supply_voltage_v", "current_a", "temperature_c", "former_command", "former_measured_speed_rad_s", "former_predicted_speed_rad_s", "former_band_variance", "former_smoothed_residual_rad_s", "former_torque_balance_command", "former_speed_baseline_rad_s", "former_balance_baseline_command", "former_score")

@@ -34,6 +34,7 @@ class InvalidReason(OpenEnum):
     CLOCK_RESTARTED = 8
     STOPPED = 9
     STARTING = 10
+    CONDITIONS_UNKNOWN = 11
 
 
 class FanState(OpenEnum):
@@ -277,6 +278,8 @@ class Prediction:
     averaged_command: Array = column("samples x fans", np.float64, optional=True)
     reading_missing: Array = column("samples x fans", np.bool_, optional=True)
     """as in Grid"""
+    air_density_ratio: Array = column("samples x fans", np.float64, optional=True)
+    """of a twin that needs the temperature: relative to its reference. Its balance is that of speeds times this"""
     supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
     current_a: Array = column("samples x fans", np.float32, optional=True)
     temperature_c: Array = column("samples x fans", np.float32, optional=True)

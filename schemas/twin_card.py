@@ -20,6 +20,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_vali
 from pydantic.dataclasses import dataclass
 
 from schemas.model_uncertainty import ModelUncertainty
+from schemas.reference_conditions import ReferenceConditions
 from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 
@@ -229,7 +230,8 @@ class TwinCard:
     square of the distance of healthy readings from those that the tachos may show of the free run, of fans that neither
     start nor stand; empty in early cards and where tachos are instantaneous: it is sigma_rad_s there.
     model_uncertainty: how far the twin itself may be wrong at each speed and command, for each fan; of hybrids only,
-    None for other kinds and in early cards.
+    None for other kinds and in early cards. conditions: the supply voltage and the air for which it holds, and so the
+    columns that it needs beside the command (schemas.reference_conditions); None: none, as in early cards.
     """
 
     kind: str
@@ -263,6 +265,7 @@ class TwinCard:
     drive: DriveCard | None = None
     reading_sigma_rad_s: tuple[Positive, ...] = ()
     model_uncertainty: ModelUncertainty | None = None
+    conditions: ReferenceConditions | None = None
     format_version: int = FORMAT_VERSION
 
     @model_validator(mode="after")

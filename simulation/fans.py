@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from simulation.faults import Fault, disturbance, four_pin_damage
 from simulation.four_pin import FourPinFans, FourPinParameters, four_pin_tray
 from simulation.plant import HEALTHY, Array, FanParameters, advance, at_rest, tray_of_fans
+from simulation.surroundings import BACK_EMF_SHARE, RESISTANCE_OHM
 
 FanKind = Literal["dc", "4-pin"]
 
@@ -47,11 +49,11 @@ def simulated_fans(kind: FanKind, fans: int, fans_seed: int, fan_variation: floa
         SimulationError: fan_variation is out of range.
     """
     if kind == "dc":
-        return _DcFans(tray_of_fans(fans, fans_seed, fan_variation))
+        return DcFans(tray_of_fans(fans, fans_seed, fan_variation))
     return _FourPinTray(four_pin_tray(fans, fans_seed, fan_variation), np.random.default_rng(seed), fans)
 
 
-class _DcFans:
+class DcFans:
     """Fans by the equation of motion of `simulation.plant`."""
 
     longest_step_s = math.inf
@@ -59,17 +61,42 @@ class _DcFans:
     def __init__(self, parameters: FanParameters) -> None:
         self.parameters = parameters
         self._state = at_rest(len(np.asarray(parameters.J)))
-        self._disturbance = HEALTHY
+        self._damage = self._disturbance = HEALTHY
+        self._around = (1.0, 1.0)
 
     @property
     def speed_rad_s(self) -> Array:
+        """See Fans."""
         return self._state.speed_rad_s
 
+    @property
+    def supply_v(self) -> Array:
+        """(fans,) voltage of their drives now."""
+        return np.broadcast_to(self.parameters.supply_v * self._disturbance.supply_factor, self.speed_rad_s.shape)
+
+    @property
+    def current_a(self) -> Array:
+        """(fans,) that they take now, A: what drives it less what the turning motor induces."""
+        back_emf_v = BACK_EMF_SHARE * self.parameters.alpha * self.speed_rad_s
+        return (self._state.current_v - back_emf_v) / RESISTANCE_OHM
+
     def advance(self, duty: Array, duration_s: float) -> None:
+        """See Fans."""
         self._state = advance(self._state, duty, duration_s, self.parameters, self._disturbance)
 
     def set_faults(self, faults: Sequence[Fault], t_s: float) -> None:
-        self._disturbance = disturbance(faults, len(self.speed_rad_s), t_s)
+        """See Fans."""
+        self._damage = disturbance(faults, len(self.speed_rad_s), t_s)
+        self.surround(*self._around)
+
+    def surround(self, supply_factor: float, drag_factor: float) -> None:
+        """The supply voltage and the drag are changed by these factors from now on, beside faults."""
+        self._around = supply_factor, drag_factor
+        self._disturbance = replace(
+            self._damage,
+            supply_factor=self._damage.supply_factor * supply_factor,
+            drag_factor=self._damage.drag_factor * drag_factor,
+        )
 
 
 class _FourPinTray(FourPinFans):

@@ -8,6 +8,7 @@ takes them as fast as they are computed, and the same seed gives both the same s
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -16,9 +17,10 @@ from numpy.typing import NDArray
 
 from simulation.errors import SimulationError
 from simulation.excitation import excitation
-from simulation.fans import FanKind, simulated_fans
+from simulation.fans import DcFans, FanKind, simulated_fans
 from simulation.faults import Fault, check_schedule, tacho_faults
 from simulation.plant import DeviceClock
+from simulation.surroundings import Surroundings, SurroundingsNow
 from simulation.tacho import TachoSettings, simulated_tacho
 
 Array: TypeAlias = NDArray[np.float64]
@@ -53,6 +55,7 @@ class TraySettings:
     tacho: TachoSettings = TachoSettings()
     clock: DeviceClock = DeviceClock()
     faults: tuple[Fault, ...] = ()
+    surroundings: Surroundings = Surroundings()
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,8 @@ class TraySample:
     command: Array
     speed_rad_s: Array
     lost: bool
+    auxiliary: Mapping[str, Array]
+    """(fans,) what is measured beside command and speed, by the name of its column"""
 
 
 class SimulatedTray:
@@ -85,6 +90,8 @@ class SimulatedTray:
             settings.fan, settings.fans, settings.fans_seed, settings.fan_variation, seed=others[4]
         )
         self.parameters = self._plant.parameters
+        surroundings_rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(1,)))
+        self._surroundings = SurroundingsNow(settings.surroundings, surroundings_rng)
         self._tacho = simulated_tacho(settings.tacho, settings.fans, tacho)
         self._command = np.zeros(settings.fans)
         self._override = np.full(settings.fans, np.nan)
@@ -108,6 +115,7 @@ class SimulatedTray:
         speed_rad_s = self._measure(t_s)
         self._command = self._next_duty(t_s, speed_rad_s, step_s)
         self._plant.set_faults(self.settings.faults, t_s)
+        auxiliary = self._surround(t_s)
         self._record_faults(t_s)
         sample = TraySample(
             t_s,
@@ -116,6 +124,7 @@ class SimulatedTray:
             self._command,
             speed_rad_s,
             bool(self._loss_rng.random() < self.settings.lost),
+            auxiliary,
         )
         self._count += 1
         self._due_s = self._next_due_s()
@@ -173,6 +182,15 @@ class SimulatedTray:
             self._tacho.turn(start_s + piece * piece_s, before, piece_end_s, self._plant.speed_rad_s)
         self._t_s = t_s
 
+    def _surround(self, t_s: float) -> dict[str, Array]:
+        """Supply and air act from now on as they do at t_s; returns what is measured of them."""
+        if self.settings.surroundings == Surroundings():
+            return {}
+        assert isinstance(self._plant, DcFans), "checked"
+        self._surroundings.advance(t_s)
+        self._plant.surround(self._surroundings.supply_factor, self._surroundings.drag_factor)
+        return self._surroundings.measure(self._plant.supply_v, self._plant.current_a)
+
     def _measure(self, t_s: float) -> Array:
         """(fans,) tacho readings. Faults do not change which random numbers are drawn."""
         faults = tacho_faults(self.settings.faults, self.fans, t_s)
@@ -215,10 +233,15 @@ def _check(settings: TraySettings) -> None:
         ("tacho noise", settings.tacho.noise.noise_rad_s, 0.0, math.inf),
         ("missing edges", settings.tacho.missing_edges, 0.0, 1.0),
         ("double edges", settings.tacho.double_edges, 0.0, 1.0),
+        ("supply wander", settings.surroundings.supply_wander, 0.0, 0.3),
+        ("air temperature", settings.surroundings.temperature_c, -50.0, 100.0),
+        ("air swing", settings.surroundings.temperature_swing_c, 0.0, 50.0),
         ("missing readings", settings.tacho.missing_readings, 0.0, 1.0),
     )
     for name, value, smallest, largest in limits:
         if not smallest <= value <= largest:
             upto = f"to {largest:g}" if math.isfinite(largest) else "on"
             raise SimulationError(f"{name} = {value:g}; give one from {smallest:g} {upto}")
+    if settings.fan != "dc" and settings.surroundings != Surroundings():
+        raise SimulationError(f"{settings.fan} fans have no supply and no air of their own: choose dc fans for them")
     check_schedule(settings.faults, settings.fans, settings.duration_s, settings.fan)

@@ -40,6 +40,7 @@ def truth(tray: SimulatedTray, start_ns: int | None, *, complete: bool, counts: 
         "jitter_us": settings.jitter_us,
         "clock": asdict(settings.clock),
         "tacho": settings.tacho.as_record(),
+        "surroundings": asdict(settings.surroundings),
         "parameters": [
             {name: float(values[fan]) for name, values in asdict(tray.parameters).items()}
             for fan in range(settings.fans)

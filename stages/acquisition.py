@@ -205,6 +205,11 @@ class AcquisitionCore(Core):
         lost_refused = self._counts["lost_refused"] + self._sequence.refused
         return {**self._counts, **({"lost_refused": lost_refused} if lost_refused else {}), **steps}
 
+    def notes(self) -> list[str]:
+        """What the source measures beside command and speed."""
+        also = ", ".join(column.title for column in AUXILIARY if column in self._auxiliary)
+        return [f"the source measures {also}, too"] if also else []
+
     def samples_in(self, item: Item) -> int:
         """The readings in a block."""
         batches = item.batches if isinstance(item, ReadingBlock) else ()

@@ -18,6 +18,10 @@ Where the card says how fans stop and start (schemas.standstill), nothing is pre
 (STOPPED). Its free run ends, and the next one starts from measured speeds once it turns; until that has settled,
 samples are not valid (STARTING).
 
+Where the card states the conditions for which the twin holds (schemas.reference_conditions), commands are converted to
+that supply voltage, and speeds to that density of the air. A value that is missing is held, the voltage for 5 s, the
+temperature for 5 minutes; then samples are not valid (CONDITIONS_UNKNOWN), and warm up again when it is back.
+
 The *torque balance* is computed as well: the command given minus the command that a healthy fan needs for the
 measured motion. It needs no free run and is available a third of a second after the first sample
 (scoring.torque_balance).
@@ -124,9 +128,21 @@ class TwinIntegratorCore(Core):
         """docs/explanation/deciding.md explains each counter."""
         return {**self._counts, **self.tray.counters()}
 
+    def notes(self) -> list[str]:
+        """Which columns the twin needs."""
+        conditions = self._twin.card.conditions
+        return [f"twin {self._twin.card.name} allows for {conditions.in_words}"] if conditions else []
+
     def problem(self) -> str:
         """A twin that does not fit the grid it receives, or a grid whose times have gone back."""
-        return self._problem or self._old_samples.problem("grid samples", "twin_integrator and scorer")
+        old = self._old_samples.problem("grid samples", "twin_integrator and scorer")
+        return self._problem or old or self._problem_of_columns()
+
+    def _problem_of_columns(self) -> str:
+        missing, name = self.tray.missing_columns, self._twin.card.name
+        if not missing:
+            return ""
+        return f"twin {name} needs {missing}, which the source does not send: send it, or train a twin without it"
 
     def _only_new(self, grid: Grid) -> Grid:
         """The block without the samples that are not newer than those before them."""

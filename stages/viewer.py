@@ -33,7 +33,7 @@ from pipeline.viewing.fleet_view import COLUMNS, FleetView
 from pipeline.viewing.loopback import check_free
 from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
 from pipeline.viewing.stages_page import StagesPage
-from pipeline.viewing.trace import TRACE_COLUMNS, Trace, state_changes, state_name, trace_of
+from pipeline.viewing.trace import MEASURED_COLUMNS, Trace, state_changes, state_name, trace_of
 from pipeline.viewing.view_sink import ViewSink
 from schemas.codec import CodecError, decode_columns
 from schemas.envelope import Envelope
@@ -183,7 +183,7 @@ class ViewerCore(Core):
             view.newest = envelope
         if view.fans == ():
             return
-        score = self._decode(view, envelope, TRACE_COLUMNS)
+        score = self._decode(view, envelope, MEASURED_COLUMNS)
         if score is None:
             return
         view.scores.append(score)

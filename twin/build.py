@@ -36,6 +36,7 @@ from twin.models.network_ode import NetworkOde
 from twin.models.physics import PARAMETER_NAMES
 from twin.networks import ForEachNetwork, one_after_another
 from twin.progress import Progress, unreported, within
+from twin.reference import at_reference, reference_of
 from twin.runs import Array, Run, common_fans, common_tacho
 
 
@@ -81,9 +82,16 @@ def train_twin(
         runs, validation_runs = _as_if_instantaneous(runs), _as_if_instantaneous(validation_runs)
     tacho = common_tacho([*runs, *validation_runs])
     started_s = time.monotonic()
+    conditions = reference_of([*runs, *validation_runs])
+    recorded, validation_recorded = at_reference(runs, None), at_reference(validation_runs, None)
+    runs, validation_runs = at_reference(runs, conditions), at_reference(validation_runs, conditions)
     identification = identify(runs, progress=progress)
-    standstill = find_standstill([*runs, *validation_runs])
-    drive = find_drive(runs, validation_runs, identification, standstill, progress) if model_kind.knows_drives else None
+    standstill = find_standstill([*recorded, *validation_recorded])
+    drive = None
+    if model_kind.knows_drives:
+        drive = find_drive(recorded, validation_recorded, identification, standstill, progress)
+    if drive is not None:  # a fan that controls its own speed makes up for its supply, in a way that is not known
+        conditions, runs, validation_runs = None, recorded, validation_recorded
     acting, validation_acting = runs, validation_runs
     if drive is not None:
         acting, validation_acting = drive.driven(runs), drive.driven(validation_runs)
@@ -126,6 +134,7 @@ def train_twin(
         drive=drive,
         uncertainty=uncertainty,
         standstill=standstill,
+        conditions=conditions,
         tacho=tacho,
         validation_data=validation_data,
         command_unit=command_unit,
@@ -136,7 +145,8 @@ def train_twin(
 
 @dataclass(frozen=True, eq=False)
 class RunsOfTwin:
-    """A twin and runs of fans that it knows. rows: of its card, one for each fan. runs: with the tachos of the card.
+    """A twin and runs of fans that it knows. rows: of its card, one for each fan. runs: with the tachos of the card, at
+    its reference conditions.
     parameters: (fans, 4), behind a drive (fans, 7). unseen_std: what widens the band where the twin was not trained."""
 
     model: OnnxTwin | Model

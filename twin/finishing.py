@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from schemas.model_uncertainty import ModelUncertainty
+from schemas.reference_conditions import ReferenceConditions
 from schemas.standstill import Standstill
 from schemas.tacho import Tacho
 from schemas.twin_card import (
@@ -78,6 +79,7 @@ def finish_twin(
     drive: FoundDrive | None,
     uncertainty: ModelUncertainty | None,
     standstill: Standstill | None,
+    conditions: ReferenceConditions | None,
     tacho: tuple[Tacho, ...],
     validation_data: Sequence[DataCard],
     command_unit: str,
@@ -85,7 +87,7 @@ def finish_twin(
     progress: Progress,
 ) -> TrainedTwin:
     """The twin of a fitted model. parameters: (fans, 4), behind a drive (fans, 7). runs: healthy ones that it was
-    fitted to. The other arguments are those of build.train_twin.
+    fitted to, at the conditions. The other arguments are those of build.train_twin.
 
     Raises TwinError when a fan was never measured, the free run diverges, or a balance never moves.
     """
@@ -148,6 +150,7 @@ def finish_twin(
         command_unit=command_unit,
         tacho=tacho[:1] if len(set(tacho)) == 1 else tacho,
         standstill=standstill,
+        conditions=conditions,
         drive=drive.card if drive else None,
         reading_sigma_rad_s=_reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces),
         model_uncertainty=uncertainty,

@@ -20,6 +20,7 @@ from twin.models.drive import DRIVE_PARAMETERS
 from twin.models.hybrid import Hybrid
 from twin.models.physics import PARAMETER_NAMES
 from twin.progress import Progress, unreported
+from twin.reference import at_reference
 from twin.runs import Array, Run, common_fans, common_tacho
 
 
@@ -53,6 +54,8 @@ def place_twin(
     started_s = time.monotonic()
     fans = common_fans([*runs, *validation_runs])
     drive = _typical_drive(model, card, fans)
+    standstill = find_standstill([*runs, *validation_runs]) or card.standstill
+    runs, validation_runs = at_reference(runs, card.conditions), at_reference(validation_runs, card.conditions)
     acting = drive.driven(runs) if drive else runs
     identification, of_unknowns = place_fans(model.network, card, acting, _correlated_samples(card, runs), progress)
     uncertainty = None
@@ -84,7 +87,8 @@ def place_twin(
         training=training,
         drive=drive,
         uncertainty=uncertainty,
-        standstill=find_standstill([*runs, *validation_runs]) or card.standstill,
+        standstill=standstill,
+        conditions=card.conditions,
         tacho=tacho,
         validation_data=validation_data,
         command_unit=card.command_unit,

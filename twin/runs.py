@@ -4,8 +4,8 @@ Units: time in seconds, speed in rad/s, command in whatever unit the caller uses
 A speed of NaN is a missing sample; a command is never missing, because the twin is driven by it.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -26,7 +26,8 @@ class Run:
 
     t_s: (n,) strictly increasing, irregular steps allowed. command: (n, fans), held from its sample to the next.
     speed_rad_s: (n, fans) readings, NaN where missing. One-dimensional command and speed mean a single fan.
-    tacho: of each fan what its readings are of its speed; one that all have in common is repeated.
+    tacho: of each fan what its readings are of its speed; one that all have in common is repeated. auxiliary: what else
+    was measured, (n, fans) each, NaN where not, by name: supply_voltage_v, temperature_c and others that are not used.
     Raises TwinError when the shapes disagree, time does not increase, or a time or command is not finite.
     """
 
@@ -35,6 +36,7 @@ class Run:
     command: Array
     speed_rad_s: Array
     tacho: tuple[Tacho, ...] = INSTANTANEOUS
+    auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
 
     def __post_init__(self) -> None:
         t_s = np.array(self.t_s, dtype=np.float64)
@@ -57,9 +59,9 @@ class Run:
             )
         if np.any(np.isinf(speed_rad_s)):
             raise TwinError(f"run {self.name!r}: a speed is infinite; mark missing speeds with NaN")
-        for field, value in (("t_s", t_s), ("command", command), ("speed_rad_s", speed_rad_s)):
+        for name, value in (("t_s", t_s), ("command", command), ("speed_rad_s", speed_rad_s)):
             value.setflags(write=False)
-            object.__setattr__(self, field, value)
+            object.__setattr__(self, name, value)
         try:
             object.__setattr__(self, "tacho", tacho_of_each_fan(self.tacho, command.shape[1]))
         except ValueError as error:
@@ -101,6 +103,7 @@ class Run:
             command=self.command[:, column],
             speed_rad_s=self.speed_rad_s[:, column],
             tacho=self.tacho[column],
+            auxiliary={name: of[:, column] for name, of in self.auxiliary.items()},
         )
 
     def between(self, start_s: float, stop_s: float) -> "Run":
@@ -111,7 +114,17 @@ class Run:
     def rows(self, first: int, last: int) -> "Run":
         """The samples first <= k < last."""
         part = slice(first, last)
-        return replace(self, t_s=self.t_s[part], command=self.command[part], speed_rad_s=self.speed_rad_s[part])
+        return replace(
+            self,
+            t_s=self.t_s[part],
+            command=self.command[part],
+            speed_rad_s=self.speed_rad_s[part],
+            auxiliary=self.auxiliary_in(part),
+        )
+
+    def auxiliary_in(self, rows: slice | NDArray[np.intp]) -> dict[str, Array]:
+        """The auxiliary columns in some rows."""
+        return {name: of[rows] for name, of in self.auxiliary.items()}
 
     def equal_parts(self, max_samples: int) -> list[tuple[int, int]]:
         """First and last row, for rows(), of about equal parts of at most max_samples; a lone sample is left out."""

@@ -14,9 +14,9 @@ import difflib
 import math
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import islice
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain, islice
 from pathlib import Path
 from typing import TextIO
 
@@ -35,6 +35,7 @@ _DELIMITERS = ",;\t"
 LONGEST_LINE = 1 << 20
 """characters"""
 _ROWS_IN_PIECE = 4096
+NO_COLUMNS: Mapping[str, Sequence[str]] = {}
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,8 @@ class Table:
     repairs: Repairs
     assumed: str = ""
     """units that were assumed, and how to give them, in one line; empty if all were given"""
+    auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    """what else was measured, (n, fans) each, NaN where not, by its name in schemas.auxiliary"""
 
     @property
     def fans(self) -> int:
@@ -113,14 +116,21 @@ class Table:
 
 
 def read_table(
-    path: Path, time: str | None, command: Sequence[str], speed: Sequence[str], *, period: str | None = None
+    path: Path,
+    time: str | None,
+    command: Sequence[str],
+    speed: Sequence[str],
+    *,
+    period: str | None = None,
+    auxiliary: Mapping[str, Sequence[str]] = NO_COLUMNS,
 ) -> Table:
     """Read a measured table.
 
     time: `COLUMN` or `COLUMN:UNIT` with unit s, ms, us, ns or iso (dates; without a time zone they are taken as UTC).
     Without a unit, numbers are seconds and anything else is a date. None: no such column, samples are `period` apart,
     for example `10ms`. command: one column per fan, or one for all. speed: `COLUMN` or `COLUMN:UNIT`, one per fan,
-    unit rad/s (the default), rpm, hz (revolutions a second) or deg/s.
+    unit rad/s (the default), rpm, hz (revolutions a second) or deg/s. auxiliary: one column for all fans, or one per
+    fan, by the name of what it is (schemas.auxiliary), in its unit.
 
     Raises:
         UserError: the file, a column or a unit cannot be used.
@@ -144,9 +154,10 @@ def read_table(
         raise UsageError(f"speeds in {', '.join(unit or 'no unit' for _, _, unit in found)}: give all in one unit")
     unit = found[0][2] or "rad/s"
     speeds = [NumberColumn(path, name, index) for name, index, _ in found]
+    others = {name: _auxiliary(path, name, given, names, len(speeds)) for name, given in auxiliary.items() if given}
     count = 0
     for piece in _pieces(rows, len(names)):
-        for column in (*filter(None, [times]), *commands, *speeds):
+        for column in (*filter(None, [times]), *commands, *speeds, *chain.from_iterable(others.values())):
             column.add(piece)
         count += len(piece)
     t_ns, has_time = times.values() if times else _counted_times(count, period or "")
@@ -154,8 +165,17 @@ def read_table(
     speed_rad_s = np.column_stack([column.values() for column in speeds])
     speed_rad_s *= RAD_S_PER_TABLE_UNIT[unit]
     assumed = _assumed(times.name if times and times.is_assumed else "", "" if found[0][2] else found[0][0])
-    table = clean_samples(path, t_ns, has_time, command_values, speed_rad_s, unit)
-    return replace(table, assumed=assumed)
+    of_all = [column.values() for columns in others.values() for column in columns * (len(speeds) // len(columns))]
+    table = clean_samples(path, t_ns, has_time, command_values, np.column_stack([speed_rad_s, *of_all]), unit)
+    of_speed, *measured = np.split(table.speed_rad_s, len(others) + 1, axis=1)
+    return replace(table, assumed=assumed, speed_rad_s=of_speed, auxiliary=dict(zip(others, measured, strict=True)))
+
+
+def _auxiliary(path: Path, what: str, given: Sequence[str], names: list[str], fans: int) -> list[NumberColumn]:
+    """The columns of one quantity beside command and speed."""
+    if len(given) not in (1, fans):
+        raise UsageError(f"{len(given)} columns of {what} for {fans} fans: give one for all fans, or one per fan")
+    return [NumberColumn(path, *_column(path, each, names, ())[:2]) for each in given]
 
 
 def _pieces(rows: Iterator[list[str]], width: int) -> Iterator[list[list[str]]]:
@@ -212,7 +232,7 @@ def _column(path: Path, given: str, names: list[str], units: Iterable[str]) -> t
         raise UserError(f"{path}: {names.count(name)} columns are called {name!r}; rename them in its first line")
     unit, units = unit.strip().lower(), list(units)
     if unit and unit not in units:
-        known = f"known: {', '.join(units)}" if units else "a command has no unit"
+        known = f"known: {', '.join(units)}" if units else "it has no unit here"
         raise UsageError(f"{given!r}: unknown unit {unit!r}; {known}")
     return name, names.index(name), unit
 
@@ -245,7 +265,8 @@ def _counted_times(rows: int, period: str) -> tuple[Array, Array]:
 
 
 def clean_samples(path: Path, t_ns: Array, has_time: Array, command: Array, speed_rad_s: Array, unit: str) -> Table:
-    """Sort rows by time, hold commands, merge rows of the same time, and count all of it.
+    """Sort rows by time, hold commands, merge rows of the same time, and count all of it. speed_rad_s: and after the
+    columns of the fans any others that may be missing, which are treated alike.
 
     A step that changes nothing copies nothing: most tables are in order and may be large.
     """
@@ -275,7 +296,8 @@ def clean_samples(path: Path, t_ns: Array, has_time: Array, command: Array, spee
     first = np.flatnonzero(np.diff(t_ns, prepend=t_ns[:1] - 1))
     if len(first) < 2:
         raise UserError(f"{path}: fewer than two rows with a time and a command")
-    speeds_missing, repeated = int(np.count_nonzero(np.isnan(speed_rad_s))), len(t_ns) - len(first)
+    speeds_missing = int(np.count_nonzero(np.isnan(speed_rad_s[:, : command.shape[1]])))
+    repeated = len(t_ns) - len(first)
     if repeated:
         last = np.append(first[1:], len(t_ns)) - 1
         t_ns, held, speed_rad_s = t_ns[first], held[last], _means(speed_rad_s, first)

@@ -15,7 +15,7 @@ import termios
 import threading
 import time
 import tty
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -50,6 +50,8 @@ class DeviceSample(Protocol):
     def speed_rad_s(self) -> NDArray[np.float64]: ...  # noqa: D102
     @property
     def lost(self) -> bool: ...  # noqa: D102
+    @property
+    def auxiliary(self) -> Mapping[str, NDArray[np.float64]]: ...  # noqa: D102  by the names of schemas.auxiliary
 
 
 class Device(Protocol):
@@ -258,7 +260,9 @@ def play(
 
 def _frame(sample: DeviceSample, rad_s_per_unit: float) -> wire.Sample:
     speed = sample.speed_rad_s / rad_s_per_unit
-    return wire.Sample(sample.clock_us, sample.sequence, tuple(sample.command.tolist()), tuple(speed.tolist()))
+    auxiliary = {name: tuple(values.tolist()) for name, values in sample.auxiliary.items()}
+    command = tuple(sample.command.tolist())
+    return wire.Sample(sample.clock_us, sample.sequence, command, tuple(speed.tolist()), **auxiliary)
 
 
 def _receive_until(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ class TableSample:
     sequence: int
     command: NDArray[np.float64]
     speed_rad_s: NDArray[np.float64]
+    auxiliary: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, NDArray[np.float64]])
     lost: bool = False
 
 
@@ -45,6 +47,7 @@ class TableDevice:
         self._clock_us = (t_ns - t_ns[0]) // 1000 % 2**32
         self._command = table.command[rows]
         self._speed_rad_s = table.speed_rad_s[rows]
+        self._auxiliary = {name: values[rows] for name, values in table.auxiliary.items()}
         self._next = 0
         self.fans = table.fans
 
@@ -57,7 +60,12 @@ class TableDevice:
         row = self._next
         self._next += 1
         return TableSample(
-            float(self._t_s[row]), int(self._clock_us[row]), row, self._command[row], self._speed_rad_s[row]
+            float(self._t_s[row]),
+            int(self._clock_us[row]),
+            row,
+            self._command[row],
+            self._speed_rad_s[row],
+            {name: values[row] for name, values in self._auxiliary.items()},
         )
 
     def command(self, values: NDArray[np.float64]) -> None:

@@ -7,8 +7,8 @@ The time of a sample is computed as in the pipeline, from the device clock if th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from pipeline.devices.device_clock import DeviceClock
 from pipeline.devices.measured_table import hold_last
 from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from schemas.auxiliary import AUXILIARY, auxiliary_columns
 from schemas.messages import Array, Raw
 from schemas.tacho import Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
@@ -38,6 +39,8 @@ class RecordedRun:
     """(n, fans), never NaN"""
     speed_rad_s: Array
     """(n, fans), NaN where the tacho gave no reading"""
+    auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    """(n, fans) each, NaN where not known: what the source measures beside, by name (schemas.auxiliary)"""
 
 
 @dataclass(frozen=True)
@@ -104,12 +107,15 @@ def read_runs(
 
 def merged(messages: Sequence[Raw]) -> list[Raw]:
     """The same samples in as few messages as possible; the many arrays of small ones take more memory than samples."""
-    groups = groupby(messages, key=lambda raw: (raw.fans, len(raw.device_clock_us) > 0, raw.tachos))
+    groups = groupby(
+        messages,
+        key=lambda raw: (raw.fans, len(raw.device_clock_us) > 0, raw.tachos, [*auxiliary_columns(raw)]),
+    )
     return [_one(list(group)) for _, group in groups]
 
 
 def _one(messages: Sequence[Raw]) -> Raw:
-    names = ("host_receive_t_ns", "device_clock_us", "command", "speed_rad_s")
+    names = ("host_receive_t_ns", "device_clock_us", "command", "speed_rad_s", *auxiliary_columns(messages[0]))
     columns = {name: np.concatenate([getattr(raw, name) for raw in messages]) for name in names}
     return Raw(header=messages[0].header, fans=messages[0].fans, tachos=messages[0].tachos, **columns)
 
@@ -147,8 +153,8 @@ def recorded_tray(
     return RecordedTray(runs, metadata.speed_unit(tray), chosen, damage)
 
 
-Columns = tuple[Array, Array, Array]
-"""t_ns (n,), command (n, fans), speed_rad_s (n, fans)."""
+Columns = tuple[Array, Array, Array, Mapping[str, Array]]
+"""t_ns (n,), command (n, fans), speed_rad_s (n, fans), and the auxiliary columns of a RecordedRun."""
 
 
 def segments_of(path: Path, messages: Sequence[Raw]) -> list[Columns]:
@@ -165,10 +171,29 @@ def segments_of(path: Path, messages: Sequence[Raw]) -> list[Columns]:
     t_ns, segment = _times(messages)
     command = np.concatenate([message.command for message in messages])
     speed_rad_s = np.concatenate([message.speed_rad_s for message in messages])
+    auxiliary = _auxiliary(messages)
     firsts = [0, *(np.flatnonzero(np.diff(segment)) + 1).tolist(), len(t_ns)]
     parts = (slice(first, last) for first, last in pairwise(firsts) if last > first)
-    segments = (_in_order(t_ns[part], command[part], speed_rad_s[part]) for part in parts)
+    segments = (
+        _in_order(t_ns[part], command[part], speed_rad_s[part], {name: of[part] for name, of in auxiliary.items()})
+        for part in parts
+    )
     return [each for each in segments if len(each[0])]
+
+
+def _auxiliary(messages: Sequence[Raw]) -> dict[str, Array]:
+    """The columns that any of the messages has, NaN in those that do not have it."""
+    present = {name for message in messages for name in auxiliary_columns(message)}
+    return {
+        column.name: np.concatenate(
+            [
+                of if len(of := getattr(message, column.name)) else np.full(message.command.shape, np.nan)
+                for message in messages
+            ]
+        )
+        for column in AUXILIARY
+        if column.name in present
+    }
 
 
 def _times(messages: Iterable[Raw]) -> tuple[Array, Array]:
@@ -192,26 +217,34 @@ def _times(messages: Iterable[Raw]) -> tuple[Array, Array]:
     return np.concatenate(times), np.concatenate(segments)
 
 
-def _in_order(t_ns: Array, command: Array, speed_rad_s: Array) -> Columns:
+def _in_order(t_ns: Array, command: Array, speed_rad_s: Array, auxiliary: Mapping[str, Array]) -> Columns:
     """Samples by rising time from the first known command on; of samples with the same time, the first received."""
     if np.all(np.diff(t_ns) > 0) and not np.isnan(command).any():
-        return t_ns, command, speed_rad_s  # as nearly all are; saves copies
+        return t_ns, command, speed_rad_s, auxiliary  # as nearly all are; saves copies
     t_ns, first = np.unique(t_ns, return_index=True)
     command = hold_last(command[first])
     known = ~np.any(np.isnan(command), axis=1)
-    return t_ns[known], command[known], speed_rad_s[first][known]
+    of_known = {name: of[first][known] for name, of in auxiliary.items()}
+    return t_ns[known], command[known], speed_rad_s[first][known], of_known
 
 
 def _run(path: Path, tray: str, segment: Columns, start_t_ns: int, fans: Sequence[int] | None) -> RecordedRun:
-    t_ns, command, speed_rad_s = segment
+    t_ns, command, speed_rad_s, auxiliary = segment
     if fans is not None:
         if not all(0 <= fan < command.shape[1] for fan in fans):
             raise RecordingError(f"{path}: the tray has fans 0 to {command.shape[1] - 1}; see --fans")
         command, speed_rad_s = command[:, fans], speed_rad_s[:, fans]
-    return RecordedRun(path, tray, (t_ns - start_t_ns) / NS_PER_S, command, speed_rad_s)
+        auxiliary = {name: of[:, fans] for name, of in auxiliary.items()}
+    return RecordedRun(path, tray, (t_ns - start_t_ns) / NS_PER_S, command, speed_rad_s, auxiliary)
 
 
 def _rows(run: RecordedRun, wanted: Array) -> RecordedRun:
     if wanted.all():
         return run
-    return replace(run, t_s=run.t_s[wanted], command=run.command[wanted], speed_rad_s=run.speed_rad_s[wanted])
+    return replace(
+        run,
+        t_s=run.t_s[wanted],
+        command=run.command[wanted],
+        speed_rad_s=run.speed_rad_s[wanted],
+        auxiliary={name: of[wanted] for name, of in run.auxiliary.items()},
+    )

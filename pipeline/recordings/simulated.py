@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -74,6 +75,9 @@ def _blocks(device: Device, played: PlaybackCounts) -> Iterator[list[DeviceSampl
 
 
 def _raw(fans: int, block: list[DeviceSample], epoch_ns: int, sequence: int) -> Raw:
+    auxiliary: dict[str, Any] = {
+        name: np.stack([sample.auxiliary[name] for sample in block]).astype(np.float32) for name in block[0].auxiliary
+    }
     return Raw(
         header=Header(PRODUCER, sequence, TRAY),
         fans=fans,
@@ -82,4 +86,5 @@ def _raw(fans: int, block: list[DeviceSample], epoch_ns: int, sequence: int) -> 
         device_sequence=np.array([sample.sequence for sample in block], np.uint32),
         command=np.stack([sample.command for sample in block]),
         speed_rad_s=np.stack([sample.speed_rad_s for sample in block]),
+        **auxiliary,
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.runtime.conditions import Ratios
 from pipeline.runtime.twin_file import TwinFile
 from schemas.messages import Array
 from schemas.units import NS_PER_S
@@ -18,10 +19,12 @@ MOST_STEPS = 1000
 
 @dataclass(frozen=True)
 class FreeRunInputs:
-    """Inputs of the free runs over a block of n samples. All (n, fans), except `missing`, (n,)."""
+    """Inputs of the free runs over a block of n samples. All arrays (n, fans), except `missing`, (n,)."""
 
     command: Array
-    """the last known command"""
+    """the last known command, at the twin's reference conditions"""
+    held: Array
+    """the same as it was given"""
     unknown: Array
     """the command of this sample is not known"""
     overdue: Array
@@ -32,14 +35,20 @@ class FreeRunInputs:
     """the sample has a reading and a command, so that it counts towards a start"""
     missing: Array
     """number of grid samples missing before this one"""
+    ratios: Ratios | None = None
+    """of a twin that needs the conditions; `command` is converted by them"""
 
     def next_event(self, after: int, running: Array) -> int:
-        """The first row after `after` where a free run may start or stop or samples are missing; n if there is none."""
+        """The first row after `after` where a free run may start or stop, samples are missing or the density of the air
+        changes; n if there is none."""
         if after + 1 == len(self.missing):
             return after + 1
         rest = slice(after + 1, None)
         may_change = (self.overdue[rest] & running) | (self.usable[rest] & ~running)
-        rows = np.flatnonzero(may_change.any(axis=1) | (self.missing[rest] > 0))
+        at_all = may_change.any(axis=1) | (self.missing[rest] > 0)
+        if self.ratios is not None:
+            at_all |= (np.diff(self.ratios.density[after:], axis=0) != 0.0).any(axis=1)
+        rows = np.flatnonzero(at_all)
         return after + 1 + int(rows[0]) if len(rows) else len(self.missing)
 
 
@@ -54,6 +63,9 @@ class FreeRun(ColumnState):
         self._twin = twin
         self._start_samples = start_samples
         fans = twin.fans
+        self._knows_density = twin.card.conditions is not None
+        self._density = np.ones(fans)
+        """of the air, relative to the twin's reference"""
         self.running = np.zeros(fans, np.bool_)
         self.started_t_ns = np.zeros(fans, np.int64)
         self.held_command = np.full(fans, twin.card.command_range[0])
@@ -89,6 +101,7 @@ class FreeRun(ColumnState):
             "readings": self._readings,
             "sum_rad_s": self._sum_rad_s,
             "state": self._state.T,
+            "density": self._density,
         }
 
     def hold(self, t_ns: Array, command: Array, known: Array) -> tuple[Array, Array]:
@@ -112,6 +125,14 @@ class FreeRun(ColumnState):
         self._out_of_range_t_ns = last[-1].copy()
         return last
 
+    def set_density(self, ratio: Array) -> None:
+        """The density of the air, (fans,) relative to the twin's reference, is so from now on. A speed stays.
+
+        The state is that at the reference: speeds and commands times the ratio.
+        """
+        self._state *= (ratio / self._density)[:, np.newaxis]
+        self._density = ratio.copy()
+
     def stop(self, fans: Array) -> None:
         """End the free run of some fans; the next one starts from measured speeds again."""
         self.running &= ~fans
@@ -130,9 +151,9 @@ class FreeRun(ColumnState):
         self._sum_rad_s[fans] = 0.0
 
     def start(self, fans: Array, t_ns: int, command: Array) -> None:
-        """Begin the free run of some fans at this sample."""
+        """Begin the free run of some fans at this sample. command: (fans,), as that of `advance`."""
         speed = np.where(fans, self._sum_rad_s / np.maximum(self._readings, 1), 0.0)
-        initial = self._twin.initial_state(speed, command)
+        initial = self._twin.initial_state(speed * self._density, command)
         self._state = np.where(fans[:, np.newaxis], initial, self._state)
         self._reading.start(fans, speed)
         self.started_t_ns[fans] = t_ns
@@ -148,7 +169,7 @@ class FreeRun(ColumnState):
         return speed_rad_s[::steps], state
 
     def advance(self, command: Array) -> tuple[Array, Array, Array]:
-        """Run over a block, or over its first part. command: (n, fans), n >= 1.
+        """Run over a block, or over its first part. command: (n, fans), n >= 1, at the twin's reference conditions.
 
         Returns the middle of the readings that the tachos may show and half of their range, (m, fans) rad/s, NaN where
         no free run is active, and which fans (fans,) diverged at the last of these samples. The run is cut at a
@@ -166,6 +187,8 @@ class FreeRun(ColumnState):
                 break
             rows //= 2
         self._state = np.where((self.running & ~diverged)[:, np.newaxis], state, self._state)
+        if self._knows_density:
+            speed_rad_s = speed_rad_s / self._density
         reading, half_range = self._reading.update(np.where(self.running & finite, speed_rad_s, np.nan))
         self.stop(diverged)
         return reading, half_range, diverged

@@ -90,6 +90,8 @@ class HealthyTwin:
     unseen_error: UnseenError | None = None
     """where healthy runs do not show it; None: its card says nothing about it"""
     is_calibrated: bool = True
+    knows_supply: bool = False
+    """whether it needs the supply voltage, and so allows for it"""
 
     def of_trays(self, count: int, fans: int) -> HealthyTwin:
         """The same for the fans of so many trays with as many fans each; without balances."""
@@ -186,4 +188,5 @@ def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
         card.command_range[1],
         twin.unseen_error,
         card.calibration is not None,
+        card.conditions is not None and card.conditions.supply_voltage_v is not None,
     )

@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from pydantic import Field
 
+from pipeline.runtime.conditions import ConditionTracker, Ratios
 from pipeline.runtime.decision_rules import DecisionRules
 from pipeline.runtime.free_run import FreeRun, FreeRunInputs
 from pipeline.runtime.stage import StageConfig
@@ -29,7 +30,19 @@ LONGEST_BRIDGE = (
     1 << 16
 )  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
 LARGEST_MOVE_S = 0.01  # times the width of the training range: a move of the command times the gap in which it was held
-NONE, GAP, STALE, WARMING_UP, OUT_OF_RANGE, NO_SPEED, NO_TWIN, CLOCK_RESTARTED, STOPPED, STARTING = map(
+(
+    NONE,
+    GAP,
+    STALE,
+    WARMING_UP,
+    OUT_OF_RANGE,
+    NO_SPEED,
+    NO_TWIN,
+    CLOCK_RESTARTED,
+    STOPPED,
+    STARTING,
+    CONDITIONS_UNKNOWN,
+) = map(
     np.uint8,
     (
         InvalidReason.NONE,
@@ -42,6 +55,7 @@ NONE, GAP, STALE, WARMING_UP, OUT_OF_RANGE, NO_SPEED, NO_TWIN, CLOCK_RESTARTED, 
         InvalidReason.CLOCK_RESTARTED,
         InvalidReason.STOPPED,
         InvalidReason.STARTING,
+        InvalidReason.CONDITIONS_UNKNOWN,
     ),
 )
 OUT_OF_RANGE_COUNT = "not_predicted_out_of_range"
@@ -95,6 +109,10 @@ class TrayIntegrator:
         if self._standstill is not None:
             self._starting = StartingFans(twin.fans, self._standstill, self._warm_up_ns, reach_s)
         self._balance = _balance_of(twin, self._off_below)
+        conditions = twin.card.conditions
+        self._conditions = ConditionTracker(conditions, twin.fans) if conditions else None
+        self.missing_columns = ""
+        """those that the twin needs and the last block did not have"""
         self._averages = any(tacho.window_s > 0.0 for tacho in twin.tachos)
         self._averaged_command = AveragedCommand(twin.tachos, 1.0)
         self._last_t_ns: int | None = None
@@ -131,12 +149,16 @@ class TrayIntegrator:
     def skip(self, grid: Grid) -> None:
         """Skip a block that a joint integrator has predicted; the states here are already those after it."""
         self._in_announced_gap, self._last_t_ns = bool(_is_silent(grid)[-1].all()), int(grid.t_ns[-1])
+        if self._conditions is not None:
+            self.missing_columns = self._conditions.missing(grid)
 
     @property
     def states(self) -> list[ColumnState]:
         """All that is kept of each fan."""
         starting = (self._starting,) if self._starting is not None else ()
-        return [*self._run.states, *starting, self._balance, *self._averaged_command.states, self._counts]
+        conditions = (self._conditions,) if self._conditions is not None else ()
+        own = [self._balance, *self._averaged_command.states, self._counts]
+        return [*self._run.states, *starting, *conditions, *own]
 
     def counters(self) -> dict[str, int]:
         """docs/explanation/deciding.md explains each counter. Those that are 0 are left out, but for samples out of
@@ -147,13 +169,17 @@ class TrayIntegrator:
     def predict(self, grid: Grid) -> Prediction:
         """The prediction of a block of new samples."""
         run = self._run
-        held_before = run.held_command
-        inputs = self._inputs(grid)
+        held = run.held_command
+        ratios = self._ratios(grid)
+        inputs = self._inputs(grid, ratios)
         predicted, reading_range = np.empty(grid.command.shape), np.empty(grid.command.shape)
         running, started_t_ns = np.empty(predicted.shape, np.bool_), np.empty(predicted.shape, np.int64)
         row = 0
         while row < len(predicted):
-            self._start_and_stop(row, grid, inputs, held_before if row == 0 else inputs.command[row - 1])
+            if ratios is not None:
+                run.set_density(ratios.density[row])
+            held_before = held if row == 0 else inputs.held[row - 1]
+            self._start_and_stop(row, grid, inputs, held_before)
             end = inputs.next_event(row, run.running)
             running[row:end], started_t_ns[row:end] = run.running, run.started_t_ns
             reading_rad_s, half_range_rad_s = self._advance(inputs.command[row:end])
@@ -162,9 +188,12 @@ class TrayIntegrator:
             if end > row + 1:
                 run.forget_readings(np.any(inputs.unknown[row + 1 : end], axis=0))
             row = end
-        in_range = (grid.command >= self._lowest_command) & (grid.command <= self._highest_command)
-        in_range &= grid.command >= self._off_below
-        beyond = np.isfinite(grid.command) & ~in_range  # where it is unknown, the free run uses the last known command
+        acting = grid.command if ratios is None else grid.command * ratios.command
+        in_range = (acting >= self._lowest_command) & (acting <= self._highest_command)
+        in_range &= acting >= self._off_below
+        beyond = np.isfinite(acting) & ~in_range  # where it is unknown, the free run uses the last known command
+        if ratios is not None:
+            beyond |= ~ratios.known
         since_t_ns = np.maximum(started_t_ns, self._run.last_out_of_range(grid.t_ns, beyond))
         warm = running & (grid.t_ns[:, np.newaxis] - since_t_ns >= self._warm_up_ns)
         if self._starting is not None:
@@ -174,6 +203,8 @@ class TrayIntegrator:
         self._counts.add(OUT_OF_RANGE_COUNT, settled & ~in_range)
         invalid_reason = np.where(settled, OUT_OF_RANGE, WARMING_UP)
         invalid_reason = np.where(settled & in_range, NONE, invalid_reason)
+        if ratios is not None:
+            invalid_reason = np.where(ratios.known, invalid_reason, CONDITIONS_UNKNOWN)
         judged = grid.valid
         if self._starting is not None:
             starting = self._starting.is_starting(inputs.stopped, warm)
@@ -181,15 +212,21 @@ class TrayIntegrator:
             invalid_reason = np.where(inputs.stopped, STOPPED, invalid_reason)
             judged = judged | ((inputs.stopped | starting) & (grid.invalid_reason == NO_SPEED))
         invalid_reason = np.where(judged, invalid_reason, grid.invalid_reason).astype(np.uint8)
-        return self._prediction(grid, predicted, reading_range, invalid_reason)
+        return self._prediction(grid, predicted, reading_range, invalid_reason, ratios)
 
     def without_twin(self, grid: Grid) -> Prediction:
         """Of a block for which the twin is not valid."""
         invalid_reason = np.where(grid.valid, NO_TWIN, grid.invalid_reason).astype(np.uint8)
         nothing = np.full(grid.command.shape, np.nan)
-        return self._prediction(grid, nothing, nothing, invalid_reason)
+        return self._prediction(grid, nothing, nothing, invalid_reason, self._ratios(grid))
 
-    def _inputs(self, grid: Grid) -> FreeRunInputs:
+    def _ratios(self, grid: Grid) -> Ratios | None:
+        if self._conditions is None:
+            return None
+        self.missing_columns = self._conditions.missing(grid)
+        return self._conditions.update(grid)
+
+    def _inputs(self, grid: Grid, ratios: Ratios | None) -> FreeRunInputs:
         held_before = self._run.held_command
         silent = _is_silent(grid)
         known = ~silent & np.isfinite(grid.command)
@@ -206,13 +243,17 @@ class TrayIntegrator:
             stopped = known & self._standstill.stops(grid.command, grid.speed_rad_s)
             overdue |= stopped
             usable &= ~stopped & (self._standstill.turns(grid.speed_rad_s) | ~self._standstill.drives(grid.command))
+        if ratios is not None:
+            usable &= ratios.known
         return FreeRunInputs(
-            command=command,
+            command=command if ratios is None else command * ratios.command,
+            held=command,
             unknown=~known,
             overdue=overdue,
             stopped=stopped,
             usable=usable,
             missing=self._missing(grid.t_ns, np.all(silent, axis=1)),
+            ratios=ratios,
         )
 
     def _missing(self, t_ns: Array, in_gap: Array) -> Array:
@@ -234,8 +275,9 @@ class TrayIntegrator:
         overdue = run.running & inputs.overdue[row]
         if missing or overdue.any():
             run.stop(overdue | (missing > LONGEST_BRIDGE))
+            held = held_command if inputs.ratios is None else held_command * inputs.ratios.command[row]
             while missing > 0 and run.running.any():
-                missing -= len(self._advance(np.tile(held_command, (missing, 1)))[0])
+                missing -= len(self._advance(np.tile(held, (missing, 1)))[0])
         run.forget_readings(inputs.unknown[row])
         starting = run.add_readings(inputs.usable[row], grid.speed_rad_s[row])
         if starting.any():
@@ -247,8 +289,9 @@ class TrayIntegrator:
         self._counts.add("diverged", diverged)
         return reading_rad_s, half_range_rad_s
 
-    def _torque_balance(self, grid: Grid) -> tuple[Array, Array]:
-        """The command averaged as the readings are, and the torque balance. Both (n, fans) in command units.
+    def _torque_balance(self, grid: Grid, ratios: Ratios | None) -> tuple[Array, Array]:
+        """The command averaged as the readings are, and the torque balance. Both (n, fans) in command units, at the
+        twin's reference conditions.
 
         A command on the plateau of a drive counts as that at its end.
 
@@ -259,6 +302,10 @@ class TrayIntegrator:
         breaks = (np.diff(grid.t_ns, prepend=last_t_ns) > self._longest_step_ns) | restarted
         known = grid.valid & np.isfinite(grid.speed_rad_s) & np.isfinite(grid.command)
         command = grid.command if self.twin.drive is None else self.twin.drive.raised(grid.command)
+        speed_rad_s = grid.speed_rad_s
+        if ratios is not None:
+            command, speed_rad_s = command * ratios.command, speed_rad_s * ratios.density
+            known &= ratios.known
         averaged, balance = np.empty(grid.command.shape), np.empty(grid.command.shape)
         starts = [0, *(np.flatnonzero(breaks[1:]) + 1).tolist(), len(breaks)]
         for first, last in pairwise(starts):
@@ -270,17 +317,24 @@ class TrayIntegrator:
             balance[rows] = self._balance.update(
                 self._period_ns / NS_PER_S,
                 averaged[rows],
-                grid.speed_rad_s[rows],
+                speed_rad_s[rows],
                 known[rows] & np.isfinite(averaged[rows]),
             )
         return averaged, balance
 
     @property
+    def _needs_temperature(self) -> bool:
+        return self._conditions is not None and self._conditions.reference.temperature_c is not None
+
+    @property
     def _longest_step_ns(self) -> int:
         return self._period_ns + (self._period_ns - 1) // 2  # above one and a half periods samples are missing
 
-    def _prediction(self, grid: Grid, predicted: Array, reading_range: Array, invalid_reason: Array) -> Prediction:
-        averaged_command, balance = self._torque_balance(grid)
+    def _prediction(
+        self, grid: Grid, predicted: Array, reading_range: Array, invalid_reason: Array, ratios: Ratios | None
+    ) -> Prediction:
+        averaged_command, balance = self._torque_balance(grid, ratios)
+        converts = self._averages or self.twin.drive is not None or ratios is not None
         self._last_t_ns = int(grid.t_ns[-1])
         nothing = np.zeros(0)
         return Prediction(
@@ -297,8 +351,9 @@ class TrayIntegrator:
             torque_balance_command=balance,
             torque_balance_sigma_command=self.twin.balance.sigma_command,
             reading_range_rad_s=reading_range if self._averages else nothing,
-            averaged_command=averaged_command if self._averages or self.twin.drive is not None else nothing,
+            averaged_command=averaged_command if converts else nothing,
             reading_missing=grid.reading_missing,
+            air_density_ratio=ratios.density if ratios is not None and self._needs_temperature else nothing,
             **auxiliary_columns(grid),
         )
 

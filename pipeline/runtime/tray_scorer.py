@@ -86,6 +86,7 @@ class TrayScorer:
             knows_readings=judges_rest,
             knows_falls=decision_rules >= DecisionRules.FALLS,
             plain_words=decision_rules >= DecisionRules.PLAIN_WORDS,
+            knows_supply=twin.knows_supply,
         )
         healthy = healthy_fans(twin.balances, twin.limits.balance)
         self.wear = WearMonitor(
@@ -229,16 +230,19 @@ class TrayScorer:
     def _feed_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
         command = item.averaged_command if len(item.averaged_command) else item.command
         expected = np.where(np.isfinite(item.measured_speed_rad_s), scored.balance_expected, np.nan)
+        density = item.air_density_ratio if len(item.air_density_ratio) else 1.0
         self._diagnoser.take(
             item.t_ns,
             item.period_ns,
             np.where(arrived(item.invalid_reason), command, np.nan),
-            item.measured_speed_rad_s,
+            item.measured_speed_rad_s * density,  # at the twin's reference, as the command and the balance are
             scored.balance_baseline * item.torque_balance_sigma_command,
             scored.balance_baseline_s,
             expected * item.torque_balance_sigma_command,
-            item.predicted_speed_rad_s,
+            item.predicted_speed_rad_s * density,
             item.reading_missing,
+            item.supply_voltage_v,
+            item.current_a,
         )
 
     def _feed_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:

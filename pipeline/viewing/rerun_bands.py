@@ -15,6 +15,7 @@ from pipeline.viewing.fleet import Fan
 from pipeline.viewing.rerun_layout import (
     LINE_WIDTH,
     TIMELINE,
+    auxiliary_path,
     fan_path,
     log_fan_styles,
     place_lane,
@@ -62,6 +63,10 @@ class RerunBands:
         """Send the next stretch of a tray."""
         for column in range(trace.fans):
             self._draw_fan(trace, column)
+        for name, values in trace.auxiliary.items():
+            for fan, of_fan in zip(trace.fan_numbers, values.T, strict=True):
+                if not self._places and self._has_news(auxiliary_path(trace.tray, name, fan), of_fan):
+                    self._send(auxiliary_path(trace.tray, name, fan), trace.t_ns, rr.Scalars.columns(scalars=of_fan))
 
     def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
         """Set the state of a fan's lane from each time on."""

@@ -15,6 +15,7 @@ from rerun.blueprint.archetypes import TextLogColumns
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
 from pipeline.viewing.trace import state_names
+from schemas.auxiliary import AuxiliaryColumn
 from schemas.units import SpeedUnit
 
 TIMELINE = "time"
@@ -47,13 +48,15 @@ UNKNOWN_COLOR = (110, 110, 110)
 class TrayLayout:
     """The fans of a tray that are shown, counted from 0, and their unit of speed.
 
-    places: in the view of a fleet, the numbers of the plots that have shown each fan.
+    places: in the view of a fleet, the numbers of the plots that have shown each fan. auxiliary: the columns beside
+    command and speed that are drawn.
     """
 
     name: str
     fans: Sequence[int]
     speed_unit: SpeedUnit
     places: Mapping[int, Sequence[int]] = field(default_factory=dict[int, Sequence[int]])
+    auxiliary: Sequence[AuxiliaryColumn] = ()
 
     def roots(self, fan: int) -> list[str]:
         """The entities below which the fan is drawn."""
@@ -81,6 +84,11 @@ def fan_path(root: str, fan: int, part: str) -> str:
 def state_path(tray: str, fan: int) -> str:
     """Entity of a fan's state lane."""
     return f"{tray}/state/fan_{fan}"
+
+
+def auxiliary_path(tray: str, column: str, fan: int | None = None) -> str:
+    """Entity of what a fan's source measures beside command and speed; without a fan, that of all fans."""
+    return f"{tray}/{column}" if fan is None else f"{tray}/{column}/fan_{fan}"
 
 
 def log_path(tray: str) -> str:
@@ -175,13 +183,29 @@ def _page(tray: TrayLayout, fans: Sequence[int], window_s: float) -> rrb.Contain
         time_view=rolling(window_s, 0.0),
     )
     lane_share = (1.7 + len(fans)) / 24
+    plots: rrb.Container = rrb.Grid(*(_fan_view(tray, fan, axis) for fan in fans), grid_columns=columns)
+    if tray.auxiliary:
+        measured = [_auxiliary_view(tray, column, fans, window_s) for column in tray.auxiliary]
+        plots = rrb.Vertical(plots, rrb.Horizontal(*measured), row_shares=[3, 1])
     return rrb.Vertical(
-        rrb.Grid(*(_fan_view(tray, fan, axis) for fan in fans), grid_columns=columns),
+        plots,
         rrb.Horizontal(
             lanes, log_view(tray.log, "alarm log" if tray.places else f"{tray.name} / alarm log"), column_shares=[3, 2]
         ),
         row_shares=[1 - lane_share, lane_share],
         name=name,
+    )
+
+
+def _auxiliary_view(
+    tray: TrayLayout, column: AuxiliaryColumn, fans: Sequence[int], window_s: float
+) -> rrb.TimeSeriesView:
+    """What is measured of some fans beside command and speed: one line for each."""
+    return rrb.TimeSeriesView(
+        origin=f"/{auxiliary_path(tray.name, column.name)}",
+        contents=[f"/{auxiliary_path(tray.name, column.name, fan)}" for fan in fans],
+        name=f"{tray.name} / {column.title} ({column.unit})",
+        axis_x=rolling(window_s, 0.0),
     )
 
 

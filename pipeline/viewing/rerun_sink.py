@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -38,6 +39,7 @@ from pipeline.viewing.rerun_layout import (
 )
 from pipeline.viewing.trace import Trace
 from pipeline.viewing.view_file import ViewFile
+from schemas.auxiliary import AUXILIARY
 from schemas.messages import Array
 from schemas.units import SpeedUnit
 
@@ -112,6 +114,8 @@ class RerunSink:
         self._bands = RerunBands(self._recording)
         self._fleet = RerunFleet(self._recording, trays) if fleet else None
         layouts = [] if fleet else [TrayLayout(tray.name, range(tray.fans), tray.speed_unit) for tray in trays]
+        self._layouts = {layout.name: layout for layout in layouts}
+        self._window_s = window_s
         tabs = [tray_tab(layout, window_s) for layout in layouts]
         if fleet and self._fleet:
             tabs = [overview_tab(self._fleet.bounds, window_s)]
@@ -138,7 +142,18 @@ class RerunSink:
 
     def draw(self, trace: Trace) -> None:
         """Send the next stretch of a tray."""
+        self._lay_out(trace)
         self._bands.draw(trace)
+
+    def _lay_out(self, trace: Trace) -> None:
+        """Give what a source measures beside command and speed its plots, when it comes for the first time."""
+        layout = self._layouts.get(trace.tray)
+        if layout is None or trace.auxiliary.keys() <= {column.name for column in layout.auxiliary}:
+            return
+        shown = [column for column in AUXILIARY if column in layout.auxiliary or column.name in trace.auxiliary]
+        self._layouts[trace.tray] = replace(layout, auxiliary=shown)
+        tabs = [tray_tab(each, self._window_s) for each in self._layouts.values()]
+        self._recording.send_blueprint(blueprint(tabs))
 
     def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
         """Set the state of a fan's lane from each time on."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from schemas.auxiliary import AUXILIARY
 from schemas.fields import LARGEST_ENUM_VALUE
 from schemas.messages import Array, FanState, InvalidReason, Score
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
@@ -21,6 +22,8 @@ TRACE_COLUMNS = (
     "invalid_reason",
 )
 """the columns of a score that a trace is made of, its times apart"""
+MEASURED_COLUMNS = (*TRACE_COLUMNS, *(column.name for column in AUXILIARY))
+"""the same with those that a source may measure beside command and speed"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +38,7 @@ class Trace:
         outside: the sample is scored and lies outside the band.
         in_alarm: an alarm was active at the sample.
         state, invalid_reason: `FanState` and `InvalidReason`.
+        auxiliary: what the source measures beside command and speed, by the name of its column; NaN where unknown.
     """
 
     tray: str
@@ -49,6 +53,7 @@ class Trace:
     in_alarm: Array
     state: Array
     invalid_reason: Array
+    auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
 
     @property
     def fans(self) -> int:
@@ -72,6 +77,7 @@ def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit, fans: Se
     def column(name: str) -> Array:
         return np.concatenate([getattr(score, name)[:, chosen] for score in scores])
 
+    present = [each.name for each in AUXILIARY if any(len(getattr(score, each.name)) for score in scores)]
     valid = column("valid")
     state = column("state")
     return Trace(
@@ -87,6 +93,14 @@ def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit, fans: Se
         in_alarm=np.isin(state, IN_ALARM) & valid,
         state=state,
         invalid_reason=column("invalid_reason"),
+        auxiliary={name: _known_or_nan(name, scores)[:, chosen] for name in present},
+    )
+
+
+def _known_or_nan(name: str, scores: Sequence[Score]) -> Array:
+    """A column of scores of which some may not have it."""
+    return np.concatenate(
+        [of if len(of := getattr(score, name)) else np.full((len(score.t_ns), score.fans), np.nan) for score in scores]
     )
 
 

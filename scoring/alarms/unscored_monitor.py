@@ -22,6 +22,7 @@ REASONS = {
     InvalidReason.CLOCK_RESTARTED: "the clock of the device restarted",
     InvalidReason.STOPPED: "stopped by its command",
     InvalidReason.STARTING: "starting",
+    InvalidReason.CONDITIONS_UNKNOWN: "a supply voltage or temperature that the twin needs is not known",
 }
 JUDGED_AT_REST = (InvalidReason.STOPPED, InvalidReason.STARTING)
 """a fan without a score for one of these reasons is judged by whether it stands or turns as commanded"""

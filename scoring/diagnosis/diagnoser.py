@@ -31,6 +31,7 @@ NEWS = 0.1  # a change of a probability that is worth a message
 
 
 _NOT_KNOWN = np.zeros(0, np.bool_)
+_NOT_MEASURED = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,9 @@ class _Block:
     expected_rad_s: Array
     reading_missing: Array
     """(n, fans) of bool; empty where the line does not tell"""
+    supply_voltage_v: Array
+    """(n, fans), as the next; empty where it is not measured"""
+    current_a: Array
 
 
 class Diagnoser:
@@ -59,11 +63,12 @@ class Diagnoser:
         knows_readings: bool = True,
         knows_falls: bool = True,
         plain_words: bool = True,
+        knows_supply: bool = False,
     ) -> None:
         """advice: None only to diagnose as for recordings made before there was any; see `diagnose`. standstill: None
         where the detector of it is not used. knows_readings: False only to diagnose as for recordings made before
         causes accounted for what a tacho resolves; knows_falls: before a fan that slows down was compared with one that
-        comes to rest; plain_words: see `diagnose`.
+        comes to rest; plain_words and knows_supply: see `diagnose`.
         """
         self._healthy = healthy
         self._advice = advice
@@ -72,6 +77,7 @@ class Diagnoser:
         self._knows_readings = knows_readings
         self._knows_falls = knows_falls
         self._plain_words = plain_words
+        self._knows_supply = knows_supply
         self._blocks: deque[_Block] = deque()
         self._period_ns = 0
         self._due: dict[int, list[int]] = {}
@@ -88,6 +94,8 @@ class Diagnoser:
         expected_command: Array | float = 0.0,
         expected_rad_s: Array | float = math.nan,
         reading_missing: Array = _NOT_KNOWN,
+        supply_voltage_v: Array = _NOT_MEASURED,
+        current_a: Array = _NOT_MEASURED,
     ) -> None:
         """Store a block; t_ns (n,), the others (n, fans).
 
@@ -95,6 +103,7 @@ class Diagnoser:
         healthy running from which the offset is known. expected_command: the expected healthy balance at
         this speed, apart from the offset; NaN where the speed is unknown. expected_rad_s: what a healthy fan would
         read. reading_missing: where the newest raw sample had no reading; empty where the line does not tell.
+        supply_voltage_v, current_a: empty where it is not measured.
         """
         if period_ns != self._period_ns:
             self._blocks.clear()
@@ -103,7 +112,18 @@ class Diagnoser:
             np.broadcast_to(one, offset_command.shape) for one in (offset_s, expected_command, expected_rad_s)
         )
         self._blocks.append(
-            _Block(t_ns, command, speed_rad_s, offset_command, offset_s, expected, reading, reading_missing)
+            _Block(
+                t_ns,
+                command,
+                speed_rad_s,
+                offset_command,
+                offset_s,
+                expected,
+                reading,
+                reading_missing,
+                supply_voltage_v,
+                current_a,
+            )
         )
         oldest_t_ns = int(t_ns[0]) - min(round(WINDOW_S * NS_PER_S), MAX_SAMPLES * period_ns)
         while int(self._blocks[0].t_ns[-1]) < oldest_t_ns:
@@ -134,7 +154,14 @@ class Diagnoser:
         if window is None:
             return ()
         tacho = self._tachos[fan] if self._knows_readings else None
-        causes = diagnose(window, self._healthy[fan], self._advice, tacho, plain_words=self._plain_words).causes
+        causes = diagnose(
+            window,
+            self._healthy[fan],
+            self._advice,
+            tacho,
+            plain_words=self._plain_words,
+            knows_supply=self._knows_supply,
+        ).causes
         if self._knows_falls and self._standstill is not None:
             rest = coming_to_rest(window, self._standstill, self._healthy[fan], self._tachos[fan])
             causes = rest.beside(causes) if rest else causes
@@ -206,6 +233,11 @@ class Diagnoser:
         if any(len(block.reading_missing) for block in blocks):
             lacks = np.zeros(index[-1] + 1, np.bool_)
             lacks[index] = np.concatenate([_lacks(block)[:, fan] for block in blocks])[rows]
+        measured: dict[str, Array | None] = {"supply_voltage_v": None, "current_a": None}
+        for name in measured:
+            if any(len(getattr(block, name)) for block in blocks):
+                of_fan = measured[name] = np.full(index[-1] + 1, np.nan)
+                of_fan[index] = np.concatenate([_known_or_nan(block, name)[:, fan] for block in blocks])[rows]
         healthy, period_s = self._healthy[fan], self._period_ns / NS_PER_S
         std_of_one_second = healthy.sigma_command * summed_deviation(healthy.autocorrelation_time_s, period_s)
         offset_s = max(_column(blocks, "offset_s", fan, rows)[-1], period_s)
@@ -218,6 +250,7 @@ class Diagnoser:
             expected_command=expected,
             expected_rad_s=reading,
             reading_missing=lacks,
+            **measured,
             fan_offset=float(_column(blocks, "offset_command", fan, rows)[-1]),
             fan_offset_std_error=std_of_one_second / math.sqrt(offset_s),
         )
@@ -229,6 +262,11 @@ def _column(blocks: Sequence[_Block], name: str, fan: int, rows: Array) -> Array
 
 def _lacks(block: _Block) -> Array:
     return block.reading_missing if len(block.reading_missing) else ~np.isfinite(block.speed_rad_s)
+
+
+def _known_or_nan(block: _Block, name: str) -> Array:
+    values: Array = getattr(block, name)
+    return values if len(values) else np.full(block.command.shape, np.nan)
 
 
 def _message(cause: RankedCause) -> CauseMessage:

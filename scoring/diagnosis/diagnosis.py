@@ -14,14 +14,15 @@ the best of the others. A sensor that drops out is right whenever it gives a rea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.tacho import Tacho
 from scoring.diagnosis.advice import Advice
-from scoring.diagnosis.hypotheses import CAUSES, Comparison, Explanation, log_sum
+from scoring.diagnosis.current_evidence import GainOfCurrent, gain_of_current
+from scoring.diagnosis.hypotheses import CAUSES, Comparison, Explanation, FaultHypothesis, log_sum
 from scoring.diagnosis.regression_window import Array, HealthyBalance, RegressionWindow, Window
 from scoring.diagnosis.sensor_evidence import (
     MAX_HEALTHY_MISSING,
@@ -32,6 +33,9 @@ from scoring.diagnosis.sensor_evidence import (
 from scoring.diagnosis.shown_causes import CANNOT_TELL, short_name
 
 STUCK, DROPOUT = "sensor_stuck", "sensor_dropout"
+GAIN_DOWN = "gain_down"
+DRIVER_SHARE = 0.5
+"""of the prior probability of less drive: the other half is that of a weak supply"""
 CANNOT_TELL_YET = "cannot tell yet"
 ADVICE = Advice()
 MIN_AFTER_ONSET_S = 0.2
@@ -86,13 +90,15 @@ def diagnose(
     tacho: Tacho | None = None,
     *,
     plain_words: bool = True,
+    knows_supply: bool = False,
 ) -> Diagnosis:
     """Diagnose one fan from its last seconds, some before the onset of the fault and all since.
 
     advice: on what would show the cause, where it is unclear; None only to diagnose as for recordings made before there
     was any. Missing readings then counted from the onset of the alarm, not from the first of them. tacho: None where
     each sample is a reading of its own, and for recordings made before it was accounted for. plain_words: False only
-    for recordings made when sentences had the names of causes that messages have.
+    for recordings made when sentences had the names of causes that messages have. knows_supply: the command is that at
+    the supply voltage as it was measured, so that a weak supply is no cause of less drive.
 
     About three seconds of health before the onset are enough; the samples after it decide. The diagnosis can be
     repeated as samples arrive. It takes milliseconds.
@@ -114,10 +120,14 @@ def diagnose(
     if enough:
         comparison = Comparison(regression, healthy)
         nothing = comparison.nothing()
-        explanations = [comparison.explain(cause) for cause in CAUSES]
+        causes = [_without_supply(cause) if knows_supply else cause for cause in CAUSES]
+        explanations = [comparison.explain(cause) for cause in causes]
     else:
         nothing, explanations = 0.0, []
     best = max((one.log_evidence for one in explanations), default=0.0)
+    by_current = gain_of_current(window, healthy)
+    if by_current is not None:
+        explanations = [_with_current(one, by_current) for one in explanations]
     names = [one.cause.name for one in explanations] or [cause.name for cause in CAUSES]
     logs = [one.log_evidence for one in explanations] or [0.0] * len(CAUSES)
     names += [STUCK, DROPOUT, CANNOT_TELL]
@@ -127,17 +137,37 @@ def diagnose(
     weight[-1] = 1.0 - weight[:-1].max()
     weight /= weight.sum()
     evidence: dict[str, tuple[Evidence | None, str]] = {one.cause.name: _evidence(one) for one in explanations}
+    if by_current is not None and GAIN_DOWN in evidence:
+        found, sentence = evidence[GAIN_DOWN]
+        evidence[GAIN_DOWN] = found, f"{sentence}, by the current {100 * by_current.change:+.0f} %"
+    if knows_supply and GAIN_DOWN in evidence:
+        found, sentence = evidence[GAIN_DOWN]
+        evidence[GAIN_DOWN] = found, f"{sentence}, beyond the supply voltage, which is measured"
     evidence[STUCK] = _of_stuck(repeats, window.period_s)
     evidence[DROPOUT] = _of_dropout(missing, 0.0 if advice is None else (len(speed) - dropout_onset) * window.period_s)
     unclear = _clarity(names, weight, healthy_share, regression.speeds_after if enough else None, plain_words)
     if advice is not None and unclear.startswith(CANNOT_TELL_YET):
         unclear = advice.added_to(unclear, window, healthy)
     evidence[CANNOT_TELL] = None, unclear
-    causes = [
+    ranked = [
         RankedCause(name, float(share), *evidence.get(name, (None, "no speed to judge by")))
         for name, share in zip(names, weight, strict=True)
     ]
-    return Diagnosis(tuple(sorted(causes, key=lambda cause: -cause.probability)))
+    return Diagnosis(tuple(sorted(ranked, key=lambda cause: -cause.probability)))
+
+
+def _with_current(explanation: Explanation, by_current: GainOfCurrent) -> Explanation:
+    """Less drive with what the current says of it; the other causes leave the drive as it is."""
+    if explanation.cause.name != GAIN_DOWN:
+        return explanation
+    size_std = (explanation.high - explanation.low) / (2.0 * 1.96)
+    ratio = by_current.log_ratio(explanation.size, size_std)
+    return replace(explanation, log_evidence=explanation.log_evidence + ratio)
+
+
+def _without_supply(cause: FaultHypothesis) -> FaultHypothesis:
+    """The cause where the supply is known to be none of it: one of two reasons for less drive is left, the driver."""
+    return replace(cause, weight=cause.weight * DRIVER_SHARE) if cause.name == GAIN_DOWN else cause
 
 
 def _evidence(explanation: Explanation) -> tuple[Evidence, str]:

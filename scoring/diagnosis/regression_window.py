@@ -79,7 +79,8 @@ class Window:
     from commissioning, and its standard error. expected_command: (n,) healthy balance expected at each speed, apart
     from the offset, from calibration; NaN where the speed is unknown. All in units of the command. expected_rad_s: (n,)
     what a healthy fan would read; NaN where it is not known. reading_missing: (n,) where the line gave no reading,
-    though its speed may be known from readings around it; None: where it is not known.
+    though its speed may be known from readings around it; None: where it is not known. supply_voltage_v, current_a:
+    (n,), NaN where it is not known; None: it is not measured.
     """
 
     period_s: float
@@ -91,6 +92,8 @@ class Window:
     expected_command: Array | float = 0.0
     expected_rad_s: Array | float = math.nan
     reading_missing: NDArray[np.bool_] | None = None
+    supply_voltage_v: Array | None = None
+    current_a: Array | None = None
 
 
 class RegressionWindow:

@@ -24,6 +24,7 @@ from schemas.tacho import Tacho
 from scoring.diagnosis.diagnosis import CANNOT_TELL, CANNOT_TELL_YET, Evidence, RankedCause
 from scoring.diagnosis.regression_window import Array, HealthyBalance, Window
 from scoring.diagnosis.shown_causes import BLOCKED, FALLING, NO_POWER, NO_TACHO, STILL_DRIVEN, WINDMILLING
+from scoring.diagnosis.supply_evidence import supply_in_words, weighed_by_supply
 
 FELL_AT_ONCE = {BLOCKED: 0.4, NO_POWER: 0.04, NO_TACHO: 0.2}
 """prior probabilities of the faults after which the reading falls at once; no power: the connector is off"""
@@ -75,17 +76,22 @@ def standstill_causes(
         return _ranked(RAN_ON, given, f"turns although the command of {command:.3g} stops it")
     turning = np.flatnonzero(healthy.turns(speed))
     recent = speed[-math.ceil((tacho.reach_s + RECENT_S) / window.period_s) :]
-    sentence = f"does not turn although commanded to {command:.3g}"
+    supply = supply_in_words(window)
+    sentence = f"does not turn although commanded to {command:.3g}{supply}"
+
+    def ranked(weights: Mapping[str, float], because: str = sentence) -> tuple[RankedCause, ...]:
+        return _ranked(weighed_by_supply(weights, window), given, because)
+
     if np.isnan(recent).mean() > 0.5:
-        return _ranked(NO_READING, given, f"gives no reading although commanded to {command:.3g}")
+        return ranked(NO_READING, f"gives no reading although commanded to {command:.3g}{supply}")
     if not len(turning) or not _was_driven(window, int(turning[-1]), healthy, tacho):
-        return _ranked(NEVER_TURNED, given, sentence)
+        return ranked(NEVER_TURNED)
     fell_at_once, coasted = (FELL_AT_ONCE, COASTED) if by_course else (FORMER_FELL_AT_ONCE, FORMER_COASTED)
     if healthy.coast_time_constant_s is None:
-        return _ranked(_sums(fell_at_once, coasted), given, sentence)
+        return ranked(_sums(fell_at_once, coasted))
     likelihoods = (_by_course if by_course else _by_duration)(window, int(turning[-1]), healthy, balance, tacho)
     likely = {cause: prior * likelihoods[0] for cause, prior in fell_at_once.items()}
-    return _ranked(_sums(likely, coasted * likelihoods[1]), given, sentence)
+    return ranked(_sums(likely, coasted * likelihoods[1]))
 
 
 @dataclass(frozen=True)
@@ -126,10 +132,12 @@ def coming_to_rest(window: Window, healthy: Standstill, balance: HealthyBalance,
     lowest = healthy.standing_below_rad_s / fall.highest_rad_s
     slowing = fall.likelihood_of_slowing(np.concatenate(fall.constants_s), lowest) + LEAST_LIKELIHOOD
     weights = _sums({cause: prior * at_once for cause, prior in FELL_AT_ONCE.items()}, COASTED * coasting)
+    weights = weighed_by_supply(weights, window)
     stops = COMES_TO_REST * sum(weights.values())
     if not stops > 0.0:
         return None
-    sentence = f"slows down to {100 * left:.0f} % of its speed although commanded to {command:.3g}"
+    slower = f"slows down to {100 * left:.0f} % of its speed although commanded to {command:.3g}"
+    sentence = f"{slower}{supply_in_words(window)}"
     evidence = Evidence(FALLING, left - 1.0, left - 1.0, left - 1.0, "relative")
     return ComingToRest(stops / (stops + (1.0 - COMES_TO_REST) * slowing), _ranked(weights, evidence, sentence))
 

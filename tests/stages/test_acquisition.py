@@ -482,6 +482,7 @@ def test_columns_beside_command_and_speed_are_in_the_message_and_the_others_empt
     assert np.array_equal(raw.temperature_c, [[math.nan, 25.0]], equal_nan=True)
     assert raw.temperature_c.dtype == np.float32
     assert raw.current_a.size == 0
+    assert core.notes() == ["the source measures supply voltage, temperature, too"]
 
 
 def test_a_column_that_some_samples_leave_out_is_unknown_there_and_splits_no_message() -> None:

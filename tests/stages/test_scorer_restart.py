@@ -45,7 +45,7 @@ def bits(scores: Sequence[Score], from_t_ns: int = 0) -> dict[str, bytes]:
     return {
         name: np.concatenate([getattr(s, name)[r] for s, r in zip(scores, rows, strict=True)]).tobytes()
         for name, column in columns(Score).items()
-        if column.by_sample
+        if column.by_sample and not column.optional
     }
 
 

@@ -7,7 +7,7 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -324,6 +324,23 @@ def test_without_the_extra_the_stage_loads_and_build_names_the_package(
 def test_importing_the_stage_does_not_import_rerun() -> None:
     code = "import sys, stages.viewer; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_what_the_source_measures_beside_is_drawn_from_its_first_sample_on(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(seconds=4)
+    half = len(scores) // 2
+    volts = [np.full(score.score.shape, 12.0 + number, np.float32) for number, score in enumerate(scores)]
+    with_supply = [replace(score, supply_voltage_v=of) for score, of in zip(scores[half:], volts[half:], strict=True)]
+    core = build(context(tmp_path)).core
+    for item in (*scores[:half], *with_supply):
+        core.step(sent(item))
+        core.tick(int(item.t_ns[-1]))
+    core.close()
+    rows = rows_of(tmp_path / "view.rrd")
+    shown = [row["Scalars:scalars"][0] for _, row in rows["/tray1/supply_voltage_v/fan_1"]]
+    known = [value for value in shown if np.isfinite(value)]
+    np.testing.assert_allclose(known, np.concatenate(volts[half:])[:, 1])
+    assert not any("temperature_c" in path for path in rows)
 
 
 def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp_path: Path) -> None:

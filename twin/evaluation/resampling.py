@@ -44,7 +44,14 @@ def resampled(run: Run, rate_hz: float) -> Run:
     if steps < 1:
         raise TwinError(f"run {run.name!r}: {run.duration_s:.3g} s are shorter than one step at {rate_hz:g} Hz")
     t_s = run.t_s[0] + np.arange(steps + 1) / rate_hz
-    return replace(run, t_s=t_s, command=_mean_command(run, t_s), speed_rad_s=_speed_rad_s(run, t_s))
+    held = np.clip(np.searchsorted(run.t_s, t_s, "right") - 1, 0, None)
+    return replace(
+        run,
+        t_s=t_s,
+        command=_mean_command(run, t_s),
+        speed_rad_s=_speed_rad_s(run, t_s),
+        auxiliary=run.auxiliary_in(held),
+    )
 
 
 def irregular(run: Run, seed: int = 0) -> Run:
@@ -72,7 +79,13 @@ def thinned(run: Run, every: int) -> Run:
 
 def _with_samples(run: Run, kept: NDArray[np.intp]) -> Run:
     t_s = run.t_s[kept]
-    return replace(run, t_s=t_s, command=_mean_command(run, t_s), speed_rad_s=run.speed_rad_s[kept])
+    return replace(
+        run,
+        t_s=t_s,
+        command=_mean_command(run, t_s),
+        speed_rad_s=run.speed_rad_s[kept],
+        auxiliary=run.auxiliary_in(kept),
+    )
 
 
 def on_grid(runs: Sequence[Run], grid: Grid, seed: int = 0) -> list[Run]:

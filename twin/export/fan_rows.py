@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from schemas.twin_card import DriveCard, TwinCard
 from twin.errors import TwinError
+from twin.reference import at_reference
 from twin.runs import Run
 
 
@@ -41,9 +42,10 @@ def drive_of_fans(card: TwinCard, rows: Sequence[int]) -> DriveCard | None:
 
 
 def measured_as_in_card(card: TwinCard, rows: Sequence[int], runs: Sequence[Run]) -> list[Run]:
-    """The runs with the tachos of a twin: what its free run has to pass before it is compared with their readings.
+    """The runs with the tachos of a twin, which its free run has to pass before it is compared with their readings, and
+    at the twin's reference conditions.
 
-    rows: as fan_rows gives them.
+    rows: as fan_rows gives them. Raises TwinError when a run lacks a column that the twin needs.
     """
     tacho = tuple(card.tacho_of_each_fan[row] for row in rows)
-    return [replace(run, tacho=tacho) for run in runs]
+    return [replace(run, tacho=tacho) for run in at_reference(runs, card.conditions)]

@@ -178,6 +178,10 @@ def _how_time_is_drawn(content: Content) -> str:
     sentences = ["Long recordings are thinned to the extremes of 500 columns, so no excursion is lost."]
     if len(line.recordings) > 1:
         sentences.append("Recordings follow one another.")
+    if conditions := content.card.conditions:
+        sentences.append(
+            f"The twin allows for {conditions.in_words}: commands and speeds are shown as they would be at these."
+        )
     if line.gaps:
         longest = max(gap.lasted_s for gap in line.gaps)
         cut = "; long ones are cut short" if any(gap.shortened for gap in line.gaps) else ""

@@ -8,13 +8,19 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
 from pydantic import ValidationError
 
-from pipeline.cli.options import JsonOption
+from pipeline.cli.options import (
+    CurrentOption,
+    JsonOption,
+    SupplyVoltageOption,
+    TemperatureOption,
+    auxiliary_options,
+)
 from pipeline.config.models import NAME_PATTERN
 from pipeline.devices.measured_table import Table, read_table
 from pipeline.devices.tacho_evidence import tacho_hints
@@ -65,6 +71,9 @@ def import_table(
     period: Annotated[
         str | None, typer.Option(metavar="TIME", help="Time between rows of a table without a time column, e.g. 10ms.")
     ] = None,
+    supply_voltage: SupplyVoltageOption = None,
+    current: CurrentOption = None,
+    temperature: TemperatureOption = None,
     tray: Annotated[str, typer.Option(help="Name of the tray in the recording.")] = "tray1",
     tacho: Annotated[
         Literal["instantaneous", "count", "average", "period"], typer.Option(help="How the speeds were measured.")
@@ -113,14 +122,16 @@ def import_table(
         raise UsageError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
+    auxiliary = auxiliary_options(supply_voltage, current, temperature)
     if kind is None:
         tachos = _tachos(tacho, pulses, window_s or [0.0], update_s, len(speed))
-        table = read_table(file, time, command, speed, period=period)
+        table = read_table(file, time, command, speed, period=period, auxiliary=auxiliary)
         notes = [table.assumed] if table.assumed else []
     else:
         if time or period:
             raise UsageError(f"--time and --period are for tables: a {kind.title} has times")
-        table, of_log = read_samples(file, open_log(file, kind, log_number), command, speed, poles)
+        log = open_log(file, kind, log_number)
+        table, of_log = read_samples(file, log, command, speed, poles, auxiliary=auxiliary)
         notes = list(of_log)
         tachos = _tachos(tacho, pulses, window_s or [0.0], update_s, table.fans)
     write_table(table, output, tray, tachos)
@@ -202,12 +213,14 @@ def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...]
     with RecordingWriter(output, metadata, t_ns=int(table.t_ns[0]), overwrite=True) as writer:
         for sequence, first in enumerate(range(0, len(table.t_ns), SAMPLES_PER_MESSAGE)):
             rows = slice(first, first + SAMPLES_PER_MESSAGE)
+            auxiliary: dict[str, Any] = {name: values[rows] for name, values in table.auxiliary.items()}
             raw = Raw(
                 header=Header("import", sequence, tray),
                 fans=table.fans,
                 host_receive_t_ns=table.t_ns[rows],
                 command=table.command[rows],
                 speed_rad_s=table.speed_rad_s[rows],
+                **auxiliary,
             )
             writer.add_message(tray_key(SITE, tray, "raw"), raw, int(table.t_ns[rows][-1]))
 
@@ -223,5 +236,6 @@ def import_summary(table: Table, output: Path) -> dict[str, object]:
         "speed_unit": table.speed_unit,
         "assumed": table.assumed,
         "gaps": table.gaps,
+        "columns": list(table.auxiliary),
         **asdict(table.repairs),
     }

@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from pydantic import ValidationError
 
-from pipeline.cli.options import JsonOption
+from pipeline.cli.options import (
+    CurrentOption,
+    JsonOption,
+    SupplyVoltageOption,
+    TemperatureOption,
+    auxiliary_options,
+)
 from pipeline.cli.simulation.simulated_hwmon import RATE_HZ, InjectedFaults, tachos_of
 from pipeline.devices.hwmon_simulator import FAULT_FILE, HwmonTree, play_hwmon
 from pipeline.devices.measured_table import read_table
@@ -25,6 +31,7 @@ from pipeline.errors import UsageError, UserError
 from pipeline.recordings.simulated import record
 from pipeline.runtime.signals import stop_on_signals
 from schemas import wire
+from schemas.auxiliary import AUXILIARY
 from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
@@ -46,6 +53,7 @@ _HWMON = "Fans of a computer instead"
 _RECORDING = "Write a recording instead"
 _FILE = "Play a measured file instead of simulating"
 _TACHO = "Tacho"
+_SURROUNDINGS = "Supply and air, of dc fans"
 _IMPERFECTIONS = "Imperfections of real trays"
 
 
@@ -140,6 +148,29 @@ def simulate(
         int,
         typer.Option(help="First reading of the device clock, which wraps at 2^32.", rich_help_panel=_IMPERFECTIONS),
     ] = 0,
+    measure: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="COLUMN",
+            help="Send this column, too: supply_voltage_v, current_a or temperature_c. Repeatable.",
+            rich_help_panel=_SURROUNDINGS,
+        ),
+    ] = None,
+    supply_wander: Annotated[
+        float,
+        typer.Option(
+            help="Wander of the supply voltage, relative standard deviation, e.g. 0.05.", rich_help_panel=_SURROUNDINGS
+        ),
+    ] = 0.0,
+    air_temperature: Annotated[
+        float, typer.Option(help="Mean temperature of the air, °C.", rich_help_panel=_SURROUNDINGS)
+    ] = 20.0,
+    air_swing: Annotated[
+        float,
+        typer.Option(
+            help="Amplitude of the temperature around it, °C, over 10 minutes.", rich_help_panel=_SURROUNDINGS
+        ),
+    ] = 0.0,
     recording: Annotated[
         Path | None,
         typer.Option(help="Recording to write, faster than real time.", rich_help_panel=_RECORDING),
@@ -183,6 +214,9 @@ def simulate(
             rich_help_panel=_FILE,
         ),
     ] = None,
+    supply_voltage: SupplyVoltageOption = None,
+    current: CurrentOption = None,
+    temperature: TemperatureOption = None,
     from_s: Annotated[
         float, typer.Option("--from", help="Start, seconds since the first row.", rich_help_panel=_FILE)
     ] = 0.0,
@@ -209,13 +243,13 @@ def simulate(
             raise UsageError(
                 "--from-csv plays a file unchanged: leave out --fault; instead of --recording use `fantwin import`"
             )
-        device = TableDevice(
-            read_table(from_csv, time or None, command or [], speed or [], period=period), from_s, to_s
-        )
+        auxiliary = auxiliary_options(supply_voltage, current, temperature)
+        table = read_table(from_csv, time or None, command or [], speed or [], period=period, auxiliary=auxiliary)
+        device = TableDevice(table, from_s, to_s)
         summary_of = partial(_summary_of_file, from_csv, device)
     else:
-        if time or period or command or speed:
-            raise UsageError("--time, --period, --command and --speed describe a file: name it with --from-csv FILE")
+        if time or period or command or speed or supply_voltage or current or temperature:
+            raise UsageError("--time, --period and columns describe a file: name it with --from-csv FILE")
         tachos = tuple(
             _tacho(kind=tacho, pulses=pulses, window_s=one, update_s=update, delay_s=tacho_delay)
             for one in window or [0.0]
@@ -228,6 +262,12 @@ def simulate(
             noise_rad_s=noise,
             shares={"missing_edges": missing_edges, "double_edges": double_edges, "missing_readings": missing},
             clock={"drift_ppm": drift_ppm, "start_us": clock_start_us},
+            surroundings={
+                "measured": _measured(measure or []),
+                "supply_wander": supply_wander,
+                "temperature_c": air_temperature,
+                "temperature_swing_c": air_swing,
+            },
             fans=fans,
             fan=fan,
             rate_hz=rate if rate is not None else RATE_HZ if hwmon else 100.0,
@@ -323,6 +363,7 @@ def _tray(
     noise_rad_s: float,
     shares: Mapping[str, float],
     clock: Mapping[str, Any],
+    surroundings: Mapping[str, Any],
     **settings: Any,
 ) -> SimulatedTray:
     """The tray with these settings; see `simulation.tray.TraySettings`.
@@ -333,15 +374,27 @@ def _tray(
     from simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
     from simulation.faults import parse_fault  # noqa: PLC0415
     from simulation.plant import DeviceClock  # noqa: PLC0415
+    from simulation.surroundings import Surroundings  # noqa: PLC0415
     from simulation.tacho import NoisyTacho, TachoSettings  # noqa: PLC0415
     from simulation.tray import SimulatedTray, TraySettings  # noqa: PLC0415
 
     measured = TachoSettings(tachos, NoisyTacho(noise_rad_s), **shares)
     try:
         schedule = tuple(map(parse_fault, faults))
-        return SimulatedTray(TraySettings(faults=schedule, tacho=measured, clock=DeviceClock(**clock), **settings))
+        around, device_clock = Surroundings(**surroundings), DeviceClock(**clock)
+        return SimulatedTray(
+            TraySettings(faults=schedule, tacho=measured, clock=device_clock, surroundings=around, **settings)
+        )
     except SimulationError as error:
         raise UsageError(str(error)) from error
+
+
+def _measured(names: list[str]) -> tuple[str, ...]:
+    known = [column.name for column in AUXILIARY]
+    for name in names:
+        if name not in known:
+            raise UsageError(f"--measure {name}: known are {', '.join(known)}")
+    return tuple(name for name in known if name in names)
 
 
 def _counts(played: PlaybackCounts) -> Summary:

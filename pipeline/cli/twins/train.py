@@ -155,6 +155,8 @@ def _print(result: dict[str, Any], training_data: TrainingData) -> None:
     typer.echo(f"{result['twin']}: {result['model']} of {result['fans']} fan(s), {networks}")
     typer.echo(f"  {result['evaluated_on']} data, {sentence(result, training_data.speed_unit)}")
     typer.echo(f"  {balance_sentence(result)}")
+    if result["allows_for"]:
+        typer.echo(f"  allows for {result['allows_for']}, and needs these columns")
     for warning in result["warnings"]:
         typer.echo(warning, err=True)
 
@@ -222,6 +224,7 @@ def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path) -> 
         "balance_sigma": list(card.balance.sigma_command),
         "balance_source": list(card.balance.source),
         "command_unit": card.command_unit,
+        "allows_for": card.conditions.in_words if card.conditions else "",
         "fans": card.fans,
         "network_parameters": card.network.parameter_count,
         "iterations": card.training.iterations,

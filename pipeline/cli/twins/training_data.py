@@ -183,7 +183,10 @@ def training_data_of(found: RecordedTray, fans: str | None = None, windows_s: Se
     tacho = counting_tachos(windows_s) if windows_s else found.tacho
     numbers = fan_numbers(fans) or list(range(found.runs[0].command.shape[1]))
     with twin_errors():
-        cleaned = [without_outliers(Run(path.stem, run.t_s, run.command, run.speed_rad_s, tacho)) for run in found.runs]
+        cleaned = [
+            without_outliers(Run(path.stem, run.t_s, run.command, run.speed_rad_s, tacho, run.auxiliary))
+            for run in found.runs
+        ]
     return TrainingData(
         runs=[run for run, _ in cleaned],
         sources=[Source(path, len(run.t_s), float(run.t_s[0]), float(run.t_s[-1])) for run in found.runs],

@@ -25,7 +25,12 @@ from schemas.messages import Alarm, Array, Score, ScorerSnapshot, Transition
 
 SCORE, SNAPSHOT = "score", "snapshot"
 _BLOCK_MESSAGES = 512
-_SAMPLE_COLUMNS = {name: column.dtype for name, column in columns(Score).items() if column.by_sample and name != "t_ns"}
+_SAMPLE_COLUMNS = {
+    name: column.dtype
+    for name, column in columns(Score).items()
+    if column.by_sample and not column.optional and name != "t_ns"
+}
+"""optional ones are only passed on from the source"""
 
 
 class TrayVerifier:

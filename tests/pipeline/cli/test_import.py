@@ -52,6 +52,33 @@ def test_the_recording_holds_the_numbers_of_the_table(tmp_path):
     np.testing.assert_allclose(speed_rad_s / (2 * np.pi / 60), values[:, 2:], rtol=1e-14)
 
 
+def test_columns_beside_command_and_speed_go_into_the_recording_and_out_into_tables(tmp_path):
+    path = tmp_path / "measured.csv"
+    rows = [f"{k / 100},{0.5},{100 + k},{99 + k},{12 - k / 1000},{11.5},{'' if k % 2 else 21.5}" for k in range(40)]
+    path.write_text("\n".join(["t,u,y1,y2,v1,v2,air", *rows, rows[-1]]) + "\n")
+    recording = tmp_path / "r.mcap"
+    given = ("--supply-voltage", "v1", "--supply-voltage", "v2", "--temperature", "air")
+    arguments = ("--time", "t", "--command", "u", "--speed", "y1", "--speed", "y2")
+    summary = json.loads(fantwin("import", path, *arguments, *given, "-o", recording, "--json").stdout)
+    assert summary["columns"] == ["supply_voltage_v", "temperature_c"]
+    assert (summary["repeated"], summary["speeds_missing"]) == (1, 0)
+    (run,) = read_runs(recording).runs
+    k = np.arange(40)
+    np.testing.assert_allclose(
+        run.auxiliary["supply_voltage_v"], np.column_stack([12 - k / 1000, 0 * k + 11.5]), rtol=1e-6
+    )
+    expected = np.where(k % 2, np.nan, 21.5)[:, np.newaxis]
+    np.testing.assert_array_equal(run.auxiliary["temperature_c"], np.repeat(expected, 2, axis=1))
+    assert fantwin("export", recording, "--to", "csv", "--topic", "raw", "-o", tmp_path / "raw.csv").exit_code == 0
+    table = np.genfromtxt(tmp_path / "raw.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(table["supply_voltage_v"][1::2], 11.5)
+    np.testing.assert_array_equal(np.isnan(table["temperature_c"]), np.repeat(k % 2 == 1, 2))
+    assert np.isnan(table["current_a"]).all()
+    assert "give one for all fans" in error_of(
+        "import", path, *arguments, *(("--current", "v1") * 3), "-o", tmp_path / "x.mcap"
+    )
+
+
 def test_json_output_has_the_counts(tmp_path):
     path, values = measured(tmp_path)
     lines = path.read_text().splitlines()

@@ -186,7 +186,7 @@ def test_a_column_whose_name_has_a_colon_is_found(tmp_path):
         ({"time": "tt"}, "did you mean 't'"),
         ({"speed": ("y:rmp",)}, "unknown unit 'rmp'; known: rad/s, rpm, hz, deg/s"),
         ({"time": "t:min"}, "unknown unit 'min'; known: s, ms, us, ns, iso"),
-        ({"command": ("u:V",)}, "a command has no unit"),
+        ({"command": ("u:V",)}, "it has no unit here"),
         ({"time": None}, "needs --time COLUMN"),
         ({"time": None, "period": "10"}, "with its unit"),
         ({"time": None, "period": "0ms"}, "with its unit"),

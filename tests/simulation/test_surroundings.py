@@ -1,0 +1,71 @@
+"""simulation.surroundings: a supply that wanders and air that warms, and what is measured of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from simulation.errors import SimulationError
+from simulation.faults import Fault
+from simulation.surroundings import Surroundings
+from simulation.tacho import NoisyTacho, TachoSettings
+from simulation.tray import SimulatedTray, TraySample, TraySettings
+
+ALL = ("supply_voltage_v", "current_a", "temperature_c")
+STILL = TraySettings(
+    fans=2, rate_hz=20.0, duration_s=30.0, tacho=TachoSettings(noise=NoisyTacho(0.0)), fan_variation=0.0
+)
+
+
+def samples(settings: TraySettings, duty: float = 0.7) -> list[TraySample]:
+    tray, found = SimulatedTray(settings), []
+    tray.command(np.full(settings.fans, duty))
+    while tray.due_s() is not None:
+        found.append(tray.take())
+    return found
+
+
+def last(settings: TraySettings) -> TraySample:
+    return samples(settings)[-1]
+
+
+def test_without_surroundings_samples_are_as_before_and_have_no_columns() -> None:
+    plain = samples(STILL)
+    assert all(not sample.auxiliary for sample in plain)
+    measured = samples(replace(STILL, surroundings=Surroundings(measured=ALL)))
+    for one, other in zip(plain, measured, strict=True):
+        np.testing.assert_array_equal(one.speed_rad_s, other.speed_rad_s)
+    assert list(measured[0].auxiliary) == [*ALL]
+
+
+def test_warm_air_drags_less_and_a_fault_of_the_supply_shows_in_its_voltage() -> None:
+    cold = last(STILL)
+    warm = last(replace(STILL, surroundings=Surroundings(temperature_c=60.0, measured=ALL)))
+    assert np.all(warm.speed_rad_s > 1.01 * cold.speed_rad_s)
+    np.testing.assert_allclose(warm.auxiliary["temperature_c"], 60.0, atol=1.0)
+    sagging = replace(STILL, faults=(Fault("supply", 1, 10.0, size=0.8),), surroundings=Surroundings(measured=ALL))
+    np.testing.assert_allclose(last(sagging).auxiliary["supply_voltage_v"], [12.0, 9.6], atol=0.2)
+
+
+def test_more_drag_takes_more_current_and_a_weak_supply_less() -> None:
+    measured = replace(STILL, surroundings=Surroundings(measured=ALL))
+    healthy, drag, supply = (
+        last(replace(measured, faults=faults)).auxiliary["current_a"][1]
+        for faults in ((), (Fault("inlet", 1, 0.0, size=1.6),), (Fault("supply", 1, 0.0, size=0.8),))
+    )
+    assert drag > healthy + 0.05
+    assert supply < healthy - 0.05
+
+
+def test_the_supply_wanders_as_much_as_it_is_set_to() -> None:
+    settings = replace(STILL, duration_s=600.0, rate_hz=2.0, surroundings=Surroundings(0.05, 5.0, measured=ALL))
+    volts = np.array([sample.auxiliary["supply_voltage_v"][0] for sample in samples(settings)])
+    assert volts.std() == pytest.approx(0.6, rel=0.3)
+    assert volts.mean() == pytest.approx(12.0, rel=0.03)
+
+
+def test_fans_that_control_their_own_speed_have_no_surroundings() -> None:
+    with pytest.raises(SimulationError, match="choose dc fans"):
+        SimulatedTray(TraySettings(fan="4-pin", surroundings=Surroundings(measured=ALL)))

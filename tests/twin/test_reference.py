@@ -1,0 +1,98 @@
+"""twin.reference: runs at other supply voltages and temperatures teach the same twin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.reference_conditions import ReferenceConditions
+from simulation.surroundings import Surroundings
+from simulation.tacho import NoisyTacho, TachoSettings
+from simulation.tray import SimulatedTray, TraySettings
+from twin.build import evaluate, train_twin
+from twin.errors import TwinError
+from twin.evaluation.resampling import resampled
+from twin.reference import at_reference, reference_of
+from twin.runs import Run
+
+NOISE_RAD_S = 2.0
+
+
+def simulated(seed: int, surroundings: Surroundings, seconds: float = 60.0) -> Run:
+    """A run of one fan under a wandering supply and air."""
+    tacho = TachoSettings(noise=NoisyTacho(NOISE_RAD_S))
+    settings = TraySettings(
+        fans=1, rate_hz=50.0, duration_s=seconds, profile="prbs", seed=seed, tacho=tacho, surroundings=surroundings
+    )
+    tray, samples = SimulatedTray(settings), []
+    while tray.due_s() is not None:
+        samples.append(tray.take())
+    return Run(
+        f"seed {seed}",
+        np.array([sample.t_s for sample in samples]),
+        np.stack([sample.command for sample in samples]),
+        np.stack([sample.speed_rad_s for sample in samples]),
+        auxiliary={name: np.stack([sample.auxiliary[name] for sample in samples]) for name in samples[0].auxiliary},
+    )
+
+
+MEASURED = Surroundings(
+    supply_wander=0.05,
+    temperature_swing_c=10.0,
+    temperature_period_s=60.0,
+    measured=("supply_voltage_v", "temperature_c"),
+)
+
+
+@pytest.fixture(scope="module")
+def runs() -> tuple[Run, Run]:
+    """One to train on, one held out."""
+    return simulated(1, MEASURED), simulated(2, MEASURED)
+
+
+def test_a_twin_that_knows_supply_and_air_is_exact_where_they_wander(runs: tuple[Run, Run]) -> None:
+    training, held_out = runs
+    twin = train_twin([training], [], "physical", name="knows")
+    blind = train_twin([replace(training, auxiliary={})], [], "physical", name="blind")
+    conditions = twin.card.conditions
+    assert conditions is not None and conditions.needed == ("supply_voltage_v", "temperature_c")
+    assert conditions.supply_voltage_v == pytest.approx(12.0, rel=0.06)
+    assert blind.card.conditions is None
+    known, unknown = (evaluate(each, [held_out]).pooled.rmse_rad_s for each in (twin, blind))
+    assert known is not None and unknown is not None
+    assert known < 2.0 * NOISE_RAD_S
+    assert unknown > 3.0 * known
+    on_another_grid = evaluate(twin, [resampled(held_out, 20.0)]).pooled.rmse_rad_s
+    assert on_another_grid is not None and on_another_grid < 2.5 * NOISE_RAD_S
+
+
+def test_a_run_without_a_column_that_the_twin_needs_is_refused(runs: tuple[Run, Run]) -> None:
+    needs = ReferenceConditions(supply_voltage_v=12.0)
+    with pytest.raises(TwinError, match="has no supply_voltage_v, which the twin needs"):
+        at_reference([replace(runs[0], auxiliary={})], needs)
+
+
+def test_only_what_all_runs_know_nearly_throughout_is_used(runs: tuple[Run, Run]) -> None:
+    one, other = runs
+    assert reference_of([one, replace(other, auxiliary={})]) is None
+    patchy = other.auxiliary["temperature_c"].copy()
+    patchy[: len(patchy) // 4] = np.nan
+    patchy_run = replace(other, auxiliary={**other.auxiliary, "temperature_c": patchy})
+    found = reference_of([one, patchy_run])
+    assert found is not None and found.needed == ("supply_voltage_v",)
+    sparse = np.full_like(patchy, np.nan)
+    sparse[::50] = 20.0  # once a second
+    found = reference_of([replace(other, auxiliary={"temperature_c": sparse})])
+    assert found is not None and found.needed == ("temperature_c",)
+
+
+def test_speeds_are_missing_where_the_conditions_are_not_known(runs: tuple[Run, Run]) -> None:
+    volts = np.full_like(runs[0].speed_rad_s, np.nan)
+    volts[:100] = 6.0
+    (converted,) = at_reference([replace(runs[0], auxiliary={"supply_voltage_v": volts})], ReferenceConditions(12.0))
+    np.testing.assert_array_equal(converted.command, 0.5 * runs[0].command)
+    known = np.isfinite(converted.speed_rad_s[:, 0])
+    assert known[: 100 + 240].all()
+    assert not known[100 + 260 :].any()
