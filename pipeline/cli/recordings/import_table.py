@@ -130,9 +130,8 @@ def import_table(
     else:
         if time or period:
             raise UsageError(f"--time and --period are for tables: a {kind.title} has times")
-        if auxiliary:
-            raise UsageError("--supply-voltage, --current and --temperature are for tables: leave them out for a log")
-        table, of_log = read_samples(file, open_log(file, kind, log_number), command, speed, poles)
+        log = open_log(file, kind, log_number)
+        table, of_log = read_samples(file, log, command, speed, poles, auxiliary=auxiliary)
         notes = list(of_log)
         tachos = _tachos(tacho, pulses, window_s or [0.0], update_s, table.fans)
     write_table(table, output, tray, tachos)

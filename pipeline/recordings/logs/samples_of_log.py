@@ -6,7 +6,7 @@ import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +18,17 @@ from schemas.messages import Array
 
 ELECTRICAL = "erpm"
 UNITS = (*RAD_S_PER_TABLE_UNIT, ELECTRICAL)
-PLACEHOLDER = re.compile(r"\*|\{fan\}")
+FAN_NUMBER = re.compile(r"\*|\{fan\}")
 MOST_SHOWN = 8
 
 
 @dataclass(frozen=True)
 class FanFields:
-    """The fields of each fan, and what was decided about them, one line each."""
+    """The fields of each fan, and what was decided about them, one line each. numbers: of the fans in the log."""
 
     command: tuple[str, ...]
     speed: tuple[str, ...]
+    numbers: tuple[int, ...]
     notes: tuple[str, ...] = ()
 
 
@@ -40,7 +41,7 @@ def fan_fields(path: Path, names: Sequence[str], command: Sequence[str], speed: 
         LogError: there is no such field.
         UsageError: names and patterns do not fit together.
     """
-    patterns = [given for given in (*command, *speed) if PLACEHOLDER.search(given)]
+    patterns = [given for given in (*command, *speed) if FAN_NUMBER.search(given)]
     if not patterns:
         for given in (*command, *speed):
             _require(path, names, given)
@@ -49,14 +50,14 @@ def fan_fields(path: Path, names: Sequence[str], command: Sequence[str], speed: 
                 f"{len(command)} command and {len(speed)} speed fields: give --speed once per fan, and --command once "
                 "for all fans or once per fan"
             )
-        return FanFields(tuple(command) * (len(speed) // len(command)), tuple(speed))
+        return FanFields(tuple(command) * (len(speed) // len(command)), tuple(speed), tuple(range(len(speed))))
     if len(speed) != 1 or len(command) != 1:
         raise UsageError(f"{patterns[0]}: with * or {{fan}} give --command and --speed once each")
     speeds = _matches(path, names, speed[0])
     commands = _matches(path, names, command[0])
-    if not PLACEHOLDER.search(command[0]):
-        return FanFields((command[0],) * len(speeds), tuple(speeds.values()))
-    if not PLACEHOLDER.search(speed[0]):
+    if not FAN_NUMBER.search(command[0]):
+        return FanFields((command[0],) * len(speeds), tuple(speeds.values()), tuple(speeds))
+    if not FAN_NUMBER.search(speed[0]):
         raise UsageError(f"--speed {speed[0]} is one field, and --command has a pattern: give a pattern for both")
     fans = [fan for fan in speeds if fan in commands]
     if not fans:
@@ -65,15 +66,23 @@ def fan_fields(path: Path, names: Sequence[str], command: Sequence[str], speed: 
     left_out += [*(speeds[fan] for fan in speeds if fan not in commands)]
     more = f" and {len(left_out) - 3} more" if len(left_out) > 3 else ""
     notes = (f"left out, without the other of command and speed: {', '.join(left_out[:3])}{more}",) if left_out else ()
-    return FanFields(tuple(commands[fan] for fan in fans), tuple(speeds[fan] for fan in fans), notes)
+    return FanFields(tuple(commands[fan] for fan in fans), tuple(speeds[fan] for fan in fans), tuple(fans), notes)
 
 
 def read_samples(
-    path: Path, log: LogFile, command: Sequence[str], speed: Sequence[str], poles: int | None
+    path: Path,
+    log: LogFile,
+    command: Sequence[str],
+    speed: Sequence[str],
+    poles: int | None,
+    *,
+    auxiliary: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[Table, tuple[str, ...]]:
     """The samples of the fans, and notes for people.
 
     command, speed: as for `fan_fields`, a speed with its unit as `NAME:UNIT`. poles: of the motors, for `erpm`.
+    auxiliary: fields of what else was measured, by the name of its column: one for all fans, one per fan, or a pattern.
+    Their values hold until the next one, as commands do.
 
     Raises:
         UserError: the fields or units cannot be used.
@@ -84,14 +93,34 @@ def read_samples(
         raise UsageError(f"speeds in {', '.join(sorted(unit or 'no unit' for unit in units))}: give all in one unit")
     (unit,) = units
     chosen = fan_fields(path, log.names, command, [name for name, _ in split])
-    series = log.read(list(dict.fromkeys((*chosen.command, *chosen.speed))))
+    others = {name: _of_fans(path, log.names, given, chosen) for name, given in (auxiliary or {}).items()}
+    measured = [name for names in others.values() for name in names if name]
+    series = log.read(list(dict.fromkeys((*chosen.command, *chosen.speed, *measured))))
     factor, shown = _rad_s_per(unit or "rad/s", poles or log.motor_poles)
     t_ns, speeds = _speeds([series[name] for name in chosen.speed])
     commands = np.column_stack([_held(series[name], t_ns) for name in chosen.command])
-    table = clean_samples(path, t_ns, np.ones(len(t_ns), np.bool_), commands, speeds * factor, shown)
+    unknown = np.full(len(t_ns), np.nan)
+    held = [_held(series[name], t_ns) if name else unknown for names in others.values() for name in names]
+    values = np.column_stack([speeds * factor, *held])
+    table = clean_samples(path, t_ns, np.ones(len(t_ns), np.bool_), commands, values, shown)
+    of_speed, *of_others = np.split(table.speed_rad_s, len(others) + 1, axis=1)
+    table = replace(table, speed_rad_s=of_speed, auxiliary=dict(zip(others, of_others, strict=True)))
     assumed = "" if unit else f"speeds in rad/s assumed; if that is wrong, use for example --speed {split[0][0]}:rpm"
     notes = [*log.notes, *chosen.notes, *([assumed] if assumed else []), *_rates(series, chosen)]
     return table, tuple(notes)
+
+
+def _of_fans(path: Path, names: Sequence[str], given: Sequence[str], chosen: FanFields) -> list[str]:
+    """The field of each fan; empty where it has none."""
+    if len(given) == 1 and FAN_NUMBER.search(given[0]):
+        found = _matches(path, names, given[0])
+        return [found.get(number, "") for number in chosen.numbers]
+    for each in given:
+        _require(path, names, each)
+    fans = len(chosen.speed)
+    if len(given) not in (1, fans):
+        raise UsageError(f"{given[0]} and {len(given) - 1} more for {fans} fans: give one for all fans, or one per fan")
+    return list(given) * (fans // len(given))
 
 
 def _rates(series: Mapping[str, Series], chosen: FanFields) -> list[str]:
@@ -151,7 +180,7 @@ def _with_unit(given: str, names: Sequence[str]) -> tuple[str, str]:
 
 def _matches(path: Path, names: Sequence[str], given: str) -> dict[int, str]:
     """The fields of a pattern by the number of the fan; of a name that field."""
-    parts = PLACEHOLDER.split(given)
+    parts = FAN_NUMBER.split(given)
     if len(parts) == 1:
         _require(path, names, given)
         return {0: given}

@@ -76,6 +76,12 @@ def test_ulog_with_commands_held_at_the_times_of_the_readings(tmp_path: Path) ->
     expected = np.interp(np.minimum(held_us, 3_997_000) / 1e6, T_S, COMMANDS[:, 0])
     np.testing.assert_allclose(command, np.column_stack([expected] * 2), rtol=1e-6)
     assert read_runs(recording).speed_unit == "rpm"
+    volts = ("--supply-voltage", "esc_status.esc[*].esc_voltage", "--force")
+    assert fantwin("import", tmp_path / "flight.ulg", *words, *volts, "-o", recording).exit_code == 0
+    (first, *_) = [entry.message for entry in read_recording(recording)]
+    assert isinstance(first, Raw)
+    np.testing.assert_allclose(first.supply_voltage_v[:2], [[12.0, 12.1]] * 2, rtol=1e-6)
+    np.testing.assert_allclose(samples(recording)[2], SPEEDS, rtol=1e-12)
 
 
 def test_blackbox_with_electrical_speeds_and_the_tacho_that_is_declared(tmp_path: Path) -> None:
