@@ -20,7 +20,7 @@ from scoring.diagnosis.regression_window import MEAN_OVER_S, Array, HealthyBalan
 MIN_ROWS_BEFORE, MIN_ROWS_AFTER = 40, 4
 """means of MEAN_OVER_S"""
 LEAST_MOVED = 0.1
-"""the commands before the onset must differ by this share: else the effects of command and speed look alike"""
+"""the commands before the onset must differ by this share: otherwise command and speed cannot be separated"""
 CLEAR_OF_ONSET_S = 1.0
 """the fault may have begun so long before the onset that was found, and the current needs as long to follow"""
 CORRELATED = 3.0
