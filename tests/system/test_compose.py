@@ -64,7 +64,7 @@ def test_a_stage_stops_before_those_that_read_from_it_and_all_before_the_router(
 
 def test_the_configuration_fits_the_services():
     config = load_config(ROOT / "pipeline" / "demo" / "compose.toml")
-    ((_, _, listen),) = fantwin_commands("router")
+    ((_, _, listen, _),) = fantwin_commands("router")
     assert (config.bus.mode, config.bus.endpoint) == ("client", f"tcp/router:{listen.rpartition(':')[2]}")
     (tray,) = config.trays
     simulate = next(words for words in fantwin_commands("acquisition") if words[0] == "simulate")

@@ -85,6 +85,7 @@ class CommandSender:
     """Sends commands to one tray."""
 
     def __init__(self, bus: Bus, site: str, tray: str, stop: threading.Event) -> None:
+        self._bus = bus
         self._acquisition = _Acquisition(bus, site, tray)
         self._tray = tray
         self.stop = stop
@@ -98,8 +99,9 @@ class CommandSender:
         """Wait for the tray's acquisition.
 
         Raises:
-            UserError: there is none.
+            UserError: there is none, or this command has no right to send.
         """
+        self._bus.require_rights(self.stop)
         self._acquisition.watch_health(self._wait(self._acquisition.at_work))
         self._before = self._wait(self._acquisition.health)
 
