@@ -87,7 +87,7 @@ class _Site:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._hosts = [Host("one", "10.77.0.11"), Host("two", "10.77.0.12")]
-        self._router = Process(["router", "--listen", ENDPOINT], folder / "router")
+        self._router = Process(["router", "--listen", ENDPOINT, "--insecure"], folder / "router")
         self._first = self._up("first", ["resampler", "twin_integrator"])
         self._recorder = self._up("recorder", ["recorder"])
         self._ups = [self._up(host.name, ON_HOSTS, n, host) for n, host in enumerate(self._hosts, 1)]
@@ -148,7 +148,14 @@ class _Site:
 
     def _up(self, name: str, stages: list[str], number: int = 0, host: Host | None = None) -> Process:
         """`fantwin up` of some stages; number: of the host among those that share the trays."""
-        words = ["up", "-c", self._folder / "site.toml", "--json", *(("--shard", f"{number}/2") if number else ())]
+        words = [
+            "up",
+            "-c",
+            self._folder / "site.toml",
+            "--insecure",
+            "--json",
+            *(("--shard", f"{number}/2") if number else ()),
+        ]
         words += ["--set", f"launcher.stages={json.dumps(stages)}", "--set", f"run_folder='{self._folder / name}'"]
         return Process(words, self._folder / name, host)
 

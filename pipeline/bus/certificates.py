@@ -97,7 +97,11 @@ def checked_credentials(security: SecurityConfig, roles: Sequence[str]) -> Crede
     Raises:
         BusError: a file is missing or cannot be used: one line that says which, why, and what to do.
     """
-    role = next((each for each in roles if of_role(security.certificate, each).exists()), roles[-1])
+    places = {role: of_role(security.certificate, role) for role in roles}
+    role = next((each for each, path in places.items() if path.exists()), "")
+    if not role:
+        names = " or ".join(map(str, dict.fromkeys(places.values())))
+        raise BusError(f"{names}: no such certificate: `fantwin certs issue` makes it")
     ca, certificate, key = (of_role(path, role) for path in (security.ca, security.certificate, security.key))
     parent, own = _loaded(ca), _loaded(certificate)
     _require_private(key)

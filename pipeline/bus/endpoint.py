@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 import socket
 
@@ -71,6 +72,19 @@ def _accepts(match: re.Match[str]) -> bool:
             return True
     except OSError:
         return False
+
+
+def is_beyond_loopback(endpoint: str) -> bool:
+    """Whether other hosts or containers may reach an endpoint: it is on a network, and not only of this host. A host
+    name that cannot be found now counts as one of others."""
+    match = _ADDRESS.fullmatch(endpoint)
+    if match is None:
+        return False
+    try:
+        found = socket.getaddrinfo(match[2].strip("[]"), int(match[3][:5]))
+    except (OSError, UnicodeError):
+        return True
+    return not all(ipaddress.ip_address(str(each[4][0]).partition("%")[0]).is_loopback for each in found)
 
 
 def require_tls_with_security(config: BusConfig) -> None:

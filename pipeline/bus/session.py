@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Self
 
 import zenoh
 
+from pipeline.bus.access_rules import SiteRoles, access_control
 from pipeline.bus.endpoint import (
     accepts_connections,
     endpoint_problem,
@@ -33,13 +34,14 @@ from pipeline.bus.endpoint import (
     somebody_listens,
 )
 from pipeline.bus.errors import BusError, reason
-from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
+from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept, kept_key
 from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
 from pipeline.bus.publisher import KeptBytes, Publisher
-from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
+from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
+from pipeline.bus.rights import OwnRights, granted_rights
 from pipeline.bus.settings import Settings
 from pipeline.bus.spool import Spool
-from pipeline.config.models import BusConfig
+from pipeline.config.models import BusConfig, Config
 from pipeline.config.roles import READERS
 from schemas.topics import Topic, largest_bytes
 
@@ -63,12 +65,14 @@ class Bus:
         *,
         listens: bool = True,
         roles: Sequence[str] = READERS,
+        site: SiteRoles | None = None,
     ) -> None:
         """Open a session. Peers need no other process. A client needs its router; with `stop` it waits for the router
         until `stop` is set.
 
         listens: whether to listen on the endpoint if no process does; not for a command that connects only briefly.
         roles: with `bus.security`, the certificate of the first of these that has one here is shown.
+        site: with `bus.security`, what peers accept of one another, and what this session may do; None: not known.
 
         Raises:
             BusError: the endpoint or a certificate cannot be used, or a client's router is not there.
@@ -82,7 +86,12 @@ class Bus:
         self.came_second = somebody_listens(config.endpoint)
         """Whether another process listened before: discovering the others takes a moment."""
         self._has_answered = config.mode == "client" or (self.came_second and _answers(config, self.credentials, stop))
-        self._session = _open(config, self.credentials, stop, listens)
+        self._session = _open(config, self.credentials, stop, listens, site)
+        self.rights: OwnRights | None = None
+        """what this session may do; None: everything, as far as is known"""
+        if self.credentials and site:
+            role, is_client = self.credentials.role, config.mode == "client"
+            self.rights = OwnRights(self._session, site, role, is_client=is_client)
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
         self.spool: Spool | None = None
@@ -99,6 +108,8 @@ class Bus:
 
     def publisher(self, key: str, topic: Topic, encoding: str, producer: str) -> Publisher:
         """Declare an output; `encoding` is the full protobuf name of its messages."""
+        self._claim("put", key)
+        self._claim("declare_queryable", recovery_key(key, producer))
         return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes, self.spool)
 
     def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> Callable[[], None]:
@@ -120,8 +131,11 @@ class Bus:
         handler = zenoh.handlers.Callback(receive, indirect=False)
         subscriber = self._session.declare_subscriber(key_expression, handler, allowed_origin=zenoh.Locality.REMOTE)
         self._declared.append(subscriber)
+        self._claim("declare_subscriber", key_expression)
 
         def unsubscribe() -> None:
+            if self.rights:
+                self.rights.discard("declare_subscriber", key_expression)
             self._declared.remove(subscriber)
             subscriber.undeclare()
 
@@ -129,6 +143,7 @@ class Bus:
 
     def declare_alive(self, key: str) -> None:
         """Show a liveliness token until this session ends, however it ends."""
+        self._claim("liveliness_token", key)
         self._declared.append(self._session.liveliness().declare_token(key))
 
     def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> None:
@@ -182,17 +197,50 @@ class Bus:
 
     def answer_for_kept(self, key_expression: str, kept_by: str, on_query: Callable[[KeptQuery], object]) -> None:
         """Call `on_query` when somebody asks for the last message on a key that is kept here."""
+        self._claim("declare_queryable", kept_key(key_expression, kept_by))
         self._declared.append(answer_for_kept(self._session, key_expression, kept_by, on_query))
 
     def ask_for_kept(self, key: str, timeout_s: float) -> tuple[list[bytes], bool]:
         """The messages that others keep for one key, and whether all of them have answered in time. Waits for it."""
         return ask_for_kept(self._session, key, timeout_s)
 
+    def require_rights(self, stop: threading.Event | None = None) -> None:
+        """Raises BusError if something that this session has declared is refused; waits a moment for the answer."""
+        if self.rights and (problem := self.rights.wait(stop)):
+            raise BusError(problem)
+
+    def has_all_rights_of_its_role(self, site: SiteRoles) -> bool:
+        """Whether the router grants what the role of this session may do in a site. Waits for the answer."""
+        assert self.credentials
+        role = self.credentials.role
+        return granted_rights(self._session, site.site, role) == site.rights(role)
+
+    def security_problem(self) -> str:
+        """What is refused, or which certificate expires soon; empty if there is nothing, or without `bus.security`.
+        To be called often."""
+        if self.credentials is None:
+            return ""
+        if self.rights:
+            self.rights.ask()
+        return "; ".join(filter(None, (self.rights.problem() if self.rights else "", self.credentials.warning())))
+
+    def _claim(self, message: str, key: str) -> None:
+        if self.rights:
+            self.rights.add(message, key)
+
     def close(self) -> None:
         """Leave the bus. What was published before has left this process."""
         self._session.close()
         if self.spool:
             self.spool.close()
+
+
+def join_bus(
+    config: Config, stop: threading.Event | None = None, *, listens: bool = True, roles: Sequence[str] = READERS
+) -> Bus:
+    """A session on the bus of a site, with the roles of the site where its bus has any. Raises BusError as Bus does."""
+    site = SiteRoles.of(config) if config.bus.security else None
+    return Bus(config.bus, stop, listens=listens, roles=roles, site=site)
 
 
 def credentials_of(config: BusConfig, roles: Sequence[str]) -> Credentials | None:
@@ -242,10 +290,14 @@ def _short_lived_config(config: BusConfig, credentials: Credentials | None) -> z
 
 
 def _open(
-    config: BusConfig, credentials: Credentials | None, stop: threading.Event | None, listens: bool
+    config: BusConfig,
+    credentials: Credentials | None,
+    stop: threading.Event | None,
+    listens: bool,
+    site: SiteRoles | None,
 ) -> zenoh.Session:
     try:
-        conf = _zenoh_config(config, credentials, listens=listens)
+        conf = _zenoh_config(config, credentials, site, listens=listens)
         if config.mode == "peer":
             return zenoh.open(conf)
     except zenoh.ZError as error:
@@ -270,7 +322,9 @@ def _open(
                 ) from error
 
 
-def _zenoh_config(config: BusConfig, credentials: Credentials | None = None, *, listens: bool) -> zenoh.Config:
+def _zenoh_config(
+    config: BusConfig, credentials: Credentials | None = None, site: SiteRoles | None = None, *, listens: bool
+) -> zenoh.Config:
     settings = Settings()
     settings.set("mode", config.mode)
     settings.set("connect/endpoints", list(config.endpoints))
@@ -289,6 +343,8 @@ def _zenoh_config(config: BusConfig, credentials: Credentials | None = None, *, 
         settings.set("listen/exit_on_failure", False)
         settings.set("scouting/gossip/enabled", True)
         settings.set("transport/link/tx/queue/congestion_control/block/wait_before_close", PEER_WAIT_US)
+        if credentials and site:
+            settings.set("access_control", access_control(site))
     settings.secure(credentials)
     settings.pass_through(config.zenoh)
     return settings.config

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import Bus, join_bus
 from pipeline.config.models import Config
 from pipeline.config.registry import LEARNER, RECORDER, STAGES
 from pipeline.config.shards import own_file
@@ -125,8 +125,10 @@ class Launcher:
         """
         self._refuse_unusable_twins()
         reads = {name: load_stage(name).reads_as_configured(self._config) for name in self._config.stages}
-        with Bus(self._config.bus, stop) as bus:
+        with join_bus(self._config, stop) as bus:
             self._refuse_second_launcher(bus, stop)
+            if problem := bus.security_problem():
+                self._say(problem)
             before = set(self._parts())
             self._watcher = SiteWatcher(bus, self._config.site)
             try:

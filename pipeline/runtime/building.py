@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import Bus, join_bus
 from pipeline.config.models import Config
 from pipeline.config.roles import role_names
 from pipeline.config.shards import Shard
@@ -29,7 +29,7 @@ def build_and_join(
 
     def bus() -> Bus:
         if not joined:
-            joined.append(Bus(config.bus, stop, roles=role_names(stage.name, shard)))
+            joined.append(join_bus(config, stop, roles=role_names(stage.name, shard)))
         return joined[0]
 
     def refuse_others() -> None:

@@ -22,7 +22,8 @@ from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.config.shards import Shard, chosen_shard
 from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.runtime.building import build_and_join
+from pipeline.errors import UserError
+from pipeline.runtime.building import abort, build_and_join
 from pipeline.runtime.clock import StageClock
 from pipeline.runtime.due_messages import DueMessages
 from pipeline.runtime.ending import Ending, Step
@@ -137,6 +138,7 @@ class Runner:
         self._tracker = self._receiver.tracker
         self._notifier = Notifier.from_environment()
         self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
+        self._require_rights()
         self._steps = Steps(
             stage,
             self._parts,
@@ -147,6 +149,11 @@ class Runner:
             health=self._health,
             clock=self._clock,
         )
+
+    @property
+    def refusal(self) -> str:
+        """What the bus refuses of this stage; empty if nothing: others may not hear it say so."""
+        return self._bus.rights.problem() if self._bus.rights else ""
 
     def run(self) -> Health:
         """Run to the end and return the last health, which is published whatever happens.
@@ -190,6 +197,15 @@ class Runner:
     def is_hung(self) -> bool:
         """Whether something was left behind in its thread: the interpreter must not wait for it."""
         return self._ending.is_hung
+
+    def _require_rights(self) -> None:
+        """Refuse to start where nobody would hear what is published."""
+        try:
+            self._bus.require_rights(self.stop)
+        except UserError:
+            abort(self._parts)
+            self._bus.close()
+            raise
 
     def _work(self) -> None:
         self._start()
@@ -370,6 +386,7 @@ class Runner:
             status=status,
             problems=[
                 self._ending.problem,
+                self._bus.security_problem(),
                 self._sessions.problem(),
                 self._tracker.problem(),
                 self._bus.spool.problem() if self._bus.spool else "",

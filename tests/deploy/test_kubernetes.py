@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from pipeline.bus.certificates import of_role
+from pipeline.config.loading import parse_config
 from pipeline.config.registry import STAGES
 from tests.support.fantwin_words import parsed
 
@@ -22,12 +24,14 @@ CHART = Path(__file__).parents[2] / "deploy" / "kubernetes" / "fantwin"
 CONFIGURATION = 'site = "plant"\n[[tray]]\nname = "a"\nfans = 8\n'
 OLDEST, NEWEST = "1.28", "1.37"
 """versions of Kubernetes: the first of which schemas have the fields that the chart needs, and the newest known"""
+SECURED = {"config": CONFIGURATION, "certificates": {"secret": "plant-certs"}}
+OPEN = {"certificates": {"secret": ""}, "insecure": True}
 MANY = {stage: {"shards": 3, "storage": "1Gi" if stage in ("recorder", "learner") else ""} for stage in STAGES}
 
 
 def rendered(**values: Any) -> list[dict[str, Any]]:
     with helm.Chart.load(str(CHART)) as chart:
-        files = chart.render({"config": CONFIGURATION, **values}, name="plant", namespace="fans")
+        files = chart.render({**SECURED, **values}, name="plant", namespace="fans")
     return [document for text in files.values() for document in yaml.safe_load_all(text) if document]
 
 
@@ -54,6 +58,7 @@ def container(stateful_set: dict[str, Any]) -> dict[str, Any]:
         {},
         {"stages": MANY, "files": {"configMap": {"name": "twins"}}, "image": {"pullSecrets": [{"name": "registry"}]}},
         {"router": {"enabled": False}},
+        OPEN,
     ],
     ids=str,
 )
@@ -71,7 +76,7 @@ def test_the_schemas_see_what_is_wrong(stages):
 
 
 def test_helm_finds_nothing_to_complain_about():
-    found = helm.lint(str(CHART), values={"config": CONFIGURATION})
+    found = helm.lint(str(CHART), values=SECURED)
     assert found["errors"] == [] or found["errors"] is None
     severe = [each for each in found["messages"] or [] if "icon" not in str(each)]
     assert severe == []
@@ -85,6 +90,7 @@ def test_helm_finds_nothing_to_complain_about():
         {"image": {"pullSecrets": ["registry"]}},
         {"stage": {}},
         {"config": ""},
+        {"certificates": {"secret": ""}},
     ],
     ids=str,
 )
@@ -113,9 +119,7 @@ def test_another_number_of_shards_is_another_set_with_pods_and_a_service_of_its_
         assert of_scorer["metadata"]["name"] == of_scorer["spec"]["serviceName"] == f"plant-scorer-of-{shards}"
     long = "a-release-whose-name-is-as-long-as-helm-allows-53-cha"
     with helm.Chart.load(str(CHART)) as chart:
-        files = chart.render(
-            {"config": CONFIGURATION, "stages": {"scorer": {"shards": 4096}}}, name=long, namespace="f"
-        )
+        files = chart.render({**SECURED, "stages": {"scorer": {"shards": 4096}}}, name=long, namespace="f")
     names = of_kind("StatefulSet", [each for text in files.values() for each in yaml.safe_load_all(text) if each])
     assert all(re.fullmatch(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?", name) for name in names)
     assert max(map(len, names)) <= 52, "the hash of the revision is appended to it in a label of 63 characters"
@@ -137,7 +141,7 @@ def test_the_pods_of_a_stage_share_the_trays_by_their_ordinals(stages, stage):
         words = [word.replace("$(SHARD)", str(number)) for word in container(stages[stage])["args"]]
         found = parsed(words)
         assert (found["stage"], found["shard"]) == (stage, f"{number}/3")
-        assert {"bus.mode=client", "bus.endpoint=tcp/plant-router:7447"} <= set(found["overrides"])
+        assert {"bus.mode=client", "bus.endpoint=tls/plant-router:7447"} <= set(found["overrides"])
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -180,3 +184,25 @@ def test_only_pods_of_the_site_reach_its_router():
     (policy,) = of_kind("NetworkPolicy", rendered()).values()
     (peer,) = policy["spec"]["ingress"][0]["from"]
     assert peer["podSelector"]["matchLabels"]["app.kubernetes.io/instance"] == "plant"
+
+
+def test_a_pod_has_the_certificate_of_its_own_role_only_and_its_commands_find_it(stages):
+    (router,) = of_kind("Deployment", rendered()).values()
+    for role, pods in {**stages, "router": router}.items():
+        (volume,) = (each for each in pods["spec"]["template"]["spec"]["volumes"] if each["name"] == "certificates")
+        files = {each["path"] for each in volume["secret"]["items"]}
+        assert (volume["secret"]["secretName"], files) == ("plant-certs", {"ca.pem", f"{role}.pem", f"{role}.key"})
+        words = container(pods)["args"]
+        settings = parse_config(CONFIGURATION, Path("fantwin.toml"), parsed(words)["overrides"], stages=())
+        assert settings.bus.security
+        wanted = [of_role(getattr(settings.bus.security, name), role) for name in ("ca", "certificate", "key")]
+        assert {str(path) for path in wanted} == {f"/etc/fantwin/certs/{name}" for name in files}
+    assert "--listen=tls/0.0.0.0:7447" in container(router)["args"]
+
+
+def test_without_certificates_every_command_says_that_it_is_insecure():
+    documents = rendered(**OPEN)
+    for pods in (*of_kind("StatefulSet", documents).values(), *of_kind("Deployment", documents).values()):
+        words = container(pods)["args"]
+        assert "--insecure" in words
+        assert not any("certs" in word or "tls" in word for word in words)

@@ -77,7 +77,8 @@ def test_a_unit_runs_the_shard_that_its_instance_names(stage):
 
 
 def test_the_router_listens():
-    assert parsed(command_of("fantwin-router.service", ""))["listen"] == "tcp/0.0.0.0:7447"
+    found = parsed(command_of("fantwin-router.service", ""))
+    assert (found["listen"], found["config"]) == ("tls/0.0.0.0:7447", Path("/etc/fantwin/fantwin.toml"))
 
 
 def test_a_stage_stops_before_those_that_read_from_it():

@@ -17,10 +17,12 @@ DAY = timedelta(days=1)
 class SiteCertificates:
     """A folder with an authority's certificate, and certificates by role."""
 
-    def __init__(self, folder: Path, authority: Authority | None = None) -> None:
+    def __init__(self, folder: Path, authority: Authority | None = None, *, is_new: bool = True) -> None:
+        """is_new: write the authority's certificate; otherwise the files are there, and only used."""
         self.folder = folder
         self.authority = authority or Authority.new("site", 10 * DAY)
-        write_file(folder / "ca.pem", self.authority.certificate.public_bytes(Encoding.PEM), is_private=False)
+        if is_new:
+            write_file(folder / "ca.pem", self.authority.certificate.public_bytes(Encoding.PEM), is_private=False)
         self.security = SecurityConfig(
             ca=folder / "ca.pem", certificate=folder / "{role}.pem", key=folder / "{role}.key"
         )

@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import Bus, join_bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.watch.request import ask
 from pipeline.config.loading import load_config
@@ -101,7 +101,7 @@ def alarms(
         if duration or comment or operator:
             raise UsageError("--for, --comment and --operator need an action: fantwin alarms ack TRAY FAN")
         stop_on_signals(stop)
-        with Bus(settings.bus, stop, listens=False) as bus:
+        with join_bus(settings, stop, listens=False) as bus:
             _list(bus, settings, stop, show_all=show_all, watch=watch, json_output=json_output)
         return
     if show_all or watch:
@@ -116,7 +116,7 @@ def alarms(
         comment=comment,
     )
     stop_on_signals(stop)
-    with Bus(settings.bus, stop, listens=False, roles=(OPERATOR,)) as bus:
+    with join_bus(settings, stop, listens=False, roles=(OPERATOR,)) as bus:
         watcher = SiteWatcher(bus, settings.site)
         wait_for_stages(bus, watcher, settings, stop, tray=name)
         fans = set(range(settings.tray(name).fans)) if number < 0 else {number}

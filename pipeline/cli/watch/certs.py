@@ -199,9 +199,9 @@ def _content(path: Path) -> bytes:
 
 
 def _hosts(request: _Request) -> list[str]:
-    match = _HOST.fullmatch(request.config.bus.endpoint)
-    of_endpoint = [match[1].strip("[]")] if match else []
-    names = [*_HERE, socket.gethostname(), *of_endpoint, *request.hosts]
+    matches = filter(None, map(_HOST.fullmatch, request.config.bus.endpoints))
+    of_endpoints = [match[1].strip("[]") for match in matches]
+    names = [*_HERE, socket.gethostname(), *of_endpoints, *request.hosts]
     return [name for name in dict.fromkeys(names) if name and name not in _EVERYWHERE]
 
 

@@ -16,7 +16,7 @@ from typing import Any, Self
 
 import typer
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import join_bus
 from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UserError
 from pipeline.selftest.scratch_site import FANTWIN
@@ -120,7 +120,7 @@ class RecordingSite:
         with self._log.open("a", encoding="utf-8") as log:
             self._up = _started(self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
         try:
-            self._bus = Bus(self._config.bus, listens=False)
+            self._bus = join_bus(self._config, listens=False)
             for tray in self._fans:
                 self._bus.subscribe(tray_key(self._config.site, tray, "raw"), self._take)
         except BaseException:

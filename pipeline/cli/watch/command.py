@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import join_bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of, share_note
 from pipeline.config.loading import load_config
@@ -42,7 +42,7 @@ def command(
     message = command_of(chosen, {number: value}, is_set_point=set_point)
     stop = threading.Event()
     stop_on_signals(stop)
-    with Bus(settings.bus, stop, listens=False, roles=(OPERATOR,)) as bus:
+    with join_bus(settings, stop, listens=False, roles=(OPERATOR,)) as bus:
         sender = CommandSender(bus, settings.site, chosen.name, stop)
         sender.connect()
         sender.send(message)

@@ -82,6 +82,7 @@ class CommandSender:
     """Sends commands to one tray."""
 
     def __init__(self, bus: Bus, site: str, tray: str, stop: threading.Event) -> None:
+        self._bus = bus
         self._acquisition = TrayAcquisition(bus, site, tray)
         self._tray = tray
         self.stop = stop
@@ -95,8 +96,9 @@ class CommandSender:
         """Wait for the tray's acquisition.
 
         Raises:
-            UserError: there is none.
+            UserError: there is none, or this command has no right to send.
         """
+        self._bus.require_rights(self.stop)
         self._wait(self._acquisition.watch_health)
         self._before = self._wait(self._acquisition.health)
 

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import Bus, join_bus
 from pipeline.cli.options import JsonOption
 from pipeline.cli.watch.demo_report import Summary, summarise
 from pipeline.cli.watch.demo_screen import DemoScreen
@@ -114,7 +114,7 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
         (out / "up.log").open("w", encoding="utf-8") as log,
         _child(simulate, stdout=log, stderr=log) as device,
         _child(up, stdout=subprocess.PIPE, stderr=log) as pipeline,
-        Bus(config.bus, listens=False) as bus,
+        join_bus(config, listens=False) as bus,
     ):
         console.print(f"simulated tray of {tray.fans} fans; starting six stages, each as a process of its own")
         _watch(config, bus, device, pipeline, stop, console)

@@ -17,14 +17,17 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from pipeline.bus.access_rules import SiteRoles
+from pipeline.bus.certificates import of_role
 from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
 from pipeline.bus.errors import BusError
-from pipeline.bus.session import Bus
+from pipeline.bus.session import credentials_of, join_bus
 from pipeline.cli.options import JsonOption, SetOption
 from pipeline.cli.watch.line_check import check_line
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, ConfigError
 from pipeline.config.registry import STAGES
+from pipeline.config.roles import READERS, role_names
 from pipeline.launch.processes import process_list
 from pipeline.optional_dependencies import how_to_install
 from pipeline.runtime.second_owner import GOSSIP_S
@@ -91,6 +94,7 @@ def _findings(
     yield from _check_run_folder(settings.run_folder)
     running: list[Session] = []
     yield from _check_bus(settings, running)
+    yield from _check_certificates(settings)
     yield from _check_stages(settings, running, listen_s, lines)
 
 
@@ -150,10 +154,44 @@ def _check_bus(settings: Config, running: list[Session]) -> Iterator[tuple[bool,
             yield False, foreign_program(endpoint)
 
 
+def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:
+    """The certificates of the processes of this configuration that this host has; whether the router grants each of
+    them what its role needs."""
+    security, site = settings.bus.security, SiteRoles.of(settings)
+    if security is None:
+        return
+    answers = settings.bus.mode == "client" and accepts_connections(settings.bus.endpoint)
+    processes = [role_names(row.stage, row.shard) for row in process_list(settings)]
+    here = [
+        role
+        for role in dict.fromkeys(role for names in (*processes, READERS) for role in names)
+        if of_role(security.certificate, role).exists()
+    ]
+    if not here:
+        yield False, f"{security.certificate}: no certificate of any role here: `fantwin certs issue` makes them"
+    for role in here:
+        try:
+            credentials = credentials_of(settings.bus, (role,))
+            assert credentials
+            if warning := credentials.warning():
+                yield False, warning
+            elif credentials.role not in site.roles:
+                yield False, f"{credentials.certificate}: {credentials.role!r} is no role of this configuration"
+            elif answers:
+                with join_bus(settings, listens=False, roles=(role,)) as bus:
+                    is_granted = bus.has_all_rights_of_its_role(site)
+                restart = "the router does not grant it the rights of its role: restart it with this configuration"
+                yield is_granted, f"certificate of {role}: {'the router grants its rights' if is_granted else restart}"
+            else:
+                yield True, f"certificate of {role}: until {credentials.own.not_after:%Y-%m-%d}"
+        except BusError as error:
+            yield False, str(error)
+
+
 def running_sessions(settings: Config) -> list[Session]:
     """The sessions of the site that run, by name; those are waited for that the first one met still introduces."""
     stop, found = threading.Event(), set[str]()
-    with Bus(settings.bus, listens=False) as bus:
+    with join_bus(settings, listens=False) as bus:
         bus.wait_for_others(stop)
         for _ in range(_LOOKS):
             found |= bus.alive(sessions_key(settings.site))

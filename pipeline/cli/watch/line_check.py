@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import join_bus
 from pipeline.config.models import Config, TrayConfig
 from pipeline.devices.device_clock import UINT32
 from pipeline.devices.line_rate import MAX_SAMPLES, GridTiming, SampleTimes, grid_rate_hz, is_too_slow, leaves_gaps
@@ -103,7 +103,7 @@ _DISTURBED_SHARE = 0.01
 def _from_bus(config: Config, tray: TrayConfig, seconds: float) -> tuple[list[Raw], str]:
     received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     samples: list[Raw] = []
-    with Bus(config.bus, listens=False) as bus:
+    with join_bus(config, listens=False) as bus:
         bus.subscribe(tray_key(config.site, tray.name, "raw"), lambda _key, payload: received.put(payload))
         until_s = time.monotonic() + FIRST_SAMPLE_S
         while (left_s := until_s - time.monotonic()) > 0:

@@ -34,10 +34,11 @@ def ask(
     count: those of the session that owns the scorer.
 
     Raises:
-        UserError: an answer is missing after `timeout_s`.
+        UserError: an answer is missing after `timeout_s`, or there is no right to ask.
     """
     producer = f"alarms-{tray}-{secrets.token_hex(4)}"
     publisher = bus.publisher(tray_key(site, tray, "request"), BY_NAME["request"], type_name(Request), producer)
+    bus.require_rights(stop)
     name = f"{producer}/{publisher.published}"
     received: queue.Queue[bytes] = queue.Queue()
     key = tray_key(site, tray, "alarm")

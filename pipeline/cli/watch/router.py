@@ -4,33 +4,79 @@ from __future__ import annotations
 
 import json
 import threading
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from pipeline.bus.access_rules import SiteRoles
 from pipeline.bus.router import open_router
-from pipeline.cli.options import JsonOption
+from pipeline.bus.session import credentials_of
+from pipeline.cli.exposure import InsecureOption, checked_exposure
+from pipeline.cli.options import JsonOption, SetOption
+from pipeline.config.loading import load_config
+from pipeline.config.models import BusConfig, Config
+from pipeline.config.roles import ROUTER
+from pipeline.errors import UsageError
 from pipeline.runtime.signals import stop_on_signals
+
+_LOOPBACK = "tcp/127.0.0.1:7447"
+_WARN_AGAIN_S = 86_400.0
 
 
 def router(
-    listen: Annotated[str, typer.Option(help="Where to listen.")] = "tcp/127.0.0.1:7447",
+    config: Annotated[
+        Path | None, typer.Option("-c", "--config", help="Configuration of the site: certificates and roles.")
+    ] = None,
+    listen: Annotated[
+        str | None, typer.Option(help=f"Where to listen; default: bus.endpoint, without -c {_LOOPBACK}.")
+    ] = None,
     connect: Annotated[
         list[str] | None, typer.Option(help="Where another router of the site listens. Repeatable.")
     ] = None,
+    insecure: InsecureOption = False,
+    overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Run a Zenoh router until Ctrl-C, for stages with bus.mode = "client".
 
-    On one host no router is needed. By default it listens on loopback only: on other addresses, anyone who reaches
-    the port can read and write everything.
+    On one host no router is needed. With bus.security in the configuration, only owners of a certificate of the site's
+    authority connect, and each may do only what its role may do (docs/how-to/security.md). Start the router again when
+    trays, stages or controllers of the configuration change.
 
     Two routers of a site connect to each other, and clients that name both use the one that is there.
 
-    Example: fantwin router --listen tcp/0.0.0.0:7447 --connect tcp/other.example:7447
+    Example: fantwin router -c fantwin.toml
+
+    Example: fantwin router -c fantwin.toml --listen tls/0.0.0.0:7447 --connect tls/other.example:7447
     """
+    if overrides and config is None:
+        raise UsageError("--set needs a configuration: give one with -c FILE")
+    settings = load_config(config, overrides or (), stages=()) if config else None
+    bus = _bus(settings, listen)
+    credentials = credentials_of(bus, (ROUTER,))
+    site = SiteRoles.of(settings) if settings and credentials else None
     stop = threading.Event()
     stop_on_signals(stop)
-    with open_router(listen, connect or ()):
-        typer.echo(json.dumps({"listening": listen}) if json_output else f"router listening on {listen}")
-        stop.wait()
+    with (
+        checked_exposure(bus, lambda line: typer.echo(line, err=True), insecure=insecure),
+        open_router(bus.endpoint, credentials, site, bus.zenoh, connect or ()),
+    ):
+        if json_output:
+            typer.echo(json.dumps({"listening": bus.endpoint}))
+        else:
+            rules = f": TLS, {len(site.roles)} roles of site {site.site!r}" if site else ""
+            typer.echo(f"router listening on {bus.endpoint}{rules}")
+        while True:
+            if credentials and (warning := credentials.warning()):
+                typer.echo(warning, err=True)
+            if stop.wait(_WARN_AGAIN_S):
+                return
+
+
+def _bus(settings: Config | None, listen: str | None) -> BusConfig:
+    if settings is None:
+        return BusConfig(endpoint=listen or _LOOPBACK)
+    if listen is None and len(settings.bus.endpoints) > 1:
+        raise UsageError("bus.endpoint names several routers: say with --listen which one this is")
+    return settings.bus.model_copy(update={"endpoint": listen}) if listen else settings.bus

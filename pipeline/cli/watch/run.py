@@ -6,15 +6,17 @@ import json
 import os
 import sys
 import threading
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from typing import Annotated
 
 import typer
 
+from pipeline.cli.exposure import InsecureOption, checked_exposure
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.config.loading import load_config
+from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
-from pipeline.config.shards import chosen_shard
+from pipeline.config.shards import Shard, chosen_shard
 from pipeline.errors import UsageError, UserError
 from pipeline.launch.event_log import without_figures
 from pipeline.launch.processes import EXIT_CANNOT_START
@@ -40,6 +42,7 @@ def run(
     overrides: SetOption = None,
     json_output: JsonOption = False,
     until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
+    insecure: InsecureOption = False,
 ) -> None:
     """Run one stage alone, until Ctrl-C.
 
@@ -54,13 +57,25 @@ def run(
         raise UsageError(f"no stage called {stage!r}; known: {', '.join(STAGES)}")
     settings = load_config(config, overrides or (), stages=(stage,))
     chosen = chosen_shard(stage, settings, trays, shard)
-    name = stage_label(stage, chosen.name)
     stop = threading.Event()
     stop_on_signals(stop)
+    # a launcher has checked it itself
+    with checked_exposure(settings.bus, _say, insecure=insecure) if not until_stdin_closes else nullcontext():
+        _run(stage, settings, chosen, stop, json_output=json_output, until_stdin_closes=until_stdin_closes)
+
+
+def _run(
+    stage: str, settings: Config, chosen: Shard, stop: threading.Event, *, json_output: bool, until_stdin_closes: bool
+) -> None:
+    name = stage_label(stage, chosen.name)
     try:
         with starting():
-            on_health = None if until_stdin_closes else Problems(name).report  # the launcher reports them itself
-            runner = Runner(load_stage(stage), settings, chosen, stop, on_health)
+            problems = Problems(name)
+
+            def report(health: Health) -> None:  # the launcher reports what it hears itself
+                problems.report(runner.refusal if until_stdin_closes else health.problem)
+
+            runner = Runner(load_stage(stage), settings, chosen, stop, report)
     except UserError as error:
         if not until_stdin_closes:
             raise
@@ -79,6 +94,9 @@ def run(
         typer.echo(
             json.dumps({"stage": stage, "lost": last.lost, "counters": {c.name: c.value for c in last.counters}})
         )
+    if runner.refusal:
+        _say(f"{name}: its messages were refused until the end: {runner.refusal}")
+        raise typer.Exit(1)
     if last.lost:
         if not until_stdin_closes:
             counts = ", ".join(
@@ -95,12 +113,12 @@ class Problems:
         self._name = name
         self._said = ""
 
-    def report(self, health: Health) -> None:
-        """Handle a health message of the stage."""
-        meaning = without_figures(health.problem)
+    def report(self, problem: str) -> None:
+        """What is wrong now; empty: nothing."""
+        meaning = without_figures(problem)
         if meaning != self._said:
             self._said = meaning
-            _say(f"{self._name}: {health.problem or 'the problem is resolved'}")
+            _say(f"{self._name}: {problem or 'the problem is resolved'}")
 
 
 def _say(line: str) -> None:

@@ -16,11 +16,12 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import Bus, join_bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
+from pipeline.config.roles import READERS, role_names
 from pipeline.config.shards import chosen_shard
 from pipeline.errors import UsageError, UserError
 from pipeline.launch.judged_fans import JudgedFans, Unjudged
@@ -81,7 +82,8 @@ def status(
         return
     if trays or shard:
         raise UsageError("--trays and --shard need --stage: which process?")
-    with Bus(settings.bus, listens=False) as bus:
+    with join_bus(settings, listens=False) as bus:
+        of_bus = _bus_lines(bus)
         watcher = SiteWatcher(bus, settings.site)
         judged = JudgedFans(bus, settings.site, settings.trays, watcher)
         if once or json_output or not sys.stdout.isatty():
@@ -91,12 +93,12 @@ def status(
             if json_output:
                 typer.echo(json.dumps(as_json(watcher, settings, judged)))
             else:
-                Console().print(stage_table(watcher, settings, judged))
+                Console().print(stage_table(watcher, settings, judged, of_bus))
         else:
             watcher.ask_for_past_alarms()
             with Live(console=Console(), refresh_per_second=4) as live:
                 while not stop.wait(0.25):
-                    live.update(stage_table(watcher, settings, judged))
+                    live.update(stage_table(watcher, settings, judged, of_bus))
             _require_a_stage(watcher, settings)
         states = site_states(watcher, process_list(settings))
         if any(state.is_fault for state in states) or unjudged(states, judged):
@@ -113,7 +115,7 @@ def _process(config: Config, stage: str, trays: str | None, shard: str | None) -
 
 def _probe(config: Config, process: StageProcess, stop: threading.Event, *, json_output: bool) -> None:
     """Say whether one process is at work: as soon as it is known, or when it has not been heard for long enough."""
-    with Bus(config.bus, listens=False) as bus:
+    with join_bus(config, listens=False, roles=(*READERS, *role_names(process.stage, process.shard))) as bus:
         watcher = SiteWatcher(bus, config.site)
         until_s = time.monotonic() + _LISTEN_MAX_S
         while True:
@@ -151,8 +153,20 @@ def _no_stage(config: Config) -> str:
     return f"no stage of site {config.site!r} answers at {config.bus.endpoint}"
 
 
-def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Group:
-    """The page for people: a row for each stage, then problems, then alarms, then the fans that are not judged."""
+def _bus_lines(bus: Bus) -> list[Text]:
+    """Which certificate this command shows, and what is wrong with it."""
+    if bus.credentials is None:
+        return []
+    own = bus.credentials.own
+    line = Text(f"certificate of this command: {own.role}, until {own.not_after:%Y-%m-%d}", style="dim")
+    return [line, *(Text(each, style="red") for each in [bus.security_problem()] if each)]
+
+
+def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans, of_bus: Sequence[Text] = ()) -> Group:
+    """The page for people: a row for each stage, then problems, then alarms, then the fans that are not judged.
+
+    of_bus: lines on the bus itself.
+    """
     table = Table(title="stages", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     lost = watcher.losses()
     states = site_states(watcher, process_list(config))
@@ -182,7 +196,9 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Gro
         not_judged = [Text(each.line(), style="red") for each in unjudged(states, judged)]
     at_rest = [Text(each.line(), style="dim") for each in judged.at_rest()]
     no_alarms = [] if alarms or not_judged else [Text("no alarms", style="green")]
-    return Group(*([table] if watcher.stages() else []), *notes, *problems, *alarms, *not_judged, *at_rest, *no_alarms)
+    return Group(
+        *([table] if watcher.stages() else []), *of_bus, *notes, *problems, *alarms, *not_judged, *at_rest, *no_alarms
+    )
 
 
 def _has_scorer(states: Sequence[StageState]) -> bool:

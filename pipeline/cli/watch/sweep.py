@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import Bus, join_bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of, require_within_limits
 from pipeline.cli.watch.excitation import Excitation, Observed, StoppedError
@@ -66,7 +66,7 @@ def sweep(
         if not json_output:
             typer.echo(line)
 
-    with Bus(settings.bus, stop, listens=False, roles=(OPERATOR,)) as bus:
+    with join_bus(settings, stop, listens=False, roles=(OPERATOR,)) as bus:
         line = _BusLine(bus, settings.site, chosen, stop)
         before = line.connect()
         key = sweep_key(settings.site, chosen.name)

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli.exposure import InsecureOption, checked_exposure
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.config.loading import load_config
 from pipeline.config.shards import chosen_trays
@@ -30,6 +31,7 @@ def up(
     shard: Annotated[
         str | None, typer.Option(metavar="K/N", help="The same for the trays of host K of N: see `fantwin run`.")
     ] = None,
+    insecure: InsecureOption = False,
     overrides: SetOption = None,
     json_output: JsonOption = False,
     until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
@@ -56,7 +58,8 @@ def up(
     log = EventLog(sys.stderr.fileno())
     launcher = Launcher(settings, overrides or (), log.say, of_host)
     try:
-        outcome = launcher.run(stop)
+        with checked_exposure(settings.bus, log.say, insecure=insecure):
+            outcome = launcher.run(stop)
         if not json_output:
             for line in (*outcome.notes, *refused_lines(outcome.refused)):
                 log.say(line)

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import join_bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.progress import working
 from pipeline.cli.watch.alarms import wait_for_stages
@@ -62,7 +62,7 @@ def wear(
         settings, damage = load_config(config, overrides or (), stages=()), []
         stop = threading.Event()
         stop_on_signals(stop)
-        with Bus(settings.bus, stop, listens=False) as bus:
+        with join_bus(settings, stop, listens=False) as bus:
             watcher = SiteWatcher(bus, settings.site)
             wait_for_stages(bus, watcher, settings, stop, what="wear")
             answers = bus.recover(tray_key(settings.site, "*", "snapshot"))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from pipeline.bus.session import Bus
+from pipeline.bus.session import join_bus
 from pipeline.config.models import Config
 from pipeline.config.roles import REPLAY
 from pipeline.errors import UserError
@@ -74,7 +74,7 @@ def publish(
     topics = playback.topics
     recorded_topics = [topic for topic in topics if BY_NAME[topic].recorded]
     outcome = Outcome(config.site)
-    with Bus(config.bus, stop, roles=(REPLAY,)) as bus:
+    with join_bus(config, stop, roles=(REPLAY,)) as bus:
         listeners = Listeners(bus, config.site)
 
         def refuse_conflicts() -> None:

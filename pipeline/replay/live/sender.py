@@ -35,6 +35,7 @@ class Sender:
         self._builder = HealthBuilder(REPLAY, ALL_TRAYS, time.time_ns(), may_drop=False)
         self.publish_health(StageStatus.STARTING)
         bus.declare_alive(alive_key(site, REPLAY, ALL_TRAYS))
+        bus.require_rights()
 
     def send(self, entry: Envelope) -> None:
         """Publish a message; blocks while a reader is behind.

@@ -67,7 +67,7 @@ def readable(mode: int) -> Callable[[SiteCertificates], object]:
     ("harm", "words"),
     [
         (lose("ca.pem"), ["ca.pem", "No such file"]),
-        (lose("scorer.pem"), ["scorer.pem", "No such file", "certs issue"]),
+        (lose("scorer.pem"), ["scorer.pem", "no such certificate", "certs issue"]),
         (lose("scorer.key"), ["scorer.key", "No such file"]),
         (break_file("ca.pem"), ["ca.pem", "no certificate"]),
         (break_file("scorer.pem"), ["scorer.pem", "no certificate"]),

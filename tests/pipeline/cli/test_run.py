@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from pipeline.cli.watch import run
-from tests.pipeline.launch.test_site_state import CONSUMER
 
 
 def test_a_stage_that_runs_alone_says_a_problem_once_and_that_it_is_resolved(monkeypatch):
@@ -13,5 +10,5 @@ def test_a_stage_that_runs_alone_says_a_problem_once_and_that_it_is_resolved(mon
     monkeypatch.setattr(run, "_say", lines.append)
     problems = run.Problems("recorder")
     for problem in ("", "12.3 MB are free", "11.9 MB are free", "", ""):
-        problems.report(replace(CONSUMER, problem=problem))
+        problems.report(problem)
     assert lines == ["recorder: 12.3 MB are free", "recorder: the problem is resolved"]

@@ -62,7 +62,7 @@ def no_bus(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def connect(*_: object) -> None:
         raise ConnectionError
 
-    monkeypatch.setattr("pipeline.launch.launcher.Bus", connect)
+    monkeypatch.setattr("pipeline.launch.launcher.join_bus", connect)
     return connect
 
 
@@ -153,6 +153,9 @@ class LateBus:
 
     def wait_for_others(self, _stop: object) -> None:
         """One has been met."""
+
+    def security_problem(self) -> str:
+        return ""
 
     def alive(self, _key: str) -> set[str]:
         return {alive_key(self._site, self._stage, "all")} if self.now_s >= self._discovered_s else set()
@@ -399,7 +402,7 @@ class NoSessions:
 def test_it_says_which_files_a_run_recorded_also_one_that_failed(tmp_path, monkeypatch, files, recorded):
     for name in ("recording.mcap", "recording-2.mcap.active"):  # the latter was left by a killed recorder
         (tmp_path / name).touch()
-    monkeypatch.setattr("pipeline.launch.launcher.Bus", lambda *_: nullcontext())
+    monkeypatch.setattr("pipeline.launch.launcher.join_bus", lambda *_: nullcontext(LateBus("elsewhere", 0.0)))
     monkeypatch.setattr("pipeline.launch.launcher.SiteWatcher", lambda *_: NoSessions())
     settings = [f"run_folder='{tmp_path}'", "launcher.stages=['recorder']"]
     launcher = Launcher(load_config(DEMO / "demo.toml", settings), (), lambda _line: None)

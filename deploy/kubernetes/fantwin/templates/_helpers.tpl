@@ -29,7 +29,29 @@ new set takes the place of the old one; a rolling update would wait for pods tha
 {{- end }}
 
 {{- define "fantwin.endpoint" -}}
-{{ .Values.router.endpoint | default (printf "tcp/%s:7447" (include "fantwin.name" (dict "root" . "part" "router"))) }}
+{{- $scheme := empty .Values.certificates.secret | ternary "tcp" "tls" }}
+{{- if not (or .Values.certificates.secret .Values.insecure) }}
+{{- fail "certificates.secret: name the Secret with the site's certificates, or accept a bus open to all with insecure=true" }}
+{{- end }}
+{{- .Values.router.endpoint | default (printf "%s/%s:7447" $scheme (include "fantwin.name" (dict "root" . "part" "router"))) }}
+{{- end }}
+
+{{- define "fantwin.security" -}}
+- --set=bus.security.ca=/etc/fantwin/certs/ca.pem
+- --set=bus.security.certificate=/etc/fantwin/certs/{role}.pem
+- --set=bus.security.key=/etc/fantwin/certs/{role}.key
+{{- end }}
+
+{{- /* The certificate of one role, and no other: (dict "root" $ "role" "scorer") */}}
+{{- define "fantwin.certificates" -}}
+- name: certificates
+  secret:
+    secretName: {{ .root.Values.certificates.secret }}
+    defaultMode: 0440  # of root, readable by the group of the pod
+    items:
+      - {key: ca.pem, path: ca.pem}
+      - {key: {{ .role }}.pem, path: {{ .role }}.pem}
+      - {key: {{ .role }}.key, path: {{ .role }}.key}
 {{- end }}
 
 {{- define "fantwin.podSecurity" -}}

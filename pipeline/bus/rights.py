@@ -1,0 +1,144 @@
+"""Whether what a session declares is accepted. Zenoh drops what is not allowed without a word to whoever sent it, so a
+session asks the router, which answers from the rules that it enforces; peers all have the same rules.
+
+A role may only ask for its own rights. So no answer means that the router does not know the role, and refuses all.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import zenoh
+
+from pipeline.bus.access_rules import Rights, SiteRoles
+from schemas.topics import key_in_words, rights_key
+
+PERIOD_S = 2.0
+"""so often a session asks"""
+ANSWER_LIMIT_S = 3.0
+_START_LIMIT_S = 3.0
+"""how long a session that begins waits for the answer of a router that may have begun just now"""
+_POLL_S = 0.1
+_SHOWN = 3
+_WORDS = {
+    "put": "publish",
+    "declare_subscriber": "read",
+    "declare_queryable": "answer for",
+    "liveliness_token": "show that it runs as",
+}
+
+
+def granted_rights(session: zenoh.Session, site: str, role: str) -> Rights | None:
+    """What the router grants a role; None if it does not answer: it does not know the role. Waits for the answer."""
+    replies = session.get(rights_key(site, role), timeout=ANSWER_LIMIT_S)
+    found = (_decoded(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None)
+    return next((each for each in found if each), None)
+
+
+class OwnRights:
+    """What one session has declared, and whether it may. Used from one thread, but for answers of the bus."""
+
+    def __init__(self, session: zenoh.Session, site: SiteRoles, role: str, *, is_client: bool) -> None:
+        self._session = session
+        self._site = site
+        self._role = role
+        self._is_client = is_client
+        self._claims: dict[tuple[str, str], None] = {}
+        self._own = site.rights(role)
+        """by this process's own configuration"""
+        self._granted: Rights | None = None
+        """by the router"""
+        self._unanswered = 0
+        self._next_s = 0.0
+        self._lock = threading.Lock()
+
+    def add(self, message: str, key: str) -> None:
+        """The session sends messages of this kind on this key or key expression."""
+        self._claims[message, key] = None
+
+    def discard(self, message: str, key: str) -> None:
+        """It does so no longer."""
+        self._claims.pop((message, key), None)
+
+    def ask(self) -> None:
+        """Ask the router, if it is time to. To be called often; the answer changes `problem`."""
+        now_s = time.monotonic()
+        if self._is_client and now_s >= self._next_s and self._session.info.routers_zid():
+            self._next_s = now_s + PERIOD_S
+            self._ask()
+
+    def problem(self) -> str:
+        """What is refused, and what to do; empty if all is accepted, as far as is known."""
+        role = self._role
+        if self._own is None:
+            return f"its certificate says {role!r}, which is no role of site {self._site.site!r}; all is refused"
+        if refused := self._refused(self._own):
+            return f"its certificate says {role!r}, which may not {refused}; give it that of its own role"
+        with self._lock:
+            granted, unanswered = self._granted, self._unanswered
+        if unanswered > 1:
+            return (
+                f"the router refuses all of role {role!r}: restart it, `fantwin router -c`, with a configuration of "
+                f"site {self._site.site!r} that has this role"
+            )
+        if granted and (refused := self._refused(granted)):
+            return f"the router does not let {role!r} {refused}: restart it with the configuration that holds here"
+        return ""
+
+    def wait(self, stop: threading.Event | None = None) -> str:
+        """The problem once the router has answered; waits for it a moment."""
+        until_s = time.monotonic() + _START_LIMIT_S
+        pause = stop or threading.Event()
+        while self._is_client and not (self.problem() and self._granted) and time.monotonic() < until_s:
+            self.ask()
+            if pause.wait(_POLL_S) or self._granted:
+                break
+            self._next_s = min(self._next_s, time.monotonic() + _POLL_S)
+        return self.problem()
+
+    def _refused(self, rights: Rights) -> str:
+        found = [(message, key) for message, key in tuple(self._claims) if not rights.allow(message, key)]
+        words = list(dict.fromkeys(f"{_WORDS.get(message, message)} {key_in_words(key)}" for message, key in found))
+        more = f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else ""
+        return ", ".join(words[:_SHOWN]) + more
+
+    def _ask(self) -> None:
+        answers: list[bytes] = []
+
+        def receive(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                answers.append(reply.ok.payload.to_bytes())
+
+        def finish() -> None:
+            rights = next((each for each in map(_decoded, answers) if each), None)
+            with self._lock:
+                self._granted = rights or self._granted
+                self._unanswered = 0 if rights else self._unanswered + 1
+
+        self._session.get(
+            rights_key(self._site.site, self._role),
+            zenoh.handlers.Callback(receive, finish, indirect=False),
+            timeout=ANSWER_LIMIT_S,
+        )
+
+
+def answer_rights(session: zenoh.Session, site: SiteRoles) -> zenoh.Queryable[None]:
+    """Answer, in a router, what each role may do."""
+
+    def receive(query: zenoh.Query) -> None:
+        with query:
+            rights = site.rights(str(query.key_expr).rpartition("/")[2])
+            if rights is not None:
+                query.reply(query.key_expr, json.dumps(dict(rights.of_message)).encode())
+
+    return session.declare_queryable(rights_key(site.site, "*"), zenoh.handlers.Callback(receive, indirect=False))
+
+
+def _decoded(answer: bytes) -> Rights | None:
+    try:
+        found = json.loads(answer)
+        return Rights({str(message): tuple(map(str, keys)) for message, keys in found.items()})
+    except (ValueError, AttributeError, TypeError):
+        return None

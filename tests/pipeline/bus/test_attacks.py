@@ -1,0 +1,201 @@
+"""What happens to those who are not invited, or go too far: the rows of the table in docs/how-to/security.md."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from pipeline.bus.access_rules import SiteRoles
+from pipeline.bus.authority import Authority
+from pipeline.bus.errors import BusError
+from pipeline.bus.router import open_router
+from pipeline.bus.session import Bus, join_bus
+from pipeline.config.loading import parse_config
+from schemas.topics import BY_NAME, tray_key
+from tests.support.secured_site import CONFIG, SITE, Heard, SecuredSite, free_endpoint
+from tests.support.site_certificates import DAY, SiteCertificates
+
+RAW = tray_key(SITE, "a", "raw")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Iterator[SecuredSite]:
+    with SecuredSite(tmp_path_factory.mktemp("site"), free_endpoint()).running() as running:
+        yield running
+
+
+def client(endpoint: str, **files: str) -> zenoh.Session:
+    """A program with Zenoh, and with these files for TLS."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+    config.insert_json5("connect/timeout_ms", "1000")
+    config.insert_json5("scouting/multicast/enabled", "false")
+    for name, path in files.items():
+        config.insert_json5(f"transport/link/tls/{name}", f'"{path}"')
+    return zenoh.open(config)
+
+
+def files_of(certificates: SiteCertificates, role: str, ca: Path | None = None) -> dict[str, str]:
+    folder = certificates.folder
+    return {
+        "root_ca_certificate": str(ca or folder / "ca.pem"),
+        "connect_certificate": str(folder / f"{role}.pem"),
+        "connect_private_key": str(folder / f"{role}.key"),
+    }
+
+
+def test_row_1_a_stranger_without_certificate_does_not_connect(site):
+    with pytest.raises(zenoh.ZError):
+        client(site.endpoint.replace("tls/", "tcp/"))
+    with pytest.raises(zenoh.ZError):
+        client(site.endpoint, root_ca_certificate=str(site.certificates.folder / "ca.pem"))
+
+
+def test_row_2_a_certificate_of_another_authority_does_not_connect(site, tmp_path):
+    other = SiteCertificates(tmp_path, Authority.new(SITE, DAY))
+    other.issue("acquisition")
+    with pytest.raises(zenoh.ZError):
+        client(site.endpoint, **files_of(other, "acquisition", site.certificates.folder / "ca.pem"))
+
+
+def test_row_3_an_expired_certificate_does_not_connect(site, tmp_path):
+    expired = SiteCertificates(tmp_path, site.certificates.authority)
+    expired.issue("acquisition", lifetime=-timedelta(minutes=1))
+    with pytest.raises(zenoh.ZError):
+        client(site.endpoint, **files_of(expired, "acquisition"))
+
+
+def test_row_4_a_router_of_another_authority_gets_no_clients(tmp_path):
+    """Who takes the place of the router sees nothing of what stages would send."""
+    theirs = SecuredSite(tmp_path / "theirs", free_endpoint())
+    ours = SiteCertificates(tmp_path / "ours")
+    ours.issue("scorer")
+    with theirs.running(), pytest.raises(zenoh.ZError):
+        client(theirs.endpoint, **files_of(ours, "scorer"))
+
+
+def test_row_5_a_stolen_viewer_certificate_reads_and_changes_nothing(site):
+    heard = Heard(site.session("router"), f"fantwin/{SITE}/a/*")
+    site.flush("router")
+    thief = site.session("viewer")
+    for topic in BY_NAME:
+        thief.put(tray_key(SITE, "a", topic), b"forged")
+        thief.delete(tray_key(SITE, "a", topic))
+    site.flush("viewer")
+    site.session("operator").put(tray_key(SITE, "a", "command"), b"sentinel")
+    assert heard.until_sentinel() == []
+
+
+def test_row_6_a_huge_message_is_refused_by_who_receives_it_and_counted(site):
+    received: list[bytes] = []
+    arrived = threading.Event()
+    key = tray_key(SITE, "a", "command")
+    with join_bus(site.config, roles=("acquisition",)) as bus:
+
+        def take(_key: str, payload: bytes) -> None:
+            received.append(payload)
+            arrived.set()
+
+        bus.subscribe(key, take)
+        bus.require_rights()
+        site.flush("operator")
+        site.session("operator").put(key, bytes(BY_NAME["command"].largest_bytes + 1))
+        site.session("operator").put(key, b"small")
+        assert arrived.wait(30)
+        assert (received, bus.refused_too_large) == ([b"small"], 1)
+
+
+def test_row_7_nonsense_on_the_port_does_not_disturb_those_who_are_connected(site):
+    host, port = site.endpoint.removeprefix("tls/").split(":")
+    heard = Heard(site.session("resampler"), RAW)
+    site.flush("resampler")
+    strangers = [socket.create_connection((host, int(port)), 5) for _ in range(50)]
+    for number, stranger in enumerate(strangers):
+        stranger.sendall(bytes([number]) * 1000)
+    site.session("acquisition").put(RAW, b"sample")
+    site.session("acquisition").put(RAW, b"sentinel")
+    assert heard.until_sentinel() == [(RAW, b"sample")]
+    for stranger in strangers:
+        stranger.close()
+
+
+def test_row_8_a_stage_with_the_certificate_of_another_role_is_refused_in_one_line(site):
+    with join_bus(site.config, roles=("resampler",)) as bus:
+        bus.publisher(RAW, BY_NAME["raw"], "x", "me")
+        with pytest.raises(BusError) as refused:
+            bus.require_rights()
+    assert str(refused.value).startswith("its certificate says 'resampler', which may not publish raw of a")
+    assert "\n" not in str(refused.value)
+
+
+def test_row_9_a_stage_whose_role_the_router_does_not_know_is_refused_in_one_line(site):
+    """A tray that the configuration of the router does not have yet."""
+    text = CONFIG.format(endpoint=site.endpoint).replace('name = "b"', 'name = "c"')
+    newer = parse_config(text, site.config.path, stages=())
+    site.certificates.issue("acquisition.c")
+    with join_bus(newer, roles=("acquisition.c",)) as bus:
+        bus.publisher(tray_key(SITE, "c", "raw"), BY_NAME["raw"], "x", "me")
+        with pytest.raises(BusError, match="the router refuses all of role 'acquisition.c': restart it"):
+            bus.require_rights()
+
+
+def test_row_10_a_router_that_comes_back_with_fewer_rights_is_noticed_while_a_stage_runs(tmp_path):
+    site = SecuredSite(tmp_path, free_endpoint())
+    roles = dict(site.site.roles)
+    fewer = SiteRoles(SITE, {**roles, "acquisition": replace(roles["acquisition"], writes=())})
+    stop = threading.Event()
+    with open_router(site.endpoint, site.credentials("router"), site.site):
+        bus = join_bus(site.config, stop, roles=("acquisition",))
+        bus.publisher(RAW, BY_NAME["raw"], "x", "me")
+        bus.require_rights()
+        assert bus.security_problem() == ""
+    problem = ""
+    with bus, open_router(site.endpoint, site.credentials("router"), fewer):
+        for _ in range(600):
+            if problem := bus.security_problem():
+                break
+            stop.wait(0.05)
+    assert problem.startswith("the router does not let 'acquisition' publish raw of a")
+
+
+def test_row_11_peers_refuse_one_another_what_a_router_would(tmp_path):
+    """Without a router: each peer has the rules itself."""
+    site = SecuredSite(tmp_path, free_endpoint())
+    text = site.config.text.replace('mode = "client"', 'mode = "peer"')
+    config = parse_config(text, site.config.path, stages=())
+    heard: list[bytes] = []
+    arrived = threading.Event()
+    with (
+        join_bus(config, roles=("resampler",)) as resampler,
+        join_bus(config, roles=("acquisition",)) as acquisition,
+        join_bus(config, roles=("viewer",)) as viewer,
+    ):
+
+        def take(_key: str, payload: bytes) -> None:
+            heard.append(payload)
+            arrived.set()
+
+        resampler.subscribe(RAW, take)
+        for bus in (acquisition, viewer):
+            bus.wait_for_others(threading.Event())
+        forging, sending = (bus.publisher(RAW, BY_NAME["raw"], "x", "me") for bus in (viewer, acquisition))
+        for _ in range(600):
+            forging.put(b"forged")
+            sending.put(b"sample")
+            if arrived.wait(0.05):
+                break
+        assert "may not publish raw of a" in viewer.security_problem()
+    assert set(heard) == {b"sample"}
+
+
+def test_a_session_without_the_roles_of_its_site_is_not_held_to_them(site):
+    with Bus(site.config.bus, roles=("viewer",)) as bus:
+        assert (bus.security_problem(), bus.rights) == ("", None)
