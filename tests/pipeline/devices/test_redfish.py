@@ -69,7 +69,7 @@ def test_the_older_schema_gives_speeds_and_the_command_of_the_vendor() -> None:
         refused = unknown.read()
         assert isinstance(refused, Rejected) and refused.kind == "unknown_command" and refused.is_sample
         assert "no fan has a number at /SpeedPercent/Reading" in refused.detail
-        unread = connected(url, 1, fans=["FAN1"], command="/Oem/Vendor/PWM", temperature="Outlet")
+        unread = connected(url, 1, fans=["FAN1"], command="/Oem/Vendor/PWM", temperature="Exhaust")
         assert math.isnan(reading(unread).temperature_c[0])
 
 
