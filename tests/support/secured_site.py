@@ -70,6 +70,12 @@ class SecuredSite:
             self._stack.enter_context(open_router(self.endpoint, self.credentials("router"), self.site))
             yield self
 
+    @contextmanager
+    def sessions_of(self) -> Iterator[SecuredSite]:
+        """With a router that the caller runs; the sessions end with it."""
+        with self._stack:
+            yield self
+
     def credentials(self, role: str) -> Credentials:
         return checked_credentials(self.certificates.security, (role,))
 
