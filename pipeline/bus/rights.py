@@ -3,7 +3,8 @@ session asks the router, which answers from the rules that it enforces; peers al
 
 Where a site has two routers, that of the session counts: what other routers pass on, each accepts.
 
-A role may only ask for its own rights. So no answer means that the router does not know the role, and refuses all.
+A role may only ask for its own rights. So no answer means that the router does not know the role, and refuses all; but
+only while the router is there: an answer is awaited for longer than a dead link goes unnoticed.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ import time
 import zenoh
 
 from pipeline.bus.access_rules import Rights, SiteRoles
+from pipeline.bus.link import LEASE_MS
 from schemas.topics import key_in_words, rights_key
 
 PERIOD_S = 2.0
 """so often a session asks"""
 ANSWER_LIMIT_S = 3.0
-_START_LIMIT_S = 3.0
-"""how long a session that begins waits for the answer of a router that may have begun just now"""
+UNANSWERED_LIMIT_S = float(LEASE_MS) / 1000 + 1.0
+"""a router that is there all this time and does not answer refuses the question"""
+_START_LIMIT_S = UNANSWERED_LIMIT_S + 1.0
+"""how long a session that begins waits for an answer"""
 _POLL_S = 0.1
 _SHOWN = 3
 _WORDS = {
@@ -51,7 +55,9 @@ class OwnRights:
         """by this process's own configuration"""
         self._granted: Rights | None = None
         """by the router"""
-        self._unanswered = 0
+        self._routers: set[str] = set()
+        self._asked_s: float | None = None
+        """since when there is a question without an answer and the same router, monotonic; None: there is none"""
         self._next_s = 0.0
         self._lock = threading.Lock()
 
@@ -66,8 +72,10 @@ class OwnRights:
     def ask(self) -> None:
         """Ask the router, if it is time to. To be called often; the answer changes `problem`."""
         now_s = time.monotonic()
-        if self._is_client and now_s >= self._next_s and self._session.info.routers_zid():
+        if self._is_client and now_s >= self._next_s and self._is_connected():
             self._next_s = now_s + PERIOD_S
+            with self._lock:
+                self._asked_s = self._asked_s or now_s
             self._ask()
 
     def problem(self) -> str:
@@ -77,9 +85,10 @@ class OwnRights:
             return f"its certificate says {role!r}, which is no role of site {self._site.site!r}; all is refused"
         if refused := self._refused(self._own):
             return f"its certificate says {role!r}, which may not {refused}; give it that of its own role"
+        is_connected = self._is_connected()
         with self._lock:
-            granted, unanswered = self._granted, self._unanswered
-        if unanswered > 1:
+            granted, asked_s = self._granted, self._asked_s
+        if is_connected and asked_s and time.monotonic() - asked_s > UNANSWERED_LIMIT_S:
             return (
                 f"the router refuses all of role {role!r}: restart it, `fantwin router -c`, with a configuration of "
                 f"site {self._site.site!r} that has this role"
@@ -92,12 +101,20 @@ class OwnRights:
         """The problem once the router has answered; waits for it a moment."""
         until_s = time.monotonic() + _START_LIMIT_S
         pause = stop or threading.Event()
-        while self._is_client and not (self.problem() and self._granted) and time.monotonic() < until_s:
+        while self._is_client and not (self._granted or self.problem()) and time.monotonic() < until_s:
             self.ask()
-            if pause.wait(_POLL_S) or self._granted:
+            if pause.wait(_POLL_S):
                 break
             self._next_s = min(self._next_s, time.monotonic() + _POLL_S)
         return self.problem()
+
+    def _is_connected(self) -> bool:
+        """Whether a router is there now. What another one was asked counts no longer."""
+        routers = {str(each) for each in self._session.info.routers_zid()}
+        with self._lock:
+            if routers != self._routers:
+                self._routers, self._asked_s = routers, None
+        return bool(routers)
 
     def _refused(self, rights: Rights) -> str:
         found = [(message, key) for message, key in tuple(self._claims) if not rights.allow(message, key)]
@@ -113,9 +130,9 @@ class OwnRights:
 
         def finish() -> None:
             rights = next(filter(None, answers), None)
-            with self._lock:
-                self._granted = rights or self._granted
-                self._unanswered = 0 if rights else self._unanswered + 1
+            if rights:
+                with self._lock:
+                    self._granted, self._asked_s = rights, None
 
         self._session.get(
             rights_key(self._site.site, self._role),

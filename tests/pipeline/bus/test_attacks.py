@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -32,6 +32,7 @@ from tests.support.running_chain import RunningCommand, eventually
 from tests.support.secured_site import CONFIG, SITE, Heard, SecuredSite, free_endpoint
 from tests.support.secured_stage import STEP_NS, SecuredStage, Sender, counter, samples
 from tests.support.site_certificates import DAY, SiteCertificates
+from tests.support.tcp_relay import TcpRelay
 
 RAW = tray_key(SITE, "a", "raw")
 FLOOD_MESSAGES, FLOOD_BYTES_AT_MOST = 20_000, 100 << 20
@@ -331,6 +332,22 @@ def test_row_14_malformed_messages_are_counted_and_stop_nobody(site, tmp_path, n
         reading = read_recording(recording)
         assert any(envelope.header.tray == "a" for envelope in reading)
         assert reading.damage == ""
+
+
+def test_a_router_that_cannot_answer_because_the_link_is_cut_refuses_nothing(site):
+    """The questions of a stage end without an answer, as at a router that does not know its role."""
+    with closing(TcpRelay(site.endpoint.replace("tls/", "tcp/"))) as relay:
+        through = site.config.bus.model_copy(update={"endpoint": relay.endpoint.replace("tcp/", "tls/")})
+        with join_bus(replace(site.config, bus=through), threading.Event(), roles=("acquisition",)) as bus:
+            bus.publisher(RAW, BY_NAME["raw"], "x", "me")
+            bus.require_rights()
+            relay.cut()
+            eventually(lambda: bus.security_problem() or not bus._session.info.routers_zid(), "the link is given up")
+            pause = threading.Event()
+            said = {bus.security_problem() for _ in range(60) if not pause.wait(0.05)}
+            relay.heal()
+            eventually(lambda: bus.security_problem() or bus._session.info.routers_zid(), "they meet again")
+            assert said | {bus.security_problem()} == {""}
 
 
 def test_a_session_without_the_roles_of_its_site_is_not_held_to_them(site):
