@@ -80,8 +80,8 @@ class ResamplerConfig(StageConfig):
     link_wait_s: float = Field(
         default=900.0,
         ge=0,
-        description="how long no gap is published while acquisition does not say that it has sent nothing: the link "
-        "may be cut, and the samples come later",
+        description="longest wait, before a gap is published, for acquisition to confirm that it has sent nothing; if "
+        "the link is cut, the samples come later",
     )
 
     @model_validator(mode="after")
