@@ -40,7 +40,7 @@ class HttpConfig(SourceConfig, frozen=True):
     def _is_protected(self) -> Self:
         if not self.is_local and self.token_file is None:
             raise ValueError(
-                f"host = {self.host!r} can be reached from other hosts: give token_file, with a token of yours"
+                f"host = {self.host!r} can be reached from other hosts: give token_file, a file with a token"
             )
         if bool(self.certificate) != bool(self.key):
             raise ValueError("give certificate and key, or neither")
