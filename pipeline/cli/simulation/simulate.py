@@ -1,4 +1,5 @@
-"""`fantwin simulate`: plays a simulated tray or a measured file on a serial line, or records a simulated tray."""
+"""`fantwin simulate`: plays a simulated tray or a measured file on a serial line, or serves or records a simulated
+tray."""
 
 from __future__ import annotations
 
@@ -229,7 +230,7 @@ def simulate(
     ] = math.inf,
     json_output: JsonOption = False,
 ) -> None:
-    """Simulate a tray of fans on a serial port that any program can open.
+    """Simulate a tray of fans on a serial port that any program can open, or as the fans of a computer.
 
     Example: fantwin simulate --link /tmp/fan-tray --fault inlet:fan=2,start=10,stop=18,size=1.6 --truth truth.json
 
