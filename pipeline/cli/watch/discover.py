@@ -29,7 +29,7 @@ def discover(
     ] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """List the fans of this computer and its serial ports, with a [[tray]] to paste for each, and what is missing.
+    """List the fans and serial ports of this computer, with a configuration to paste for each, and what is missing.
 
     It writes nothing to a device. Exit code 1 if nothing can be watched.
 
