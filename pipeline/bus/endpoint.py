@@ -74,6 +74,23 @@ def _accepts(match: re.Match[str]) -> bool:
         return False
 
 
+def _speaks_tls(match: re.Match[str]) -> bool:
+    """Whether the program there takes part in TLS: it shows a certificate, whoever signed it."""
+    import ssl  # noqa: PLC0415  takes a moment, and only who cannot connect needs it
+
+    context = ssl.create_default_context()
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    try:
+        with (
+            socket.create_connection((match[2].strip("[]"), int(match[3])), _CONNECT_TIMEOUT_S) as connection,
+            context.wrap_socket(connection),
+        ):
+            return True
+    except OSError:
+        return False
+
+
 def is_beyond_loopback(endpoint: str) -> bool:
     """Whether other hosts or containers may reach an endpoint: it is on a network, and not only of this host. A host
     name that cannot be found now counts as one of others."""
@@ -100,15 +117,26 @@ def require_tls_with_security(config: BusConfig) -> None:
             )
 
 
-def foreign_program(endpoint: str, *, is_secure: bool = False) -> str:
+def foreign_program(endpoint: str, *, is_secure: bool) -> str:
     """One line about an endpoint that accepts connections and does not answer as fantwin.
 
     is_secure: with `bus.security`; the other end does not say why it refuses.
     """
-    if is_secure:
+    has_tls = any(map(_speaks_tls, _addresses(endpoint)))
+    if is_secure and has_tls:
         return (
             f"bus.endpoint = {endpoint!r}: what listens there has a certificate of another authority or without "
-            "this host name, takes no TLS, or is not fantwin: see `fantwin certs show` there and here"
+            "this host name, or is not fantwin: see `fantwin certs show` there and here"
+        )
+    if is_secure:
+        return (
+            f"bus.endpoint = {endpoint!r}: the program that listens there takes no TLS: it has no [bus.security], is "
+            "not fantwin, or hangs"
+        )
+    if has_tls:
+        return (
+            f"bus.endpoint = {endpoint!r}: the program that listens there takes TLS only: give this configuration the "
+            "section [bus.security] and an endpoint tls/HOST:PORT, see `fantwin certs --help`"
         )
     return (
         f"bus.endpoint = {endpoint!r}: the program that listens there is not fantwin, or hangs, so stages cannot "

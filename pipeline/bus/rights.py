@@ -1,6 +1,8 @@
 """Whether what a session declares is accepted. Zenoh drops what is not allowed without a word to whoever sent it, so a
 session asks the router, which answers from the rules that it enforces; peers all have the same rules.
 
+Where a site has two routers, that of the session counts: what other routers pass on, each accepts.
+
 A role may only ask for its own rights. So no answer means that the router does not know the role, and refuses all.
 """
 
@@ -32,9 +34,8 @@ _WORDS = {
 
 def granted_rights(session: zenoh.Session, site: str, role: str) -> Rights | None:
     """What the router grants a role; None if it does not answer: it does not know the role. Waits for the answer."""
-    replies = session.get(rights_key(site, role), timeout=ANSWER_LIMIT_S)
-    found = (_decoded(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None)
-    return next((each for each in found if each), None)
+    replies = session.get(rights_key(site, role), timeout=ANSWER_LIMIT_S, consolidation=zenoh.ConsolidationMode.NONE)
+    return next(filter(None, (_rights_in(reply, session) for reply in replies)), None)
 
 
 class OwnRights:
@@ -105,14 +106,13 @@ class OwnRights:
         return ", ".join(words[:_SHOWN]) + more
 
     def _ask(self) -> None:
-        answers: list[bytes] = []
+        answers: list[Rights | None] = []
 
         def receive(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                answers.append(reply.ok.payload.to_bytes())
+            answers.append(_rights_in(reply, self._session))
 
         def finish() -> None:
-            rights = next((each for each in map(_decoded, answers) if each), None)
+            rights = next(filter(None, answers), None)
             with self._lock:
                 self._granted = rights or self._granted
                 self._unanswered = 0 if rights else self._unanswered + 1
@@ -121,6 +121,7 @@ class OwnRights:
             rights_key(self._site.site, self._role),
             zenoh.handlers.Callback(receive, finish, indirect=False),
             timeout=ANSWER_LIMIT_S,
+            consolidation=zenoh.ConsolidationMode.NONE,
         )
 
 
@@ -134,6 +135,15 @@ def answer_rights(session: zenoh.Session, site: SiteRoles) -> zenoh.Queryable[No
                 query.reply(query.key_expr, json.dumps(dict(rights.of_message)).encode())
 
     return session.declare_queryable(rights_key(site.site, "*"), zenoh.handlers.Callback(receive, indirect=False))
+
+
+def _rights_in(reply: zenoh.Reply, session: zenoh.Session) -> Rights | None:
+    """The rights in an answer of the router of a session. Another router of the site, which does not decide what this
+    session may do, answers as well."""
+    router = reply.replier_id
+    if reply.ok is None or (router is not None and router.zid not in session.info.routers_zid()):
+        return None
+    return _decoded(reply.ok.payload.to_bytes())
 
 
 def _decoded(answer: bytes) -> Rights | None:

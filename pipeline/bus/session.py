@@ -314,6 +314,9 @@ def _open(
             attempts += 1
             if attempts < len(endpoints):
                 continue
+            if stop is None and attempts == len(endpoints) and accepts_connections(config.endpoint):
+                time.sleep(_ROUTER_RETRY_S)  # a router that is just starting accepts connections before it answers
+                continue
             if time.monotonic() > until_s and accepts_connections(config.endpoint):
                 raise BusError(foreign_program(config.endpoint, is_secure=credentials is not None)) from error
             if stop is None or stop.wait(_ROUTER_RETRY_S):

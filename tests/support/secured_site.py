@@ -16,7 +16,8 @@ from pipeline.bus.router import open_router
 from pipeline.bus.settings import Settings
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config
-from schemas.topics import rights_key
+from schemas.topics import alive_key, rights_key
+from tests.support.running_chain import eventually
 from tests.support.site_certificates import SiteCertificates
 
 SITE, TRAYS = "site", ("a", "b")
@@ -70,6 +71,12 @@ class SecuredSite:
             self._stack.enter_context(open_router(self.endpoint, self.credentials("router"), self.site))
             yield self
 
+    @contextmanager
+    def sessions_of(self) -> Iterator[SecuredSite]:
+        """With a router that the caller runs; the sessions end with it."""
+        with self._stack:
+            yield self
+
     def credentials(self, role: str) -> Credentials:
         return checked_credentials(self.certificates.security, (role,))
 
@@ -84,6 +91,12 @@ class SecuredSite:
             session = self.sessions[role] = zenoh.open(settings.config)
             self._stack.callback(session.close)
         return self.sessions[role]
+
+    def sees(self, stage: str) -> bool:
+        """Whether a process of a stage comes to be on the bus."""
+        key = alive_key(SITE, stage, "all")
+        liveliness = self.session("viewer").liveliness()
+        return eventually(lambda: [reply for reply in liveliness.get(key) if reply.ok], f"{stage} is there")
 
     def flush(self, role: str) -> None:
         """Return when the router has handled all that this session has sent: a connection keeps the order."""

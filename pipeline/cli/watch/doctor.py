@@ -151,7 +151,7 @@ def _check_bus(settings: Config, running: list[Session]) -> Iterator[tuple[bool,
             site = f"site {settings.site!r} runs there" if running else "fantwin answers there"
             yield True, f"bus.endpoint {endpoint}: {site}"
         except BusError:
-            yield False, foreign_program(endpoint)
+            yield False, foreign_program(endpoint, is_secure=config.security is not None)
 
 
 def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zenoh
 
@@ -18,11 +23,18 @@ from pipeline.bus.errors import BusError
 from pipeline.bus.router import open_router
 from pipeline.bus.session import Bus, join_bus
 from pipeline.config.loading import parse_config
-from schemas.topics import BY_NAME, tray_key
+from pipeline.recordings.reading import read_recording
+from schemas.codec import decode, encode
+from schemas.messages import Grid, Header, Health, StageStatus
+from schemas.topics import BY_NAME, health_key, tray_key
+from tests.support.flooding_client import NOISE
+from tests.support.running_chain import RunningCommand, eventually
 from tests.support.secured_site import CONFIG, SITE, Heard, SecuredSite, free_endpoint
+from tests.support.secured_stage import STEP_NS, SecuredStage, Sender, counter, samples
 from tests.support.site_certificates import DAY, SiteCertificates
 
 RAW = tray_key(SITE, "a", "raw")
+FLOOD_MESSAGES, FLOOD_BYTES_AT_MOST = 20_000, 100 << 20
 
 
 @pytest.fixture(scope="module")
@@ -194,6 +206,131 @@ def test_row_11_peers_refuse_one_another_what_a_router_would(tmp_path):
                 break
         assert "may not publish raw of a" in viewer.security_problem()
     assert set(heard) == {b"sample"}
+
+
+def test_row_12_recorded_messages_that_are_sent_again_are_not_taken_again(site):
+    """By whoever may not publish them they reach nobody. By whoever may: those of a session that a stage knows are
+    duplicates, and those of one from before it started are of a stranger."""
+    operator = join_bus(site.config, roles=("operator",))
+    grids: list[Grid] = []
+    operator.subscribe(tray_key(SITE, "a", "grid"), lambda _key, payload: grids.append(decode(Grid, payload)))
+    with join_bus(site.config, roles=("acquisition",)) as bus:
+        before = Sender(bus, "before")
+        for _ in range(3):
+            before.send()
+    with (
+        operator,
+        SecuredStage(site, "resampler", "resampler.rate_hz=100") as stage,
+        join_bus(site.config, roles=("acquisition",)) as bus,
+    ):
+        sender = Sender(bus, "now")
+        for _ in range(5):
+            sender.send()
+        sender.send_health()
+        stage.health_with(lambda health: has_received(health, sender, 5), "all has arrived")
+        recorded = [*before.sent, *sender.sent]
+        for role in ("viewer", "resampler", "acquisition.b", "acquisition"):
+            for payload in recorded:
+                site.session(role).put(RAW, payload)
+            site.flush(role)
+        sender.send()
+        health = stage.health_with(lambda health: has_received(health, sender, 6), "the next one has arrived")
+        assert sum(line.duplicated for line in health.inputs) == len(sender.sent) - 1
+        assert counter(health, "refused_producers") == len(before.sent)
+        assert "acquisition-all-before is not a stage of this site" in health.problem
+        newest_ns = sender.newest_ns
+        eventually(lambda: grids and grids[-1].t_ns[-1] >= newest_ns - STEP_NS, "the grid of all samples is there")
+    t_ns = np.concatenate([grid.t_ns for grid in grids])
+    valid = np.concatenate([grid.valid for grid in grids])
+    assert (np.diff(t_ns) == STEP_NS).all() and valid.all(), "each time once, and no sample of another session"
+
+
+def has_received(health: Health, sender: Sender, number: int) -> bool:
+    return any(line.producer == sender.producer and line.received >= number for line in health.inputs)
+
+
+def test_row_13_a_flood_holds_nobody_up_and_fills_no_memory(tmp_path):
+    """A viewer floods the topic of healthy samples, where it may not; the owner of tray b's certificate its own topic,
+    which the same stage reads. The samples of tray a arrive, in order and without loss. All are processes of their own:
+    within one, sessions share threads of Zenoh."""
+    site = SecuredSite(tmp_path, free_endpoint())
+    site.config.path.write_text(site.config.text)
+    router = RunningCommand(["router", "-c", site.config.path])
+    try:
+        run_row_13(site, router.process.pid)
+    finally:
+        router.kill()
+
+
+def run_row_13(site: SecuredSite, router_id: int) -> None:
+    with (
+        SecuredStage(site, "resampler") as stage,
+        join_bus(site.config, roles=("acquisition",)) as bus,
+        flooding(site, "viewer", RAW) as refused,
+        flooding(site, "acquisition.b", tray_key(SITE, "b", "raw")) as taken,
+    ):
+        sender = Sender(bus, "healthy")
+        before = [resident_bytes(process_id) for process_id in (router_id, os.getpid())]
+        eventually(lambda: counter(stage.newest, "undecodable"), "the flood has begun")
+        for number in range(1, 4):
+            began = counter(stage.newest, "undecodable")
+            sender.send()
+            health = stage.health_with(lambda health, number=number: has_received(health, sender, number), "it arrives")
+            assert counter(health, "undecodable") > began, "the flood goes on meanwhile"
+        sent = [int(each.communicate(timeout=60)[0]) for each in (refused, taken)]
+        health = stage.health_with(lambda health: counter(health, "undecodable") == sent[1], "all is counted")
+        after = [resident_bytes(process_id) for process_id in (router_id, os.getpid())]
+        grown = [now - earlier for now, earlier in zip(after, before, strict=True)]
+        assert max(grown) < FLOOD_BYTES_AT_MOST < len(NOISE) * min(sent), grown
+    assert health.lost == 0
+    assert [(line.received, line.missing) for line in health.inputs] == [(3, 0)]
+
+
+def resident_bytes(process_id: int) -> int:
+    return int(Path(f"/proc/{process_id}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@contextmanager
+def flooding(site: SecuredSite, role: str, key: str) -> Iterator[subprocess.Popen[str]]:
+    files = [str(site.certificates.folder), site.endpoint]
+    words = [sys.executable, "-m", "tests.support.flooding_client", *files, role, key, str(FLOOD_MESSAGES)]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("name", ["resampler", "recorder", "viewer"])
+def test_row_14_malformed_messages_are_counted_and_stop_nobody(site, tmp_path, name):
+    """Noise, parts of messages, and messages with changed bytes, on each topic of a tray that the stage reads."""
+    settings = [f"run_folder='{tmp_path}'", *(["viewer.serve=false"] if name == "viewer" else [])]
+    random = np.random.default_rng(1)
+    good = encode(replace(samples(0, 0), header=Header("x", 0, "b")))
+    noise = [b"\xff" * size for size in (1, 10, 1000)]
+    parts = [good[:size] for size in range(1, len(good), 40)]
+    changed = [bytearray(good) for _ in range(100)]
+    for each in changed:
+        each[int(random.integers(len(each)))] = int(random.integers(256))
+    writer = {"viewer": "scorer"}.get(name, "acquisition")
+    topic = {"viewer": "score"}.get(name, "raw")
+    with SecuredStage(site, name, *settings) as stage:
+        for payload in (*noise, *parts, *changed):
+            site.session(writer).put(tray_key(SITE, "b", topic), bytes(payload))
+        site.session(writer).put(health_key(SITE, writer, "all"), noise[1])
+        site.flush(writer)
+        health = stage.health_with(lambda health: counter(health, "undecodable") > len(noise), "noise has been counted")
+        assert health.status != StageStatus.STOPPED
+        if writer == "acquisition":
+            with join_bus(site.config, roles=("acquisition",)) as bus:
+                sender = Sender(bus, "healthy")
+                sender.send()
+                stage.health_with(lambda health: has_received(health, sender, 1), "a good message arrives")
+    if name == "recorder":
+        (recording,) = tmp_path.glob("*.mcap")
+        reading = read_recording(recording)
+        assert any(envelope.header.tray == "a" for envelope in reading)
+        assert reading.damage == ""
 
 
 def test_a_session_without_the_roles_of_its_site_is_not_held_to_them(site):

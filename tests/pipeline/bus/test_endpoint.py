@@ -5,13 +5,17 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 
 import pytest
 
 from pipeline.bus.endpoint import accepts_connections, endpoint_problem, somebody_listens
 from pipeline.bus.errors import BusError
-from pipeline.bus.session import Bus
+from pipeline.bus.router import open_router
+from pipeline.bus.session import Bus, join_bus
 from pipeline.config.models import BusConfig
+from tests.support.secured_site import SecuredSite, free_endpoint
+from tests.support.tcp_relay import TcpRelay
 
 NOBODY = "no-such-host.invalid"
 
@@ -55,6 +59,34 @@ def test_row_15_a_foreign_program_at_the_endpoint_is_one_line(foreign, monkeypat
         f"bus.endpoint = {foreign!r}: the program that listens there is not fantwin, or hangs, so stages cannot "
         "connect: stop it, or choose another port"
     )
+
+
+@pytest.mark.parametrize("mode", ["peer", "client"])
+def test_row_15_without_certificates_at_a_port_with_tls_is_one_line_that_says_so(tmp_path, monkeypatch, mode):
+    monkeypatch.setattr("pipeline.bus.session.MEETING_LIMIT_S", 0.0)
+    with SecuredSite(tmp_path, free_endpoint()).running() as site, pytest.raises(BusError) as refused:
+        Bus(BusConfig(mode=mode, endpoint=site.endpoint.replace("tls/", "tcp/")))
+    assert "the program that listens there takes TLS only: give this configuration" in str(refused.value)
+
+
+def test_row_15_certificates_at_a_port_without_tls_are_one_line_that_says_so(tmp_path, foreign):
+    site = SecuredSite(tmp_path, foreign)
+    with pytest.raises(BusError, match="the program that listens there takes no TLS: it has no"):
+        join_bus(site.config, roles=("viewer",))
+
+
+def test_row_15_a_command_tries_again_where_a_router_is_just_starting(endpoint, monkeypatch):
+    """It accepts connections and does not answer yet."""
+    with open_router(endpoint), closing(TcpRelay(endpoint)) as relay:
+        relay.cut()
+
+        def is_asked(asked: str) -> bool:
+            relay.heal()
+            return accepts_connections(asked)
+
+        monkeypatch.setattr("pipeline.bus.session.accepts_connections", is_asked)
+        with Bus(BusConfig(mode="client", endpoint=relay.endpoint)) as bus:
+            assert bus.alive("fantwin/**") == set()
 
 
 def test_row_15_where_nobody_listens_nobody_is_waited_for(endpoint):

@@ -15,6 +15,7 @@ import pytest
 
 from pipeline.bus.errors import BusError
 from pipeline.bus.link import LEASE_MS
+from pipeline.bus.router import open_router
 from pipeline.bus.session import Bus, _zenoh_config
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, tray_key
@@ -137,6 +138,24 @@ def test_a_second_router_at_the_same_place_is_refused_in_one_line(endpoint, star
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "is one running already?" in done.stderr
+
+
+def test_a_router_takes_settings_of_zenoh(endpoint):
+    """As docs/how-to/security.md has it: no message of this topic is longer than 1000 bytes."""
+    rule = {"flows": ["ingress"], "messages": ["put"], "key_exprs": [KEY], "size_limit": 1000}
+    received: queue.Queue[bytes] = queue.Queue()
+    settings = {"low_pass_filter": [rule]}
+    with open_router(endpoint, zenoh_settings=settings), client(endpoint) as one, client(endpoint) as other:
+        exchange(one, other)
+        one.subscribe(KEY, lambda _key, payload: received.put(payload))
+        publisher = other.publisher(KEY, BY_NAME["alarm"], "x", "speaker-2")
+
+        def next_length() -> int:
+            publisher.put(bytes(2000))
+            publisher.put(bytes(1000))
+            return len(received.get(timeout=20))
+
+        assert {next_length() for _ in range(3)} == {1000}
 
 
 def test_row_16_a_client_and_its_router_notice_a_dead_connection_after_four_seconds():

@@ -6,14 +6,19 @@ import queue
 import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 from pydantic import ValidationError
 
-from pipeline.bus.session import Bus
+from pipeline.bus.access_rules import SiteRoles
+from pipeline.bus.errors import BusError
+from pipeline.bus.router import open_router
+from pipeline.bus.session import Bus, join_bus
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, alive_key, tray_key
 from tests.support.running_chain import RunningCommand, eventually
+from tests.support.secured_site import SITE, SecuredSite, free_endpoint
 
 KEY = tray_key("site", "tray", "alarm")
 TOKEN = alive_key("site", "scorer", "all")
@@ -79,6 +84,69 @@ def test_row_16_clients_of_two_routers_hear_one_another_whichever_of_them_is_the
             are_together(b"without router %d" % number)
             routers.start(number)
             are_together(b"with router %d again" % number)
+
+
+@pytest.fixture
+def secured(tmp_path) -> Iterator[tuple[SecuredSite, SecuredSite]]:
+    """A site by each of its two routers, which are connected. The second one does not let the recorder read."""
+    first = SecuredSite(tmp_path, free_endpoint())
+    second = SecuredSite(tmp_path, free_endpoint(), is_new=False)
+    roles = dict(first.site.roles)
+    fewer = SiteRoles(SITE, {**roles, "recorder": replace(roles["recorder"], reads=())})
+    with (
+        first.running(),
+        second.sessions_of(),
+        open_router(second.endpoint, second.credentials("router"), fewer, others=[first.endpoint]),
+    ):
+        yield first, second
+
+
+def test_clients_of_two_secured_routers_may_do_on_either_what_their_role_may(secured):
+    """Samples, what was missed, and tokens pass from one router to the other; what a role may not do passes neither."""
+    first, second = secured
+    key, alive = tray_key(SITE, "a", "raw"), alive_key(SITE, "acquisition", "all")
+    received, tokens = [], {}
+    with (
+        join_bus(first.config, roles=("resampler",)) as reader,
+        join_bus(second.config, roles=("acquisition",)) as writer,
+        join_bus(second.config, roles=("resampler",)) as reader_there,
+    ):
+        for bus in (reader, reader_there):
+            bus.subscribe(key, lambda _key, payload: received.append(payload))
+        reader.watch_alive(alive, tokens.__setitem__)
+        writer.declare_alive(alive)
+        publisher = writer.publisher(key, BY_NAME["raw"], "x", "me")
+        for bus in (reader, reader_there, writer):
+            bus.require_rights()
+        eventually(lambda: tokens.get(alive), "the token passes")
+        eventually(lambda: publisher.put(b"sample") or received.count(b"sample") > 1, "samples pass to both")
+        assert {payload for _, payload in reader.recover(key, "me")} == {b"sample"}
+        for site in secured:
+            for role in ("viewer", "acquisition.b"):
+                liveliness = site.session(role).liveliness().declare_token(alive_key(SITE, "scorer", "all"))
+                site.session(role).put(key, b"forged")
+                site.flush(role)
+                assert (
+                    reader.alive(alive_key(SITE, "*", "*")) == reader_there.alive(alive_key(SITE, "*", "*")) == {alive}
+                )
+                liveliness.undeclare()
+        publisher.put(b"last")
+        eventually(lambda: received.count(b"last") == 2, "the last one has arrived")
+    assert set(received) == {b"sample", b"last"}
+
+
+def test_a_client_asks_its_own_router_for_its_rights_and_no_other(secured):
+    """The other one answers as well, and may have other rules."""
+    first, second = secured
+    with join_bus(first.config, roles=("recorder",)) as good, join_bus(second.config, roles=("recorder",)) as refused:
+        for bus in (good, refused):
+            bus.subscribe(tray_key(SITE, "a", "raw"), lambda _key, _payload: None)
+        for _ in range(3):
+            good.require_rights()
+            with pytest.raises(BusError, match="the router does not let 'recorder' read raw of a"):
+                refused.require_rights()
+        assert good.has_all_rights_of_its_role(first.site)
+        assert not refused.has_all_rights_of_its_role(first.site)
 
 
 def test_peers_have_one_endpoint():

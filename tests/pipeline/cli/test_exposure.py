@@ -1,0 +1,54 @@
+"""A bus that others can reach without certificates: refused unless it is wanted, and said again and again."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from pipeline.cli.exposure import checked_exposure
+from pipeline.config.models import BusConfig
+from pipeline.errors import UsageError
+from tests.support.running_chain import DEMO, fantwin
+
+OPEN = "tcp/0.0.0.0:7447"
+DRIVES = "whoever reaches it can drive the fans, forge samples and silence alarms"
+
+
+@pytest.mark.parametrize("words", [["up"], ["run", "scorer"], ["router"]])
+def test_each_command_that_stays_on_the_bus_ends_with_2_and_one_line(words, tmp_path):
+    settings = ["--set", f"bus.endpoint='{OPEN}'", "--set", f"run_folder='{tmp_path}'"]
+    done = fantwin(*words, "-c", DEMO / "demo.toml", *settings)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1
+    assert DRIVES in done.stderr and "fantwin certs init" in done.stderr and "--insecure" in done.stderr
+
+
+def test_who_accepts_it_is_reminded_until_the_end(monkeypatch):
+    monkeypatch.setattr("pipeline.cli.exposure.AGAIN_S", 0.001)
+    said: list[str] = []
+    often = threading.Event()
+
+    def say(line: str) -> None:
+        said.append(line)
+        if len(said) == 3:
+            often.set()
+
+    with checked_exposure(BusConfig(endpoint=OPEN), say, insecure=True):
+        assert often.wait(30)
+    assert set(said) == {f"insecure: bus.endpoint = {OPEN!r}: {DRIVES}"}
+    assert not [thread for thread in threading.enumerate() if thread.name.endswith("(remind)")]
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tcp/localhost:7447", "tcp/[::1]:7447"])
+def test_on_loopback_there_is_nothing_to_say(endpoint):
+    said: list[str] = []
+    with checked_exposure(BusConfig(endpoint=endpoint), said.append, insecure=False):
+        pass
+    assert said == []
+
+
+def test_one_endpoint_of_several_that_others_reach_is_enough():
+    bus = BusConfig.model_validate({"mode": "client", "endpoint": ["tcp/127.0.0.1:7447", OPEN]})
+    with pytest.raises(UsageError, match="whoever reaches it"), checked_exposure(bus, print, insecure=False):
+        pass

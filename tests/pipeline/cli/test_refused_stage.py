@@ -1,0 +1,94 @@
+"""`fantwin run` and `fantwin doctor` at a router that refuses: one line, and the exit code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+
+from pipeline.bus.access_rules import SiteRoles
+from pipeline.bus.router import open_router
+from tests.support.fantwin_command import fantwin as called
+from tests.support.running_chain import RunningCommand, fantwin
+from tests.support.secured_site import SITE, SecuredSite, free_endpoint
+
+
+@pytest.fixture
+def site(tmp_path) -> Iterator[SecuredSite]:
+    made = SecuredSite(tmp_path, free_endpoint())
+    made.config.path.write_text(made.config.text)
+    yield made
+
+
+def fewer_rights(site: SecuredSite) -> SiteRoles:
+    """The resampler may not publish."""
+    roles = dict(site.site.roles)
+    return SiteRoles(SITE, {**roles, "resampler": replace(roles["resampler"], writes=())})
+
+
+def test_a_stage_with_a_certificate_of_another_role_ends_with_1_and_one_line(site):
+    other = site.certificates.folder / "viewer"
+    words = [f"bus.security.{name}='{other}.{end}'" for name, end in (("certificate", "pem"), ("key", "key"))]
+    with site.running():
+        done = fantwin("run", "resampler", "-c", site.config.path, *(w for word in words for w in ("--set", word)))
+    assert done.returncode == 1
+    assert done.stderr.startswith("fantwin: its certificate says 'viewer', which may not publish grid of a"), (
+        done.stderr
+    )
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.real_time
+def test_a_stage_that_is_refused_while_it_runs_says_so_and_ends_with_1(site):
+    stage = None
+    try:
+        with open_router(site.endpoint, site.credentials("router"), site.site):
+            stage = RunningCommand(["run", "resampler", "-c", site.config.path])
+            with site.sessions_of():
+                assert site.sees("resampler")
+        with open_router(site.endpoint, site.credentials("router"), fewer_rights(site)):
+            line = stage.line_with("the router does not let 'resampler' publish grid of a")
+            assert line.startswith("resampler: ")
+            assert stage.end() == 1
+            assert "its messages were refused until the end" in stage.lines[-1]
+    finally:
+        if stage:
+            stage.kill()
+
+
+def examined(site: SecuredSite) -> tuple[list[str], list[str]]:
+    """The lines of doctor about certificates: good ones and problems."""
+    done = called("doctor", "-c", site.config.path, "--listen-s", 0, "--json")
+    found = json.loads(done.stdout)
+    good, problems = ([line for line in found[kind] if "certificate" in line] for kind in ("good", "problems"))
+    return good, problems
+
+
+def test_doctor_says_of_each_certificate_whether_the_router_grants_its_rights(site):
+    for role in ("twin_integrator", "scorer", "recorder"):
+        (site.certificates.folder / f"{role}.pem").unlink()
+    with open_router(site.endpoint, site.credentials("router"), site.site):
+        good, problems = examined(site)
+    assert "certificate of resampler: the router grants its rights" in good
+    assert not [line for line in good if "scorer:" in line], "it is not here"
+    assert problems == []
+    with open_router(site.endpoint, site.credentials("router"), fewer_rights(site)):
+        good, problems = examined(site)
+    assert "certificate of viewer: the router grants its rights" in good
+    assert problems == [
+        "certificate of resampler: the router does not grant it the rights of its role: restart it with this "
+        "configuration"
+    ]
+
+
+def test_doctor_without_a_router_says_until_when_certificates_hold_and_where_there_are_none(site):
+    good, problems = examined(site)
+    assert [line for line in good if line.startswith("certificate of resampler: until 2")]
+    assert problems == []
+    for path in site.certificates.folder.glob("*.pem"):
+        path.unlink()
+    assert examined(site)[1] == [
+        f"{site.certificates.folder}/{{role}}.pem: no certificate of any role here: `fantwin certs issue` makes them"
+    ]

@@ -1,0 +1,117 @@
+"""A real stage on a secured bus, run in a thread of this process, and an acquisition that feeds it, for tests."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from pipeline.bus.session import Bus
+from pipeline.config.loading import parse_config
+from pipeline.devices.host_clock import HOST_CLOCK
+from pipeline.runtime.runner import Runner
+from pipeline.runtime.sessions import Session
+from pipeline.runtime.stage import load_stage
+from schemas.codec import encode, type_name
+from schemas.messages import Header, Health, Output, Raw, StageStatus
+from schemas.topics import BY_NAME, health_key, tray_key
+from tests.support.running_chain import eventually
+from tests.support.secured_site import SITE, SecuredSite
+
+SAMPLES, STEP_NS = 10, 10_000_000
+"""of a message: 0.1 s at 100 Hz"""
+
+
+class SecuredStage:
+    """Runs until the block ends; what it raised is raised then."""
+
+    def __init__(self, site: SecuredSite, name: str, *settings: str) -> None:
+        config = parse_config(site.config.text, site.config.path, settings, stages=(name,))
+        self._stop = threading.Event()
+        self.newest: Health | None = None
+        """the last that it has sent; None: none yet"""
+        self._error: BaseException | None = None
+        self.runner = Runner(load_stage(name), config, None, self._stop, self._take)
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        self.health_with(lambda health: health.status == StageStatus.OK, "the stage is ready")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+        if error is None and self._error is not None:
+            raise self._error
+
+    def health_with(self, fits: Callable[[Health], bool], what: str) -> Health:
+        """The first health from now on that fits."""
+        return eventually(lambda: self.newest if self.newest and fits(self.newest) else None, what)
+
+    def _take(self, health: Health) -> None:
+        self.newest = health
+
+    def _run(self) -> None:
+        try:
+            self.newest = self.runner.run()
+        except BaseException as error:  # noqa: BLE001  raised again at the end of the block
+            self._error = error
+
+
+class Sender:
+    """An acquisition of tray a as the others see it: its token, its samples, its health."""
+
+    def __init__(self, bus: Bus, name: str) -> None:
+        self.producer = f"acquisition-all-{name}"
+        session = Session("acquisition", "all", HOST_CLOCK.now_ns(), self.producer, "host", 1)
+        bus.declare_alive(session.key(SITE))
+        self._raw = bus.publisher(tray_key(SITE, "a", "raw"), BY_NAME["raw"], type_name(Raw), self.producer)
+        self._health = bus.publisher(
+            health_key(SITE, "acquisition", "all"), BY_NAME["health"], type_name(Health), self.producer
+        )
+        self._began_ns = HOST_CLOCK.now_ns() - STEP_NS * SAMPLES
+        self.sent: list[bytes] = []
+
+    def send(self) -> None:
+        """The next samples, which continue those before without a gap."""
+        number = self._raw.published
+        message = replace(samples(self._began_ns, number), header=Header(self.producer, number, "a"))
+        self.sent.append(encode(message))
+        self._raw.put(self.sent[-1])
+
+    @property
+    def newest_ns(self) -> int:
+        """The time of the last sample that was sent."""
+        return self._began_ns + STEP_NS * (SAMPLES * self._raw.published - 1)
+
+    def send_health(self) -> None:
+        """That it is there, and what it publishes."""
+        health = Health(
+            header=Header(self.producer, self._health.published, ""),
+            stage="acquisition",
+            instance="all",
+            status=StageStatus.OK,
+            t_ns=HOST_CLOCK.now_ns(),
+            uptime_s=1,
+            outputs=(Output(key=self._raw.key, published=self._raw.published),),
+        )
+        self._health.put(encode(health))
+
+
+def samples(began_ns: int, number: int) -> Raw:
+    """Message `number` of a tray of two fans."""
+    t_ns = began_ns + STEP_NS * (SAMPLES * number + np.arange(SAMPLES))
+    column = np.full((SAMPLES, 2), 0.5)
+    return Raw(fans=2, host_receive_t_ns=t_ns, command=column, speed_rad_s=200 * column)
+
+
+def counter(health: Health | None, name: str) -> int:
+    """A counter of a health; 0 if it has none of this name."""
+    return next((each.value for each in (health.counters if health else ()) if each.name == name), 0)
