@@ -349,4 +349,4 @@ class Tray:
             if is_there:
                 _LOG.warning("tray %s: acquisition is back", self.name)
             else:
-                _LOG.warning("tray %s: acquisition is gone; %d samples are kept", self.name, self._kept_samples)
+                _LOG.warning("tray %s: acquisition is gone; up to %d samples are kept", self.name, self._kept_samples)

@@ -80,8 +80,8 @@ class ResamplerConfig(StageConfig):
     link_wait_s: float = Field(
         default=900.0,
         ge=0,
-        description="how long no gap is published while acquisition does not say that it has sent nothing: the link "
-        "may be cut, and the samples come later",
+        description="longest wait, before a gap is published, for acquisition to confirm that it has sent nothing; if "
+        "the link is cut, the samples come later",
     )
 
     @model_validator(mode="after")
@@ -194,13 +194,13 @@ class ResamplerCore(Core):
         try:
             tachos = tacho_of_each_fan([each.tacho for each in stated], self._fans) if stated else self._tachos
         except ValueError:
-            return "raw messages state a tacho that this version does not know: use the version of their acquisition"
+            return "raw messages state a tacho that this version does not know: use the version that acquisition runs"
         others = [fan for fan, its in enumerate(tachos) if its != self._tachos[fan]]
         if not others:
             return ""
         fan, more = others[0], f" (and {len(others) - 1} more)" if len(others) > 1 else ""
         return (
-            f"raw messages state another tacho than this configuration, of fan {fan}{more} {tachos[fan]}, not "
+            f"raw messages state another tacho than this configuration, for fan {fan}{more} {tachos[fan]} instead of "
             f"{self._tachos[fan]}: set tacho = {tachos[fan].as_toml} in [[tray]], or correct the source"
         )
 

@@ -163,7 +163,7 @@ def _require_private(key: Path) -> None:
 def _described(path: Path, certificate: x509.Certificate) -> Certificate:
     role = _common_name(certificate.subject)
     if not role:
-        raise BusError(f"{path}: a certificate without a common name, which would be its role")
+        raise BusError(f"{path}: a certificate without a common name, which would name its role")
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         hosts = tuple(str(each.value) for each in names)

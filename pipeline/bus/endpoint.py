@@ -112,7 +112,7 @@ def require_tls_with_security(config: BusConfig) -> None:
             raise BusError(f"bus.endpoint = {endpoint!r}: with [bus.security] write tls/{place}")
         if not config.security and scheme in ("tls", "quic"):
             raise BusError(
-                f"bus.endpoint = {endpoint!r}: {scheme} needs certificates: a section [bus.security], see "
+                f"bus.endpoint = {endpoint!r}: {scheme} needs certificates: write a section [bus.security], see "
                 "`fantwin certs --help`"
             )
 
@@ -125,8 +125,8 @@ def foreign_program(endpoint: str, *, is_secure: bool) -> str:
     has_tls = any(map(_speaks_tls, _addresses(endpoint)))
     if is_secure and has_tls:
         return (
-            f"bus.endpoint = {endpoint!r}: what listens there is of another authority, has a certificate without this "
-            "host name, or is not fantwin: see `fantwin certs show` there and here"
+            f"bus.endpoint = {endpoint!r}: what listens there has a certificate of another authority or without "
+            "this host name, or is not fantwin: see `fantwin certs show` there and here"
         )
     if is_secure:
         return (

@@ -149,7 +149,7 @@ class Spool:
         why = error.strerror or type(error).__name__
         self._unwritable = (
             f"messages cannot be kept on disk in {self._folder} ({why}): a long cut may lose some; make room "
-            "there, or give it to this user"
+            "there, or let this user write there"
         )
 
 

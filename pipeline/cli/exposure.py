@@ -15,7 +15,11 @@ from pipeline.errors import UsageError
 
 AGAIN_S = 60.0
 InsecureOption: TypeAlias = Annotated[
-    bool, typer.Option("--insecure", help="Without certificates, though others reach the bus: everybody may do all.")
+    bool,
+    typer.Option(
+        "--insecure",
+        help="Run without certificates on a bus that other hosts reach: whoever reaches it may do everything.",
+    ),
 ]
 
 

@@ -87,18 +87,19 @@ ROLE_PLACE = "{role}"
 
 
 class SecurityConfig(Section):
-    """Mutual TLS and roles. Each process shows a certificate that says its role; `fantwin certs` makes them. Paths may
-    hold `{role}`: each process then finds those of its own role."""
+    """Mutual TLS and roles. Each process shows a certificate that names its role; `fantwin certs` makes them. `{role}`
+    in a path stands for the role of the process."""
 
     ca: Path = Field(default=Path("certs/ca.pem"), description="certificate of the site's authority")
     certificate: Path = Field(
         default=Path("certs/{role}.pem"), description="certificate of a process; `{role}` is the name of its role"
     )
     key: Path = Field(
-        default=Path("certs/{role}.key"), description="private key of that certificate, readable by its owner only"
+        default=Path("certs/{role}.key"),
+        description="private key of that certificate; only its owner may be able to read it",
     )
     controllers: tuple[Name, ...] = Field(
-        default=(), description="roles of programs that command fans, as operators do, and may do nothing else"
+        default=(), description="roles of programs that command fans: each has the rights of `operator`"
     )
 
     def within(self, folder: Path) -> Self:
@@ -110,7 +111,7 @@ class SecurityConfig(Section):
 class SpoolConfig(Section):
     """What a process keeps on disk of what it has published, in `run_folder/spool`."""
 
-    megabytes: float = Field(default=200.0, ge=1, description="the most that a process keeps on disk")
+    megabytes: float = Field(default=200.0, ge=1, description="most that a process keeps on disk, MB")
     kept_s: float = Field(default=900.0, ge=1, description="how long a message is kept")
 
 
@@ -123,8 +124,8 @@ class BusConfig(Section):
     )
     endpoint: Annotated[str, BeforeValidator(_joined)] = Field(
         default="tcp/127.0.0.1:7447",
-        description="where peers meet, or the router's address for clients; a list of several routers: a client uses "
-        "the first that answers, and another one when that has gone",
+        description="where peers meet, or for clients the address of the router; or a list of routers: a client uses "
+        "the first that answers, and another when that one is gone",
     )
     recovery_timeout_s: float = Field(
         default=5.0, gt=0, description="how long to wait for missed messages that were requested again"
@@ -224,8 +225,8 @@ class TrayConfig(Section):
     twin: Path | None = Field(default=None, description="ONNX file of the healthy twin")
     tacho: Tachos | None = Field(
         default=None,
-        description="how the speed is measured: one tacho for all fans, or a list with one for each; without it what "
-        "the source states to measure, or else instantaneous",
+        description="how the speed is measured: one tacho for all fans, or a list with one for each; without it, what "
+        "the source states, or else instantaneous",
     )
 
     @property

@@ -63,12 +63,13 @@ def page() -> str:
         "Certificates and roles ([security](../how-to/security.md)). Without this section there are none.\n",
         _table(SecurityConfig, but=()),
         "## `[bus.zenoh]`\n",
-        "Settings of Zenoh itself, passed through to every session and to the router: path = value, with the paths of "
-        'Zenoh\'s own configuration, as `"transport/unicast/max_sessions" = 5000`. Refused: what Zenoh does not know, '
-        "and what fantwin sets itself.\n",
+        "Settings of Zenoh itself, passed to every session and to the router: path = value, with the paths of Zenoh's "
+        'own configuration, for example `"transport/unicast/max_sessions" = 5000`. What Zenoh does not know, or '
+        "fantwin sets itself, is refused.\n",
         "## `[bus.spool]`\n",
-        "What a process keeps on disk of what it has published, in `run_folder/spool`, for consumers that are cut off "
-        "for long ([partitions](../how-to/deployment.md#partitions)). Without this section nothing.\n",
+        "What a process keeps on disk of the messages that it has published, in `run_folder/spool`, for consumers that "
+        "are cut off for long ([partitions](../how-to/deployment.md#partitions)). Without this section it keeps "
+        "nothing.\n",
         _table(SpoolConfig, but=()),
         "## `[launcher]`\n",
         _table(LauncherConfig, but=()),
@@ -107,7 +108,7 @@ def _tables_within(model: type[BaseModel]) -> Iterator[str]:
             if inner is not None and inner not in shown:
                 shown.add(inner)
                 waiting.append(inner)
-                yield f"Each table such as `{key}`: {(inner.__doc__ or '').splitlines()[0]}\n"
+                yield f"A table such as `{key}`: {(inner.__doc__ or '').splitlines()[0]}\n"
                 yield _table(inner, but=())
 
 

@@ -80,7 +80,7 @@ def discover_serial() -> Iterator[Found]:
             "speed_unit": "rpm",
             "source": {"kind": "serial", "port": port.device, "protocol": "text"},
         }
-        note = "fans, protocol and unit are not known from here: `fantwin doctor` listens and says what does not fit"
+        note = "fans, protocol and unit are a guess: `fantwin doctor` listens and says what does not fit"
         yield Found("serial", f"{port.device}: {port.description}", keys, (note,), missing)
     if not ports:
         yield Found("serial", "serial ports", {}, missing=("none is there: connect the device",))
@@ -91,7 +91,7 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
     with_pwm = [fan for fan in chip.fans if fan in chip.pwms]
     turning = [fan for fan in with_pwm if readings[fan] is not None and readings[fan] != 0]
     missing = [
-        f"fan{fan} has no pwm{fan}, so its command is not known: name the pwm that drives it with pwms"
+        f"fan{fan} has no pwm{fan}, so its command is not known: name the pwm that drives it in pwms"
         for fan in chip.fans
         if fan not in chip.pwms
     ]
@@ -104,7 +104,7 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
     fans = sorted([*turning, *stopped]) if turning else standing
     if fans and (closed := [fan for fan in fans if not os.access(chip.path / f"pwm{fan}", os.W_OK)]):
         numbers = ", ".join(f"pwm{fan}" for fan in closed)
-        missing.append(f"this user may not write {numbers}: only needed for commands (writable), as root or by udev")
+        missing.append(f"this user may not write {numbers}, which only commands need: run as root, or add a udev rule")
     row = chip_of(chip.name)
     notes = [f"fan{fan}{_label(chip, fan)}: {readings[fan]} rpm" for fan in fans]
     notes.append(f"measures {row.tacho} ({row.source})" if row and row.tacho else _unknown(chip.name))
@@ -131,7 +131,7 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
 
 
 def _unknown(name: str) -> str:
-    return f"what the readings of {name} are is not known: readings count as instantaneous unless tacho says more"
+    return f"how {name} measures speeds is not known: readings count as instantaneous unless tacho says otherwise"
 
 
 def _number(chip: ChipFolder, file: str) -> int | None:

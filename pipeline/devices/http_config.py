@@ -18,14 +18,15 @@ class HttpConfig(SourceConfig, frozen=True):
 
     kind: Literal["http"] = "http"
     host: str = Field(
-        default="127.0.0.1", min_length=1, description="address it listens on; beyond loopback it needs token_file"
+        default="127.0.0.1", min_length=1, description="address to listen on; beyond loopback, token_file is needed"
     )
-    port: int = Field(default=8765, ge=1, le=65535, description="its port, another one for each tray")
+    port: int = Field(default=8765, ge=1, le=65535, description="port to listen on, another one for each tray")
     token_file: Path | None = Field(
-        default=None, description="file with a token in its first line, that its owner only may read; clients send it"
+        default=None,
+        description="file with the token that clients send, in its first line; only its owner may be able to read it",
     )
     certificate: Path | None = Field(default=None, description="certificate of the server, for https")
-    key: Path | None = Field(default=None, description="its private key")
+    key: Path | None = Field(default=None, description="private key of that certificate")
 
     @property
     def is_local(self) -> bool:
@@ -39,7 +40,7 @@ class HttpConfig(SourceConfig, frozen=True):
     def _is_protected(self) -> Self:
         if not self.is_local and self.token_file is None:
             raise ValueError(
-                f"host = {self.host!r} can be reached from other hosts: give token_file, with a token of yours"
+                f"host = {self.host!r} can be reached from other hosts: give token_file, a file with a token"
             )
         if bool(self.certificate) != bool(self.key):
             raise ValueError("give certificate and key, or neither")

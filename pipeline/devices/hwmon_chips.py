@@ -46,7 +46,7 @@ CHIPS: tuple[Chip, ...] = (
         "pwmfan",
         "drivers/hwmon/pwm-fan.c",
         Tacho(kind="count", pulses=2, window_s=1.0),
-        "pulses of one second; pulses-per-revolution of the device tree is taken for 2",
+        "counts pulses for one second; pulses-per-revolution of the device tree is taken as 2",
     ),
     Chip("nct6[0-9]+", "drivers/hwmon/nct6775-core.c", _held(1.5), "the driver reads the chip every 1.5 s at most"),
     Chip(
@@ -72,7 +72,7 @@ CHIPS: tuple[Chip, ...] = (
         "nzxtsmart2",
         "Documentation/hwmon/nzxt-smart2.rst",
         _held(1.0),
-        "update_interval (1000 ms, at least 250) says how often it measures; it gives voltage and current of each fan",
+        "measures every update_interval (1000 ms, at least 250); it gives voltage and current of each fan",
     ),
     Chip(
         "aspeed_pwm_tacho",

@@ -25,11 +25,11 @@ class HwmonConfig(PolledConfig, frozen=True):
     )
     device: str = Field(
         default="",
-        description="end of the path of its device, where several chips have one name: numbers of hwmon change",
+        description="end of the path of its device; needed where several chips have the same name",
     )
     fans: tuple[Number, ...] = Field(
         default=(),
-        description="N of fanN_input, in the order of the tray; without it 1, 2, ... as many as the tray has",
+        description="N of fanN_input, in the order of the tray; without it 1, 2, ... up to the number of fans",
     )
     pwms: tuple[Number, ...] = Field(
         default=(), description="N of pwmN that drives each fan, or one for all; without it the numbers of the fans"
@@ -41,13 +41,14 @@ class HwmonConfig(PolledConfig, frozen=True):
         default=(), description="N of inN_input, the supply voltage of each fan, or one for all"
     )
     voltage_scale: float = Field(
-        default=1.0, gt=0, le=1000, description="by which inN_input is multiplied: that of a divider on the board"
+        default=1.0, gt=0, le=1000, description="factor for inN_input, for a divider on the board"
     )
     currents: tuple[Number, ...] = Field(default=(), description="N of currN_input of each fan, or one for all")
     writable: bool = Field(
-        default=False, description="whether commands are written; pwmN_enable is then set to 1, and back at the end"
+        default=False,
+        description="whether commands are written; pwmN_enable is then set to 1 (manual), and restored at the end",
     )
-    root: Path = Field(default=ROOT, description="where the chips are")
+    root: Path = Field(default=ROOT, description="folder of the chips")
 
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
         """What the driver of the chip gives, where it is known."""

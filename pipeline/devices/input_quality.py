@@ -65,7 +65,7 @@ class InputQuality:
         settings: of the tray, to be checked where the fault does not say which one it is.
         """
         if now_ns - self._input_t_ns > self._silence_s * NS_PER_S:
-            return f"nothing received for {self._silence_s:g} s; is the device powered, connected and sending?"
+            return f"nothing received for {self._silence_s:g} s; is the source running, connected and sending?"
         has_valid = now_ns - self._valid_t_ns <= self._silence_s * NS_PER_S
         if has_valid and not self._mostly_faulty:
             return ""

@@ -16,11 +16,13 @@ RegisterType = Literal["u16", "s16", "u32", "s32", "f32"]
 class Register(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """One number in a device: its registers times `scale`, plus `offset`."""
 
-    address: int = Field(ge=0, le=65535, description="as the request has it: from 0, without a leading 3 or 4")
-    type: RegisterType = Field(default="u16", description="16 bits, or 32 in two registers")
-    table: Literal["holding", "input"] = Field(default="holding", description="function 3 or function 4")
+    address: int = Field(ge=0, le=65535, description="address in the request: from 0, without a leading 3 or 4")
+    type: RegisterType = Field(default="u16", description="unsigned, signed or float; 32 bits are in two registers")
+    table: Literal["holding", "input"] = Field(
+        default="holding", description="read by function 3 (holding) or 4 (input)"
+    )
     word_order: Literal["big", "little"] = Field(default="big", description="which of two registers comes first")
-    scale: float = Field(default=1.0, description="of one count of the register")
+    scale: float = Field(default=1.0, description="value of one count of the register")
     offset: float = Field(default=0.0, description="value at a register of 0")
 
     @model_validator(mode="after")
@@ -33,15 +35,15 @@ class Register(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
 class ModbusFan(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """The registers of one fan."""
 
-    unit: int = Field(default=1, ge=0, le=255, description="unit id of its device on the bus")
-    speed: Register = Field(description="its scale gives rpm")
-    command: Register = Field(description="the command that acts; its scale gives the unit of the tray's commands")
+    unit: int = Field(default=1, ge=0, le=255, description="unit id of the fan's device")
+    speed: Register = Field(description="speed in rpm, after scale and offset")
+    command: Register = Field(description="command that acts on the fan, in the command unit of the tray")
     write: Register | None = Field(
         default=None, description="where commands are written; without it, this fan takes none"
     )
-    supply_voltage: Register | None = Field(default=None, description="its scale gives V")
-    current: Register | None = Field(default=None, description="its scale gives A")
-    temperature: Register | None = Field(default=None, description="of the air; its scale gives degrees Celsius")
+    supply_voltage: Register | None = Field(default=None, description="supply voltage, V")
+    current: Register | None = Field(default=None, description="current, A")
+    temperature: Register | None = Field(default=None, description="temperature of the air, °C")
 
 
 class ModbusConfig(PolledConfig, frozen=True):
@@ -49,25 +51,25 @@ class ModbusConfig(PolledConfig, frozen=True):
 
     kind: Literal["modbus"] = "modbus"
     host: str = Field(default="", description="name or address, for Modbus TCP")
-    tcp_port: int = Field(default=502, ge=1, le=65535, description="of the host")
+    tcp_port: int = Field(default=502, ge=1, le=65535, description="TCP port of the host")
     port: str = Field(default="", description="serial port, for Modbus RTU")
-    baud: int = Field(default=19200, gt=0, description="bits a second of the serial port")
+    baud: int = Field(default=19200, gt=0, description="speed of the serial port, bits a second")
     parity: Literal["N", "E", "O"] = Field(
         default="E", description="none, even or odd; the serial port has 8 data bits"
     )
-    stop_bits: Literal[1, 2] = Field(default=1, description="of the serial port")
-    timeout_s: float = Field(default=0.5, gt=0, le=10, description="for the answer to one request")
+    stop_bits: Literal[1, 2] = Field(default=1, description="stop bits of the serial port")
+    timeout_s: float = Field(default=0.5, gt=0, le=10, description="longest wait for the answer to a request")
     average_s: float | None = Field(
         default=None,
         gt=0,
         le=LONGEST_WINDOW_S,
-        description="over how long the device averages a speed (its filter); without it, what it measures is not known",
+        description="how long the device averages a speed (its filter); without it, readings count as instantaneous",
     )
     update_s: float = Field(
         default=0.0,
         ge=0,
         le=LONGEST_WINDOW_S,
-        description="time between new speeds in the register; default: average_s",
+        description="time between new speeds in the register; 0: average_s",
     )
     fan: tuple[ModbusFan, ...] = Field(min_length=1, description="one [[tray.source.fan]] for each fan, in their order")
 

@@ -19,34 +19,44 @@ class MqttConfig(SourceConfig, frozen=True):
 
     kind: Literal["mqtt"] = "mqtt"
     host: str = Field(min_length=1, description="name or address of the broker")
-    port: int = Field(default=1883, ge=1, le=65535, description="its port; 8883 is usual with TLS")
-    topic: str = Field(default="", description="topic of samples in JSON; + and # may stand for parts of it")
+    port: int = Field(default=1883, ge=1, le=65535, description="port of the broker; with TLS usually 8883")
+    topic: str = Field(default="", description="topic of samples in JSON; may have the wildcards + and #")
     speed_topic: str = Field(
-        default="", description="instead: topic of the speed of a fan, a number; `{fan}` stands for the fan's number"
+        default="",
+        description="instead of topic: topic of the speed of a fan as a number; `{fan}` stands for the fan's number",
     )
-    command_topic: str = Field(default="", description="with speed_topic: topic of the command of a fan, a number")
+    command_topic: str = Field(default="", description="with speed_topic: topic of the command of a fan as a number")
     first_fan: int = Field(default=0, ge=0, description="number of the first fan in topics with `{fan}`")
     send_topic: str = Field(
         default="",
-        description="commands of `fantwin command` go there, as JSON; with `{fan}` as a number for each fan; without "
-        "it commands are refused",
+        description="topic to which commands of `fantwin command` are sent, as JSON, or with `{fan}` in it as a number "
+        "for each fan; without it no commands are sent",
     )
     qos: Literal[0, 1, 2] = Field(default=1, description="quality of service of subscriptions and commands")
     client_id: str = Field(
-        default="", description="given: the broker keeps messages for this client while acquisition is away"
+        default="",
+        description="id of this client, another one for each tray; with it, the broker keeps messages while "
+        "acquisition is away",
     )
-    keepalive_s: int = Field(default=30, ge=5, le=3600, description="the broker hears of this client at least so often")
+    keepalive_s: int = Field(
+        default=30, ge=5, le=3600, description="this client sends the broker something at least this often"
+    )
     username: str = Field(default="", description="user of the broker")
     password_file: Path | None = Field(
-        default=None, description="file with the password in its first line; its owner only may read it"
+        default=None, description="file with the password in its first line; only its owner may be able to read it"
     )
-    password_env: str = Field(default="", description="instead: the variable of the environment that has the password")
+    password_env: str = Field(
+        default="", description="instead of password_file: environment variable that holds the password"
+    )
     tls: bool = Field(
-        default=False, description="whether the connection is encrypted and the broker has to prove itself"
+        default=False, description="whether the connection is encrypted and the certificate of the broker checked"
     )
-    ca: Path | None = Field(default=None, description="authority of the broker's certificate; without it the system's")
+    ca: Path | None = Field(
+        default=None,
+        description="certificate of the authority that signed the broker's; without it those of the system",
+    )
     certificate: Path | None = Field(default=None, description="certificate of this client, if the broker asks for one")
-    key: Path | None = Field(default=None, description="its private key")
+    key: Path | None = Field(default=None, description="private key of that certificate")
 
     @property
     def has_values(self) -> bool:

@@ -233,7 +233,9 @@ class PollingSource:
         skipped = max(0, math.ceil(late_s / self._period_s) - 1)
         self._sequence += skipped
         if skipped:
-            took = f"{late_s:.2g} s passed since the last one was due, period_s = {self._period_s:g}: give a longer one"
+            took = (
+                f"{late_s:.2g} s passed since the last one was due, period_s = {self._period_s:g}: choose a longer one"
+            )
             self._count("skipped_polls", took, skipped)
         return due_s + (skipped + 1) * self._period_s
 

@@ -19,38 +19,39 @@ class RedfishConfig(PolledConfig, frozen=True):
 
     kind: Literal["redfish"] = "redfish"
     period_s: float = Field(default=1.0, gt=0, le=SLOWEST_S, description="time between two readings")
-    url: str = Field(description="of the controller, for example https://bmc1; without user and password")
-    chassis: str = Field(default="", description="Id of the chassis; needed where the controller has several")
+    url: str = Field(description="address of the controller, for example https://bmc1; without user and password")
+    chassis: str = Field(default="", description="id of the chassis; needed where the controller has several")
     fans: tuple[str, ...] = Field(
-        default=(), description="names or ids of the fans, in the order of the tray; without it all, as they are listed"
+        default=(),
+        description="names or ids of the fans, in the order of the tray; without it all, in the controller's order",
     )
     command: str = Field(
         default="/SpeedPercent/Reading",
         pattern="^/",
-        description="where the command is in the object of a fan (JSON pointer), in the unit of the tray",
+        description="where the command is in the object of a fan (JSON pointer); its unit is the tray's",
     )
     temperature: str = Field(
         default="",
-        description="name of the sensor of the air (Thermal), or key of TemperatureSummaryCelsius (ThermalSubsystem)",
+        description="sensor of the air: its name (Thermal), or a key of TemperatureSummaryCelsius (ThermalSubsystem)",
     )
     credentials: Path | None = Field(
         default=None,
-        description=f"file of two lines, user and password, that only its owner may read; without it the environment, "
-        f"{USER_VARIABLE} and {PASSWORD_VARIABLE}",
+        description=f"file of two lines, user and password; only its owner may be able to read it; without it the "
+        f"environment variables {USER_VARIABLE} and {PASSWORD_VARIABLE}",
     )
     verify: bool = Field(default=True, description="whether the certificate of the controller is checked")
-    ca: Path | None = Field(default=None, description="certificate of the authority that signed that of the controller")
-    timeout_s: float = Field(default=5.0, gt=0, le=60, description="for the answer to one request")
+    ca: Path | None = Field(default=None, description="certificate of the authority that signed the controller's")
+    timeout_s: float = Field(default=5.0, gt=0, le=60, description="longest wait for the answer to a request")
     average_s: float | None = Field(
         default=None,
         gt=0,
         le=LONGEST_WINDOW_S,
-        description="over how long the controller measures a speed; without it, what it measures is not known",
+        description="how long the controller averages a speed; without it, readings count as instantaneous",
     )
-    update_s: float = Field(
-        default=0.0, ge=0, le=LONGEST_WINDOW_S, description="time between new speeds; default: average_s"
+    update_s: float = Field(default=0.0, ge=0, le=LONGEST_WINDOW_S, description="time between new speeds; 0: average_s")
+    delay_s: float = Field(
+        default=0.0, ge=0, le=LONGEST_WINDOW_S, description="age of a new speed when it is first shown"
     )
-    delay_s: float = Field(default=0.0, ge=0, le=LONGEST_WINDOW_S, description="how old a new speed is")
 
     @field_validator("url")
     @classmethod

@@ -96,7 +96,7 @@ class RedfishDevice:
         if all(map(math.isnan, command)):
             return Rejected(
                 "unknown_command",
-                f"{self.name}: no fan has a number at {self._config.command}: name where its command is",
+                f"{self.name}: no fan has a number at {self._config.command}: say where its command is",
                 is_sample=True,
                 setting="source.command",
             )

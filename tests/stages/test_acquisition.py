@@ -348,7 +348,7 @@ def test_a_silent_line_is_a_problem_after_two_seconds_and_not_before() -> None:
     core.tick(3 * S)
     assert core.problem() == ""
     core.tick(3 * S + 1)
-    assert core.problem().startswith("/dev/ttyTEST: nothing received for 2 s; is the device powered")
+    assert core.problem().startswith("/dev/ttyTEST: nothing received for 2 s; is the source running")
     feed(core, [sample(1)], t_ns=4 * S)
     assert core.problem() == ""
 

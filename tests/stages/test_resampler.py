@@ -484,7 +484,7 @@ def test_health_says_when_messages_state_another_tacho_than_the_configuration() 
     core.step(message)
     assert core.problem() == ""
     core.step(replace(message, tachos=(StatedTacho.of(average), StatedTacho(TachoKind.PERIOD, pulses=2))))
-    assert "of fan 1 period, not average over 1 s, in steps of 0.1 rad/s: set tacho = " in core.problem()
+    assert "for fan 1 period instead of average over 1 s, in steps of 0.1 rad/s: set tacho = " in core.problem()
     core.step(replace(message, tachos=(StatedTacho(TachoKind(99)),)))
     assert "a tacho that this version does not know" in core.problem()
     core.step(message)

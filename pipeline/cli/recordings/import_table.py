@@ -54,7 +54,7 @@ def import_table(
         typer.Option(
             metavar="COLUMN",
             help="Command column: one for all fans, or one per fan. Repeatable. In a log a field, or one pattern for "
-            "all fans, as 'motor[*]'.",
+            "all fans, for example 'motor[*]'.",
         ),
     ] = None,
     speed: Annotated[
@@ -91,10 +91,10 @@ def import_table(
         float, typer.Option("--update", metavar="S", help="Seconds between new counts. Default: the window.")
     ] = 0.0,
     poles: Annotated[
-        int | None, typer.Option(help="Magnetic poles of the motors, for speeds in erpm of a log that does not say it.")
+        int | None, typer.Option(help="Magnetic poles of a motor, for speeds in erpm, if the log does not say it.")
     ] = None,
     log_number: Annotated[
-        int, typer.Option("--log", metavar="N", help="Which log of a file that has several, from 1.")
+        int, typer.Option("--log", metavar="N", help="Which log of a file that has several, counted from 1.")
     ] = 1,
     list_fields: Annotated[
         bool, typer.Option("--list", help="Show the fields of a log and their rates; import nothing.")
@@ -129,7 +129,7 @@ def import_table(
         notes = [table.assumed] if table.assumed else []
     else:
         if time or period:
-            raise UsageError(f"--time and --period are for tables: a {kind.title} has times")
+            raise UsageError(f"--time and --period are for tables: a {kind.title} has its own times")
         log = open_log(file, kind, log_number)
         table, of_log = read_samples(file, log, command, speed, poles, auxiliary=auxiliary)
         notes = list(of_log)

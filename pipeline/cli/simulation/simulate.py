@@ -1,4 +1,5 @@
-"""`fantwin simulate`: plays a simulated tray or a measured file on a serial line, or records a simulated tray."""
+"""`fantwin simulate`: plays a simulated tray or a measured file on a serial line, or serves or records a simulated
+tray."""
 
 from __future__ import annotations
 
@@ -60,7 +61,10 @@ _IMPERFECTIONS = "Imperfections of real trays"
 def simulate(
     fans: Annotated[int, typer.Option(help="Number of fans, 1 to 64.")] = 8,
     rate: Annotated[
-        float | None, typer.Option(help="Samples per second; default 100, with --hwmon how often it serves its files.")
+        float | None,
+        typer.Option(
+            help="Samples per second; with --hwmon, how often its files are written. Default 100, with --hwmon 20."
+        ),
     ] = None,
     fan: Annotated[
         Literal["dc", "4-pin"], typer.Option(help="Kind of fan: on a bridge, or with a PWM input of its own.")
@@ -84,13 +88,13 @@ def simulate(
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Folder of files to serve as a driver in /sys/class/hwmon does. Write a fault into its file `fault`.",
+            help="Folder for files such as those in /sys/class/hwmon. To inject a fault, write it to `fault` in it.",
             rich_help_panel=_HWMON,
         ),
     ] = None,
     chip: Annotated[
         str,
-        typer.Option(help="Name of the chip, which says how its driver measures speeds.", rich_help_panel=_HWMON),
+        typer.Option(help="Name of the chip, which determines how its driver measures speeds.", rich_help_panel=_HWMON),
     ] = "nct6798",
     fault: Annotated[
         list[str] | None,
@@ -152,14 +156,14 @@ def simulate(
         list[str] | None,
         typer.Option(
             metavar="COLUMN",
-            help="Send this column, too: supply_voltage_v, current_a or temperature_c. Repeatable.",
+            help="Also send this column: supply_voltage_v, current_a or temperature_c. Repeatable.",
             rich_help_panel=_SURROUNDINGS,
         ),
     ] = None,
     supply_wander: Annotated[
         float,
         typer.Option(
-            help="Wander of the supply voltage, relative standard deviation, e.g. 0.05.", rich_help_panel=_SURROUNDINGS
+            help="Relative standard deviation of the supply voltage, for example 0.05.", rich_help_panel=_SURROUNDINGS
         ),
     ] = 0.0,
     air_temperature: Annotated[
@@ -168,7 +172,8 @@ def simulate(
     air_swing: Annotated[
         float,
         typer.Option(
-            help="Amplitude of the temperature around it, °C, over 10 minutes.", rich_help_panel=_SURROUNDINGS
+            help="Amplitude of the air temperature around its mean, °C; period 10 minutes.",
+            rich_help_panel=_SURROUNDINGS,
         ),
     ] = 0.0,
     recording: Annotated[
@@ -225,7 +230,7 @@ def simulate(
     ] = math.inf,
     json_output: JsonOption = False,
 ) -> None:
-    """Simulate a tray of fans on a serial port that any program can open.
+    """Simulate a tray of fans on a serial port that any program can open, or as the fans of a computer.
 
     Example: fantwin simulate --link /tmp/fan-tray --fault inlet:fan=2,start=10,stop=18,size=1.6 --truth truth.json
 

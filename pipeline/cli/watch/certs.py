@@ -44,7 +44,7 @@ class Action(StrEnum):
 
 @dataclass(frozen=True)
 class _Request:
-    """What was typed, beside the action."""
+    """What was typed, except the action."""
 
     config: Config
     security: SecurityConfig
@@ -59,22 +59,28 @@ def certs(
     action: Annotated[Action, typer.Argument(metavar="ACTION", help=f"{', '.join(Action)}.")],
     roles: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[ROLE]...", help="Roles: a stage, operator, viewer, router, source; see --help."),
+        typer.Argument(
+            metavar="[ROLE]...", help="Roles: a stage, operator, viewer, router, source, ... as explained above."
+        ),
     ] = None,
     config: ConfigOption = DEFAULT_CONFIG,
     authority: Annotated[
-        Path, typer.Option(help="Folder of the authority and its key; relative to the configuration.")
+        Path, typer.Option(help="Folder of the authority's certificate and key; relative to the configuration.")
     ] = Path("authority"),
     tray: Annotated[
         list[str] | None, typer.Option("--tray", metavar="NAME", help="Only for this tray. Repeatable.")
     ] = None,
     host: Annotated[
         list[str] | None,
-        typer.Option("--host", metavar="NAME", help="A name or address at which its owner listens. Repeatable."),
+        typer.Option(
+            "--host", metavar="NAME", help="A further name or address at which its owner listens. Repeatable."
+        ),
     ] = None,
     days: Annotated[
         int | None,
-        typer.Option(min=1, max=36_500, help=f"How long it is valid; {_DAYS}, of an authority {_AUTHORITY_DAYS}."),
+        typer.Option(
+            min=1, max=36_500, help=f"Days for which it is valid; default {_DAYS}, of an authority {_AUTHORITY_DAYS}."
+        ),
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace what exists.")] = False,
     overrides: SetOption = None,
@@ -82,15 +88,16 @@ def certs(
 ) -> None:
     """Make and show certificates of a site: who may do what on its bus (docs/how-to/security.md).
 
-    init makes the site's authority. issue makes the certificate of a role, or all that the site needs and has not;
-    renew makes new ones for the same roles and hosts; show says what there is, for whom, until when.
+    init makes the site's authority. issue makes the certificates of the named roles; without a role, those that the
+    site needs and that do not exist yet. renew makes new ones for the same roles and hosts. show lists all, with their
+    roles and when they expire.
 
-    A role is a stage, operator (commands and requests), viewer (looks), router, source (gives readings), replay, or a
-    controller named in bus.security. With --tray it is for one tray only: its name is then as acquisition.tray1.
-    Files are where bus.security says: certs/ROLE.pem and certs/ROLE.key. Give a host what its own processes need, and
-    keep the folder of the authority elsewhere: whoever has its key is everybody.
+    A role is a stage, operator (may command and send requests), viewer (may look), router, source (may push samples),
+    replay, or a controller named in bus.security. With --tray it is for one tray only, and called, for example,
+    acquisition.tray1. Files are where bus.security says: certs/ROLE.pem and certs/ROLE.key. Give a host only the files
+    of its own processes, and keep the folder of the authority elsewhere: whoever has its key can act in every role.
 
-    Exit code 1 if show finds one that cannot be used.
+    Exit code 1 if show finds a certificate that has expired or is not valid yet.
 
     Example: fantwin certs init -c fantwin.toml
 
@@ -129,7 +136,7 @@ def _with_trays(config: Config, roles: Sequence[str], trays: Sequence[str]) -> l
         UsageError: there is no such role or tray.
     """
     if trays and not roles:
-        raise UsageError("--tray needs a role: which?")
+        raise UsageError("--tray needs a role: name one")
     asked = [f"{role}.{config.tray(name).name}" for role in roles for name in trays] if trays else list(roles)
     known = roles_of(config)
     for role in asked:
@@ -184,7 +191,7 @@ def _make(
         raise UsageError(f"{security.certificate}: name the one role of this file, or write {ROLE_PLACE} into its path")
     authority = Authority.read(request.authority)
     if authority.certificate.public_bytes(Encoding.PEM) != _content(security.ca):
-        raise UserError(f"{security.ca} is of another authority than {request.authority}: use those of one site")
+        raise UserError(f"{security.ca} is not the certificate of {request.authority}: use the files of one site")
     signed, key = authority.issue(role, list(dict.fromkeys(hosts)), timedelta(days=request.days or days or _DAYS))
     certificate = of_role(security.certificate, role)
     write_pair(certificate, of_role(security.key, role), signed, key, replace=replace)
@@ -219,7 +226,7 @@ def _show(request: _Request, *, json_output: bool) -> None:
     else:
         found = _issued(request)
     if not found:
-        raise UserError(f"{request.security.certificate.parent}: no certificates: `fantwin certs init` begins")
+        raise UserError(f"{request.security.certificate.parent}: no certificates: start with `fantwin certs init`")
     now, roles = datetime.now(UTC), roles_of(request.config)
     if json_output:
         typer.echo(json.dumps([_as_json(each) for each in found]))

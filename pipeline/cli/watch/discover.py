@@ -1,4 +1,4 @@
-"""`fantwin discover`: what this computer could watch, with a [[tray]] to paste for each."""
+"""`fantwin discover`: the fans and serial ports of this computer, with a [[tray]] to paste for each."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from pipeline.errors import UserError
 
 
 def discover(
-    root: Annotated[Path, typer.Option(help="Where the hwmon chips are.")] = ROOT,
+    root: Annotated[Path, typer.Option(help="Folder of the hwmon chips.")] = ROOT,
     write: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write a configuration of all hwmon chips with fans to this new file."),
     ] = None,
     writable: Annotated[
-        bool, typer.Option("--writable", help="Let fantwin command the fans: `sweep` and `command` need it.")
+        bool, typer.Option("--writable", help="Let fantwin command the fans found: `sweep` and `command` need that.")
     ] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """List the fans of this computer and its serial ports, with a [[tray]] to paste for each, and what is missing.
+    """List the fans and serial ports of this computer, with a configuration to paste for each, and what is missing.
 
-    Nothing is written to a device. Exit code 1 if nothing can be watched.
+    It writes nothing to a device. Exit code 1 if nothing can be watched.
 
     Example: fantwin discover --write fantwin.toml
     """

@@ -29,7 +29,7 @@ def router(
         Path | None, typer.Option("-c", "--config", help="Configuration of the site: certificates and roles.")
     ] = None,
     listen: Annotated[
-        str | None, typer.Option(help=f"Where to listen; default: bus.endpoint, without -c {_LOOPBACK}.")
+        str | None, typer.Option(help=f"Where to listen; default bus.endpoint, or without -c {_LOOPBACK}.")
     ] = None,
     connect: Annotated[
         list[str] | None, typer.Option(help="Where another router of the site listens. Repeatable.")
@@ -40,11 +40,11 @@ def router(
 ) -> None:
     """Run a Zenoh router until Ctrl-C, for stages with bus.mode = "client".
 
-    On one host no router is needed. With bus.security in the configuration, only owners of a certificate of the site's
-    authority connect, and each may do only what its role may do (docs/how-to/security.md). Start the router again when
-    trays, stages or controllers of the configuration change.
+    On one host no router is needed. With bus.security in the configuration, only clients with a certificate of the
+    site's authority connect, and each may do only what its role allows (docs/how-to/security.md). Restart the router
+    when trays, shards or controllers of the configuration change.
 
-    Two routers of a site connect to each other, and clients that name both use the one that is there.
+    A site may have two routers, which --connect joins; clients that name both use one that runs.
 
     Example: fantwin router -c fantwin.toml
 

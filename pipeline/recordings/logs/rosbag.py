@@ -58,7 +58,7 @@ class RosbagFile:
         self.names: Sequence[str] = list(self._values)
         self._by_receipt = by_receipt
         self.notes: Sequence[str] = [
-            f"{topic} is left out: the bag does not hold its type {kind}" for topic, kind in sorted(unknown.items())
+            f"{topic} is left out: the bag does not define its type {kind}" for topic, kind in sorted(unknown.items())
         ]
 
     def read(self, names: Sequence[str]) -> Mapping[str, Series]:

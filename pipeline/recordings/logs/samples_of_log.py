@@ -61,11 +61,15 @@ def fan_fields(path: Path, names: Sequence[str], command: Sequence[str], speed: 
         raise UsageError(f"--speed {speed[0]} is one field, and --command has a pattern: give a pattern for both")
     fans = [fan for fan in speeds if fan in commands]
     if not fans:
-        raise LogError(f"{path}: no number of a fan is in both {command[0]} and {speed[0]}")
+        raise LogError(f"{path}: no fan has both {command[0]} and {speed[0]}")
     left_out = [*(commands[fan] for fan in commands if fan not in speeds)]
     left_out += [*(speeds[fan] for fan in speeds if fan not in commands)]
     more = f" and {len(left_out) - 3} more" if len(left_out) > 3 else ""
-    notes = (f"left out, without the other of command and speed: {', '.join(left_out[:3])}{more}",) if left_out else ()
+    notes = (
+        (f"left out, because only one of command and speed is there: {', '.join(left_out[:3])}{more}",)
+        if left_out
+        else ()
+    )
     return FanFields(tuple(commands[fan] for fan in fans), tuple(speeds[fan] for fan in fans), tuple(fans), notes)
 
 
@@ -161,10 +165,10 @@ def _rad_s_per(unit: str, poles: int | None) -> tuple[float, str]:
         return RAD_S_PER_TABLE_UNIT[unit], unit
     if poles is None:
         raise UsageError(
-            "speeds in erpm are electrical revolutions: give the magnetic poles of the motor, as --poles 14"
+            "speeds in erpm are electrical revolutions: give the magnetic poles of the motor, for example --poles 14"
         )
     if poles < 2 or poles % 2:
-        raise UsageError(f"--poles {poles}: magnetic poles come in pairs, as 14")
+        raise UsageError(f"--poles {poles}: magnetic poles come in pairs, for example 14")
     return 2.0 * math.pi / 60.0 / (poles / 2), "rpm"
 
 
@@ -189,7 +193,7 @@ def _matches(path: Path, names: Sequence[str], given: str) -> dict[int, str]:
     pattern = re.compile(rf"{re.escape(parts[0])}(\d+){re.escape(parts[1])}")
     found = {int(match[1]): name for name in names if (match := pattern.fullmatch(name))}
     if not found:
-        raise LogError(f"{path}: no field is {given}; --list shows them all{_like(names, given)}")
+        raise LogError(f"{path}: no field matches {given}; --list shows them all{_like(names, given)}")
     return dict(sorted(found.items()))
 
 

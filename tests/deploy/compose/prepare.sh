@@ -29,8 +29,8 @@ free_kb=$(df --output=avail -k "$folder" | tail -n 1)
 if [ ! -e "$folder/base.tar" ]; then
     mmdebstrap --quiet --mode=root --variant=apt --include=python3,python3-pip,ca-certificates \
         --customize-hook='rm -f "$1"/usr/lib/python3.11/EXTERNALLY-MANAGED; ln -sf python3 "$1"/usr/bin/python' \
-        bookworm "$folder/base.part" >&2 || cannot "no base system: mmdebstrap cannot reach a mirror"
-    mv "$folder/base.part" "$folder/base.tar"
+        bookworm "$folder/part.tar" >&2 || cannot "no base system: mmdebstrap cannot reach a mirror"
+    mv "$folder/part.tar" "$folder/base.tar"
 fi
 
 # also what builds packages that have no wheel, and fantwin itself

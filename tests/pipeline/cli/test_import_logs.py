@@ -67,7 +67,10 @@ def test_ulog_with_commands_held_at_the_times_of_the_readings(tmp_path: Path) ->
     result = fantwin("import", ulog(tmp_path), *words, "-o", recording)
     assert result.exit_code == 0, result.output
     assert result.stdout.startswith(f"{recording}: 200 samples of 2 fans over 4.0 s, 20 ms apart (median)")
-    assert "left out, without the other of command and speed: actuator_outputs.output[2], actuator" in result.stdout
+    assert (
+        "left out, because only one of command and speed is there: actuator_outputs.output[2], actuator"
+        in result.stdout
+    )
     assert "commands at 250 Hz, speeds at 50 Hz; each speed has the command held then" in result.stdout
     t_ns, command, speed = samples(recording)
     np.testing.assert_allclose(t_ns / 1e9, T_S + 0.009, atol=1e-9)
@@ -87,7 +90,7 @@ def test_ulog_with_commands_held_at_the_times_of_the_readings(tmp_path: Path) ->
 def test_blackbox_with_electrical_speeds_and_the_tacho_that_is_declared(tmp_path: Path) -> None:
     path, recording = blackbox(tmp_path), tmp_path / "r.mcap"
     words = ("--command", "motor[*]", "--speed", "eRPM[*]:erpm", "-o", recording)
-    assert "give the magnetic poles of the motor, as --poles 14" in error_of("import", path, *words)
+    assert "give the magnetic poles of the motor, for example --poles 14" in error_of("import", path, *words)
     assert "poles come in pairs" in usage_error_of("import", path, *words, "--poles", "13")
     result = fantwin("import", path, *words, "--poles", 14, "--tacho", "count", "--window", "0.02")
     assert "log 1 of 2 in the file; --log chooses another" in result.stdout
@@ -142,11 +145,11 @@ def test_a_mistake_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
     assert "an import needs -o, --command and --speed; --list shows the fields" in usage_error_of("import", path)
     for words, error in (
         (("--command", "actuator_output.output[0]", "--speed", speed), "did you mean 'actuator_outputs.output[0]'"),
-        (("--command", "motor[*]", "--speed", speed), "no field is motor[*]; --list shows them all"),
+        (("--command", "motor[*]", "--speed", speed), "no field matches motor[*]; --list shows them all"),
         (("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[*].esc_voltage:V"), "unknown unit 'V'"),
         (("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[0].esc_rpm"), "pattern for both"),
         (("--command", "actuator_outputs.output[*]", "--speed", speed, "--speed", speed), "once each"),
-        (("--command", "actuator_outputs.output[*]", "--speed", speed, "--time", "t"), "a ULog has times"),
+        (("--command", "actuator_outputs.output[*]", "--speed", speed, "--time", "t"), "a ULog has its own times"),
     ):
         assert error in error_of("import", path, *words, *out)
     path.write_bytes(path.read_bytes()[:20])

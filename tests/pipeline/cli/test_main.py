@@ -67,7 +67,8 @@ def test_the_process_of_a_stage_imports_no_rich_and_no_other_command():
     )
     done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
     assert set(ast.literal_eval(done.stdout)) == {
-        *("pipeline.cli.main", "pipeline.cli.options", "pipeline.cli.watch", "pipeline.cli.watch.run")
+        *("pipeline.cli.exposure", "pipeline.cli.main", "pipeline.cli.options"),
+        *("pipeline.cli.watch", "pipeline.cli.watch.run"),
     }
 
 
