@@ -25,7 +25,7 @@ from schemas.topics import (
     sweep_key,
     tray_key,
 )
-from tests.support.secured_site import ANSWER_S, SITE, TRAYS, Heard, SecuredSite, free_endpoint
+from tests.support.secured_site import ANSWER_S, SITE, TRAYS, Heard, SecuredSite, free_endpoint, put
 
 PEOPLE = {
     "operator": {"command", "request"},
@@ -89,18 +89,18 @@ def test_who_may_publish_what(site):
         session = site.session(role)
         for topic in OF_TRAYS:
             for tray in TRAYS:
-                session.put(tray_key(SITE, tray, topic), role.encode())
+                put(session, tray_key(SITE, tray, topic), role.encode())
                 if may_write(role, topic, tray):
                     allowed.add((tray_key(SITE, tray, topic), role))
         for stage, instance in PROCESSES:
-            session.put(health_key(SITE, stage, instance), role.encode())
+            put(session, health_key(SITE, stage, instance), role.encode())
             if is_process_of(role, stage, instance):
                 allowed.add((health_key(SITE, stage, instance), role))
         session.delete(tray_key(SITE, "a", "raw"))
-        session.put(rights_key(SITE, role), role.encode())
-        session.put("another/key", role.encode())
+        put(session, rights_key(SITE, role), role.encode())
+        put(session, "another/key", role.encode())
         site.flush(role)
-    site.session("operator").put(tray_key(SITE, "a", "command"), b"sentinel")
+    put(site.session("operator"), tray_key(SITE, "a", "command"), b"sentinel")
     arrived = {(key, payload.decode()) for key, payload in heard.until_sentinel()}
     assert arrived == allowed
     writers = {
@@ -125,8 +125,8 @@ def test_who_may_read_what(site):
     speaker = site.session("router")
     for topic in OF_TRAYS:
         for tray in TRAYS:
-            speaker.put(tray_key(SITE, tray, topic), b"x")
-    speaker.put(health_key(SITE, "scorer", "all"), b"sentinel")
+            put(speaker, tray_key(SITE, tray, topic), b"x")
+    put(speaker, health_key(SITE, "scorer", "all"), b"sentinel")
     for role in roles(site):
         ends[role].until_sentinel()
         allowed = {tray_key(SITE, tray, topic) for topic in OF_TRAYS for tray in TRAYS if may_read(role, topic, tray)}

@@ -29,7 +29,7 @@ from schemas.messages import Grid, Header, Health, StageStatus
 from schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.flooding_client import NOISE
 from tests.support.running_chain import RunningCommand, eventually
-from tests.support.secured_site import CONFIG, SITE, Heard, SecuredSite, free_endpoint
+from tests.support.secured_site import CONFIG, SITE, Heard, SecuredSite, free_endpoint, put
 from tests.support.secured_stage import STEP_NS, SecuredStage, Sender, counter, samples
 from tests.support.site_certificates import DAY, SiteCertificates
 from tests.support.tcp_relay import TcpRelay
@@ -100,10 +100,10 @@ def test_row_5_a_stolen_viewer_certificate_reads_and_changes_nothing(site):
     site.flush("router")
     thief = site.session("viewer")
     for topic in BY_NAME:
-        thief.put(tray_key(SITE, "a", topic), b"forged")
+        put(thief, tray_key(SITE, "a", topic), b"forged")
         thief.delete(tray_key(SITE, "a", topic))
     site.flush("viewer")
-    site.session("operator").put(tray_key(SITE, "a", "command"), b"sentinel")
+    put(site.session("operator"), tray_key(SITE, "a", "command"), b"sentinel")
     assert heard.until_sentinel() == []
 
 
@@ -120,8 +120,8 @@ def test_row_6_a_huge_message_is_refused_by_who_receives_it_and_counted(site):
         bus.subscribe(key, take)
         bus.require_rights()
         site.flush("operator")
-        site.session("operator").put(key, bytes(BY_NAME["command"].largest_bytes + 1))
-        site.session("operator").put(key, b"small")
+        put(site.session("operator"), key, bytes(BY_NAME["command"].largest_bytes + 1))
+        put(site.session("operator"), key, b"small")
         assert arrived.wait(30)
         assert (received, bus.refused_too_large) == ([b"small"], 1)
 
@@ -133,8 +133,8 @@ def test_row_7_nonsense_on_the_port_does_not_disturb_those_who_are_connected(sit
     strangers = [socket.create_connection((host, int(port)), 5) for _ in range(50)]
     for number, stranger in enumerate(strangers):
         stranger.sendall(bytes([number]) * 1000)
-    site.session("acquisition").put(RAW, b"sample")
-    site.session("acquisition").put(RAW, b"sentinel")
+    put(site.session("acquisition"), RAW, b"sample")
+    put(site.session("acquisition"), RAW, b"sentinel")
     assert heard.until_sentinel() == [(RAW, b"sample")]
     for stranger in strangers:
         stranger.close()
@@ -232,7 +232,7 @@ def test_row_12_recorded_messages_that_are_sent_again_are_not_taken_again(site):
         recorded = [*before.sent, *sender.sent]
         for role in ("viewer", "resampler", "acquisition.b", "acquisition"):
             for payload in recorded:
-                site.session(role).put(RAW, payload)
+                put(site.session(role), RAW, payload)
             site.flush(role)
         sender.send()
         health = stage.health_with(lambda health: has_received(health, sender, 6), "the next one has arrived")
@@ -317,8 +317,8 @@ def test_row_14_malformed_messages_are_counted_and_stop_nobody(site, tmp_path, n
     topic = {"viewer": "score"}.get(name, "raw")
     with SecuredStage(site, name, *settings) as stage:
         for payload in (*noise, *parts, *changed):
-            site.session(writer).put(tray_key(SITE, "b", topic), bytes(payload))
-        site.session(writer).put(health_key(SITE, writer, "all"), noise[1])
+            put(site.session(writer), tray_key(SITE, "b", topic), bytes(payload))
+        put(site.session(writer), health_key(SITE, writer, "all"), noise[1])
         site.flush(writer)
         health = stage.health_with(lambda health: counter(health, "undecodable") > len(noise), "noise has been counted")
         assert health.status != StageStatus.STOPPED

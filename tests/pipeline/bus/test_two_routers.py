@@ -18,7 +18,7 @@ from pipeline.bus.session import Bus, join_bus
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, alive_key, tray_key
 from tests.support.running_chain import RunningCommand, eventually
-from tests.support.secured_site import SITE, SecuredSite, free_endpoint
+from tests.support.secured_site import SITE, SecuredSite, free_endpoint, put
 
 KEY = tray_key("site", "tray", "alarm")
 TOKEN = alive_key("site", "scorer", "all")
@@ -124,7 +124,7 @@ def test_clients_of_two_secured_routers_may_do_on_either_what_their_role_may(sec
         for site in secured:
             for role in ("viewer", "acquisition.b"):
                 liveliness = site.session(role).liveliness().declare_token(alive_key(SITE, "scorer", "all"))
-                site.session(role).put(key, b"forged")
+                put(site.session(role), key, b"forged")
                 site.flush(role)
                 assert (
                     reader.alive(alive_key(SITE, "*", "*")) == reader_there.alive(alive_key(SITE, "*", "*")) == {alive}
