@@ -84,7 +84,9 @@ def test_row_16_a_cut_that_hides_a_whole_fault_loses_nothing_and_no_alarm(site):
         site.relay.cut()
         threading.Event().wait(CUT_S)
         assert not [line for line in judges.lines if "ALARM" in line], "nobody has seen the fault"
+        source.line_with(f"acquisition/{TRAY}: the connection to the bus is lost")
         site.relay.heal()
+        source.line_with(f"acquisition/{TRAY}: at work again")
         judges.line_with(f"ALARM  {TRAY}  fan {FAULTY}")
         judges.line_with(f"cleared  {TRAY}  fan {FAULTY}")
     assert device.end() == 0

@@ -67,7 +67,7 @@ GENUINE: dict[str, object] = {
     "connect_private_key": "/certs/operator/key.pem",
 }
 CUT_S = 3.0
-WITHIN_S = 60.0
+WITHIN_S = 120.0
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -92,7 +92,7 @@ def has_alarm(seen: site.Status) -> bool:
 
 
 def test_all_is_well_without_losses():
-    seen, took_s = site.well_again(60.0)
+    seen, took_s = site.well_again(WITHIN_S)
     print(f"well after {took_s:.1f} s")
     assert {each["stage"] for each in seen["stages"]} == set(ENABLED)
     assert not site.losses(seen)
