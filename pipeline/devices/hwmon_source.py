@@ -112,11 +112,18 @@ class HwmonDevice:
         if not all(map(math.isnan, set_point)):
             raise DeviceError("hwmon fans take commands, no set-points")
         chip = self._connected()
-        for number, value in dict(zip(self._pwms, command, strict=True)).items():
+        wanted: dict[int, int] = {}
+        for number, value in zip(self._pwms, command, strict=True):
             if math.isnan(value):
                 continue
+            pwm = min(max(round(value), 0), HIGHEST_PWM)
+            if wanted.setdefault(number, pwm) != pwm:
+                raise DeviceError(
+                    f"pwm{number} moves several fans: give them one command, not {wanted[number]} and {pwm}"
+                )
+        for number, pwm in wanted.items():
             self._take_over(chip, number)
-            _write(chip, f"pwm{number}", min(max(round(value), 0), HIGHEST_PWM))
+            _write(chip, f"pwm{number}", pwm)
             self._written = True
 
     def disconnect(self) -> None:

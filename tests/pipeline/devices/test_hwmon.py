@@ -156,6 +156,17 @@ def test_what_a_killed_process_took_over_is_given_back_by_the_next_one(root: Pat
     assert modes[0].read_text() == "2", "as it was found last"
 
 
+def test_fans_that_share_a_pwm_take_one_command(root: Path) -> None:
+    folder = board(root)
+    made = connected(root, 3, pwms=[1], writable=True)
+    for command, pwm in (((200.0, NAN, NAN), "200"), ((NAN, 90.0, NAN), "90"), ((80.0, NAN, 80.0), "80")):
+        made.write(command, ())
+        assert (folder / "pwm1").read_text() == pwm
+    with pytest.raises(DeviceError, match="pwm1 moves several fans: give them one command, not 10 and 20"):
+        made.write((10.0, NAN, 20.0), ())
+    assert (folder / "pwm1").read_text() == "80"
+
+
 def test_nothing_is_written_unless_the_configuration_says_so(root: Path) -> None:
     board(root)
     config = HwmonConfig(chip="nct6798", root=root)
