@@ -21,6 +21,7 @@ from fantwin_client.errors import (
     NotKeptError,
     NotReceivedError,
     SamplesLostError,
+    SendError,
     TimeOrderError,
 )
 from fantwin_client.losses import Losses
@@ -36,6 +37,7 @@ __all__ = [
     "NotKeptError",
     "NotReceivedError",
     "SamplesLostError",
+    "SendError",
     "TimeOrderError",
     "Tray",
     "connect",

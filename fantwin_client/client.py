@@ -8,7 +8,7 @@ import time
 from types import TracebackType
 from typing import Any, Self
 
-from fantwin_client.errors import NotReceivedError
+from fantwin_client.errors import NotReceivedError, SendError
 from fantwin_client.tray import Tray
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
@@ -71,13 +71,14 @@ class Client:
 
         Raises:
             NotReceivedError: it has not received all.
+            SendError: a thread that sends has failed.
         """
         until_s = time.monotonic() + timeout_s
-        errors: list[NotReceivedError] = []
+        errors: list[NotReceivedError | SendError] = []
         for tray in self._trays.values():
             try:
                 tray.wait_received(max(0.0, until_s - time.monotonic()))
-            except NotReceivedError as error:
+            except (NotReceivedError, SendError) as error:
                 errors.append(error)
             tray.stop()
         self._bus.close()
@@ -92,7 +93,7 @@ class Client:
     ) -> None:
         try:
             self.close()
-        except NotReceivedError as not_received:
+        except (NotReceivedError, SendError) as not_received:
             if error is None:
                 raise
             _LOG.warning("%s", not_received)  # the other error is the one to raise

@@ -34,3 +34,7 @@ class NotReceivedError(ClientError):
 
 class SamplesLostError(ClientError):
     """Samples that were published did not become samples of the site."""
+
+
+class SendError(ClientError):
+    """The thread that sends has failed, the cause is attached: nothing more is sent. Open the client again."""

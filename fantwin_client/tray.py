@@ -24,6 +24,7 @@ from fantwin_client.errors import (
     NotKeptError,
     NotReceivedError,
     SamplesLostError,
+    SendError,
     TimeOrderError,
 )
 from fantwin_client.losses import WITHOUT_SPEED, CountsOfAcquisition, Losses
@@ -61,6 +62,8 @@ class Tray:
         self._kept_samples = kept_samples
         self._changed = threading.Condition()
         self._stopped = self._has_news = False
+        self._failure: Exception | None = None
+        """what has ended the thread"""
         self._outbox = Outbox()
         self._published = self._not_kept = 0
         self._newest_t_ns: int | None = None
@@ -106,6 +109,7 @@ class Tray:
         Raises:
             FanCountError, CommandError, TimeOrderError: the values cannot be samples of this tray.
             NotKeptError: there is no room: acquisition is gone, or behind for longer.
+            SendError: the thread that sends has failed; nothing was taken.
         """
         times = times_ns(t)
         commands, speeds = self._by_fan(command, len(times), "command"), self._by_fan(speed, len(times), "speed")
@@ -119,6 +123,7 @@ class Tray:
             if values is not None
         }
         with self._changed:
+            self._check_thread()
             self._check_times(times)
             self._wait_for_room(len(times))
             self._check_times(times)  # another thread may have published meanwhile
@@ -153,6 +158,7 @@ class Tray:
 
         Raises:
             NotReceivedError: it has not received all of them in time.
+            SendError: the thread that sends has failed.
             SamplesLostError: since the last check samples were refused or lost, or not kept.
         """
         self.wait_received(timeout_s)
@@ -168,9 +174,12 @@ class Tray:
 
         Raises:
             NotReceivedError: it has not received all of them in time.
+            SendError: the thread that sends has failed.
         """
         with self._changed:
-            if not self._changed.wait_for(lambda: not self._outbox.samples, timeout_s):
+            is_received = self._changed.wait_for(lambda: not self._outbox.samples or self._failure, timeout_s)
+            self._check_thread()
+            if not is_received:
                 raise NotReceivedError(
                     f"tray {self.name}: acquisition has not received {self._outbox.samples} of {self._published} "
                     f"samples: {self._why_waiting()}"
@@ -236,6 +245,13 @@ class Tray:
                 f"and within command_min = {low:g} to command_max = {high:g}"
             )
 
+    def _check_thread(self) -> None:
+        if self._failure is not None:
+            what = f"{type(self._failure).__name__}: {self._failure}"
+            raise SendError(
+                f"tray {self.name}: nothing is sent any more: {what}; open the client again"
+            ) from self._failure
+
     def _check_times(self, times: NDArray[np.int64]) -> None:
         before = times[:1] - 1 if self._newest_t_ns is None else np.array([self._newest_t_ns])
         steps = np.diff(times, prepend=before)
@@ -281,7 +297,16 @@ class Tray:
         self._changed.notify_all()
 
     def _send_all(self) -> None:
-        """The thread: sends while acquisition is at work, and takes what that confirms."""
+        """The thread. What ends it is raised by `publish` and `check`."""
+        try:
+            self._send_until_stopped()
+        except Exception as error:  # noqa: BLE001  nobody would see it
+            with self._changed:
+                self._failure = error
+                self._wake()
+
+    def _send_until_stopped(self) -> None:
+        """Sends while acquisition is at work, and takes what that confirms."""
         heard: Health | None = None
         asked_s = time.monotonic()
         while True:

@@ -392,7 +392,15 @@ def build_tray_source(context: Context) -> SampleSource:
     tray = context.tray
     try:
         return build_source(
-            tray.source, SourceContext(tray.fans, tray.speed_unit, context.folder, tray.name, limits_of(tray))
+            tray.source,
+            SourceContext(
+                tray.fans,
+                tray.speed_unit,
+                context.folder,
+                tray.name,
+                limits_of(tray),
+                run_folder=context.run_folder,
+            ),
         )
     except UserError as error:
         raise StageError(f"[[tray]] {tray.name}: {error}") from error

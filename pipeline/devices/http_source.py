@@ -25,7 +25,7 @@ from pipeline.devices.json_samples import (
     parse_samples,
 )
 from pipeline.devices.receipt_times import ReceiptTimes
-from pipeline.devices.sample_source import LinkDown, LinkUp, Rejected, SourceContext, SourceEvent
+from pipeline.devices.sample_source import LinkDown, LinkUp, ReadingBatch, Rejected, SourceContext, SourceEvent
 from pipeline.devices.secret_file import read_secret
 from pipeline.errors import UserError
 from pipeline.optional_dependencies import how_to_install, is_installed
@@ -66,7 +66,7 @@ class HttpSource:
         self._waiting: deque[SourceEvent] = deque()
         """for acquisition"""
         self._waiting_samples = 0
-        self._accepted = self._refused = self._turned_away = 0
+        self._accepted = self._refused = self._turned_away = self._over_limit = 0
         self._stopping = False
         self._server: Server | None = None
         self._threads: list[threading.Thread] = []
@@ -127,12 +127,10 @@ class HttpSource:
         )
 
     async def _get(self, request: Request) -> Response:
-        return self._unauthorized(request) or _answer(
-            200, {"tray": self._context.tray, **self._limits(), **self._counts()}
-        )
+        return self._refusal(request) or _answer(200, {"tray": self._context.tray, **self._limits(), **self._counts()})
 
     async def _post(self, request: Request) -> Response:
-        refusal = self._unauthorized(request)
+        refusal = self._refusal(request)
         if refusal is not None:
             return refusal
         body = bytearray()
@@ -177,6 +175,22 @@ class HttpSource:
             answer["speeds_beyond_speed_max"] = absurd
         return _answer(200 if accepted or not reasons else 422, answer)
 
+    def _refusal(self, request: Request) -> Response | None:
+        return self._too_many_connections() or self._unauthorized(request)
+
+    def _too_many_connections(self) -> Response | None:
+        if self._server is None or len(self._server.server_state.connections) < MOST_CONNECTIONS:
+            return None
+        error = f"{MOST_CONNECTIONS} connections are open"
+        with self._changed:
+            self._over_limit += 1
+            if self._waiting_samples < MOST_WAITING:  # acquisition counts it, too
+                rejected = Rejected("too_many_connections", error, harmless=True)
+                self._waiting.append(ReadingBatch(HOST_CLOCK.now_ns(), (rejected,)))
+                self._waiting_samples += 1
+                self._changed.notify_all()
+        return _answer(503, {"error": error, "accepted": 0}, {"Retry-After": str(RETRY_AFTER_S), "Connection": "close"})
+
     def _unauthorized(self, request: Request) -> Response | None:
         given = request.headers.get("authorization", "").encode()
         if not self._token or hmac.compare_digest(given, f"Bearer {self._token}".encode()):
@@ -201,6 +215,7 @@ class HttpSource:
                 "accepted": self._accepted,
                 "refused": self._refused,
                 "turned_away": self._turned_away,
+                "too_many_connections": self._over_limit,
                 "waiting": self._waiting_samples,
             }
 
@@ -232,15 +247,16 @@ class HttpSource:
     def _serve_on(self, listening: socket.socket) -> None:
         import uvicorn  # noqa: PLC0415  an extra
 
+        from pipeline.devices.http_protocol import LimitedProtocol  # noqa: PLC0415  needs the extra
+
         logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
         folder, certificate, key = self._context.folder, self._config.certificate, self._config.key
         config = uvicorn.Config(
             self.app(),
-            http="h11",
+            http=LimitedProtocol,
             lifespan="off",
             access_log=False,
             log_config=None,
-            limit_concurrency=MOST_CONNECTIONS,
             timeout_graceful_shutdown=1,
             ssl_certfile=str(folder / certificate) if certificate else None,
             ssl_keyfile=str(folder / key) if key else None,

@@ -2,6 +2,9 @@
 
 The chip is found by its name and its device, each time it is connected: hwmonN changes from boot to boot, and when a
 driver is loaded again. A file that cannot be read is NaN; a chip that goes away is a LinkDown.
+
+How a pwm was found is kept in a file before it is written for the first time, until it has been given back: after a
+process that was killed, the next one finds it manual and would otherwise leave it so.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from collections.abc import Sequence
 
 from pipeline.devices.hwmon_chips import chip_of
 from pipeline.devices.hwmon_config import HwmonConfig
+from pipeline.devices.hwmon_modes import FoundModes, FoundPwm
 from pipeline.devices.hwmon_tree import ChipFolder, chip_folders, device_words
 from pipeline.devices.polling import DeviceError, PollingSource
 from pipeline.devices.sample_source import Reading, Rejected, SourceContext
@@ -51,8 +55,11 @@ class HwmonDevice:
         self._voltages = _of_each_fan("voltages", config.voltages, fans)
         self._currents = _of_each_fan("currents", config.currents, fans)
         self._chip: ChipFolder | None = None
-        self._before: dict[int, tuple[int | None, int | None]] = {}
-        """pwm_enable and pwm as they were, by pwm that was written"""
+        self._modes = FoundModes(context.run_folder / f"hwmon-{context.tray}.json" if context.run_folder else None)
+        self._before: dict[int, FoundPwm] = {}
+        """how each pwm that was written, also by a process that was killed, was found"""
+        self._taken_over: set[int] = set()
+        """the pwms that this connection has made manual"""
         self._written = False
 
     @property
@@ -72,8 +79,11 @@ class HwmonDevice:
 
     def connect(self) -> None:
         """Find the chip."""
-        self._chip = self._find()
-        self._before = {}
+        self._chip = chip = self._find()
+        kept = self._modes.kept(chip)
+        # What is not manual any more has been given back, or the driver was loaded again.
+        self._taken_over = set()
+        self._before = {number: found for number, found in kept.items() if self._mode(chip, number) in (None, MANUAL)}
 
     def read(self) -> Reading | Rejected:
         """Speeds, pwm values and what else is asked for."""
@@ -102,11 +112,18 @@ class HwmonDevice:
         if not all(map(math.isnan, set_point)):
             raise DeviceError("hwmon fans take commands, no set-points")
         chip = self._connected()
-        for number, value in dict(zip(self._pwms, command, strict=True)).items():
+        wanted: dict[int, int] = {}
+        for number, value in zip(self._pwms, command, strict=True):
             if math.isnan(value):
                 continue
+            pwm = min(max(round(value), 0), HIGHEST_PWM)
+            if wanted.setdefault(number, pwm) != pwm:
+                raise DeviceError(
+                    f"pwm{number} moves several fans: give them one command, not {wanted[number]} and {pwm}"
+                )
+        for number, pwm in wanted.items():
             self._take_over(chip, number)
-            _write(chip, f"pwm{number}", min(max(round(value), 0), HIGHEST_PWM))
+            _write(chip, f"pwm{number}", pwm)
             self._written = True
 
     def disconnect(self) -> None:
@@ -114,17 +131,19 @@ class HwmonDevice:
         chip, before = self._chip, self._before
         self._chip, self._before = None, {}
         failures = []
-        for number, (mode, pwm) in before.items() if chip else ():
+        for number, found in before.items() if chip else ():
             assert chip is not None
             try:
-                if mode == MANUAL or mode is None:
-                    _write(chip, f"pwm{number}", HIGHEST_PWM if pwm is None else pwm)
-                if mode not in (None, MANUAL):
-                    _write(chip, f"pwm{number}_enable", mode)
+                if found.mode == MANUAL or found.mode is None:
+                    _write(chip, f"pwm{number}", HIGHEST_PWM if found.pwm is None else found.pwm)
+                if found.mode not in (None, MANUAL):
+                    _write(chip, f"pwm{number}_enable", found.mode)
             except DeviceError as error:
                 failures.append(str(error))
         if failures:
             raise DeviceError("; ".join(failures))
+        if before:  # kept until all of it was given back
+            self._modes.forget()
 
     def check(self) -> list[str]:
         """What is not there, or may not be read or written."""
@@ -202,22 +221,31 @@ class HwmonDevice:
         return rpm * self._unit_per_rpm
 
     def _take_over(self, chip: ChipFolder, number: int) -> None:
-        if number in self._before:
+        if number in self._taken_over:
             return
-        file = f"pwm{number}_enable"
-        mode: int | None = None
-        if (chip.path / file).exists():
+        enable, mode = chip.path / f"pwm{number}_enable", self._mode(chip, number)
+        has_enable = enable.exists()
+        if number not in self._before:
+            automatic = self._quirks.automatic if self._quirks else None
             try:
-                mode = chip.number(file)
+                pwm = chip.number(f"pwm{number}")
             except OSError:
-                mode = self._quirks.automatic if self._quirks else None
-            if mode != MANUAL:
-                _write(chip, file, MANUAL)
+                pwm = None
+            self._before[number] = FoundPwm(automatic if has_enable and mode is None else mode, pwm)
         try:
-            pwm = chip.number(f"pwm{number}")
+            self._modes.keep(chip, self._before)
+        except OSError as error:
+            raise DeviceError(f"the mode of pwm{number} cannot be kept in run_folder: {error.strerror}") from error
+        if has_enable and mode != MANUAL:
+            _write(chip, enable.name, MANUAL)
+        self._taken_over.add(number)
+
+    def _mode(self, chip: ChipFolder, number: int) -> int | None:
+        """What pwmN_enable says; None if there is no such file, or it cannot be read."""
+        try:
+            return chip.number(f"pwm{number}_enable")
         except OSError:
-            pwm = None
-        self._before[number] = (mode, pwm)
+            return None
 
 
 _SETTING = {"fan": "fans", "pwm": "pwms", "temp": "temperatures", "in": "voltages", "curr": "currents"}

@@ -66,6 +66,8 @@ class MqttSource:
             for fan in range(context.fans if config.has_values else 1)
         }
         """what is subscribed to; of numbers, which fan a topic is of, and whether it is its speed"""
+        self._foreign: deque[str] = deque(maxlen=MOST_RECENT)
+        """topics that are not of this tray, and were unsubscribed"""
         self._recent: deque[tuple[str, bytes]] = deque(maxlen=MOST_RECENT)
         self._is_up = False
         self._is_refused = False
@@ -206,14 +208,32 @@ class MqttSource:
         self._is_refused = False
 
     def _on_message(self, _client: Any, _data: Any, message: MQTTMessage) -> None:
-        received_t_ns = HOST_CLOCK.now_ns()
-        for batch in self.batches(message.topic, bytes(message.payload), received_t_ns, message.retain, message.dup):
+        received_t_ns, payload = HOST_CLOCK.now_ns(), bytes(message.payload)
+        try:
+            topic = message.topic
+            batches = self.batches(topic, payload, received_t_ns, message.retain, message.dup)
+            if not self._is_own(topic) and topic not in self._foreign:
+                self._foreign.append(topic)
+                self._client.unsubscribe(topic)
+        except Exception as error:  # noqa: BLE001  it would end the thread, and with it the source
+            detail = f"unexpected {type(error).__name__}: {error}"
+            batches = [_refused(received_t_ns, payload, Rejected("malformed", detail, is_sample=True))]
+        for batch in batches:
             self._deliver(batch)
+
+    def _is_own(self, topic: str) -> bool:
+        """Whether it is subscribed to. With a client_id the broker keeps the subscriptions of former settings."""
+        from paho.mqtt.client import topic_matches_sub  # noqa: PLC0415  an extra
+
+        return topic in self._topics or any(topic_matches_sub(_unshared(each), topic) for each in self._topics)
 
     def batches(
         self, topic: str, payload: bytes, received_t_ns: int, is_retained: bool = False, is_again: bool = False
     ) -> list[ReadingBatch]:
         """What a message has. is_retained: the broker had kept it. is_again: the broker may have sent it before."""
+        if not self._is_own(topic):
+            detail = f"{topic} is not a topic of this tray: it is a former subscription of client_id, and is ended"
+            return [_refused(received_t_ns, payload, Rejected("foreign_topic", detail, harmless=True))]
         if self._config.has_values:
             items = self._items_of_value(topic, payload, is_retained)
             return [ReadingBatch(received_t_ns, tuple(items), len(payload))]
@@ -242,6 +262,11 @@ class MqttSource:
         if not readings and self._values.lacks_commands:
             return [Rejected("no_command", "the command of a fan is not known yet", harmless=True)]
         return list(readings)
+
+
+def _unshared(pattern: str) -> str:
+    """The topics that a subscription is for: one that is shared ($share/GROUP/...) begins with its group."""
+    return pattern.split("/", 2)[-1] if pattern.startswith("$share/") else pattern
 
 
 def _refused(received_t_ns: int, payload: bytes, rejected: Rejected) -> ReadingBatch:

@@ -138,6 +138,8 @@ class RedfishDevice:
             lines = path.read_text(encoding="utf-8").splitlines()
         except OSError as error:
             raise DeviceError(f"{path}: {error.strerror}; correct source.credentials", is_lost=True) from error
+        except UnicodeDecodeError as error:
+            raise DeviceError(f"{path}: is no text in UTF-8: save it as such", is_lost=True) from error
         if len(lines) < 2:
             raise DeviceError(f"{path}: write the user in its first line and the password in its second", is_lost=True)
         return lines[0].strip(), lines[1]

@@ -99,6 +99,8 @@ class SourceContext:
     """its name"""
     limits: ReadingLimits | None = None
     """which readings acquisition accepts, for a source that says so to whoever sends them; None: not known"""
+    run_folder: Path | None = None
+    """where it may keep files; None: nowhere"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 
 import fantwin_client
-from fantwin_client import Client, CommandError, FanCountError, NoAcquisitionError, NotKeptError, TimeOrderError
+from fantwin_client import (
+    Client,
+    CommandError,
+    FanCountError,
+    NoAcquisitionError,
+    NotKeptError,
+    SendError,
+    TimeOrderError,
+)
 from fantwin_client.outbox import MOST_SENT_MESSAGES
 from fantwin_client.times import times_ns
 from schemas.topics import BY_NAME
@@ -108,12 +116,34 @@ def test_what_cannot_be_a_sample_of_the_tray_is_refused_at_once(
             (np.nan, "no time"),
             (1e12, "2116"),
             ("now", "give seconds"),
+            (datetime(2200, 1, 1, tzinfo=UTC), "2200-01-01 .*: beyond the year 2116"),
+            (datetime(2300, 1, 1, tzinfo=UTC), "2116"),
+            (np.datetime64("2200-01-01"), "2200-01-01: beyond the year 2116"),
+            (np.datetime64("3000-01-01"), "2116"),  # wraps to 1830 in ns
+            (np.datetime64("1700-01-01T00:00:00.000000000"), "2116"),
         ):
             with pytest.raises(TimeOrderError, match=words):
                 tray.publish(t, [0.5, 0.5], [1.0, 1.0])  # type: ignore[arg-type]
         tray.restart_time()
         tray.publish(T_S - 100, [0.5, 0.5], [1.0, 1.0])
         assert tray.check().received == 3
+
+
+def test_what_ends_the_thread_is_raised_by_publish_and_check(
+    endpoint: str, raws: Raws, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with acquisition(push_config(endpoint, tmp_path)):
+        client = fantwin_client.connect(endpoint, site=SITE)
+        tray = client.tray(TRAY)
+        monkeypatch.setattr("fantwin_client.tray.encode", lambda _message: 1 / 0)
+        tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])
+        with pytest.raises(SendError, match="ZeroDivisionError: division by zero; open the client again") as caught:
+            tray.check(60.0)
+        assert isinstance(caught.value.__cause__, ZeroDivisionError)
+        with pytest.raises(SendError):
+            tray.publish(T_S + 1, [0.5, 0.5], [1.0, 1.0])
+        with pytest.raises(SendError):
+            client.close()
 
 
 def test_without_such_a_tray_one_line_says_so(endpoint: str, client: Client, raws: Raws, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import socket
 import ssl
 import subprocess
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,7 +22,8 @@ from pydantic import ValidationError
 
 from pipeline.devices import http_source
 from pipeline.devices.http_config import HttpConfig
-from pipeline.devices.http_source import MOST_WAITING, HttpSource
+from pipeline.devices.http_protocol import LimitedProtocol
+from pipeline.devices.http_source import MOST_CONNECTIONS, MOST_WAITING, HttpSource
 from pipeline.devices.json_samples import LARGEST_BYTES
 from pipeline.devices.sample_source import (
     LinkDown,
@@ -29,6 +31,7 @@ from pipeline.devices.sample_source import (
     Reading,
     ReadingBatch,
     ReadingLimits,
+    Rejected,
     SourceContext,
     SourceEvent,
 )
@@ -137,6 +140,45 @@ def test_a_token_is_asked_for(tmp_path: Path) -> None:
         assert ask(source, SAMPLE)[0] == ask(source)[0] == 401
         assert ask(source, SAMPLE, Authorization="Bearer wrong")[0] == 401
         assert ask(source, SAMPLE, Authorization="Bearer secret")[0] == 200
+
+
+def test_connections_that_ask_nothing_are_closed_and_do_not_block_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(LimitedProtocol, "request_limit_s", 1.0)
+    source = source_of()
+    with running(source) as events:
+        assert ask(source, SAMPLE)[0] == 200
+        assert source._server is not None
+        at_server = source._server.server_state
+        eventually(lambda: not at_server.connections, "the first request has ended")
+        head = b"POST /v1/trays/tray1/samples HTTP/1.1\r\nHost: x\r\n"
+        idle = []
+        for sent in (head + b"Content-Length: 99\r\n\r\n{", head, b"", b""):
+            for _ in range(MOST_CONNECTIONS // 4):
+                idle.append(socket.create_connection(("127.0.0.1", source._config.port)))
+                idle[-1].sendall(sent)
+            eventually(lambda: len(at_server.connections) == len(idle), "they are connected")
+            eventually(lambda: len(at_server.tasks) == MOST_CONNECTIONS // 4, "the first ones have begun a request")
+        assert ask(source, SAMPLE)[:2] == (503, {"error": "32 connections are open", "accepted": 0})
+        eventually(lambda: ask(source, SAMPLE)[0] == 200, "they were closed")
+        assert ask(source)[1]["too_many_connections"] >= 1
+        kept = HTTPConnection("127.0.0.1", source._config.port, timeout=20)
+        for _ in range(4):  # longer than the limit, but with requests
+            kept.request("POST", f"{PATH}/samples", json.dumps(SAMPLE))
+            assert kept.getresponse().read()
+            time.sleep(0.4)
+        kept.close()
+        for connection in idle:
+            connection.close()
+    kinds = {
+        item.kind
+        for each in events
+        if isinstance(each, ReadingBatch)
+        for item in each.items
+        if isinstance(item, Rejected)
+    }
+    assert kinds == {"too_many_connections"}
 
 
 def test_beyond_loopback_a_token_is_required() -> None:

@@ -125,6 +125,48 @@ def test_a_commanded_fan_is_taken_over_and_given_back(root: Path) -> None:
         made.write((NAN, NAN, NAN), (900.0, NAN, NAN))
 
 
+def test_what_a_killed_process_took_over_is_given_back_by_the_next_one(root: Path, tmp_path: Path) -> None:
+    folder = board(root)
+    config = HwmonConfig(chip="nct6798", root=root, writable=True)
+    context = SourceContext(3, "rpm", Path(), "a", run_folder=tmp_path / "runs")
+    modes = [folder / f"pwm{number}_enable" for number in (1, 2)]
+
+    def started() -> HwmonDevice:
+        made = HwmonDevice(config, context)
+        made.connect()
+        return made
+
+    started().write((30.0, 40.0, 50.0), ())  # killed: it does not disconnect
+    second = started()
+    second.write((60.0, NAN, NAN), ())
+    assert [mode.read_text() for mode in modes] == ["1", "1"]
+    second.disconnect()
+    assert [mode.read_text() for mode in modes] == ["5", "5"], "also the one that it did not write"
+    assert (folder / "pwm3").read_text() == "255"
+    assert list(context.run_folder.iterdir() if context.run_folder else ()) == []
+
+    started().write((30.0, NAN, NAN), ())
+    modes[0].write_text("2")  # the driver is loaded again
+    third = started()
+    third.disconnect()
+    assert modes[0].read_text() == "2"
+    third.connect()
+    third.write((30.0, NAN, NAN), ())
+    third.disconnect()
+    assert modes[0].read_text() == "2", "as it was found last"
+
+
+def test_fans_that_share_a_pwm_take_one_command(root: Path) -> None:
+    folder = board(root)
+    made = connected(root, 3, pwms=[1], writable=True)
+    for command, pwm in (((200.0, NAN, NAN), "200"), ((NAN, 90.0, NAN), "90"), ((80.0, NAN, 80.0), "80")):
+        made.write(command, ())
+        assert (folder / "pwm1").read_text() == pwm
+    with pytest.raises(DeviceError, match="pwm1 moves several fans: give them one command, not 10 and 20"):
+        made.write((10.0, NAN, 20.0), ())
+    assert (folder / "pwm1").read_text() == "80"
+
+
 def test_nothing_is_written_unless_the_configuration_says_so(root: Path) -> None:
     board(root)
     config = HwmonConfig(chip="nct6798", root=root)

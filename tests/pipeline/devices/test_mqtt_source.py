@@ -74,6 +74,12 @@ class Events(list[SourceEvent]):
         return [item for batch in self.of(ReadingBatch) for item in batch.items]
 
 
+def message_of(topic: str, payload: bytes) -> paho.MQTTMessage:
+    message = paho.MQTTMessage(topic=topic.encode())
+    message.payload = payload
+    return message
+
+
 @contextmanager
 def running(source: MqttSource) -> Iterator[Events]:
     events = Events()
@@ -107,6 +113,37 @@ def test_a_message_that_the_broker_sends_again_is_left_out(broker: MqttBroker) -
         for item in batch.items
     ]
     assert [getattr(item, "kind", "reading") for item in items] == ["reading", "repeated", "reading"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "own", "foreign"),
+    [
+        (NUMBERS, "plant/fan1/rpm", "old/2/rpm"),
+        ({"topic": "plant/tray2"}, "plant/tray2", "plant/tray1"),
+        ({"topic": "plant/+/tray2"}, "plant/a/tray2", "plant/a/tray1"),
+        ({"topic": "$share/group/plant/#"}, "plant/tray2", "other/tray2"),
+    ],
+)
+def test_a_topic_of_a_former_subscription_is_refused_and_unsubscribed(
+    settings: dict[str, Any], own: str, foreign: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, events, unsubscribed = source_of(1, **settings), Events(), list[str]()
+    monkeypatch.setattr(source._client, "unsubscribe", unsubscribed.append)
+    source._deliver = events.append
+    for topic in (foreign, own, foreign):
+        source._on_message(None, None, message_of(topic, b"100" if settings is NUMBERS else SAMPLE.encode()))
+    kinds = [item.kind for item in events.items if isinstance(item, Rejected)]
+    assert kinds.count("foreign_topic") == 2 and "malformed" not in kinds
+    assert unsubscribed == [foreign], "once"
+
+
+def test_no_message_ends_the_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    source, events = source_of(1), Events()
+    source._deliver = events.append
+    monkeypatch.setattr(mqtt_source, "parse_samples", lambda _payload: 1 / 0)
+    source._on_message(None, None, message_of("plant/tray1", b"{}"))
+    source._on_message(None, None, paho.MQTTMessage(topic=b"\xff"))
+    assert [item.kind for item in events.items if isinstance(item, Rejected)] == ["malformed", "malformed"]
 
 
 def test_numbers_of_single_fans_become_readings_of_the_tray(broker: MqttBroker, publish: Callable[..., None]) -> None:
