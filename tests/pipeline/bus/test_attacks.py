@@ -24,12 +24,13 @@ from pipeline.bus.router import open_router
 from pipeline.bus.session import Bus, join_bus
 from pipeline.config.loading import parse_config
 from pipeline.recordings.reading import read_recording
+from pipeline.runtime.sessions import Session
 from schemas.codec import decode, encode
 from schemas.messages import Grid, Header, Health, StageStatus
 from schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.flooding_client import NOISE
 from tests.support.running_chain import RunningCommand, eventually
-from tests.support.secured_site import CONFIG, SITE, Heard, SecuredSite, free_endpoint, put
+from tests.support.secured_site import ANSWER_S, CONFIG, SITE, Heard, SecuredSite, free_endpoint, put
 from tests.support.secured_stage import STEP_NS, SecuredStage, Sender, counter, samples
 from tests.support.site_certificates import DAY, SiteCertificates
 
@@ -331,6 +332,31 @@ def test_row_14_malformed_messages_are_counted_and_stop_nobody(site, tmp_path, n
         reading = read_recording(recording)
         assert any(envelope.header.tray == "a" for envelope in reading)
         assert reading.damage == ""
+
+
+def test_row_15_tokens_of_a_viewer_silence_no_stage(site):
+    """A viewer may show tokens, and may write any producer into them: that of a stage, too."""
+    with (
+        SecuredStage(site, "resampler") as stage,
+        join_bus(site.config, roles=("acquisition",)) as bus,
+    ):
+        sender = Sender(bus, "healthy")
+        sender.send()
+        liveliness = site.session("viewer").liveliness()
+        forged = Session("viewer", "all", 1, sender.producer, "host", 2)
+        later = Session("viewer", "all", 2, "viewer-all-1", "host", 2)
+        tokens = [liveliness.declare_token(session.key(SITE)) for session in (forged, later)]
+        shown = site.session("router").liveliness().get(forged.key(SITE), timeout=ANSWER_S)
+        assert any(reply.ok for reply in shown), "the rules let it show them"
+        sender.send()
+        health = stage.health_with(lambda health: has_received(health, sender, 2), "the next sample has arrived")
+        assert counter(health, "refused_of_second") == 0
+        for token in tokens:
+            token.undeclare()
+        sender.send()
+        health = stage.health_with(lambda health: has_received(health, sender, 3), "and the one after it")
+        assert counter(health, "refused_of_second") == 0
+    assert health.lost == 0
 
 
 def test_a_session_without_the_roles_of_its_site_is_not_held_to_them(site):
