@@ -28,7 +28,7 @@ from pipeline.runtime.subscriptions import Subscriptions
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Health, StageStatus
-from schemas.topics import ALL_TRAYS, alive_key, health_key, sessions_key, topic_of, tray_key
+from schemas.topics import ALL_TRAYS, alive_key, health_key, sessions_key, topic_of, tray_key, tray_of
 
 MANY_TRAYS = 16
 """in a process that processes several trays in one pass: then it takes messages at its ticks, together"""
@@ -236,7 +236,18 @@ class Receiver:
         except (KeyError, CodecError):
             self.counts["undecodable"] += 1
             return None
+        if not self._is_of_its_key(envelope):
+            self.counts["refused_of_other_key"] += 1
+            return None
         return envelope
+
+    def _is_of_its_key(self, envelope: Envelope) -> bool:
+        """Whether a message is of the tray, or of the process, of its key: rights are about keys, and cores go by what
+        is in the message."""
+        if envelope.topic != "health":
+            return envelope.header.tray == tray_of(envelope.key)
+        health = envelope.message
+        return isinstance(health, Health) and envelope.key == health_key(self._site, health.stage, health.instance)
 
     def is_undecoded(self, envelope: Envelope) -> bool:
         """Whether the core takes a message as it came."""

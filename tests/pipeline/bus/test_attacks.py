@@ -23,6 +23,7 @@ from pipeline.bus.errors import BusError
 from pipeline.bus.router import open_router
 from pipeline.bus.session import Bus, join_bus
 from pipeline.config.loading import parse_config
+from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.recordings.reading import read_recording
 from pipeline.runtime.sessions import Session
 from schemas.codec import decode, encode
@@ -357,6 +358,21 @@ def test_row_15_tokens_of_a_viewer_silence_no_stage(site):
         health = stage.health_with(lambda health: has_received(health, sender, 3), "and the one after it")
         assert counter(health, "refused_of_second") == 0
     assert health.lost == 0
+
+
+def test_row_16_a_certificate_for_one_tray_writes_no_other_tray(site):
+    """The rules see the key, and a core is chosen by the tray in the header."""
+    with SecuredStage(site, "resampler") as stage:
+        grids = Heard(site.session("twin_integrator"), tray_key(SITE, "b", "grid"))
+        site.flush("twin_integrator")
+        began_ns = HOST_CLOCK.now_ns() - STEP_NS * 300
+        for number in range(30):
+            forged = replace(samples(began_ns, number), header=Header("acquisition-a-1", number, "b"))
+            put(site.session("acquisition.a"), RAW, encode(forged))
+        site.flush("acquisition.a")
+        health = stage.health_with(lambda health: counter(health, "refused_of_other_key") == 30, "all are counted")
+        assert health.inputs == ()
+    assert grids.messages == []
 
 
 def test_a_session_without_the_roles_of_its_site_is_not_held_to_them(site):
