@@ -27,7 +27,7 @@ from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.recordings.reading import read_recording
 from pipeline.runtime.sessions import Session
 from schemas.codec import decode, encode
-from schemas.messages import Grid, Header, Health, StageStatus
+from schemas.messages import Grid, Header, Health, Output, StageStatus
 from schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.flooding_client import NOISE
 from tests.support.running_chain import RunningCommand, eventually
@@ -373,6 +373,40 @@ def test_row_16_a_certificate_for_one_tray_writes_no_other_tray(site):
         health = stage.health_with(lambda health: counter(health, "refused_of_other_key") == 30, "all are counted")
         assert health.inputs == ()
     assert grids.messages == []
+
+
+@pytest.mark.parametrize(
+    ("role", "stage", "instance"), [("viewer", "viewer", "evil"), ("acquisition.b", "acquisition", "b")]
+)
+def test_row_17_a_health_that_claims_what_its_stage_does_not_write_is_not_believed(site, role, stage, instance):
+    """Otherwise each message of others on that key would be one of a stranger, and what was never sent a loss."""
+    producer = f"{stage}-{instance}-1"
+    claims = Health(
+        header=Header(producer, 0, ""),
+        stage=stage,
+        instance=instance,
+        status=StageStatus.OK,
+        t_ns=HOST_CLOCK.now_ns(),
+        uptime_s=1,
+        outputs=(Output(key=RAW, published=4000),),
+    )
+    with (
+        SecuredStage(site, "resampler") as receiver,
+        join_bus(site.config, roles=("acquisition",)) as bus,
+    ):
+        thief = site.session(role)
+        token = thief.liveliness().declare_token(Session(stage, instance, 1, producer, "host", 2, ()).key(SITE))
+        put(thief, health_key(SITE, stage, instance), encode(claims))
+        site.flush(role)
+        receiver.health_with(lambda health: counter(health, "refused_outputs") == 1, "the claim was seen")
+        sender = Sender(bus, "healthy")
+        sender.send()
+        sender.send_health()
+        health = receiver.health_with(lambda health: has_received(health, sender, 1), "samples of others arrive")
+        assert counter(health, "refused_producers") == 0
+        token.undeclare()
+    assert health.lost == 0
+    assert [line.producer for line in health.inputs] == [sender.producer]
 
 
 def test_a_session_without_the_roles_of_its_site_is_not_held_to_them(site):
