@@ -218,11 +218,25 @@ def _hosts(request: _Request) -> list[str]:
 
 
 def _issued(request: _Request) -> list[Certificate]:
-    """The certificates in the folder of the site, and that of its authority first."""
+    """The certificates in the folder of the site, and that of its authority first. A file of no role of the site that
+    is no certificate is named on standard error, and left out.
+
+    Raises:
+        UserError: the file of a role, or of the authority, is no certificate.
+    """
     security = request.security
     pattern = glob.escape(str(security.certificate)).replace(ROLE_PLACE, "*")
     paths = [security.ca, *map(Path, sorted(glob.glob(pattern)))]  # noqa: PTH207  the role may be a folder
-    return [read_certificate(path) for path in dict.fromkeys(paths) if path.exists()]
+    own = {security.ca, *(of_role(security.certificate, role) for role in roles_of(request.config))}
+    found: list[Certificate] = []
+    for path in dict.fromkeys(paths):
+        try:
+            found += [read_certificate(path)] if path.exists() else []
+        except UserError as error:
+            if path in own:
+                raise
+            typer.echo(str(error), err=True)
+    return found
 
 
 def _show(request: _Request, *, json_output: bool) -> None:

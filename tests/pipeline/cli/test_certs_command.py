@@ -174,3 +174,22 @@ def test_this_host_may_have_a_name_for_which_there_is_no_certificate(path, monke
     monkeypatch.setattr("socket.gethostname", lambda: "münchen")
     certs(path, "init")
     assert made(certs(path, "issue", "router", "--json")) == ["router"]
+
+
+@pytest.mark.parametrize("content", [b"", b"no certificate\n", b"\xff\xfe"])
+def test_a_file_of_others_among_the_certificates_is_named_and_the_rest_is_shown_and_renewed(path, content):
+    certs(path, "init")
+    certs(path, "issue", "router")
+    (path.parent / "certs" / "a-foreign.pem").write_bytes(content)
+    done = certs(path, "show", "--json")
+    assert [each["role"] for each in json.loads(done.stdout)] == ["fantwin plant", "router"]
+    assert done.stderr.count("\n") == 1 and "a-foreign.pem" in done.stderr
+    assert made(certs(path, "renew", "--json")) == ["router"]
+
+
+def test_a_damaged_certificate_of_a_role_is_not_passed_over(path):
+    certs(path, "init")
+    certs(path, "issue", "router")
+    (path.parent / "certs" / "router.pem").write_bytes(b"damaged")
+    done = certs(path, "show")
+    assert isinstance(done.exception, UserError) and "router.pem" in str(done.exception)
