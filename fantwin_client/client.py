@@ -10,6 +10,7 @@ from typing import Any, Self
 
 from fantwin_client.errors import NotReceivedError, SendError
 from fantwin_client.tray import Tray
+from pipeline.bus.errors import BusError
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from pipeline.config.roles import SOURCE
@@ -25,13 +26,16 @@ def connect(endpoint: str = "tcp/127.0.0.1:7447", site: str = "site", **bus: Any
 
     endpoint: `bus.endpoint` of the configuration. site: its `site`. bus: other settings of its `[bus]`, such as
     `mode="client"` where processes meet at `fantwin router`, and `security={"ca": ..., "certificate": ..., "key": ...}`
-    where it has certificates, of role `source`; relative paths start at the working directory.
+    where it has certificates, of role `source`, for clients only; relative paths start at the working directory.
 
     Raises:
         BusError: the endpoint cannot be used, or nobody answers there as fantwin does.
         pydantic.ValidationError: no such setting.
     """
-    return Client(Bus(BusConfig(endpoint=endpoint, **bus), listens=False, roles=(SOURCE,)), site)
+    settings = BusConfig(endpoint=endpoint, **bus)
+    if settings.security and settings.mode == "peer":  # a peer takes messages itself, and knows no roles of the site
+        raise BusError('security needs mode="client": who may do what is checked by `fantwin router`')
+    return Client(Bus(settings, listens=False, roles=(SOURCE,)), site)
 
 
 class Client:

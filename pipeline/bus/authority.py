@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import re
 import secrets
 from collections.abc import Sequence
 from contextlib import suppress
@@ -30,6 +31,9 @@ LONGEST_ROLE = 64
 """characters of a common name"""
 CLOCK_SKEW = timedelta(minutes=5)
 """a certificate holds from so long before it was made: clocks of hosts differ"""
+_LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
+_HOST_NAME = re.compile(rf"(\*\.)?{_LABEL}(\.{_LABEL})*")
+_LONGEST_HOST = 253
 _PRIVATE, _PUBLIC = 0o600, 0o644
 
 
@@ -104,6 +108,15 @@ class Authority:
             .add_extension(signer, critical=False)
         )
         return builder.sign(self._key, hashes.SHA256()), key
+
+
+def is_host(text: str) -> bool:
+    """Whether a certificate can be for this name or address of a host."""
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return len(text) <= _LONGEST_HOST and _HOST_NAME.fullmatch(text) is not None
+    return "%" not in text
 
 
 def write_pair(

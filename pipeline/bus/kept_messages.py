@@ -46,7 +46,7 @@ def answer_for_kept(
     """
 
     def receive(query: zenoh.Query) -> None:
-        on_query(KeptQuery(str(query.key_expr).partition(_KEPT)[0], kept_by, query))
+        on_query(KeptQuery(str(query.key_expr).rpartition(_KEPT)[0], kept_by, query))
 
     handler = zenoh.handlers.Callback(receive, indirect=False)
     return session.declare_queryable(kept_key(key_expression, kept_by), handler)

@@ -31,7 +31,7 @@ def recovery_key(key: str, producer: str) -> str:
 
 def published_key(recovery_key: str) -> str:
     """The key whose messages are recovered at a recovery key."""
-    return recovery_key.partition(_RECOVER)[0]
+    return recovery_key.rpartition(_RECOVER)[0]  # a site or tray may have that name
 
 
 @dataclass(frozen=True, slots=True)

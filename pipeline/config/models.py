@@ -86,6 +86,10 @@ ROLE_PLACE = "{role}"
 """in a path of `bus.security`: the name of the role of a process"""
 
 
+OWN_ROLES = ("operator", "viewer", "source", "replay", "router")
+"""roles of people and programs that are no stages"""
+
+
 class SecurityConfig(Section):
     """Mutual TLS and roles. Each process shows a certificate that names its role; `fantwin certs` makes them. `{role}`
     in a path stands for the role of the process."""
@@ -101,6 +105,14 @@ class SecurityConfig(Section):
     controllers: tuple[Name, ...] = Field(
         default=(), description="roles of programs that command fans: each has the rights of `operator`"
     )
+
+    @field_validator("controllers")
+    @classmethod
+    def _are_new_roles(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for name in value:
+            if name in STAGES or name in OWN_ROLES:
+                raise ValueError(f"{name!r} is a role of its own, with other rights: choose another name")
+        return value
 
     def within(self, folder: Path) -> Self:
         """The same with absolute paths: relative ones start at `folder`."""

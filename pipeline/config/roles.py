@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from pipeline.config.models import Config
+from pipeline.config.models import OWN_ROLES, Config
 from pipeline.config.registry import STAGES
 from pipeline.config.shards import Shard, shard_of, shards_of
 from schemas.topics import ALL_TRAYS, BY_NAME, TOPICS, makes_samples_of_samples
 
-OPERATOR, VIEWER, SOURCE, REPLAY, ROUTER = "operator", "viewer", "source", "replay", "router"
+OPERATOR, VIEWER, SOURCE, REPLAY, ROUTER = OWN_ROLES
 READERS = (VIEWER, OPERATOR)
 """roles of a command that only looks, the one with the fewest rights first"""
 OPERATED = ("command", "request")

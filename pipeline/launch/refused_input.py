@@ -15,6 +15,8 @@ WORDS = {
     "refused_of_second": "messages from a second process of a stage",
     "refused_of_replay": "commands of a replay",
     "refused_clocks": "clock messages from others than the replay",
+    "refused_of_other_key": "messages of another tray or process than their key",
+    "refused_outputs": "healths that claim outputs which their stage may not write",
     "refused_numbers": "messages with impossible numbers",
     "refused_producers": "messages from unknown or too many producers",
     "refused_too_large": "messages that are too large",

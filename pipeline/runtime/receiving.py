@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence, Set
+from dataclasses import replace
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
+from pipeline.config.roles import roles_of
 from pipeline.config.shards import Shard
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.runtime.clock import REPLAY, StageClock
@@ -28,7 +30,7 @@ from pipeline.runtime.subscriptions import Subscriptions
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Health, StageStatus
-from schemas.topics import ALL_TRAYS, alive_key, health_key, sessions_key, topic_of, tray_key
+from schemas.topics import ALL_TRAYS, alive_key, health_key, sessions_key, topic_of, tray_key, tray_of
 
 MANY_TRAYS = 16
 """in a process that processes several trays in one pass: then it takes messages at its ticks, together"""
@@ -55,6 +57,7 @@ class Receiver:
         what is received changes them."""
         self._stage = stage
         self._site = config.site
+        self._roles = {name: role for name, role in roles_of(config).items() if role.stage}
         self._shard = shard
         self._trays = frozenset(shard.trays)
         self._is_patient = stage.is_patient or (stage.joint is not None and len(shard.trays) >= MANY_TRAYS)
@@ -204,6 +207,10 @@ class Receiver:
         return not (is_ignored or self._sessions.is_stranger(envelope.key, producer))
 
     def _take_health(self, envelope: Envelope, health: Health) -> None:
+        allowed = [output for output in health.outputs if self._may_write(health, output.key)]
+        if len(allowed) < len(health.outputs):
+            self.counts["refused_outputs"] += 1
+            health = replace(health, outputs=tuple(allowed))
         if not self.tracker.believes(health):
             return
         self.peers.add_health(alive_key(self._site, health.stage, health.instance), health)
@@ -214,6 +221,18 @@ class Receiver:
         self._silences.add_health(health, self.tracker.has_all_of)
         if "health" in self._stage.reads and self._concerns(envelope):
             self._due.add(self.tracker.accept(envelope))
+
+    def _may_write(self, health: Health, key: str) -> bool:
+        """Whether the process of a health may have published on a key. Of a stage that this version does not know all
+        is believed: no certificate is for such a stage."""
+        role = self._roles.get(f"{health.stage}.{health.instance}") or self._roles.get(health.stage)
+        if role is None:
+            return True
+        try:
+            topic = topic_of(key).name
+        except KeyError:
+            return False
+        return topic in role.writes and (not role.trays or tray_of(key) in role.trays)
 
     def _concerns(self, envelope: Envelope) -> bool:
         """Whether a message is of a tray of this process. Health is of all trays of its process: so each recorder has
@@ -236,7 +255,18 @@ class Receiver:
         except (KeyError, CodecError):
             self.counts["undecodable"] += 1
             return None
+        if not self._is_of_its_key(envelope):
+            self.counts["refused_of_other_key"] += 1
+            return None
         return envelope
+
+    def _is_of_its_key(self, envelope: Envelope) -> bool:
+        """Whether a message is of the tray, or of the process, of its key: rights are about keys, and cores go by what
+        is in the message."""
+        if envelope.topic != "health":
+            return envelope.header.tray == tray_of(envelope.key)
+        health = envelope.message
+        return isinstance(health, Health) and envelope.key == health_key(self._site, health.stage, health.instance)
 
     def is_undecoded(self, envelope: Envelope) -> bool:
         """Whether the core takes a message as it came."""

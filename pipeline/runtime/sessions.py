@@ -33,7 +33,7 @@ class Session:
 
     Attributes:
         started_t_ns: when it began, host time.
-        producer: how it signs messages.
+        producer: how it signs messages: its stage, its instance, and what is its own, as `scorer-all-0a1b2c3d`.
         trays: those that it has; none: all of the site.
     """
 
@@ -54,7 +54,8 @@ class Session:
 
     @classmethod
     def of_key(cls, key: str) -> Session | None:
-        """The session that shows the token `key`; None if it is no such token.
+        """The session that shows the token `key`; None if it is no such token, or names a producer of others: rights
+        are about stage and instance alone.
 
         A token without trays, as those of earlier versions, is of all trays or of the one that its instance names.
         """
@@ -63,6 +64,8 @@ class Session:
             return None
         stage, instance, started, producer, host, process_id = parts[3:9]
         if not (_is_number(started) and _is_number(process_id)):
+            return None
+        if producer.rpartition("-")[0] != f"{stage}-{instance}":
             return None
         named = parts[9].split(_BETWEEN_TRAYS) if len(parts) > 9 else () if instance == ALL_TRAYS else (instance,)
         return cls(stage, instance, int(started), producer, host, int(process_id), tuple(named))
@@ -128,6 +131,8 @@ class Sessions:
         session = Session.of_key(key)
         if session is None or (alive and len(self._alive) >= MOST_SESSIONS):
             return
+        if self._by_producer.get(session.producer, session) != session:
+            return  # whoever signs as a session that is there does not take its place
         if alive:
             self._alive[key] = self._by_producer[session.producer] = session
             self._written.setdefault(session.producer, {health_key(key.split("/")[1], session.stage, session.instance)})

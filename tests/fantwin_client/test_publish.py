@@ -22,6 +22,11 @@ from fantwin_client import (
 )
 from fantwin_client.outbox import MOST_SENT_MESSAGES
 from fantwin_client.times import times_ns
+from pipeline.bus.access_rules import SiteRoles
+from pipeline.bus.certificates import checked_credentials
+from pipeline.bus.errors import BusError
+from pipeline.bus.router import open_router
+from pipeline.config.loading import parse_config
 from schemas.topics import BY_NAME
 from stages.acquisition import AcquisitionCore, limits_of
 from tests.support.running_acquisition import SITE, TRAY, Raws, acquisition, push_config, raws_of
@@ -252,12 +257,19 @@ def test_a_date_in_summer_time_is_the_moment_it_names() -> None:
 
 def test_with_certificates_a_source_publishes(endpoint: str, tmp_path: Path) -> None:
     certificates = SiteCertificates(tmp_path)
-    certificates.issue("acquisition", "source")
+    certificates.issue("acquisition", "source", "router")
     endpoint = endpoint.replace("tcp/", "tls/")
     security = certificates.security.model_dump(exclude={"controllers"})
     lines = "\n".join(f'{name} = "{path}"' for name, path in security.items())
-    config = push_config(endpoint, tmp_path, more=f"[bus.security]\n{lines}\n")
-    with acquisition(config), fantwin_client.connect(endpoint, SITE, security=security) as client:
+    of_peers = push_config(endpoint, tmp_path, more=f"[bus.security]\n{lines}\n")
+    config = parse_config(of_peers.text, of_peers.path, ("bus.mode='client'",))
+    with pytest.raises(BusError, match='security needs mode="client"'):
+        fantwin_client.connect(endpoint, SITE, security=security)
+    with (
+        open_router(endpoint, checked_credentials(certificates.security, ("router",)), SiteRoles.of(config)),
+        acquisition(config),
+        fantwin_client.connect(endpoint, SITE, mode="client", security=security) as client,
+    ):
         tray = client.tray(TRAY)
         tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])
         assert tray.check(10).received == 1

@@ -19,7 +19,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.bus.authority import LONGEST_ROLE, Authority, write_file, write_pair
+from pipeline.bus.authority import LONGEST_ROLE, Authority, is_host, write_file, write_pair
 from pipeline.bus.certificates import Certificate, in_words, of_role, read_certificate
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.config.loading import load_config
@@ -107,6 +107,11 @@ def certs(
 
     Example: fantwin certs show -c fantwin.toml
     """
+    for name in host or ():
+        if not is_host(name):
+            raise UsageError(
+                f"--host {name!r}: give a name of ASCII letters (of others its form xn--...) or an address"
+            )
     settings = load_config(config, overrides or (), stages=())
     security = settings.bus.security or SecurityConfig().within(settings.folder)
     wanted = _with_trays(settings, roles or [], tray or [])
@@ -209,15 +214,29 @@ def _hosts(request: _Request) -> list[str]:
     matches = filter(None, map(_HOST.fullmatch, request.config.bus.endpoints))
     of_endpoints = [match[1].strip("[]") for match in matches]
     names = [*_HERE, socket.gethostname(), *of_endpoints, *request.hosts]
-    return [name for name in dict.fromkeys(names) if name and name not in _EVERYWHERE]
+    return [name for name in dict.fromkeys(names) if is_host(name) and name not in _EVERYWHERE]
 
 
 def _issued(request: _Request) -> list[Certificate]:
-    """The certificates in the folder of the site, and that of its authority first."""
+    """The certificates in the folder of the site, and that of its authority first. A file of no role of the site that
+    is no certificate is named on standard error, and left out.
+
+    Raises:
+        UserError: the file of a role, or of the authority, is no certificate.
+    """
     security = request.security
     pattern = glob.escape(str(security.certificate)).replace(ROLE_PLACE, "*")
     paths = [security.ca, *map(Path, sorted(glob.glob(pattern)))]  # noqa: PTH207  the role may be a folder
-    return [read_certificate(path) for path in dict.fromkeys(paths) if path.exists()]
+    own = {security.ca, *(of_role(security.certificate, role) for role in roles_of(request.config))}
+    found: list[Certificate] = []
+    for path in dict.fromkeys(paths):
+        try:
+            found += [read_certificate(path)] if path.exists() else []
+        except UserError as error:
+            if path in own:
+                raise
+            typer.echo(str(error), err=True)
+    return found
 
 
 def _show(request: _Request, *, json_output: bool) -> None:

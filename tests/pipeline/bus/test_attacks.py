@@ -23,13 +23,15 @@ from pipeline.bus.errors import BusError
 from pipeline.bus.router import open_router
 from pipeline.bus.session import Bus, join_bus
 from pipeline.config.loading import parse_config
+from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.recordings.reading import read_recording
+from pipeline.runtime.sessions import Session
 from schemas.codec import decode, encode
-from schemas.messages import Grid, Header, Health, StageStatus
+from schemas.messages import Grid, Header, Health, Output, StageStatus
 from schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.flooding_client import NOISE
 from tests.support.running_chain import RunningCommand, eventually
-from tests.support.secured_site import CONFIG, SITE, Heard, SecuredSite, free_endpoint, put
+from tests.support.secured_site import ANSWER_S, CONFIG, SITE, Heard, SecuredSite, free_endpoint, put
 from tests.support.secured_stage import STEP_NS, SecuredStage, Sender, counter, samples
 from tests.support.site_certificates import DAY, SiteCertificates
 from tests.support.tcp_relay import TcpRelay
@@ -348,6 +350,81 @@ def test_a_router_that_cannot_answer_because_the_link_is_cut_refuses_nothing(sit
             relay.heal()
             eventually(lambda: bus.security_problem() or bus._session.info.routers_zid(), "they meet again")
             assert said | {bus.security_problem()} == {""}
+
+
+def test_row_15_tokens_of_a_viewer_silence_no_stage(site):
+    """A viewer may show tokens, and may write any producer into them: that of a stage, too."""
+    with (
+        SecuredStage(site, "resampler") as stage,
+        join_bus(site.config, roles=("acquisition",)) as bus,
+    ):
+        sender = Sender(bus, "healthy")
+        sender.send()
+        liveliness = site.session("viewer").liveliness()
+        forged = Session("viewer", "all", 1, sender.producer, "host", 2)
+        later = Session("viewer", "all", 2, "viewer-all-1", "host", 2)
+        tokens = [liveliness.declare_token(session.key(SITE)) for session in (forged, later)]
+        site.flush("viewer")
+        shown = site.session("router").liveliness().get(forged.key(SITE), timeout=ANSWER_S)
+        assert any(reply.ok for reply in shown), "the rules let it show them"
+        sender.send()
+        health = stage.health_with(lambda health: has_received(health, sender, 2), "the next sample has arrived")
+        assert counter(health, "refused_of_second") == 0
+        for token in tokens:
+            token.undeclare()
+        sender.send()
+        health = stage.health_with(lambda health: has_received(health, sender, 3), "and the one after it")
+        assert counter(health, "refused_of_second") == 0
+    assert health.lost == 0
+
+
+def test_row_16_a_certificate_for_one_tray_writes_no_other_tray(site):
+    """The rules see the key, and a core is chosen by the tray in the header."""
+    with SecuredStage(site, "resampler") as stage:
+        grids = Heard(site.session("twin_integrator"), tray_key(SITE, "b", "grid"))
+        site.flush("twin_integrator")
+        began_ns = HOST_CLOCK.now_ns() - STEP_NS * 300
+        for number in range(30):
+            forged = replace(samples(began_ns, number), header=Header("acquisition-a-1", number, "b"))
+            put(site.session("acquisition.a"), RAW, encode(forged))
+        site.flush("acquisition.a")
+        health = stage.health_with(lambda health: counter(health, "refused_of_other_key") == 30, "all are counted")
+        assert health.inputs == ()
+    assert grids.messages == []
+
+
+@pytest.mark.parametrize(
+    ("role", "stage", "instance"), [("viewer", "viewer", "evil"), ("acquisition.b", "acquisition", "b")]
+)
+def test_row_17_a_health_that_claims_what_its_stage_does_not_write_is_not_believed(site, role, stage, instance):
+    """Otherwise each message of others on that key would be one of a stranger, and what was never sent a loss."""
+    producer = f"{stage}-{instance}-1"
+    claims = Health(
+        header=Header(producer, 0, ""),
+        stage=stage,
+        instance=instance,
+        status=StageStatus.OK,
+        t_ns=HOST_CLOCK.now_ns(),
+        uptime_s=1,
+        outputs=(Output(key=RAW, published=4000),),
+    )
+    with (
+        SecuredStage(site, "resampler") as receiver,
+        join_bus(site.config, roles=("acquisition",)) as bus,
+    ):
+        thief = site.session(role)
+        token = thief.liveliness().declare_token(Session(stage, instance, 1, producer, "host", 2, ()).key(SITE))
+        put(thief, health_key(SITE, stage, instance), encode(claims))
+        site.flush(role)
+        receiver.health_with(lambda health: counter(health, "refused_outputs") == 1, "the claim was seen")
+        sender = Sender(bus, "healthy")
+        sender.send()
+        sender.send_health()
+        health = receiver.health_with(lambda health: has_received(health, sender, 1), "samples of others arrive")
+        assert counter(health, "refused_producers") == 0
+        token.undeclare()
+    assert health.lost == 0
+    assert [line.producer for line in health.inputs] == [sender.producer]
 
 
 def test_a_session_without_the_roles_of_its_site_is_not_held_to_them(site):

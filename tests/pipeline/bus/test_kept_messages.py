@@ -7,6 +7,7 @@ from queue import SimpleQueue
 import pytest
 
 from pipeline.bus import publisher as publisher_module
+from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
 from pipeline.bus.recovery import Answer
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
@@ -27,6 +28,24 @@ def test_row_16_what_is_sent_while_a_link_is_lost_for_30_s_is_kept(endpoint):
         eventually(lambda: asker.recover(key, "p"), "they have met")
         assert len(asker.recover(key, "p")) == LOST_S * RATE_HZ + CATCH_UP_MESSAGES
         assert len(asker.recover(key)) == CATCH_UP_MESSAGES
+
+
+@pytest.mark.parametrize("name", ["recover", "kept"])
+def test_a_site_or_tray_may_have_a_name_of_which_other_keys_are_made(endpoint, name):
+    config, topic = BusConfig(endpoint=endpoint), BY_NAME["snapshot"]
+    with Bus(config) as bus, Bus(config) as asker:
+        for key in (tray_key("s", name, "snapshot"), tray_key(name, "a", "snapshot"), tray_key(name, name, "snapshot")):
+            bus.publisher(key, topic, "", "p").put(b"one")
+            asked: list[str] = []
+            with answer_for_kept(bus._session, key, "recorder", lambda query, asked=asked: answer(query, asked)):
+                found = eventually(lambda key=key: ask_for_kept(asker._session, key, 1.0)[0], "what is kept is found")
+            assert (found, set(asked)) == ([b"one"], {key})
+            assert eventually(lambda key=key: asker.recover(key, "p"), "they have met") == [(key, b"one")]
+
+
+def answer(query: KeptQuery, asked: list[str]) -> None:
+    asked.append(query.key)
+    query.answer(b"one")
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def test_without_an_acquisition_the_command_is_reported_as_not_received(chain):
 
 def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
     def session(number: int, *trays: str) -> Session:
-        return Session("acquisition", f"{number}-of-2", number, f"acquisition-{number}", "board", number, trays)
+        return Session("acquisition", f"{number}-of-2", number, f"acquisition-{number}-of-2-1", "board", number, trays)
 
     def beat(session: Session, publisher: Publisher) -> None:
         health = Health(
@@ -87,7 +87,7 @@ def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
         connecting.result()
         answers = sender._acquisition.health()
     assert answers
-    assert answers.header.producer == "acquisition-1"
+    assert answers.header.producer == "acquisition-1-of-2-1"
 
 
 def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():

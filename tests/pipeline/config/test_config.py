@@ -46,6 +46,10 @@ def test_a_good_file_gives_every_enabled_stage_its_section():
         (GOOD.replace("fans = 8", "fans = 1025"), ["tray.0.fans = 1025", "1024"]),
         (GOOD.replace("fans = 8\n", ""), ["'tray.0.fans' is missing"]),
         (GOOD.replace('name = "a"', 'name = "health"'), ["reserved name"]),
+        *(
+            (f'{GOOD}[bus.security]\ncontrollers = ["dcim", "{role}"]\n', [f"'{role}' is a role of its own"])
+            for role in ("scorer", "operator", "viewer", "source", "replay", "router")
+        ),
         ("site = 'x'\n", ["'tray' is missing"]),
         ("site = \n", ["not valid TOML"]),
         (GOOD.replace("0.25", "inf"), ["scorer.on_delay_s = inf", "finite"]),

@@ -13,7 +13,7 @@ from pipeline.runtime.tracked_streams import Request
 from schemas.codec import encode, type_name
 from schemas.messages import Grid, Header, Health, Output, Raw, StageStatus
 from schemas.topics import BY_NAME, health_key, tray_key
-from tests.pipeline.runtime.test_sequence_tracker import KEY, health, packet, sequences
+from tests.pipeline.runtime.test_sequence_tracker import KEY, PRODUCER, health, packet, sequences
 from tests.support.toy_stage import TRAY_A, Bench, raw, toy
 
 
@@ -51,7 +51,7 @@ def test_row_10_a_number_that_its_producer_has_not_reached_is_refused(forged):
     (line,) = tracker.inputs()
     assert (line.received, line.missing, line.duplicated) == (12, 0, 0)
     assert tracker.counters() == {"refused_numbers": 1}
-    assert f"{KEY}: p cannot have published {forged + 1} messages after 10" in tracker.problem()
+    assert f"{KEY}: {PRODUCER} cannot have published {forged + 1} messages after 10" in tracker.problem()
 
 
 def test_row_10_a_first_message_with_a_number_that_its_producer_has_not_reached_is_refused():

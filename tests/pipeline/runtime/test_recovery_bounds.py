@@ -99,21 +99,21 @@ def test_row_11_a_flood_of_producers_leaves_the_real_one_in_sequence_and_few_oth
 
 def test_row_11_in_a_flood_of_producers_a_session_of_a_stage_is_admitted():
     sessions = Sessions()
-    sessions.update(Session("acquisition", "tray", 1, "restarted", "host", 1).key("site"), alive=True)
+    sessions.update(Session("acquisition", "tray", 1, "acquisition-tray-restarted", "host", 1).key("site"), alive=True)
     tracker = SequenceTracker(lambda _request: Found(), sessions=sessions)
     for number in range(2 * MOST_PRODUCERS):
         tracker.accept(packet(1, f"false-{number}"))
-    assert sequences(tracker.accept(packet(0, "restarted"))) == [0]
+    assert sequences(tracker.accept(packet(0, "acquisition-tray-restarted"))) == [0]
     assert sequences(tracker.accept(packet(0, "stranger"))) == []
 
 
 def test_row_11_where_a_stage_publishes_others_are_refused_without_asking():
     sessions, requests = Sessions(), []
-    acquisition = Session("acquisition", "tray", 1, "real", "host", 1)
+    acquisition = Session("acquisition", "tray", 1, "acquisition-tray-real", "host", 1)
     sessions.update(acquisition.key("site"), alive=True)
     tracker = SequenceTracker(requests.append, sessions=sessions)
     tracker.accept(packet(3, "early"))
-    sessions.add_health(health(0, "real"), {KEY})
+    sessions.add_health(health(0, "acquisition-tray-real"), {KEY})
     requests.clear()
     assert tracker.accept(packet(4, "early")) == [], "it was heard before the stage had said what it publishes"
     tracker.accept(packet(3, "stranger"))
@@ -123,14 +123,16 @@ def test_row_11_where_a_stage_publishes_others_are_refused_without_asking():
     assert not requests
     assert tracker.counters() == {"refused_producers": 3}
     assert f"{own_health}: stranger is not a stage of this site" in tracker.problem()
-    assert sequences(tracker.accept(packet(0, "real"))) == [0]
+    assert sequences(tracker.accept(packet(0, "acquisition-tray-real"))) == [0]
     sessions.update(acquisition.key("site"), alive=False)
     tracker.accept(packet(3, "a replay"))
     assert [request.producer for request in requests] == ["a replay"]
-    successor = Session("acquisition", "tray", 2, "next", "host", 2)
+    successor = Session("acquisition", "tray", 2, "acquisition-tray-next", "host", 2)
     sessions.update(successor.key("site"), alive=True)
-    sessions.add_health(health(0, "next"), {KEY})
-    assert sequences(tracker.accept(packet(1, "real"))) == [1], "it may have been on the way when the session ended"
+    sessions.add_health(health(0, "acquisition-tray-next"), {KEY})
+    assert sequences(tracker.accept(packet(1, "acquisition-tray-real"))) == [1], (
+        "it may have been on the way when the session ended"
+    )
 
 
 def test_row_11_a_flood_of_healths_is_remembered_in_part():

@@ -14,9 +14,10 @@ from schemas.messages import Alarm, Header, Health, Output, Severity, StageStatu
 from schemas.topics import CATCH_UP_MESSAGES, tray_key
 
 KEY = tray_key("site", "tray", "alarm")
+PRODUCER = "scorer-all-p"
 
 
-def packet(sequence: int, producer: str = "p") -> Envelope:
+def packet(sequence: int, producer: str = PRODUCER) -> Envelope:
     header = Header(producer, sequence, "tray")
     alarm = Alarm(
         header=header,
@@ -49,7 +50,7 @@ def sequences(packets: Iterable[Envelope]) -> list[int]:
     return [p.message.header.sequence for p in packets]
 
 
-def health(published: int, producer: str = "p") -> Health:
+def health(published: int, producer: str = PRODUCER) -> Health:
     return Health(
         header=Header(producer, 0, ""),
         stage="s",
@@ -110,7 +111,7 @@ def test_a_consumer_restarted_late_gets_what_is_kept_also_when_a_live_message_co
 @pytest.mark.parametrize(("found", "missing"), [(Found(), 8), (Found(published=9), 0), (Found(was_asked=False), 0)])
 def test_first_messages_of_a_stage_that_does_not_answer_are_missing_and_not_history(found, missing):
     sessions = Sessions()
-    sessions.update(Session("scorer", "all", 1, "p", "host", 1).key("site"), alive=True)
+    sessions.update(Session("scorer", "all", 1, PRODUCER, "host", 1).key("site"), alive=True)
     tracker = SequenceTracker(lambda _request: found, sessions=sessions)
     assert sequences(tracker.accept(packet(8))) == [8]
     (line,) = tracker.inputs()
@@ -209,7 +210,7 @@ class SlowProducer:
 
 def tracker_of_session(slow: SlowProducer, *, alive: bool) -> SequenceTracker:
     sessions = Sessions()
-    token = Session("s", "all", 1, "p", "host", 1).key("site")
+    token = Session("scorer", "all", 1, PRODUCER, "host", 1).key("site")
     sessions.update(token, alive=True)
     tracker = SequenceTracker(slow.ask, lambda: slow.now_s, sessions)
     assert sequences(tracker.accept(packet(0))) == [0]

@@ -37,6 +37,32 @@ def test_row_07_a_session_is_read_from_the_key_of_its_token():
     assert Session.of_key(FIRST.key("s").replace("4711", "x")) is None
 
 
+@pytest.mark.parametrize(
+    ("stage", "instance"),
+    [("viewer", "all"), ("acquisition", "b"), ("acquisition", f"{TRAY_A}-b")],
+    ids=["of another stage", "of another tray", "of a tray with a similar name"],
+)
+def test_row_07_a_token_that_names_the_producer_of_another_process_is_none(stage, instance):
+    """Who may show a token may not choose whom it is about."""
+    sessions = known(FIRST)
+    forged = replace(FIRST, stage=stage, instance=instance, trays=())
+    assert Session.of_key(forged.key("s")) is None
+    for session in (forged, replace(forged, started_t_ns=2, producer=f"{stage}-{instance}-2")):
+        sessions.update(session.key("s"), alive=True)
+    assert not sessions.is_ignored(FIRST.producer, TRAY_A)
+    sessions.update(forged.key("s"), alive=False)
+    assert sessions.is_alive(FIRST.producer)
+
+
+def test_row_07_a_token_of_the_same_producer_does_not_take_the_place_of_one_that_is_there():
+    sessions = known(FIRST)
+    again = replace(FIRST, started_t_ns=1, process_id=1)
+    sessions.update(again.key("s"), alive=True)
+    assert sessions.named("acquisition", TRAY_A) == FIRST
+    sessions.update(again.key("s"), alive=False)
+    assert sessions.is_alive(FIRST.producer)
+
+
 @pytest.mark.parametrize("order", [(FIRST, SECOND), (SECOND, FIRST)])
 def test_row_07_of_two_sessions_the_later_owns_the_stage_until_it_ends(order):
     sessions = Sessions()
@@ -52,8 +78,11 @@ def test_row_07_of_two_sessions_the_later_owns_the_stage_until_it_ends(order):
 
 def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict():
     sessions = Sessions()
-    for session in (FIRST, replace(SECOND, instance="b", trays=("b",)), replace(SECOND, stage="scorer")):
+    of_b = replace(SECOND, instance="b", producer="acquisition-b-1", trays=("b",))
+    scorer = replace(SECOND, stage="scorer", producer="scorer-a-1")
+    for session in (FIRST, of_b, scorer):
         sessions.update(session.key("s"), alive=True)
+        assert sessions.named(session.stage, session.instance) == session
     assert not sessions.problem()
 
 
@@ -106,7 +135,7 @@ def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(
     stop = threading.Event()
     stop.set()
     with Bus(config.bus) as bus:
-        bus.declare_alive(replace(shard("a+x", 1, "a", "x"), stage="resampler").key("s"))
+        bus.declare_alive(replace(shard("a+x", 1, "a", "x"), stage="resampler", producer="resampler-a+x-1").key("s"))
         with pytest.raises(StageError) as refused:
             Runner(toy(), config, Shard("all", (TRAY_A, TRAY_B)), stop)
         assert str(refused.value) == (
@@ -164,7 +193,7 @@ def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_sit
 @pytest.mark.parametrize("process_id", [2**22 + 1, os.getpid()], ids=["ended", "our number, as in a container"])
 def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(config, monkeypatch, process_id):
     monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
-    ours = Session.of_this_process("resampler", Shard("all", (TRAY_A, TRAY_B)), 1, "p")
+    ours = Session.of_this_process("resampler", Shard("all", (TRAY_A, TRAY_B)), 1, "resampler-all-1")
     with Bus(config.bus) as bus:
         bus.declare_alive(replace(ours, process_id=process_id).key("s"))
         stop = threading.Event()
@@ -198,7 +227,10 @@ def test_row_07_where_two_run_the_samples_of_one_are_ignored_and_both_are_named(
 
 
 def test_row_07_alarms_of_a_second_scorer_are_not_shown(config):
-    first, second = (replace(s, stage="scorer", instance="all", trays=()) for s in (FIRST, SECOND))
+    first, second = (
+        replace(s, stage="scorer", instance="all", producer=f"scorer-all-{s.started_t_ns}", trays=())
+        for s in (FIRST, SECOND)
+    )
     with Bus(config.bus) as site, Bus(config.bus) as ours:
         watcher = SiteWatcher(ours, "s")
         for session in (first, second):
