@@ -134,9 +134,10 @@ class TwinIntegratorCore(Core):
         return [f"twin {self._twin.card.name} allows for {conditions.in_words}"] if conditions else []
 
     def problem(self) -> str:
-        """A twin that does not fit the grid it receives, or a grid whose times have gone back."""
+        """A twin that does not fit the grid it receives or the supply of its fans, or a grid whose times have gone
+        back."""
         old = self._old_samples.problem("grid samples", "twin_integrator and scorer")
-        return self._problem or old or self._problem_of_columns()
+        return self._problem or old or self._problem_of_columns() or self.tray.problem()
 
     def _problem_of_columns(self) -> str:
         missing, name = self.tray.missing_columns, self._twin.card.name

@@ -11,7 +11,8 @@ from pipeline.config.models import BETWEEN_ENDPOINTS, BusConfig
 
 _ADDRESS = re.compile(r"(tcp|tls|ws|udp|quic)/(\[[^\]]*\]|[^:/?#]*):(\d+)(?:[?#].*)?")
 _CONNECTING = ("tcp", "tls", "ws")
-_OF_THIS_HOST = ("unixsock-stream", "unixpipe")
+_WITHIN_HOST = ("unixsock-stream", "unixpipe")
+"""schemes of endpoints that are files of a host"""
 _CONNECT_TIMEOUT_S = 1.0
 
 
@@ -94,10 +95,10 @@ def _speaks_tls(match: re.Match[str]) -> bool:
 
 def is_beyond_loopback(endpoint: str) -> bool:
     """Whether other hosts or containers may reach an endpoint: it is on a network, and not only of this host. A host
-    name that cannot be found now counts as one of others, and so does an address that only Zenoh understands."""
+    name that cannot be found now, and an address of another form, count as those of others."""
     match = _ADDRESS.fullmatch(endpoint)
     if match is None:
-        return endpoint.partition("/")[0] not in _OF_THIS_HOST
+        return endpoint.partition("/")[0] not in _WITHIN_HOST
     try:
         found = socket.getaddrinfo(match[2].strip("[]"), int(match[3][:5]))
     except (OSError, UnicodeError):

@@ -40,6 +40,7 @@ class _File:
     bytes: int
     began_s: float
     newest_s: float
+    is_removed: bool = False
 
 
 class Spool:
@@ -86,6 +87,8 @@ class Spool:
     def close(self) -> None:
         """Remove all files."""
         with self._lock:
+            for file in self._files:
+                file.is_removed = True
             self._files.clear()
             self._bytes = 0
         shutil.rmtree(self._folder, ignore_errors=True)
@@ -113,6 +116,8 @@ class Spool:
     def grow(self, file: _File, sequence: int, size: int) -> bool:
         """A message was written. Returns whether another one may follow in the same file. Removes what is too much."""
         with self._lock:
+            if file.is_removed:  # by another stream since this one wrote to it: the message is gone as well
+                return False
             file.last, file.newest_s = sequence, self._now_s()
             file.bytes += size
             self._bytes += size
@@ -129,7 +134,7 @@ class Spool:
     def is_kept(self, file: _File) -> bool:
         """Whether a file has not been removed, for its size or its age."""
         with self._lock:
-            return file in self._files
+            return not file.is_removed
 
     def damaged(self, file: _File) -> None:
         """A file does not hold what was written."""
@@ -142,6 +147,7 @@ class Spool:
 
     def _remove(self, file: _File) -> None:
         self._bytes -= file.bytes
+        file.is_removed = True
         file.path.unlink(missing_ok=True)
 
     def _fail(self, error: OSError) -> None:
@@ -163,6 +169,8 @@ class SpooledStream:
 
     def add(self, sequence: int, payload: bytes) -> None:
         """Keep a message; their numbers grow."""
+        if self._opened is not None and not self._spool.is_kept(self._files[-1]):
+            self._close()
         if self._opened is None:
             begun = self._spool.begin(sequence)
             if begun is None:

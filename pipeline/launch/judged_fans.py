@@ -17,8 +17,9 @@ from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode
 from schemas.fan_numbers import fans_in_words
-from schemas.messages import FanState, InvalidReason, Score
+from schemas.messages import Alarm, FanState, InvalidReason, Score
 from schemas.topics import tray_key
+from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST, REASONS
 
 RETURNING = "within its limits (the alarm clears once it stays there, for most faults near the speeds of the alarm)"
@@ -35,6 +36,10 @@ class Unjudged:
     tray: str
     fans: tuple[int, ...]
     why: str
+
+    def concerns(self, tray: str, fan: int) -> bool:
+        """Whether a fan is one of them."""
+        return tray == self.tray and (not self.fans or fan in self.fans)
 
     def line(self) -> str:
         """For people."""
@@ -157,6 +162,18 @@ class JudgedFans:
                     why = REASONS.get(InvalidReason(reason), InvalidReason(reason).words)
                     found.append(Unjudged(tray.name, () if len(of_reason) == tray.fans else of_reason, why))
         return found
+
+
+def as_judged(alarms: Sequence[CurrentAlarm], unjudged: Sequence[Unjudged]) -> list[CurrentAlarm]:
+    """The alarms; those that are active and whose fan is not judged now are not confirmed by data. Their scorer says so
+    only when samples without a speed arrive, which may take minutes while a link could be cut."""
+
+    def is_stale(alarm: Alarm) -> bool:
+        return alarm.active and any(each.concerns(alarm.header.tray, alarm.fan) for each in unjudged)
+
+    return [
+        replace(each, newest=replace(each.newest, stale=True)) if is_stale(each.newest) else each for each in alarms
+    ]
 
 
 class JudgedChanges:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from schemas.fan_numbers import fans_in_words
 from schemas.messages import Array, Grid
 from schemas.reference_conditions import ConditionRatios, ReferenceConditions
 from schemas.units import NS_PER_S
-from scoring.column_state import ColumnState
+from scoring.column_state import NEVER_NS, ColumnState
 
 
 @dataclass(frozen=True)
@@ -27,16 +30,43 @@ class Ratios:
         return self.torque * self.density
 
 
+SHOWN_NS = 5 * NS_PER_S
+"""for so long a problem names a fan that conditions took out of the twin's range"""
+
+
 class ConditionTracker(ColumnState):
     """Follows what is measured; a value that is missing is held for a while. Does not depend on the cuts of blocks."""
 
     def __init__(self, reference: ReferenceConditions, fans: int) -> None:
         self.reference = reference
         self._ratios = ConditionRatios(reference, fans)
+        self._beyond_t_ns = np.full(fans, NEVER_NS)
+        """of the last sample that the conditions alone took out of the twin's range, and the ratio of torque there"""
+        self._beyond_torque = np.ones(fans)
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
-        return self._ratios.columns()
+        beyond = {"beyond_t_ns": self._beyond_t_ns, "beyond_torque": self._beyond_torque}
+        return {**self._ratios.columns(), **beyond}
+
+    def note_beyond(self, t_ns: Array, torque: Array, beyond: Array) -> None:
+        """Where the conditions alone take commands out of the twin's range: (n, fans) of bool; torque: the ratio."""
+        fans = np.flatnonzero(np.any(beyond, axis=0))
+        last = len(beyond) - 1 - np.argmax(beyond[::-1, fans], axis=0)
+        self._beyond_t_ns[fans] = t_ns[last]
+        self._beyond_torque[fans] = torque[last, fans]
+
+    def problem(self, t_ns: int) -> str:
+        """Which fans the conditions have just taken out of the twin's range; empty for none."""
+        fans = np.flatnonzero(self._beyond_t_ns > t_ns - SHOWN_NS)
+        if not len(fans):
+            return ""
+        subject = f"fan {fans[0]} is" if len(fans) == 1 else f"fans {fans_in_words(fans.tolist())} are"
+        voltage_v, cause = self.reference.supply_voltage_v, "the temperature of the air takes"
+        if voltage_v is not None:
+            found_v = voltage_v * self._beyond_torque[fans].mean()
+            cause = f"a supply of {found_v:.2g} V, where the twin's reference is {voltage_v:.3g} V, takes"
+        return f"{subject} not scored: {cause} the command out of the twin's range"
 
     def update(self, grid: Grid) -> Ratios:
         """Those of the next block."""

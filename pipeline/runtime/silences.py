@@ -8,6 +8,7 @@ its producer, and come when the link is there again.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 from schemas.messages import Health, StageStatus
 from schemas.streams import StreamId, output_streams
@@ -20,7 +21,9 @@ class Silences:
         """trays: that of each key of the main input."""
         self._trays = trays
         self._reporting: set[str] = set()
-        """trays whose producer publishes health, and has not ended in order"""
+        """trays whose producer publishes health, and has not ended in order with all that it sent"""
+        self._ended: dict[str, Callable[[], bool]] = {}
+        """of trays whose producer has ended in order: whether all that it sent has arrived"""
         self._shown: set[str] = set()
 
     def add_health(self, health: Health, has_all_of: Callable[[StreamId, int], bool]) -> None:
@@ -29,16 +32,21 @@ class Silences:
             tray = self._trays.get(stream[0])
             if tray is None:
                 continue
-            if has_all_of(stream, published):
+            has_all = partial(has_all_of, stream, published)
+            if has_all():
                 self._shown.add(tray)
+            self._reporting.add(tray)
             if health.status == StageStatus.STOPPED:
-                self._reporting.discard(tray)
+                self._ended[tray] = has_all
             else:
-                self._reporting.add(tray)
+                self._ended.pop(tray, None)
 
     def take(self, tray: str) -> bool:
         """Whether its producer has shown, since this was last asked, that there is no more; True also for a producer
         that never shows it."""
+        if tray in self._ended and self._ended[tray]():
+            self._reporting.discard(tray)
+            del self._ended[tray]
         if tray not in self._reporting:
             return True
         is_shown = tray in self._shown

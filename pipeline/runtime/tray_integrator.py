@@ -189,10 +189,11 @@ class TrayIntegrator:
                 run.forget_readings(np.any(inputs.unknown[row + 1 : end], axis=0))
             row = end
         acting = grid.command if ratios is None else grid.command * ratios.command
-        in_range = (acting >= self._lowest_command) & (acting <= self._highest_command)
-        in_range &= acting >= self._off_below
+        in_range = self._is_in_range(acting)
         beyond = np.isfinite(acting) & ~in_range  # where it is unknown, the free run uses the last known command
-        if ratios is not None:
+        if ratios is not None and self._conditions is not None:
+            of_conditions = beyond & ratios.known & self._is_in_range(grid.command)
+            self._conditions.note_beyond(grid.t_ns, ratios.torque, of_conditions)
             beyond |= ~ratios.known
         since_t_ns = np.maximum(started_t_ns, self._run.last_out_of_range(grid.t_ns, beyond))
         warm = running & (grid.t_ns[:, np.newaxis] - since_t_ns >= self._warm_up_ns)
@@ -214,11 +215,21 @@ class TrayIntegrator:
         invalid_reason = np.where(judged, invalid_reason, grid.invalid_reason).astype(np.uint8)
         return self._prediction(grid, predicted, reading_range, invalid_reason, ratios)
 
+    def problem(self) -> str:
+        """What takes fans out of the twin's range now, other than their commands; empty for nothing."""
+        if self._conditions is None or self._last_t_ns is None:
+            return ""
+        return self._conditions.problem(self._last_t_ns)
+
     def without_twin(self, grid: Grid) -> Prediction:
         """Of a block for which the twin is not valid."""
         invalid_reason = np.where(grid.valid, NO_TWIN, grid.invalid_reason).astype(np.uint8)
         nothing = np.full(grid.command.shape, np.nan)
         return self._prediction(grid, nothing, nothing, invalid_reason, self._ratios(grid))
+
+    def _is_in_range(self, command: Array) -> Array:
+        in_range = (command >= self._lowest_command) & (command <= self._highest_command)
+        return in_range & (command >= self._off_below)
 
     def _ratios(self, grid: Grid) -> Ratios | None:
         if self._conditions is None:

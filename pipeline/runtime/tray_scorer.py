@@ -229,12 +229,14 @@ class TrayScorer:
 
     def _feed_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
         command = item.averaged_command if len(item.averaged_command) else item.command
+        is_known = arrived(item.invalid_reason)
+        is_converted = self.twin.knows_supply or len(item.air_density_ratio) > 0
         expected = np.where(np.isfinite(item.measured_speed_rad_s), scored.balance_expected, np.nan)
         density = item.air_density_ratio if len(item.air_density_ratio) else 1.0
         self._diagnoser.take(
             item.t_ns,
             item.period_ns,
-            np.where(arrived(item.invalid_reason), command, np.nan),
+            np.where(is_known, command, np.nan),
             item.measured_speed_rad_s * density,  # at the twin's reference, as the command and the balance are
             scored.balance_baseline * item.torque_balance_sigma_command,
             scored.balance_baseline_s,
@@ -243,6 +245,7 @@ class TrayScorer:
             item.reading_missing,
             item.supply_voltage_v,
             item.current_a,
+            np.where(is_known, item.command, np.nan) if is_converted else np.zeros(0),
         )
 
     def _feed_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:

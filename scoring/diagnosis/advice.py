@@ -35,16 +35,17 @@ class Advice:
 
     def added_to(self, unclear: str, window: Window, healthy: HealthyBalance) -> str:
         """Why the cause is unclear, with what would tell."""
-        speed, command = np.abs(window.speed_rad_s[window.onset :]), window.command[window.onset :]
-        given = command[np.isfinite(command)]
+        speed, acting = np.abs(window.speed_rad_s[window.onset :]), window.command[window.onset :]
+        command = window.as_given.command[window.onset :]
+        acting, given = acting[np.isfinite(acting)], command[np.isfinite(command)]
         if len(speed) * window.period_s < SOON_S:
             return f"{unclear}: more is known in a few seconds"
-        if not np.isfinite(speed).any() or not len(given):
+        if not np.isfinite(speed).any() or not len(given) or not len(acting):
             return unclear
-        now = float(np.median(given))
         low, high = (float(np.nanquantile(speed, q)) for q in QUANTILES)
         if high <= healthy.lowest_speed_rad_s:
-            if abs(now) > abs(_needed(healthy, window, MIN_SPEEDS * healthy.lowest_speed_rad_s)):
+            now = float(np.median(given))
+            if abs(np.median(acting)) > abs(_needed(healthy, window, MIN_SPEEDS * healthy.lowest_speed_rad_s)):
                 return f"{unclear}: at {self._of(now)} it should turn: see whether it is free to turn and has power"
             target = max(_needed(healthy, window, 2.0 * MIN_SPEEDS * healthy.lowest_speed_rad_s), self.lowest_command)
             return f"{unclear}: it hardly turns: move the command to {self._of(min(target, self.highest_command))}"

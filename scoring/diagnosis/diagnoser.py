@@ -48,6 +48,8 @@ class _Block:
     supply_voltage_v: Array
     """(n, fans), as the next; empty where it is not measured"""
     current_a: Array
+    given_command: Array
+    """(n, fans); empty where `command` is as it was given"""
 
 
 class Diagnoser:
@@ -96,6 +98,7 @@ class Diagnoser:
         reading_missing: Array = _NOT_KNOWN,
         supply_voltage_v: Array = _NOT_MEASURED,
         current_a: Array = _NOT_MEASURED,
+        given_command: Array = _NOT_MEASURED,
     ) -> None:
         """Store a block; t_ns (n,), the others (n, fans).
 
@@ -103,7 +106,8 @@ class Diagnoser:
         healthy running from which the offset is known. expected_command: the expected healthy balance at
         this speed, apart from the offset; NaN where the speed is unknown. expected_rad_s: what a healthy fan would
         read. reading_missing: where the newest raw sample had no reading; empty where the line does not tell.
-        supply_voltage_v, current_a: empty where it is not measured.
+        supply_voltage_v, current_a: empty where it is not measured. given_command: as the fans were given it; empty
+        where `command` is not converted to reference conditions.
         """
         if period_ns != self._period_ns:
             self._blocks.clear()
@@ -123,6 +127,7 @@ class Diagnoser:
                 reading_missing,
                 supply_voltage_v,
                 current_a,
+                given_command,
             )
         )
         oldest_t_ns = int(t_ns[0]) - min(round(WINDOW_S * NS_PER_S), MAX_SAMPLES * period_ns)
@@ -233,10 +238,10 @@ class Diagnoser:
         if any(len(block.reading_missing) for block in blocks):
             lacks = np.zeros(index[-1] + 1, np.bool_)
             lacks[index] = np.concatenate([_lacks(block)[:, fan] for block in blocks])[rows]
-        measured: dict[str, Array | None] = {"supply_voltage_v": None, "current_a": None}
-        for name in measured:
+        others: dict[str, Array | None] = {"supply_voltage_v": None, "current_a": None, "given_command": None}
+        for name in others:
             if any(len(getattr(block, name)) for block in blocks):
-                of_fan = measured[name] = np.full(index[-1] + 1, np.nan)
+                of_fan = others[name] = np.full(index[-1] + 1, np.nan)
                 of_fan[index] = np.concatenate([_known_or_nan(block, name)[:, fan] for block in blocks])[rows]
         healthy, period_s = self._healthy[fan], self._period_ns / NS_PER_S
         std_of_one_second = healthy.sigma_command * summed_deviation(healthy.autocorrelation_time_s, period_s)
@@ -250,7 +255,7 @@ class Diagnoser:
             expected_command=expected,
             expected_rad_s=reading,
             reading_missing=lacks,
-            **measured,
+            **others,
             fan_offset=float(_column(blocks, "offset_command", fan, rows)[-1]),
             fan_offset_std_error=std_of_one_second / math.sqrt(offset_s),
         )

@@ -24,7 +24,7 @@ therefore has a column, scaled by its standard deviation.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -80,7 +80,8 @@ class Window:
     from the offset, from calibration; NaN where the speed is unknown. All in units of the command. expected_rad_s: (n,)
     what a healthy fan would read; NaN where it is not known. reading_missing: (n,) where the line gave no reading,
     though its speed may be known from readings around it; None: where it is not known. supply_voltage_v, current_a:
-    (n,), NaN where it is not known; None: it is not measured.
+    (n,), NaN where it is not known; None: it is not measured. given_command: (n,) as the fan was given it, where
+    `command` is that at the twin's reference conditions; None: they do not differ.
     """
 
     period_s: float
@@ -94,6 +95,12 @@ class Window:
     reading_missing: NDArray[np.bool_] | None = None
     supply_voltage_v: Array | None = None
     current_a: Array | None = None
+    given_command: Array | None = None
+
+    @property
+    def as_given(self) -> Window:
+        """With the command as the fan was given it: whether it should turn does not depend on what it is supplied."""
+        return self if self.given_command is None else replace(self, command=self.given_command)
 
 
 class RegressionWindow:

@@ -69,6 +69,7 @@ def standstill_causes(
     by_course: False only to diagnose as for recordings made before the course of the readings was compared, and not
     only the duration of their fall.
     """
+    window = window.as_given
     commands = window.command[np.isfinite(window.command)]
     command = float(commands[-1]) if len(commands) else math.nan
     given, speed = _of_command(command), np.abs(window.speed_rad_s)
@@ -118,6 +119,7 @@ class ComingToRest:
 
 def coming_to_rest(window: Window, healthy: Standstill, balance: HealthyBalance, tacho: Tacho) -> ComingToRest | None:
     """Of a fan that is driven and whose reading has fallen; None where it has not, or nothing is known of coasts."""
+    window = window.as_given
     command, speed = float(window.command[-1]), np.abs(window.speed_rad_s)
     turning = np.flatnonzero(healthy.turns(speed))
     if healthy.coast_time_constant_s is None or not command >= healthy.turning_command or not np.isfinite(speed[-1]):

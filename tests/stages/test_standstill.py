@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
 from schemas.blocks import cut
 from schemas.messages import Alarm, FanState, Grid, InvalidReason, Prediction, Score, Statistic, Transition
+from schemas.reference_conditions import ReferenceConditions
 from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS
 from scoring.alarms.current_alarms import current_alarms
@@ -70,6 +71,8 @@ def seen(
     alarm_sigmas: float = 1e6,
     missing_share: float = 1.0,
     decision_rules: DecisionRules = CURRENT_RULES,
+    supply_v: Floats | None = None,
+    conditions: ReferenceConditions | None = None,
 ) -> Seen:
     """With alarm_sigmas and missing_share as they are, only the detectors of standstill can raise an alarm."""
     config = ScorerConfig(alarm_sigmas=alarm_sigmas, not_judged_s=5.0)
@@ -77,8 +80,10 @@ def seen(
     tacho = TachoSettings(stuck_s=1e9, missing_share=missing_share)
     limits = limits.model_copy(update={"detectors": {**limits.detectors, "sensor": tacho}})
     twin = HealthyTwin("t", limits, [balance_of_a_fan()], "%", INSTANTANEOUS, healthy)
+    twin = replace(twin, knows_supply=conditions is not None)
+    predicting = physical_twin(standstill=healthy)
     integrator, scorer = (
-        core_of(physical_twin(standstill=healthy), warm_up_s=1.0),
+        core_of(replace(predicting, card=replace(predicting.card, conditions=conditions)), warm_up_s=1.0),
         ScorerCore(1, "rad/s", config, twin, decision_rules=decision_rules),
     )
     messages, problems = [], set()
@@ -91,6 +96,7 @@ def seen(
         speed_rad_s=speed[:, np.newaxis],
         valid=valid,
         invalid_reason=np.where(valid, InvalidReason.NONE, InvalidReason.NO_SPEED).astype(np.uint8),
+        supply_voltage_v=np.zeros(0) if supply_v is None else supply_v[:, np.newaxis],
     )
     for first in range(0, len(command), block):
         for prediction in integrator.step(cut(grid, first, min(first + block, len(command)))):
@@ -156,6 +162,21 @@ def test_a_blocked_fan_at_its_minimum_is_an_alarm_that_a_stop_does_not_end(block
     other = seen(command, speed, block=7)
     np.testing.assert_array_equal(found.scores, other.scores)
     assert [vars(alarm) for alarm in found.alarms] == [vars(alarm) for alarm in other.alarms]
+
+
+@pytest.mark.parametrize("conditions", [None, ReferenceConditions(supply_voltage_v=12.0)])
+def test_a_fan_whose_supply_is_gone_has_no_power_whether_or_not_its_twin_knows_the_voltage(
+    conditions: ReferenceConditions | None,
+) -> None:
+    command = commands((60.0, 40.0))
+    since_s = PERIOD_S * np.arange(len(command)) - 20.0
+    speed = speed_of(command)
+    coasting = np.where(since_s > 6.0, 0.0, speed[round(20.0 / PERIOD_S)] * np.exp(-np.maximum(since_s, 0.0)))
+    supply_v = np.where(since_s < 0.0, 12.0, 0.1)
+    found = seen(command, np.where(since_s < 0.0, speed, coasting), supply_v=supply_v, conditions=conditions)
+    (raised, *_) = found.alarms
+    assert raised.causes[0].cause == "no_power" and raised.causes[0].probability > 0.9
+    assert "does not turn although commanded to 60; its supply has 0.1 V and had 12 V" in raised.message
 
 
 def test_a_fan_without_power_coasts_and_that_tells_it_from_a_blocked_one() -> None:

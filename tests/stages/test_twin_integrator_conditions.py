@@ -170,3 +170,21 @@ def test_the_card_in_the_file_says_what_the_twin_needs(tmp_path: Path) -> None:
     assert card.conditions == REFERENCE
     assert card.conditions.needed == ("supply_voltage_v", "temperature_c")
     assert TwinFile.load(write_twin(tmp_path / "t.onnx"), FANS).card.conditions is None
+
+
+def test_a_supply_that_takes_commands_out_of_the_twins_range_is_said(twin: TwinFile) -> None:
+    supply_v = np.where(np.arange(20 * RATE_HZ) < 10 * RATE_HZ, 12.0, 60.0)
+    grid = grid_of(20.0, supply_v, 20.0)
+    before, after = cut(grid, 0, 10 * RATE_HZ), cut(grid, 10 * RATE_HZ, len(grid.t_ns))
+    core = core_of(twin)
+    predicted(core, [before])
+    assert core.problem() == ""
+    assert (predicted(core, [after]).invalid_reason == int(InvalidReason.OUT_OF_RANGE)).any()
+    line = "fans 0, 1 are not scored: a supply of 60 V, where the twin's reference is 12 V, takes the command out of"
+    assert core.problem().startswith(line)
+    later = replace(before, t_ns=grid.t_ns[-1] + STEP_NS + before.t_ns - before.t_ns[0])
+    predicted(core, [later])
+    assert core.problem() == "", "the supply is back"
+    other = core_of(twin)
+    predicted(other, [replace(grid, command=grid.command * 5.0, supply_voltage_v=np.full_like(grid.command, 12.0))])
+    assert other.problem() == "", "the commands themselves are out of range"

@@ -25,7 +25,7 @@ from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.config.roles import OPERATOR
 from pipeline.errors import UsageError, UserError
-from pipeline.launch.judged_fans import JudgedChanges, JudgedFans, Unjudged
+from pipeline.launch.judged_fans import JudgedChanges, JudgedFans, Unjudged, as_judged
 from pipeline.launch.processes import process_list
 from pipeline.launch.site_state import site_states
 from pipeline.launch.site_watcher import SiteWatcher
@@ -138,6 +138,7 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
     found = [each for each in current_alarms(sorted(known, key=newest_t_ns)) if show_all or is_listed(each.newest)]
     console = Console(soft_wrap=True, highlight=False)
     unjudged = _wait_until_judged(watcher, judged, config, stop)
+    found = as_judged(found, unjudged)
     slow = _slow_changes(watcher)
     if json_output:
         shown = {"alarms": [each.as_json() for each in found], "not_judged": [each.as_json() for each in unjudged]}

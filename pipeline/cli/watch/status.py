@@ -24,7 +24,7 @@ from pipeline.config.registry import STAGES
 from pipeline.config.roles import READERS, role_names
 from pipeline.config.shards import chosen_shard
 from pipeline.errors import UsageError, UserError
-from pipeline.launch.judged_fans import JudgedFans, Unjudged
+from pipeline.launch.judged_fans import JudgedFans, Unjudged, as_judged
 from pipeline.launch.processes import StageProcess, process_list
 from pipeline.launch.refused_input import refused_lines
 from pipeline.launch.site_state import AT_WORK, StageState, Word, site_states
@@ -186,14 +186,15 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans, of_bus
             problems.append(Text(f"{state.label}: {state.view.health.problem}", style="red"))
     notes = [Text(line) for line in note_lines(state.view.health for state in states if state.view)]
     problems += [Text(line, style="yellow") for line in (*loss_lines(states), *refused_lines(watcher.refused()))]
-    now = judged.words_now()
-    alarms = [_alarm_line(each, now) for each in watcher.current_alarms() if is_listed(each.newest)]
+    now, lacking = judged.words_now(), unjudged(states, judged)
+    current = as_judged(watcher.current_alarms(), lacking)
+    alarms = [_alarm_line(each, now) for each in current if is_listed(each.newest)]
     if not _has_scorer(states):
         not_judged = [Text("no fan is judged: the configuration has no scorer", style="yellow")]
     elif not any(state.view and state.view.alive and state.view.health.stage == "scorer" for state in states):
         not_judged = [Text("alarms unknown: no scorer is alive", style="red")]
     else:
-        not_judged = [Text(each.line(), style="red") for each in unjudged(states, judged)]
+        not_judged = [Text(each.line(), style="red") for each in lacking]
     at_rest = [Text(each.line(), style="dim") for each in judged.at_rest()]
     no_alarms = [] if alarms or not_judged else [Text("no alarms", style="green")]
     return Group(
@@ -256,10 +257,11 @@ def _alarm_line(current: CurrentAlarm, words_now: Mapping[tuple[str, int], str])
 def as_json(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> dict[str, object]:
     """The same for machines (`--json`)."""
     states, lost = site_states(watcher, process_list(config)), watcher.losses()
+    lacking = unjudged(states, judged)
     return {
         "stages": [_state_as_json(state, lost.get(state.label, 0)) for state in states],
-        "alarms": [current.as_json() for current in watcher.current_alarms()],
-        "not_judged": [each.as_json() for each in unjudged(states, judged)],
+        "alarms": [current.as_json() for current in as_judged(watcher.current_alarms(), lacking)],
+        "not_judged": [each.as_json() for each in lacking],
         "at_rest": [each.as_json() for each in judged.at_rest()],
     }
 

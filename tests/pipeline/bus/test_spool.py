@@ -73,6 +73,33 @@ def test_the_oldest_files_of_all_publishers_are_removed_beyond_the_size(tmp_path
     assert spool.problem() == ""
 
 
+def test_a_file_that_is_removed_while_its_publisher_still_writes_to_it_counts_no_longer(tmp_path):
+    now = Time()
+    spool = Spool(tmp_path, LARGE, 160.0, now)
+    rare, frequent = spool.stream(), spool.stream()
+    rare.add(0, payload(0))
+    now.now_s += 170.0
+    fill(frequent, 0, 5)
+    assert numbers(rare.read(0, 9)) == [], "too old"
+    rare.add(1, payload(1))
+    assert numbers(rare.read(0, 9)) == [1]
+
+
+def test_the_size_of_a_file_that_was_removed_while_it_was_written_is_not_kept(tmp_path):
+    now = Time()
+    spool = Spool(tmp_path, 10_000_000, 160.0, now)
+    begun = spool.begin(0)
+    assert begun
+    file, opened = begun
+    spool.grow(file, 0, 5_000_000)
+    now.now_s += 170.0
+    spool.stream().add(0, payload(0))
+    assert not spool.is_kept(file)
+    assert not spool.grow(file, 1, 5_000_000), "the message is gone with its file"
+    opened.close()
+    assert spool.note() == "0 MB of messages are kept on disk"
+
+
 def test_what_is_too_old_is_removed(tmp_path):
     now = Time()
     spool = Spool(tmp_path, LARGE, 160.0, now)

@@ -214,6 +214,16 @@ def test_row_01_no_alarms_is_not_said_while_a_fan_is_not_judged(site):
     assert document["not_judged"][1] == {"tray": TRAY, "fans": [0], "why": "no speed"}
 
 
+def test_an_active_alarm_of_a_fan_that_is_not_judged_now_is_listed_as_not_confirmed_by_data(site):
+    site.raise_alarm(1)
+    assert "not confirmed by data" not in site.ask()
+    site.core.not_judged = (InvalidReason.NONE, InvalidReason.STALE, InvalidReason.NONE)
+    done = fantwin("alarms", *site.words)
+    assert "  active, not confirmed by data, unacknowledged  since " in done.stdout and done.exit_code == 1
+    (alarm,) = json.loads(fantwin("alarms", "--json", *site.words).stdout)["alarms"]
+    assert alarm["stale"]
+
+
 def test_an_alarm_of_a_newer_scorer_is_listed_with_its_number():
     newest = replace(alarms_of_one_fan()[0], severity=Severity(7), transition=Transition(88), active=True)
     assert "UNKNOWN (7)" in alarm_lines(CurrentAlarm(newest, newest.message, (), "")).plain

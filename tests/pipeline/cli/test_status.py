@@ -245,6 +245,18 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
     assert (reported[3]["retained"], reported[4]["presented"]) == (False, False)
 
 
+def test_an_active_alarm_of_a_fan_that_is_not_judged_now_is_not_confirmed_by_data(site):
+    site.alarm.put(encode(replace(ALARM, header=Header("scorer-all-1", 0, TRAY))))
+    watcher = SiteWatcher(site.outside, SITE)
+    view(site, watcher, HEALTH)
+    watcher.ask_for_past_alarms()
+    lacking = site.judged(*[InvalidReason.NONE] * 2, InvalidReason.NO_SPEED)
+    assert "fan 2: active, not confirmed by data" in " ".join(shown(watcher, lacking).split())
+    assert [alarm["stale"] for alarm in document(watcher, lacking)["alarms"]] == [True]
+    assert "not confirmed" not in shown(watcher, site.judged()), "this fan is judged"
+    assert [alarm["stale"] for alarm in document(watcher, site.judged())["alarms"]] == [False]
+
+
 def test_problems_of_stages_are_shown(site):
     watcher = SiteWatcher(site.outside, SITE)
     view(site, watcher, replace(HEALTH, problem="the line is silent"))

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from pipeline.config.models import TrayConfig
-from pipeline.launch.judged_fans import JUDGED_WITHIN_S, RETURNING, JudgedChanges, JudgedFans, Unjudged
+from pipeline.launch.judged_fans import JUDGED_WITHIN_S, RETURNING, JudgedChanges, JudgedFans, Unjudged, as_judged
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import encode
-from schemas.messages import FanState, Header, InvalidReason, Output
+from schemas.messages import Alarm, FanState, Header, InvalidReason, Output, Severity
 from schemas.topics import tray_key
+from scoring.alarms.current_alarms import CurrentAlarm
 from tests.pipeline.launch.test_site_watcher import SCORER, STRANGER, StubBus, health
 from tests.support.score_data import one_sample
 
@@ -133,3 +134,23 @@ def test_changes_are_of_fans_and_reasons_and_not_of_figures():
     ]
     assert changes.lines([]) == ["b: every fan is judged now"]
     assert changes.lines([]) == []
+
+
+def test_active_alarms_of_fans_that_are_not_judged_are_not_confirmed_by_data():
+    def alarm(tray: str, fan: int, *, active: bool = True) -> CurrentAlarm:
+        newest = Alarm(
+            header=Header("", 0, tray),
+            fan=fan,
+            active=active,
+            severity=Severity.ALARM,
+            t_ns=1,
+            onset_t_ns=1,
+            residual_rad_s=0.0,
+            limit_rad_s=0.0,
+            message="too slow",
+        )
+        return CurrentAlarm(newest, newest.message, (), "")
+
+    alarms = [alarm("a", 0), alarm("a", 1), alarm("b", 2), alarm("b", 3, active=False), alarm("c", 0)]
+    found = as_judged(alarms, [Unjudged("a", (1,), "no speed"), Unjudged("b", (), "no score arrives")])
+    assert [each.newest.stale for each in found] == [False, True, True, False, False]

@@ -45,6 +45,24 @@ def test_row_16_a_silence_is_shown_once_by_each_health_that_says_that_all_has_ar
 def test_after_a_producer_that_has_stopped_in_order_nothing_more_is_waited_for():
     silences, arrived = Silences({KEY: "a"}), Arrived()
     silences.add_health(health(5), arrived.has_all_of)
+    arrived.number = 5
     silences.add_health(health(5, StageStatus.STOPPED), arrived.has_all_of)
     assert silences.take("a")
     assert silences.take("a")
+
+
+def test_what_a_producer_that_has_stopped_in_order_has_sent_is_still_waited_for():
+    silences, arrived = Silences({KEY: "a"}), Arrived()
+    silences.add_health(health(5, StageStatus.STOPPED), arrived.has_all_of)
+    assert not silences.take("a"), "its last messages are still being fetched"
+    arrived.number = 5
+    assert silences.take("a")
+    assert silences.take("a")
+
+
+def test_a_producer_that_begins_again_is_waited_for_again():
+    silences, arrived = Silences({KEY: "a"}), Arrived()
+    silences.add_health(health(5, StageStatus.STOPPED), arrived.has_all_of)
+    silences.add_health(health(7), arrived.has_all_of)
+    arrived.number = 5
+    assert not silences.take("a"), "the seventh is on the way"
