@@ -61,6 +61,7 @@ class Client:
 
         Raises:
             NoAcquisitionError: no acquisition of this tray is at work, or its source is not `push`.
+            ClientError: there is no such unit.
             ValueError: it was taken up before.
         """
         if name in self._trays:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fantwin_client.errors import (
+    ClientError,
     CommandError,
     FanCountError,
     NoAcquisitionError,
@@ -56,6 +57,8 @@ class Tray:
         self, bus: Bus, site: str, name: str, speed_unit: SpeedUnit, kept_samples: int, timeout_s: float
     ) -> None:
         """See `Client.tray`."""
+        if speed_unit not in RAD_S_PER_UNIT:
+            raise ClientError(f"speed_unit {speed_unit!r} is not known; known: {', '.join(RAD_S_PER_UNIT)}")
         self.name = name
         self._site = site
         self._rad_s_per_unit = RAD_S_PER_UNIT[speed_unit]

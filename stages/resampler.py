@@ -22,6 +22,7 @@ docs/explanation/time.md.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -175,7 +176,8 @@ class ResamplerCore(Core):
         if self._grid is None or self._timing is None:
             waiting = sum(len(item.host_receive_t_ns) for item in self._waiting)
             return [f"the rate of the line is being measured ({waiting} samples so far)"] if waiting else []
-        line = "" if self._line_hz is None else f" (the line sends {self._line_hz:.3g} samples a second)"
+        is_known = self._line_hz is not None and math.isfinite(self._line_hz)
+        line = f" (the line sends {self._line_hz:.3g} samples a second)" if is_known else ""
         counts = self._grid.counters()
         samples, in_gaps = counts.get("grid_samples", 0), counts.get("grid_samples_in_gaps", 0)
         share = 100 * min(in_gaps / samples, 1) if samples else 0.0

@@ -23,6 +23,20 @@ InsecureOption: TypeAlias = Annotated[
 ]
 
 
+def is_exposed(bus: BusConfig) -> bool:
+    """Whether others may reach this bus, and it has no certificates."""
+    return bus.security is None and any(map(is_beyond_loopback, bus.endpoints))
+
+
+def exposure_problem(bus: BusConfig) -> str:
+    """What an exposed bus means, and what to do, in one line."""
+    return f"{_what(bus)}: make certificates (`fantwin certs init`), or accept that with --insecure"
+
+
+def _what(bus: BusConfig) -> str:
+    return f"bus.endpoint = {bus.endpoint!r}: whoever reaches it can drive the fans, forge samples and silence alarms"
+
+
 @contextmanager
 def checked_exposure(bus: BusConfig, say: Callable[[str], None], *, insecure: bool) -> Iterator[None]:
     """Refuse, or say each minute while the block runs, that whoever reaches this bus may do everything.
@@ -30,12 +44,12 @@ def checked_exposure(bus: BusConfig, say: Callable[[str], None], *, insecure: bo
     Raises:
         UsageError: others may reach it, it has no certificates, and it is not to be insecure.
     """
-    if bus.security or not any(map(is_beyond_loopback, bus.endpoints)):
+    if not is_exposed(bus):
         yield
         return
-    what = f"bus.endpoint = {bus.endpoint!r}: whoever reaches it can drive the fans, forge samples and silence alarms"
     if not insecure:
-        raise UsageError(f"{what}: make certificates (`fantwin certs init`), or accept that with --insecure")
+        raise UsageError(exposure_problem(bus))
+    what = _what(bus)
     ended = threading.Event()
 
     def remind() -> None:

@@ -13,6 +13,7 @@ import pytest
 import fantwin_client
 from fantwin_client import (
     Client,
+    ClientError,
     CommandError,
     FanCountError,
     NoAcquisitionError,
@@ -48,6 +49,11 @@ def client(endpoint: str, raws: Raws) -> Iterator[Client]:
     client = fantwin_client.connect(endpoint, site=SITE)
     yield client
     client.close(timeout_s=0.5)
+
+
+def test_a_unit_that_is_not_known_is_one_line_that_names_those_that_are(client: Client) -> None:
+    with pytest.raises(ClientError, match="speed_unit 'RPM' is not known; known: .*rpm"):
+        client.tray(TRAY, speed_unit="RPM")  # pyright: ignore[reportArgumentType]
 
 
 def test_samples_arrive_with_their_times_numbers_and_units(endpoint: str, raws: Raws, tmp_path: Path) -> None:

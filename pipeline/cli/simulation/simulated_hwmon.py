@@ -20,8 +20,10 @@ RATE_HZ = 20.0
 
 
 def tachos_of(chip: str) -> tuple[Tacho, ...]:
-    """The tacho behind the driver of a chip; instantaneous where it is not known."""
+    """The tacho behind the driver of a chip; instantaneous where it is not known, with a note if the chip is not."""
     row = chip_of(chip)
+    if row is None:
+        typer.echo(f"note: the driver of chip {chip!r} is not known: readings are instantaneous", err=True)
     return (row.tacho,) if row and row.tacho else INSTANTANEOUS
 
 

@@ -22,6 +22,7 @@ from pipeline.bus.certificates import of_role
 from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
 from pipeline.bus.errors import BusError
 from pipeline.bus.session import credentials_of, join_bus
+from pipeline.cli.exposure import exposure_problem, is_exposed
 from pipeline.cli.options import JsonOption, SetOption
 from pipeline.cli.watch.line_check import check_line
 from pipeline.config.loading import load_config
@@ -138,7 +139,10 @@ def _check_run_folder(folder: Path) -> Iterator[tuple[bool, str]]:
 def _check_bus(settings: Config, running: list[Session]) -> Iterator[tuple[bool, str]]:
     """Whether processes can meet at the endpoint. Adds the sessions of the site that run there."""
     config, endpoint = settings.bus, settings.bus.endpoint
-    if problem := endpoint_problem(endpoint):
+    problem = endpoint_problem(endpoint)
+    if not problem and is_exposed(config):
+        yield False, exposure_problem(config)
+    if problem:
         yield False, problem
     elif not accepts_connections(endpoint):
         yield (

@@ -51,6 +51,13 @@ def test_an_installation_in_order_is_fine(capsys):
     assert any(line.startswith("eclipse-zenoh 1.") for line in found["good"])
 
 
+def test_a_bus_that_others_reach_without_certificates_is_a_problem(capsys, tmp_path, port):
+    settings = (f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", "bus.endpoint='tcp/0.0.0.0:17447'")
+    code, found = examine(capsys, DEMO / "demo.toml", *settings)
+    assert code == 1
+    assert [line for line in found["problems"] if "can drive the fans" in line and "--insecure" in line]
+
+
 def test_a_configuration_in_order_can_start(capsys, tmp_path, port):
     code, found = examine(capsys, DEMO / "demo.toml", f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
     assert (code, found["problems"]) == (0, [])
