@@ -50,6 +50,8 @@ if TYPE_CHECKING:
 
 _ROUTER_TIMEOUT_MS = 1000
 _ROUTER_RETRY_S = 0.2
+SAID_AFTER_S = 3.0
+"""a client that waits so long for its router says so"""
 MEETING_LIMIT_S = 10.0
 """by then a process that listens at the endpoint has answered, however busy the machine"""
 _MEETING_POLL_S = 0.01
@@ -236,11 +238,24 @@ class Bus:
 
 
 def join_bus(
-    config: Config, stop: threading.Event | None = None, *, listens: bool = True, roles: Sequence[str] = READERS
+    config: Config,
+    stop: threading.Event | None = None,
+    *,
+    listens: bool = True,
+    roles: Sequence[str] = READERS,
+    say: Callable[[str], None] = lambda _line: None,
 ) -> Bus:
-    """A session on the bus of a site, with the roles of the site where its bus has any. Raises BusError as Bus does."""
+    """A session on the bus of a site, with the roles of the site where its bus has any. say: is given a line if a
+    client has to wait for its router. Raises BusError as Bus does."""
     site = SiteRoles.of(config) if config.bus.security else None
-    return Bus(config.bus, stop, listens=listens, roles=roles, site=site)
+    line = f"waiting for a router at {config.bus.endpoint}: start `fantwin router`"
+    waiting = threading.Timer(SAID_AFTER_S, say, [line])
+    if config.bus.mode == "client":
+        waiting.start()
+    try:
+        return Bus(config.bus, stop, listens=listens, roles=roles, site=site)
+    finally:
+        waiting.cancel()
 
 
 def credentials_of(config: BusConfig, roles: Sequence[str]) -> Credentials | None:

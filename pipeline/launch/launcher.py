@@ -125,7 +125,7 @@ class Launcher:
         """
         self._refuse_unusable_twins()
         reads = {name: load_stage(name).reads_as_configured(self._config) for name in self._config.stages}
-        with join_bus(self._config, stop) as bus:
+        with join_bus(self._config, stop, say=self._say) as bus:
             self._refuse_second_launcher(bus, stop)
             if problem := bus.security_problem():
                 self._say(problem)

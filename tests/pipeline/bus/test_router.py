@@ -16,7 +16,8 @@ import pytest
 from pipeline.bus.errors import BusError
 from pipeline.bus.link import LEASE_MS
 from pipeline.bus.router import open_router
-from pipeline.bus.session import Bus, _zenoh_config
+from pipeline.bus.session import Bus, _zenoh_config, join_bus
+from pipeline.config.loading import load_config
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, tray_key
 from tests.support.running_chain import DEMO, RunningCommand, eventually, fantwin
@@ -58,6 +59,21 @@ def test_two_clients_hear_each_other_through_the_router(endpoint, started):
         assert exchange(other, one) == b"hello"
     assert router.end() == 0
     assert router.output() == {"listening": endpoint}
+
+
+def test_a_client_that_waits_for_its_router_says_so(endpoint, monkeypatch):
+    monkeypatch.setattr("pipeline.bus.session.SAID_AFTER_S", 0.0)
+    said: queue.Queue[str] = queue.Queue()
+    stop = threading.Event()
+
+    def say(line: str) -> None:
+        said.put(line)
+        stop.set()
+
+    config = load_config(DEMO / "demo.toml", ["bus.mode='client'", f"bus.endpoint='{endpoint}'"], stages=())
+    with pytest.raises(BusError, match="no router answers"):
+        join_bus(config, stop, say=say)
+    assert said.get_nowait() == f"waiting for a router at {endpoint}: start `fantwin router`"
 
 
 def test_clients_that_start_before_the_router_connect_once_it_runs(endpoint, started):

@@ -59,7 +59,7 @@ def test_a_wrong_configuration_is_one_line_before_anything_starts(tmp_path, endp
 def no_bus(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Where the launcher would connect to the bus, before it starts anything, ConnectionError is raised."""
 
-    def connect(*_: object) -> None:
+    def connect(*_: object, **__: object) -> None:
         raise ConnectionError
 
     monkeypatch.setattr("pipeline.launch.launcher.join_bus", connect)
@@ -402,7 +402,7 @@ class NoSessions:
 def test_it_says_which_files_a_run_recorded_also_one_that_failed(tmp_path, monkeypatch, files, recorded):
     for name in ("recording.mcap", "recording-2.mcap.active"):  # the latter was left by a killed recorder
         (tmp_path / name).touch()
-    monkeypatch.setattr("pipeline.launch.launcher.join_bus", lambda *_: nullcontext(LateBus("elsewhere", 0.0)))
+    monkeypatch.setattr("pipeline.launch.launcher.join_bus", lambda *_, **__: nullcontext(LateBus("elsewhere", 0.0)))
     monkeypatch.setattr("pipeline.launch.launcher.SiteWatcher", lambda *_: NoSessions())
     settings = [f"run_folder='{tmp_path}'", "launcher.stages=['recorder']"]
     launcher = Launcher(load_config(DEMO / "demo.toml", settings), (), lambda _line: None)
