@@ -95,10 +95,12 @@ def _speaks_tls(match: re.Match[str]) -> bool:
 
 def is_beyond_loopback(endpoint: str) -> bool:
     """Whether other hosts or containers may reach an endpoint: it is on a network, and not only of this host. A host
-    name that cannot be found now, and an address of another form, count as those of others."""
+    name that cannot be found now, and an address of another form, count as those of others. What is no endpoint, Zenoh
+    refuses."""
     match = _ADDRESS.fullmatch(endpoint)
     if match is None:
-        return endpoint.partition("/")[0] not in _WITHIN_HOST
+        scheme, slash, _ = endpoint.partition("/")
+        return bool(slash) and scheme not in _WITHIN_HOST
     try:
         found = socket.getaddrinfo(match[2].strip("[]"), int(match[3][:5]))
     except (OSError, UnicodeError):
