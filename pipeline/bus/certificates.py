@@ -14,7 +14,7 @@ from pathlib import Path
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509.oid import NameOID
 
 from pipeline.bus.errors import BusError
@@ -109,7 +109,7 @@ def checked_credentials(security: SecurityConfig, roles: Sequence[str]) -> Crede
         private = load_pem_private_key(_content(key), password=None)
     except (ValueError, TypeError) as error:
         raise BusError(f"{key}: no private key in PEM without a password: `fantwin certs issue {role}`") from error
-    if _public(private.public_key()) != _public(own.public_key()):
+    if private.public_key() != own.public_key():
         raise BusError(f"{key}: does not match {certificate}: `fantwin certs issue {role} --replace` makes both")
     try:
         own.verify_directly_issued_by(parent)
@@ -188,10 +188,6 @@ def _described(path: Path, certificate: x509.Certificate) -> Certificate:
 def _common_name(name: x509.Name) -> str:
     values = [str(each.value) for each in name.get_attributes_for_oid(NameOID.COMMON_NAME)]
     return values[0] if values else ""
-
-
-def _public(key: object) -> bytes:
-    return key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)  # type: ignore[attr-defined]
 
 
 def _left(time: timedelta) -> str:
