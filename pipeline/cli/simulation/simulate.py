@@ -54,7 +54,7 @@ _HWMON = "Fans of a computer instead"
 _RECORDING = "Write a recording instead"
 _FILE = "Play a measured file instead of simulating"
 _TACHO = "Tacho"
-_SURROUNDINGS = "Supply and air, of dc fans"
+_SURROUNDINGS = "Supply and air"
 _IMPERFECTIONS = "Imperfections of real trays"
 
 
@@ -166,6 +166,13 @@ def simulate(
             help="Relative standard deviation of the supply voltage, for example 0.05.", rich_help_panel=_SURROUNDINGS
         ),
     ] = 0.0,
+    supply_held: Annotated[
+        float,
+        typer.Option(
+            help="Share of it for which 4-pin fans make up: 1 if they control their speed, 0 if it follows the supply.",
+            rich_help_panel=_SURROUNDINGS,
+        ),
+    ] = 1.0,
     air_temperature: Annotated[
         float, typer.Option(help="Mean temperature of the air, °C.", rich_help_panel=_SURROUNDINGS)
     ] = 20.0,
@@ -270,6 +277,7 @@ def simulate(
             surroundings={
                 "measured": _measured(measure or []),
                 "supply_wander": supply_wander,
+                "supply_held": supply_held,
                 "temperature_c": air_temperature,
                 "temperature_swing_c": air_swing,
             },
