@@ -129,7 +129,8 @@ def check_supply(chain: Chain) -> None:
     """The voltage that the tray measures is in each message on the way to the score, and in the view."""
     for topic in ("raw", "grid", "prediction", "score"):
         entries = [entry for path in chain.recordings() for entry in read_recording(path, topics=[topic])]
-        volts = np.concatenate([np.reshape(entry.message.supply_voltage_v, (-1, FANS)) for entry in entries])
+        messages: list[Any] = [entry.message for entry in entries]
+        volts = np.concatenate([np.reshape(message.supply_voltage_v, (-1, FANS)) for message in messages])
         assert len(volts) > 1_000, topic
         assert np.nanmedian(volts, axis=0) == pytest.approx(12.0, abs=0.02), topic
         assert np.isfinite(volts).mean() > 0.5, f"{topic}: unknown only in the pause of acquisition"

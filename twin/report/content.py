@@ -84,8 +84,8 @@ class Summary:
 @dataclass(frozen=True, eq=False)
 class FanContent(FanSummary):
     """One fan with its samples. column: of the runs. Arrays (n,) are in rad/s or command units, over all pieces one
-    after the other; predicted_rad_s, error_rad_s: as of recording_sums.FreeRun. auxiliary: what else was measured, (n,) by
-    name, NaN where not."""
+    after the other; predicted_rad_s, error_rad_s: as of recording_sums.FreeRun. auxiliary: what else was measured,
+    (n,) by name, NaN where not."""
 
     column: int
     command: Array

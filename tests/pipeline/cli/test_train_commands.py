@@ -4,6 +4,7 @@ import builtins
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,13 +26,14 @@ def record(path: Path, run: Run, unit: str = "rad/s", tray: str = "tray1") -> Pa
     metadata = {"speed_unit": unit, f"tacho.{tray}": tachos_to_json(run.tacho)}
     with RecordingWriter(path, metadata, overwrite=True) as writer:
         t_ns = np.rint(run.t_s * 1e9).astype(np.int64)
+        auxiliary: dict[str, Any] = {name: of.astype(np.float32) for name, of in run.auxiliary.items()}
         raw = Raw(
             header=Header("test", 0, tray),
             fans=run.fans,
             host_receive_t_ns=t_ns,
             command=run.command,
             speed_rad_s=run.speed_rad_s,
-            **{name: of.astype(np.float32) for name, of in run.auxiliary.items()},
+            **auxiliary,
         )
         writer.add_message(tray_key("test", tray, "raw"), raw, int(t_ns[-1]))
     return path

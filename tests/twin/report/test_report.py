@@ -521,7 +521,7 @@ def test_what_is_measured_beside_command_and_speed_has_its_curve_and_what_is_not
     volts[1000:] = np.nan
     nothing = np.full_like(volts, np.nan)
     measured = replace(run, auxiliary={"supply_voltage_v": volts, "current_a": nothing})
-    for given, units in ((run, ()), (measured, ("(V)",))):
-        content = report_content(twin, [given], [DataCard("r", "", 1, run.samples)], RAD_S)
+    for one, units in ((run, ()), (measured, ("(V)",))):
+        content = report_content(twin, [one], [DataCard("r", "", 1, run.samples)], RAD_S)
         drawn = figures.over_time(content, content.fans[0], narrow=False)
         assert tuple(unit for unit in ("(V)", "(A)", "(°C)") if unit in drawn) == units
