@@ -1,4 +1,4 @@
-"""The firmware's parts without hardware: they agree with schemas/wire.py, and measure what they should."""
+"""The firmware's parts without hardware: they agree with schemas/wire, and measure what they should."""
 
 from __future__ import annotations
 

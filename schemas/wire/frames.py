@@ -1,0 +1,86 @@
+"""What a frame of the serial line carries, and why a piece of the stream is no frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import TypeAlias
+
+from schemas.auxiliary import AUXILIARY
+
+VERSION = 1
+MAX_FANS = 64
+UINT32 = 1 << 32
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One sample of a device.
+
+    Attributes:
+        clock_us, sequence: wrap at 2^32; None if a text device has none.
+        command: one value per fan, in the tray's command unit.
+        speed: one value per fan, in the tray's speed unit; NaN without a tacho reading.
+        supply_voltage_v, current_a, temperature_c: one value per fan, NaN if unknown; empty if not measured.
+    """
+
+    clock_us: int | None
+    sequence: int | None
+    command: tuple[float, ...]
+    speed: tuple[float, ...]
+    supply_voltage_v: tuple[float, ...] = ()
+    current_a: tuple[float, ...] = ()
+    temperature_c: tuple[float, ...] = ()
+
+    @property
+    def auxiliary(self) -> list[tuple[float, ...]]:
+        """The columns beside command and speed, in the order of `AUXILIARY`."""
+        return [getattr(self, column.name) for column in AUXILIARY]
+
+
+@dataclass(frozen=True, slots=True)
+class CommandFrame:
+    """Commands, one per fan, in the tray's command unit; NaN leaves a fan unchanged."""
+
+    command: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SetPointFrame:
+    """Speed set-points, one per fan, in the tray's speed unit, for a device with its own loop; NaN: unchanged."""
+
+    set_point: tuple[float, ...]
+
+
+class FaultKind(Enum):
+    """Why a piece of the stream is not a frame."""
+
+    RESYNC = "resync"  # the rest of a frame that began before listening started: harmless
+    GARBAGE = "garbage"  # does not look like a frame
+    TRUNCATED = "truncated"  # begins like a frame, but has the wrong length
+    OVERSIZED = "oversized"  # longer than any frame
+    WRONG_CRC = "wrong_crc"
+    WRONG_VERSION = "wrong_version"
+    WRONG_TYPE = "wrong_type"  # unknown, or not for this end of the line
+    WRONG_FAN_COUNT = "wrong_fan_count"
+    BAD_NUMBER = "bad_number"  # a field of a text line is not a number, or is out of range
+    BAD_COMMAND = "bad_command"  # a sample's command is NaN or infinite
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A piece of the stream that is not a frame, and why."""
+
+    kind: FaultKind
+    detail: str
+
+
+Frame: TypeAlias = Sample | CommandFrame | SetPointFrame
+
+
+class FrameError(Exception):
+    """A piece of the stream is not a frame, for the reason of `fault`."""
+
+    def __init__(self, kind: FaultKind, detail: str) -> None:
+        super().__init__(kind, detail)
+        self.fault = Fault(kind, detail)
