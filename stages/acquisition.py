@@ -237,6 +237,8 @@ class AcquisitionCore(Core):
         """The samples that are new and plausible; all others are counted."""
         if batch.byte_count:
             self._counts["bytes"] += batch.byte_count
+        for name, count in batch.device_counts.items():
+            self._counts[f"device_{name}"] += count
         self._quality.add_input(batch.received_t_ns)
         self._now_ns = max(self._now_ns, batch.received_t_ns)
         for item in batch.items:

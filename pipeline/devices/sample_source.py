@@ -9,8 +9,8 @@ pipeline/devices/source_kinds.py.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Protocol, TypeAlias
 
@@ -151,6 +151,8 @@ class ReadingBatch:
     """bytes received, where the source counts them"""
     tachos: tuple[Tacho, ...] = ()
     """what the device itself says that it measures, one for all fans or one for each; empty where it does not say"""
+    device_counts: Mapping[str, int] = field(default_factory=dict)
+    """what the device itself has counted since it said so last, such as damaged frames"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,14 +12,25 @@ import numpy as np
 from cobs import cobs
 
 from schemas.auxiliary import AUXILIARY
-from schemas.wire.frames import VERSION, CommandFrame, FaultKind, Frame, FrameError, Sample, SetPointFrame
+from schemas.wire.frames import (
+    DEVICE_COUNTERS,
+    VERSION,
+    CommandFrame,
+    DeviceCounters,
+    FaultKind,
+    Frame,
+    FrameError,
+    Sample,
+    SetPointFrame,
+)
 
 _HEAD = struct.Struct("<BB")  # version, type
 _CLOCK_SEQUENCE = struct.Struct("<II")
 _CRC = struct.Struct("<I")
-_SAMPLE, _COMMAND, _SET_POINT, _SAMPLE_WITH_COLUMNS = 1, 2, 3, 4
+_UPTIME_COUNT = struct.Struct("<IB")  # of device counters
+_SAMPLE, _COMMAND, _SET_POINT, _SAMPLE_WITH_COLUMNS, _DEVICE_COUNTERS = 1, 2, 3, 4, 5
 _SAMPLES = (_SAMPLE, _SAMPLE_WITH_COLUMNS)
-_TYPES = (_SAMPLE, _COMMAND, _SET_POINT, _SAMPLE_WITH_COLUMNS)
+_TYPES = (_SAMPLE, _COMMAND, _SET_POINT, _SAMPLE_WITH_COLUMNS, _DEVICE_COUNTERS)
 _SHORTEST = _HEAD.size + 1 + _CRC.size
 
 
@@ -37,6 +48,9 @@ def encode_binary(frame: Frame) -> bytes:
         if present:
             payload += bytes([sum(1 << bit for bit, column in enumerate(frame.auxiliary) if column)])
         payload += _float32_bytes([value for row in rows for value in row])
+    elif isinstance(frame, DeviceCounters):
+        payload = _HEAD.pack(VERSION, _DEVICE_COUNTERS) + _UPTIME_COUNT.pack(frame.uptime_s, len(frame.counts))
+        payload += struct.pack(f"<{len(frame.counts)}H", *frame.counts)
     else:
         is_command = isinstance(frame, CommandFrame)
         values = frame.command if is_command else frame.set_point
@@ -72,7 +86,10 @@ def _layout(payload: bytes) -> _Layout:
 
 
 def _fits_its_length(payload: bytes) -> bool:
-    """Whether the length of a payload of a known type fits its fan count and columns."""
+    """Whether the length of a payload of a known type fits its fan count and columns, or its number of counters."""
+    if payload[1] == _DEVICE_COUNTERS:
+        values_at = _HEAD.size + _UPTIME_COUNT.size
+        return len(payload) >= values_at and len(payload) == values_at + 2 * payload[values_at - 1]
     try:
         layout = _layout(payload)
     except IndexError:
@@ -99,14 +116,27 @@ def decode_binary(piece: bytes) -> Frame:
         if not known:
             raise FrameError(FaultKind.GARBAGE, f"{len(data)} bytes that are not a frame")
         if not _fits_its_length(payload):
-            raise FrameError(FaultKind.TRUNCATED, f"{len(data)} bytes do not fit the fan count of the frame")
+            raise FrameError(FaultKind.TRUNCATED, f"{len(data)} bytes do not fit the counts of the frame")
         raise FrameError(FaultKind.WRONG_CRC, f"CRC-32 {crc:08x} does not match the frame")
     if version != VERSION:
         raise FrameError(FaultKind.WRONG_VERSION, f"version {version}, this side has {VERSION}")
     if not known:
-        raise FrameError(FaultKind.WRONG_TYPE, f"unknown frame type {frame_type}")
+        raise FrameError(FaultKind.UNKNOWN_TYPE, f"unknown frame type {frame_type}")
     if not _fits_its_length(payload):
-        raise FrameError(FaultKind.TRUNCATED, f"{len(data)} bytes do not fit the fan count of the frame")
+        raise FrameError(FaultKind.TRUNCATED, f"{len(data)} bytes do not fit the counts of the frame")
+    return _frame(frame_type, payload)
+
+
+def _frame(frame_type: int, payload: bytes) -> Frame:
+    """The frame of a payload of a known type and the right length.
+
+    Raises:
+        FrameError: it has unknown columns.
+    """
+    if frame_type == _DEVICE_COUNTERS:
+        uptime_s, count = _UPTIME_COUNT.unpack_from(payload, _HEAD.size)
+        counts = struct.unpack_from(f"<{count}H", payload, _HEAD.size + _UPTIME_COUNT.size)
+        return DeviceCounters(uptime_s, counts[: len(DEVICE_COUNTERS)])
     layout = _layout(payload)
     values = struct.unpack_from(f"<{layout.per_fan * layout.fans}f", payload, layout.at)
     if frame_type == _COMMAND:

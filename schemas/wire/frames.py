@@ -10,7 +10,12 @@ from schemas.auxiliary import AUXILIARY
 
 VERSION = 1
 MAX_FANS = 64
-UINT32 = 1 << 32
+UINT16, UINT32 = 1 << 16, 1 << 32
+DEVICE_COUNTERS = (
+    *("frames", "bad_length", "bad_crc", "wrong_kind", "bad_value", "line_errors", "overruns", "unsent_samples"),
+    *("lost_edges", "glitches", "host_silences", "watchdog_resets"),
+)
+"""what a device counts, in the order of its frame; docs/reference/wire-protocol.md explains each"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +57,19 @@ class SetPointFrame:
     set_point: tuple[float, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class DeviceCounters:
+    """What a device has counted since it started.
+
+    Attributes:
+        uptime_s: whole seconds since then; larger in each frame, so that a smaller one shows a restart.
+        counts: of the first ones of `DEVICE_COUNTERS`; wrap at 2^16.
+    """
+
+    uptime_s: int
+    counts: tuple[int, ...]
+
+
 class FaultKind(Enum):
     """Why a piece of the stream is not a frame."""
 
@@ -61,7 +79,8 @@ class FaultKind(Enum):
     OVERSIZED = "oversized"  # longer than any frame
     WRONG_CRC = "wrong_crc"
     WRONG_VERSION = "wrong_version"
-    WRONG_TYPE = "wrong_type"  # unknown, or not for this end of the line
+    UNKNOWN_TYPE = "unknown_type"  # a whole frame of a later version of the protocol: harmless
+    WRONG_TYPE = "wrong_type"  # not for this end of the line, or with unknown columns
     WRONG_FAN_COUNT = "wrong_fan_count"
     BAD_NUMBER = "bad_number"  # a field of a text line is not a number, or is out of range
     BAD_COMMAND = "bad_command"  # a sample's command is NaN or infinite
@@ -75,7 +94,7 @@ class Fault:
     detail: str
 
 
-Frame: TypeAlias = Sample | CommandFrame | SetPointFrame
+Frame: TypeAlias = Sample | DeviceCounters | CommandFrame | SetPointFrame
 
 
 class FrameError(Exception):

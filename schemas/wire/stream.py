@@ -7,9 +7,12 @@ from typing import Literal, TypeAlias
 
 from schemas.wire.binary import decode_binary, encode_binary
 from schemas.wire.frames import (
+    DEVICE_COUNTERS,
     MAX_FANS,
+    UINT16,
     UINT32,
     CommandFrame,
+    DeviceCounters,
     Fault,
     FaultKind,
     Frame,
@@ -34,8 +37,10 @@ def encode(protocol: Protocol, frame: Frame) -> bytes:
 
     Raises:
         ValueError: no fans or more than 64, columns of different length, a clock or sequence outside 32 bits, or
-            a binary sample without one of them.
+            a binary sample without one of them; device counters outside 16 bits, too many of them, or in text.
     """
+    if isinstance(frame, DeviceCounters):
+        return _encode_counters(protocol, frame)
     fans = len(frame.set_point if isinstance(frame, SetPointFrame) else frame.command)
     if not 1 <= fans <= MAX_FANS:
         raise ValueError(f"{fans} fans; a frame carries 1 to {MAX_FANS}")
@@ -50,6 +55,16 @@ def encode(protocol: Protocol, frame: Frame) -> bytes:
     return encode_binary(frame) if protocol == "binary" else encode_text(frame)
 
 
+def _encode_counters(protocol: Protocol, frame: DeviceCounters) -> bytes:
+    if protocol != "binary":
+        raise ValueError("device counters have a binary form only")
+    if len(frame.counts) > len(DEVICE_COUNTERS) or not all(0 <= count < UINT16 for count in frame.counts):
+        raise ValueError(f"device counters are at most {len(DEVICE_COUNTERS)} numbers of 16 bits")
+    if not 0 <= frame.uptime_s < UINT32:
+        raise ValueError(f"uptime_s = {frame.uptime_s} does not fit 32 bits")
+    return encode_binary(frame)
+
+
 class Decoder:
     """Incremental parser for one end of a line: takes bytes as they arrive, gives frames and faults in order.
 
@@ -58,11 +73,12 @@ class Decoder:
     """
 
     def __init__(self, protocol: Protocol, fans: int, end: End = "host") -> None:
-        """Every frame must have `fans` fans. The end `host` accepts samples, `device` commands and set-points."""
+        """Every frame must have `fans` fans. The end `host` accepts samples and counters of the device, `device`
+        commands and set-points."""
         self._text = protocol == "text"
         self._delimiter = DELIMITERS[protocol]
         self._fans = fans
-        self._accepts = (Sample,) if end == "host" else (CommandFrame, SetPointFrame)
+        self._accepts = (Sample, DeviceCounters) if end == "host" else (CommandFrame, SetPointFrame)
         self.reset()
 
     def reset(self) -> None:
@@ -114,6 +130,8 @@ class Decoder:
         """The frame, if it is for this end and tray."""
         if not isinstance(frame, self._accepts):
             raise FrameError(FaultKind.WRONG_TYPE, f"{type(frame).__name__} is not for this end of the line")
+        if isinstance(frame, DeviceCounters):
+            return frame
         fans = len(frame.set_point if isinstance(frame, SetPointFrame) else frame.command)
         if fans != self._fans:
             raise FrameError(FaultKind.WRONG_FAN_COUNT, f"frame of {fans} fans, this tray has {self._fans}")

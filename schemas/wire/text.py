@@ -29,7 +29,7 @@ def _text_group(values: Sequence[float]) -> list[str]:
     return fields[:1] if fields.count(fields[0]) == len(fields) else fields
 
 
-def encode_text(frame: Frame) -> bytes:
+def encode_text(frame: Sample | CommandFrame | SetPointFrame) -> bytes:
     """The lines of a valid frame."""
     if isinstance(frame, Sample):
         head = ["-" if field is None else str(field) for field in (frame.clock_us, frame.sequence)]
