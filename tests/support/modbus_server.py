@@ -108,13 +108,13 @@ def modbus_server(drives: dict[int, Drive], port: int = 0) -> Iterator[int]:
 class SerialLine:
     """Two serial ports, `device` and `host`, with a cable between them.
 
-    carried: the bytes that went over it, to the device and to the host.
+    transferred: the bytes that went over it, to the device and to the host.
     """
 
     def __init__(self) -> None:
         self._ends = [self._open(), self._open()]
         self.device, self.host = (os.ttyname(port) for _, port in self._ends)
-        self.carried = {"device": b"", "host": b""}
+        self.transferred = {"device": b"", "host": b""}
         self._is_cut = False
         self._thread = threading.Thread(target=self._carry)
         self._thread.start()
@@ -131,7 +131,7 @@ class SerialLine:
             for end in select.select([device, host], [], [], 0.02)[0]:
                 to, other = ("device", device) if end == host else ("host", host)
                 data = os.read(end, 4096)
-                self.carried[to] += data
+                self.transferred[to] += data
                 os.write(other, data)
 
     def unplug(self) -> None:

@@ -170,8 +170,10 @@ def test_frames_of_modbus_rtu_go_over_a_serial_line_both_ways() -> None:
         made.disconnect()
     # unit, function, address, count or value, CRC: seven registers from 10 on, and 900 to register 100
     read, write = bytes.fromhex("0303000a000725e8"), bytes.fromhex("031000640001020384b787")
-    assert line.carried["device"].startswith(read + write + read)
-    assert line.carried["host"].startswith(bytes.fromhex("03030e")) and len(line.carried["host"]) == 2 * 19 + 8 + 5
+    assert line.transferred["device"].startswith(read + write + read)
+    assert (
+        line.transferred["host"].startswith(bytes.fromhex("03030e")) and len(line.transferred["host"]) == 2 * 19 + 8 + 5
+    )
 
 
 def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_one_works() -> None:
