@@ -1,4 +1,5 @@
-"""What stages have refused, over all their sessions: messages of others, and input of devices that is no usable sample.
+"""What stages have refused, over all their sessions: messages of others, and input of devices that is no usable sample;
+and what devices themselves have refused or lost, where they count it.
 
 Refused input is shown apart from losses. A stage that has refused all that its device sent has failed.
 """
@@ -26,6 +27,19 @@ WORDS = {
     "absurd_speed": "speeds beyond speed_max",
 }
 """by counter"""
+ON_THE_DEVICE = {
+    "device_bad_length": "frames of a wrong length",
+    "device_bad_crc": "frames with a wrong checksum",
+    "device_wrong_kind": "frames of another version, type or number of fans",
+    "device_bad_value": "commands out of range",
+    "device_line_errors": "bytes with framing errors",
+    "device_overruns": "bytes that came too fast",
+    "device_unsent_samples": "samples for which the line had no room",
+    "device_lost_edges": "tacho edges that came too fast",
+    "device_host_silences": "silences of the host",
+    "device_watchdog_resets": "restarts by its watchdog",
+}
+"""by counter: what is lost or wrong there"""
 _LINE = "protocol, baud and the wiring"
 _SETTINGS = {
     "absurd_command": "command_min and command_max",
@@ -44,25 +58,29 @@ _SETTINGS = {
 
 
 def refused(healths: Iterable[Health]) -> dict[str, dict[str, int]]:
-    """How much each stage has refused, by its label and by counter; only what is not 0. `refused_input` is the sum of
-    the faults of a device's input, which are there, too.
+    """How much each stage and its device have refused or lost, by the label of the stage and by counter; only what is
+    not 0. `refused_input` is the sum of the faults of a device's input, which are there, too.
 
     healths: the last of every session.
     """
-    known = {*WORDS, *_SETTINGS}
+    known = {*WORDS, *_SETTINGS, *ON_THE_DEVICE}
     found = {name: {c: n for c, n in counts.items() if c in known and n} for name, counts in _sums(healths).items()}
     return {name: counts for name, counts in sorted(found.items()) if counts}
 
 
 def refused_lines(found: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """A line for each stage."""
+    """A line for each stage, and one for its device."""
     lines: list[str] = []
     for name, counts in found.items():
         kinds = ", ".join(
             f"{kind} {count}" for kind, count in counts.items() if kind in _SETTINGS and kind not in WORDS
         )
         words = [f"{count} {WORDS[counter]}" for counter, count in counts.items() if counter in WORDS]
-        lines.append(f"{name}: refused: {', '.join(words)}" + (f" ({kinds})" if kinds else ""))
+        if words:
+            lines.append(f"{name}: refused: {', '.join(words)}" + (f" ({kinds})" if kinds else ""))
+        there = [f"{count} {ON_THE_DEVICE[counter]}" for counter, count in counts.items() if counter in ON_THE_DEVICE]
+        if there:
+            lines.append(f"{name}: counted by the device itself: {', '.join(there)}")
     return lines
 
 

@@ -178,7 +178,7 @@ def test_what_acquisition_refuses_is_counted_by_reason_and_raised_by_check(
         core, accepted = running.runner._parts[TRAY].core, tray._accepts
         assert isinstance(core, AcquisitionCore)
         core._tray = push_config(endpoint, tmp_path, fans=3).trays[0]
-        core._limits = limits_of(core._tray)
+        core._plausibility.limits = limits_of(core._tray)
         core.accepts = lambda: accepted
         tray.publish(T_S + 1, [0.5, 0.5], [1.0, 1.0])
         with pytest.raises(fantwin_client.SamplesLostError, match=r"1 refused \(wrong_fan_count\)"):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import random
+import struct
+import zlib
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from cobs import cobs
 
 from pipeline.config.models import TrayConfig
 from pipeline.config.registry import STAGES
@@ -24,7 +27,17 @@ from schemas.codec import decode
 from schemas.codec import encode as encode_message
 from schemas.messages import Command, Raw
 from schemas.units import NS_PER_S
-from schemas.wire import CommandFrame, Decoder, Frame, Protocol, Sample, SetPointFrame, encode
+from schemas.wire import (
+    DEVICE_COUNTERS,
+    CommandFrame,
+    Decoder,
+    DeviceCounters,
+    Frame,
+    Protocol,
+    Sample,
+    SetPointFrame,
+    encode,
+)
 from stages.acquisition import STAGE, AcquisitionConfig, AcquisitionCore
 from tests.support.serial_core import FakeLink, SerialCore
 
@@ -277,6 +290,73 @@ def test_faulty_frames_are_counted_by_kind_and_valid_ones_pass(protocol: Protoco
     assert counters["wrong_fan_count"] == 1
     assert counters["wrong_type"] == 1
     assert counters["samples"] == 2
+
+
+def test_a_frame_of_a_later_protocol_is_skipped_and_is_no_fault() -> None:
+    core = make_core()
+    payload = b"\x01\x09later"
+    later = b"\0" + cobs.encode(payload + struct.pack("<I", zlib.crc32(payload))) + b"\0"
+    for number in range(100):
+        feed(core, [sample(number)])
+        core.step(ReceivedBytes(later * 3, S))
+    counters = core.counters()
+    assert counters["unknown_type"] == 300
+    assert counters["samples"] == 100
+    assert not {"refused_input", "lost_on_line", "lost_refused"} & {name for name, count in counters.items() if count}
+    assert core.problem() == ""
+
+
+def device_counts(core: SerialCore) -> dict[str, int]:
+    """What the device has counted itself, only what is not 0."""
+    names = {f"device_{name}" for name in DEVICE_COUNTERS}
+    return {name: count for name, count in core.counters().items() if name in names and count}
+
+
+def test_a_device_without_counters_has_none() -> None:
+    core = make_core()
+    feed_sequences(core, range(200))
+    assert not {f"device_{name}" for name in DEVICE_COUNTERS} & core.counters().keys()
+
+
+def test_what_the_device_counts_is_counted_since_the_line_was_opened() -> None:
+    core = make_core()
+    feed(core, [DeviceCounters(70, (9, 65_530, 4))])
+    assert device_counts(core) == {}
+    assert core.counters()["device_bad_crc"] == 0, "it is known to be none"
+    feed(core, [sample(1), DeviceCounters(71, (9, 65_533, 4)), sample(2), DeviceCounters(72, (10, 2, 4))])
+    assert device_counts(core) == {"device_frames": 1, "device_bad_length": 8}
+    assert core.counters()["samples"] == 2
+    assert core.problem() == ""
+
+
+def test_counters_of_one_read_are_added_up() -> None:
+    core = make_core()
+    frames = (DeviceCounters(uptime_s, (0, 0, uptime_s)) for uptime_s in range(5))
+    core.step(ReceivedBytes(b"".join(encode("binary", frame) for frame in frames) + encode("binary", sample(1)), S))
+    assert device_counts(core) == {"device_bad_crc": 4}
+
+
+def test_a_device_that_restarts_counts_from_0_again() -> None:
+    core = make_core()
+    feed(
+        core, [DeviceCounters(70, (9,) * 12), DeviceCounters(0, (0,) * 11 + (1,)), DeviceCounters(1, (0,) * 11 + (1,))]
+    )
+    assert device_counts(core) == {"device_watchdog_resets": 1}
+
+
+def test_what_the_device_counts_while_the_line_is_closed_is_not_counted_unless_it_restarts() -> None:
+    core = make_core()
+    feed(core, [DeviceCounters(70, (0, 0, 5))])
+    for frame, counted in (
+        (DeviceCounters(90, (0, 0, 3)), {}),
+        (DeviceCounters(1, (0, 0, 2)), {"device_bad_crc": 2}),
+    ):
+        core.step(LinkDown("gone"))
+        core.step(LinkUp())
+        feed(core, [frame])
+        assert device_counts(core) == counted
+    feed(core, [DeviceCounters(2, (0, 0, 3))])
+    assert device_counts(core) == {"device_bad_crc": 3}
 
 
 def command(*values: float, set_point: tuple[float, ...] = (), fans: int = 2) -> Command:
