@@ -20,7 +20,7 @@ WORDS = {
     "refused_numbers": "messages with impossible numbers",
     "refused_producers": "messages from unknown or too many producers",
     "refused_too_large": "messages that are too large",
-    "refused_commands": "commands out of range or of another number of fans",
+    "refused_commands": "commands that the tray does not take",
     "refused_other_time": "samples of another time",
     "refused_input": "lines or frames that are no usable sample",
     "absurd_speed": "speeds beyond speed_max",

@@ -297,22 +297,27 @@ def test_commands_and_set_points_are_sent_in_the_unit_of_the_tray(protocol: Prot
 
 
 @pytest.mark.parametrize(
-    "refused",
+    ("refused", "reason"),
     [
-        command(1.5, 0.5),
-        command(-0.1, 0.5),
-        command(math.inf, 0.5),
-        command(0.5, 0.5, set_point=(2000.0, 0.0)),
-        command(0.5, fans=1),
-        command(0.5, 0.5, 0.5, fans=3),
+        (command(1.5, 0.5), "the command of fan 0 is 1.5, outside 0 to 1"),
+        (command(0.5, -0.1), "the command of fan 1 is -0.1, outside 0 to 1"),
+        (command(math.inf, 0.5), "the command of fan 0 is inf, outside 0 to 1"),
+        (command(0.5, 0.5, set_point=(2000.0, 0.0)), "the set-point, rad/s, of fan 0 is 2000, outside -1000 to 1000"),
+        (command(0.5, fans=1), "it is for 1 fans, the tray has 2"),
+        (command(0.5, 0.5, 0.5, fans=3), "it is for 3 fans, the tray has 2"),
     ],
 )
-def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_counted(refused: Command) -> None:
+def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_counted_with_the_reason(
+    refused: Command, reason: str
+) -> None:
     link = FakeLink()
     core = make_core(link, speed_max=1000)
     core.step(refused)
+    assert core.notes() == [f"1 command refused: {reason}"]
+    core.step(refused)
     assert link.written == b""
-    assert core.counters()["refused_commands"] == 1
+    assert core.counters()["refused_commands"] == 2
+    assert core.notes() == [f"2 commands refused, the last one: {reason}"]
 
 
 def test_a_command_that_was_not_written_is_counted_as_lost() -> None:
@@ -321,6 +326,7 @@ def test_a_command_that_was_not_written_is_counted_as_lost() -> None:
     core = make_core(link)
     core.step(command(0.5, 0.5))
     assert core.counters()["lost_commands"] == 1
+    assert core.notes()[0].startswith("1 command lost on the way to the device: ")
 
 
 def test_a_command_that_changes_nothing_is_not_sent() -> None:
