@@ -153,6 +153,8 @@ class AcquisitionCore(Core):
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
         self._quality = InputQuality(started_t_ns, config.silence_s)
+        self._first_refused: dict[str, str] = {}
+        """by kind of refused input: what was wrong with the first"""
         self._auxiliary: list[AuxiliaryColumn] = []
         """those that the source has given"""
 
@@ -212,9 +214,14 @@ class AcquisitionCore(Core):
         }
 
     def notes(self) -> list[str]:
-        """What the source measures beside command and speed, and which commands were not sent."""
+        """What the source measures beside command and speed, and which input and commands were refused."""
         also = ", ".join(column.title for column in AUXILIARY if column in self._auxiliary)
-        return [*([f"the source measures {also}, too"] if also else []), *filter(None, [self._commands.note()])]
+        found = [f"the source measures {also}, too"] if also else []
+        found += [
+            f"refused input: {kind} {self._counts[kind]}, the first of them: {detail}"
+            for kind, detail in self._first_refused.items()
+        ]
+        return [*found, *filter(None, [self._commands.note()])]
 
     def samples_in(self, item: Item) -> int:
         """The readings in a block."""
@@ -320,6 +327,7 @@ class AcquisitionCore(Core):
         if not rejected.harmless:
             self._counts["refused_input"] += 1
             self._quality.add_fault(rejected)
+            self._first_refused.setdefault(rejected.kind, rejected.detail)
         return None
 
     def _is_ordinary(self, reading: Reading) -> bool:

@@ -249,7 +249,7 @@ class MqttSource:
         try:
             found = parse_samples(payload)
         except JsonSamplesError as error:
-            return [_refused(received_t_ns, payload, Rejected("malformed", str(error), is_sample=True))]
+            return [_refused(received_t_ns, payload, Rejected("malformed", f"{topic}: {error}", is_sample=True))]
         return batches_of(found, received_t_ns, self._receipts, len(payload))
 
     def _items_of_value(self, topic: str, payload: bytes, is_retained: bool) -> list[Reading | Rejected]:

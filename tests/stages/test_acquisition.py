@@ -83,6 +83,15 @@ def test_samples_that_arrive_together_share_the_time_at_which_they_arrived() -> 
     assert [raw.host_receive_t_ns.tolist() for raw in messages] == [[2 * S] * 3]
 
 
+def test_refused_input_is_named_by_kind_with_what_was_wrong_with_the_first() -> None:
+    core = make_core()
+    assert core.notes() == []
+    feed(core, [sample(0), sample(1, command=7.0), sample(2, command=8.0), sample(3)])
+    assert core.notes() == [
+        "refused input: absurd_command 2, the first of them: command 7 is outside command_min = 0 to command_max = 1"
+    ]
+
+
 def feed_times(core: SerialCore, times_ms: Iterable[int]) -> list[tuple[int, list[int]]]:
     """Feed a sample at each of these times; returns when messages came out, and the samples in each."""
     return [
