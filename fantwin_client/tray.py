@@ -30,6 +30,8 @@ from schemas.topics import BY_NAME, tray_key
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
 
 Values: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | NDArray[Any]
+READING = "reading"
+"""the topic of pushed samples"""
 WATCH_S = 0.5
 """how often the thread looks by itself whether acquisition is there"""
 ASK_AGAIN_S = 2.0
@@ -65,11 +67,11 @@ class Tray:
         self._reported = Losses(0, 0, 0, 0)
         """the losses of the last check"""
         self._producer = f"client-{name}-{secrets.token_hex(4)}"
-        self._key = tray_key(site, name, "reading")
+        self._key = tray_key(site, name, READING)
         self._acquisition = TrayAcquisition(bus, site, name, self._on_change)
         first, self._accepts = self._first_health(timeout_s)
         self._counts = CountsOfAcquisition(first)
-        self._publisher = bus.publisher(self._key, BY_NAME["reading"], type_name(PushedSamples), self._producer)
+        self._publisher = bus.publisher(self._key, BY_NAME[READING], type_name(PushedSamples), self._producer)
         self._thread = threading.Thread(target=self._send_all, name=f"send {name}", daemon=True)
         self._thread.start()
 

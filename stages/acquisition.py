@@ -14,7 +14,6 @@ repeated samples, convert units, make messages of samples.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TypeAlias
@@ -35,10 +34,10 @@ from pipeline.devices.sample_source import (
     ReadingLimits,
     SampleSource,
     SourceContext,
-    within,
 )
 from pipeline.devices.source_kinds import build_source
 from pipeline.errors import UserError
+from pipeline.runtime.device_commands import DeviceCommands
 from pipeline.runtime.raw_messages import ReceivedReading, raw_message
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from schemas.auxiliary import AUXILIARY
@@ -97,6 +96,7 @@ class AcquisitionCore(Core):
         self._stated_tachos = tuple(map(StatedTacho.of, tray.stated_tachos))
         self._tachos: tuple[Tacho, ...] = ()
         """as the device itself says"""
+        self._commands = DeviceCommands(tray, source)
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
@@ -106,7 +106,7 @@ class AcquisitionCore(Core):
     def step(self, item: Item) -> list[Raw]:
         """Handle input from the source, a change of its connection, or a command to send."""
         if isinstance(item, Command):
-            self._send(item)
+            self._commands.send(item, self._down_reason)
             return []
         if isinstance(item, PushedSamples):
             return self._take_pushed(item)
@@ -151,12 +151,22 @@ class AcquisitionCore(Core):
         """Input by kind; docs/reference/wire-protocol.md explains each counter."""
         steps = {"host_clock_steps": self._host_clock.steps} if self._host_clock.steps else {}
         lost_refused = self._counts["lost_refused"] + self._sequence.refused
-        return {**self._counts, **({"lost_refused": lost_refused} if lost_refused else {}), **steps}
+        return {
+            **self._counts,
+            **self._commands.counts,
+            **({"lost_refused": lost_refused} if lost_refused else {}),
+            **steps,
+        }
 
     def notes(self) -> list[str]:
-        """What the source measures beside command and speed."""
+        """What the source measures beside command and speed, and which input and commands were refused."""
         also = ", ".join(column.title for column in AUXILIARY if column in self._plausibility.auxiliary)
-        return [f"the source measures {also}, too"] if also else []
+        found = [f"the source measures {also}, too"] if also else []
+        found += [
+            f"refused input: {kind} {self._counts[kind]}, the first of them: {detail}"
+            for kind, detail in self._plausibility.first_refused.items()
+        ]
+        return [*found, *filter(None, [self._commands.note()])]
 
     def samples_in(self, item: Item) -> int:
         """The readings in a block."""
@@ -246,20 +256,6 @@ class AcquisitionCore(Core):
             if reading is not None and self._sequence.is_new(reading, self._counts):
                 self._counts["samples"] += 1
                 yield ReceivedReading(self._plausibility.with_plausible_columns(reading), batch.received_t_ns)
-
-    def _send(self, wanted: Command) -> None:
-        """Send a command to the device; one that this tray cannot carry out is refused as a whole."""
-        tray = self._tray
-        command = tuple(map(float, wanted.command))
-        set_point = tuple(float(value) / RAD_S_PER_UNIT[tray.speed_unit] for value in wanted.set_point_rad_s)
-        if (
-            any(len(values) not in (0, tray.fans) for values in (command, set_point))
-            or not all(math.isnan(c) or within(c, tray.command_min, tray.command_max) for c in command)
-            or not all(math.isnan(s) or within(s, -tray.speed_max, tray.speed_max) for s in set_point)
-        ):
-            self._counts["refused_commands"] += 1
-        elif not all(map(math.isnan, command + set_point)):
-            self._counts["sent_commands" if self._source.send(command, set_point) else "lost_commands"] += 1
 
 
 def build_tray_source(context: Context) -> SampleSource:

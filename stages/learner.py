@@ -283,7 +283,7 @@ class LearnerCore(Core):
     def _waits_for(self) -> str:
         minutes = self._history.seconds / 60.0
         missing = self._operation.missing()
-        lacks = f"; not moved enough yet: {'; '.join(missing)}; `fantwin sweep` moves the fans" if missing else ""
+        lacks = f"; not moved enough yet: {'; '.join(missing)}; {self._operation.how_to_move}" if missing else ""
         needed = f"{self._config.first_minutes:g} needed"
         return f"no twin yet, nothing is judged; {minutes:.0f} min recorded ({needed}){lacks}"
 

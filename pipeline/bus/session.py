@@ -43,7 +43,7 @@ from pipeline.bus.settings import Settings
 from pipeline.bus.spool import Spool
 from pipeline.config.models import BusConfig, Config
 from pipeline.config.roles import READERS
-from schemas.topics import Topic, largest_bytes
+from schemas.topics import Topic, key_in_words, largest_bytes
 
 if TYPE_CHECKING:
     from pipeline.bus.certificates import Credentials
@@ -55,6 +55,8 @@ SAID_AFTER_S = 3.0
 MEETING_LIMIT_S = 10.0
 """by then a process that listens at the endpoint has answered, however busy the machine"""
 _MEETING_POLL_S = 0.01
+RIGHTS_ASKED = 2
+"""times that a router is asked before no answer is one: a busy host may be late"""
 
 
 class Bus:
@@ -216,6 +218,19 @@ class Bus:
         assert self.credentials
         role = self.credentials.role
         return granted_rights(self._session, site.site, role) == site.rights(role)
+
+    def why_not_published(self, site: str, key: str) -> str:
+        """Why the router lets nothing through that this session publishes on a key of a site, and what to do; empty if
+        it does, or without `bus.security`. For a program that knows no roles; it waits for the answer."""
+        if self.credentials is None:
+            return ""
+        role = self.credentials.role
+        asked = (granted_rights(self._session, site, role) for _ in range(RIGHTS_ASKED))
+        granted = next(filter(None, asked), None)
+        whose = f"{self.credentials.certificate} is a certificate of role {role!r}"
+        if granted is None:
+            return f"{whose}, which the router at {self._config.endpoint} refuses: no such role in site {site!r}"
+        return "" if granted.allow("put", key) else f"{whose}, which may not publish {key_in_words(key)}"
 
     def security_problem(self) -> str:
         """What is refused, or which certificate expires soon; empty if there is nothing, or without `bus.security`.

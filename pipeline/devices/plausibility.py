@@ -31,6 +31,8 @@ class Plausibility:
         self._sequence = sequence
         self.auxiliary: list[AuxiliaryColumn] = []
         """the columns beside command and speed that the source has given"""
+        self.first_refused: dict[str, str] = {}
+        """by kind of refused input: what was wrong with the first"""
 
     def plausible(self, item: Reading | Rejected) -> Reading | None:
         """The reading, without implausible speeds; None, and counted, if it cannot be used."""
@@ -47,6 +49,7 @@ class Plausibility:
         if not rejected.harmless:
             self._counts["refused_input"] += 1
             self._quality.add_fault(rejected)
+            self.first_refused.setdefault(rejected.kind, rejected.detail)
         return None
 
     def _is_ordinary(self, reading: Reading) -> bool:

@@ -38,6 +38,11 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         """The most fans of a tray with this source."""
         return MOST_FANS
 
+    @property
+    def why_no_commands(self) -> str:
+        """Why commands of `fantwin command` and `sweep` cannot reach the fans, in a few words; empty: they may."""
+        return ""
+
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
         """What readings of this source are of the speed, one for all fans or one for each; None if the kind of source
         does not determine it. `tacho` of the [[tray]] overrides it."""
@@ -197,8 +202,9 @@ class SampleSource(Protocol):
         """Deliver what has already arrived, then end."""
         ...
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
-        """Send to the device; False if it was not sent. Never blocks for long, never raises.
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        """Send to the device. Returns why it was not sent, in a few words; empty: it was. Never blocks for long, never
+        raises.
 
         command: in the tray's command unit; set_point: in its speed unit. Each has one value per fan, where NaN leaves
         the fan as it is, or is empty.

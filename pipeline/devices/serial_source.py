@@ -89,16 +89,17 @@ class SerialSource:
                 readings.append(self._reading_of(found))
         return ReadingBatch(item.received_t_ns, readings, len(item.data), device_counts=device_counts)
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
         """Write one frame for commands and one for set-points, where a value is given."""
         frames = ((command, wire.CommandFrame(command)), (set_point, wire.SetPointFrame(set_point)))
-        return self._link.write(
+        is_written = self._link.write(
             b"".join(
                 wire.encode(self._config.protocol, frame)
                 for values, frame in frames
                 if not all(map(math.isnan, values))
             )
         )
+        return "" if is_written else f"{self.name} is not connected, or accepted no bytes"
 
     def check(self) -> list[str]:
         """Whether the port exists and may be opened."""

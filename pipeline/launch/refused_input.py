@@ -21,10 +21,11 @@ WORDS = {
     "refused_numbers": "messages with impossible numbers",
     "refused_producers": "messages from unknown or too many producers",
     "refused_too_large": "messages that are too large",
-    "refused_commands": "commands out of range or of another number of fans",
+    "refused_commands": "commands that the tray does not take",
     "refused_other_time": "samples of another time",
-    "refused_input": "lines or frames that are no usable sample",
+    "refused_input": "pieces of input that are no usable sample",
     "absurd_speed": "speeds beyond speed_max",
+    "undecodable": "messages that cannot be read",
 }
 """by counter"""
 ON_THE_DEVICE = {
@@ -40,17 +41,24 @@ ON_THE_DEVICE = {
     "device_watchdog_resets": "restarts by its watchdog",
 }
 """by counter: what is lost or wrong there"""
-_LINE = "protocol, baud and the wiring"
+_LINE = "protocol and baud of the [[tray]], and the wiring"
+_TIMES = "the times that its client gives"
 _SETTINGS = {
-    "absurd_command": "command_min and command_max",
-    "absurd_samples": "speed_max and speed_unit",
+    "absurd_age": _TIMES,
+    "absurd_command": "command_min and command_max of the [[tray]]",
+    "absurd_samples": "speed_max and speed_unit of the [[tray]]",
     "bad_command": "what the device sends as command",
     "bad_number": _LINE,
+    "failed_polls": "source of the [[tray]], and the device",
     "garbage": _LINE,
+    "malformed": "the form of what is sent (docs/reference/json-samples.md)",
     "oversized": _LINE,
+    "skipped_polls": "period_s in source of the [[tray]]",
+    "time_order": _TIMES,
     "truncated": _LINE,
+    "unknown_command": "where source of the [[tray]] finds the command",
     "wrong_crc": _LINE,
-    "wrong_fan_count": "fans",
+    "wrong_fan_count": "fans of the [[tray]]",
     "wrong_type": "whether the line returns what is sent",
     "wrong_version": "the device's version of the protocol",
 }
@@ -95,7 +103,7 @@ def unusable_lines(healths: Iterable[Health], launched: Collection[Launched]) ->
         kinds = Counter({kind: counts[kind] for kind in _SETTINGS if counts[kind]}).most_common()
         if pieces and counts["samples"] == counts["absurd_samples"]:
             why = ", ".join(f"{kind} {count}" for kind, count in kinds)
-            check = f"check {_SETTINGS[kinds[0][0]]} of the [[tray]]" if kinds else "check source of the [[tray]]"
+            check = f"check {_SETTINGS[kinds[0][0]]}" if kinds else "check source of the [[tray]]"
             lines.append(
                 f"{name}: no sample could be used, {pieces} were refused ({why or 'of unknown kind'}): {check}"
             )

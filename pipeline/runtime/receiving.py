@@ -30,10 +30,13 @@ from pipeline.runtime.subscriptions import Subscriptions
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Health, StageStatus
-from schemas.topics import ALL_TRAYS, alive_key, health_key, sessions_key, topic_of, tray_key, tray_of
+from schemas.topics import ALL_TRAYS, alive_key, health_key, key_in_words, sessions_key, topic_of, tray_key, tray_of
 
 MANY_TRAYS = 16
 """in a process that processes several trays in one pass: then it takes messages at its ticks, together"""
+
+MOST_UNREADABLE_KEYS = 16
+"""so many keys of messages that cannot be read are named"""
 
 
 class Receiver:
@@ -69,6 +72,8 @@ class Receiver:
         self._health = health
         self._due = due
         self.counts: Counter[str] = Counter()
+        self._unreadable: Counter[str] = Counter()
+        """messages that cannot be read, by key; of the first MOST_UNREADABLE_KEYS"""
         """of messages that could not be taken"""
         self._recovery = Recovery(bus, inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
         self.tracker = SequenceTracker(self._recovery.ask, sessions=sessions)
@@ -248,12 +253,19 @@ class Receiver:
         decoded = (self._decode(key, payload, received_t_ns) for key, payload in messages)
         return [envelope for envelope in decoded if envelope]
 
+    def note(self) -> str:
+        """Where messages came that cannot be read, and how many; empty if there were none."""
+        where = ", ".join(f"{count} on {key_in_words(key)}" for key, count in self._unreadable.most_common())
+        return f"messages that cannot be read: {where}" if where else ""
+
     def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
         try:
             envelope = Envelope(key, topic_of(key).name, payload, received_t_ns)
             _ = envelope.header if self.is_undecoded(envelope) else envelope.message
         except (KeyError, CodecError):
             self.counts["undecodable"] += 1
+            if key in self._unreadable or len(self._unreadable) < MOST_UNREADABLE_KEYS:
+                self._unreadable[key] += 1
             return None
         if not self._is_of_its_key(envelope):
             self.counts["refused_of_other_key"] += 1

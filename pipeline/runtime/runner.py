@@ -402,6 +402,8 @@ class Runner:
         return replace(health, header=Header(self.producer, self._health_publisher.published, ""))
 
     def _notes(self) -> Iterator[Note]:
+        if note := self._receiver.note():
+            yield Note(tray="", text=note)
         for name, parts in self._parts.items():
             yield from (Note(tray=name, text=note) for note in parts.core.notes())
         if self._bus.spool and (note := self._bus.spool.note()):

@@ -48,6 +48,13 @@ class SimulatedBoard:
         return self.process.communicate(timeout=DEADLINE_S)[1].decode()
 
 
+def test_the_simulator_says_that_it_is_ready_and_where_its_line_is(board: SimulatedBoard, tmp_path: Path) -> None:
+    assert board.process.stderr
+    expected = f"simulator: ready: the serial line of the board is {tmp_path / 'tray'}; settings and faults on "
+    assert board.process.stderr.readline().decode().startswith(expected)
+    assert (tmp_path / "tray").exists()
+
+
 @pytest.fixture
 def board(tmp_path: Path) -> Iterator[SimulatedBoard]:
     board = SimulatedBoard(tmp_path / "tray", tmp_path / "pins.vcd")

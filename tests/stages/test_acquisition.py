@@ -96,6 +96,15 @@ def test_samples_that_arrive_together_share_the_time_at_which_they_arrived() -> 
     assert [raw.host_receive_t_ns.tolist() for raw in messages] == [[2 * S] * 3]
 
 
+def test_refused_input_is_named_by_kind_with_what_was_wrong_with_the_first() -> None:
+    core = make_core()
+    assert core.notes() == []
+    feed(core, [sample(0), sample(1, command=7.0), sample(2, command=8.0), sample(3)])
+    assert core.notes() == [
+        "refused input: absurd_command 2, the first of them: command 7 is outside command_min = 0 to command_max = 1"
+    ]
+
+
 def feed_times(core: SerialCore, times_ms: Iterable[int]) -> list[tuple[int, list[int]]]:
     """Feed a sample at each of these times; returns when messages came out, and the samples in each."""
     return [
@@ -377,22 +386,27 @@ def test_commands_and_set_points_are_sent_in_the_unit_of_the_tray(protocol: Prot
 
 
 @pytest.mark.parametrize(
-    "refused",
+    ("refused", "reason"),
     [
-        command(1.5, 0.5),
-        command(-0.1, 0.5),
-        command(math.inf, 0.5),
-        command(0.5, 0.5, set_point=(2000.0, 0.0)),
-        command(0.5, fans=1),
-        command(0.5, 0.5, 0.5, fans=3),
+        (command(1.5, 0.5), "the command of fan 0 is 1.5, outside 0 to 1"),
+        (command(0.5, -0.1), "the command of fan 1 is -0.1, outside 0 to 1"),
+        (command(math.inf, 0.5), "the command of fan 0 is inf, outside 0 to 1"),
+        (command(0.5, 0.5, set_point=(2000.0, 0.0)), "the set-point, rad/s, of fan 0 is 2000, outside -1000 to 1000"),
+        (command(0.5, fans=1), "it is for 1 fans, the tray has 2"),
+        (command(0.5, 0.5, 0.5, fans=3), "it is for 3 fans, the tray has 2"),
     ],
 )
-def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_counted(refused: Command) -> None:
+def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_counted_with_the_reason(
+    refused: Command, reason: str
+) -> None:
     link = FakeLink()
     core = make_core(link, speed_max=1000)
     core.step(refused)
+    assert core.notes() == [f"1 command refused: {reason}"]
+    core.step(refused)
     assert link.written == b""
-    assert core.counters()["refused_commands"] == 1
+    assert core.counters()["refused_commands"] == 2
+    assert core.notes() == [f"2 commands refused, the last one: {reason}"]
 
 
 def test_a_command_that_was_not_written_is_counted_as_lost() -> None:
@@ -401,6 +415,7 @@ def test_a_command_that_was_not_written_is_counted_as_lost() -> None:
     core = make_core(link)
     core.step(command(0.5, 0.5))
     assert core.counters()["lost_commands"] == 1
+    assert core.notes()[0].startswith("1 command lost on the way to the device: ")
 
 
 def test_a_command_that_changes_nothing_is_not_sent() -> None:

@@ -88,8 +88,8 @@ class TableSource:
     def stop(self) -> None:
         pass
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
-        return False
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        return "not connected"
 
     def check(self) -> list[str]:
         return []

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -211,8 +212,10 @@ def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...]
     if tachos != INSTANTANEOUS:
         metadata[f"{TACHO_KEY}.{tray}"] = tachos_to_json(tachos)
     with RecordingWriter(output, metadata, t_ns=int(table.t_ns[0]), overwrite=True) as writer:
-        for sequence, first in enumerate(range(0, len(table.t_ns), SAMPLES_PER_MESSAGE)):
-            rows = slice(first, first + SAMPLES_PER_MESSAGE)
+        # a message has the time of its last sample; the first is of one sample: the recording begins with its first
+        starts = [0, *range(1, len(table.t_ns), SAMPLES_PER_MESSAGE), len(table.t_ns)]
+        for sequence, (first, end) in enumerate(pairwise(starts)):
+            rows = slice(first, end)
             auxiliary: dict[str, Any] = {name: values[rows] for name, values in table.auxiliary.items()}
             raw = Raw(
                 header=Header("import", sequence, tray),

@@ -31,7 +31,7 @@ def test_row_07_what_sessions_have_refused_is_added_up():
 def test_noise_on_a_line_is_listed_with_its_kinds():
     found = refused([health(samples=9, garbage=3, truncated=1, resync=1, refused_input=4)])
     assert found == {"acquisition/bench": {"garbage": 3, "truncated": 1, "refused_input": 4}}
-    words = "4 lines or frames that are no usable sample (garbage 3, truncated 1)"
+    words = "4 pieces of input that are no usable sample (garbage 3, truncated 1)"
     assert refused_lines(found) == [f"acquisition/bench: refused: {words}"]
 
 
@@ -84,6 +84,19 @@ def test_sessions_that_others_have_started_do_not_count():
 def test_every_fault_of_the_line_has_a_setting_to_look_at(kind: FaultKind):
     (line,) = unusable_lines([health(refused_input=1, **{kind.value: 1})], LAUNCHED)
     assert "source of the [[tray]]" not in line
+
+
+def test_faults_of_other_sources_are_named_with_what_to_look_at():
+    sessions = [health(malformed=3, refused_input=3)]
+    words = "acquisition/bench: refused: 3 pieces of input that are no usable sample (malformed 3)"
+    assert refused_lines(refused(sessions)) == [words]
+    (line,) = unusable_lines(sessions, LAUNCHED)
+    assert line.endswith("(malformed 3): check the form of what is sent (docs/reference/json-samples.md)")
+
+
+def test_messages_of_the_bus_that_cannot_be_read_are_listed():
+    found = refused([health("scorer/all", undecodable=2)])
+    assert refused_lines(found) == ["scorer: refused: 2 messages that cannot be read"]
 
 
 def test_a_device_of_which_all_was_refused_is_a_failure_of_the_site():

@@ -16,7 +16,7 @@ from pipeline.launch.loss_accounting import losses
 from pipeline.runtime.stage import BuiltStage, Context, Core
 from schemas.codec import encode, type_name
 from schemas.envelope import Envelope
-from schemas.messages import Command, Grid, Header, Health, InputPosition, Message, Output, Raw, StageStatus
+from schemas.messages import Command, Grid, Header, Health, InputPosition, Message, Note, Output, Raw, StageStatus
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from schemas.units import NS_PER_S
 from tests.support.running_chain import eventually
@@ -224,6 +224,7 @@ def test_row_18_undecodable_bytes_of_a_stranger_are_counted_and_are_no_loss_of_t
     assert bench.next(Grid).t_ns.tolist() == [1]
     last = bench.end()
     assert {c.name: c.value for c in last.counters}["undecodable"] == 1
+    assert Note(tray="", text=f"messages that cannot be read: 1 on raw of {TRAY_A}") in last.notes
     assert last.lost == 4  # the counters of the two cores
 
 
