@@ -19,17 +19,18 @@ from pipeline.runtime.clock import REPLAY, StageClock
 from pipeline.runtime.due_messages import DueMessages
 from pipeline.runtime.health import HealthBuilder
 from pipeline.runtime.inbox import FromBus, Inbox, Liveness, Newest, Recovered
+from pipeline.runtime.killed_sessions import KilledSessions
 from pipeline.runtime.newest_messages import NewestMessages
 from pipeline.runtime.peers import Peers
 from pipeline.runtime.recovery import Recovery
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from pipeline.runtime.sessions import Sessions
+from pipeline.runtime.sessions import Sessions, this_host
 from pipeline.runtime.silences import Silences
 from pipeline.runtime.stage import Stage
 from pipeline.runtime.subscriptions import Subscriptions
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
-from schemas.messages import Clock, Health, StageStatus
+from schemas.messages import Clock, Health
 from schemas.topics import ALL_TRAYS, alive_key, health_key, sessions_key, topic_of, tray_key, tray_of
 
 MANY_TRAYS = 16
@@ -81,6 +82,7 @@ class Receiver:
         self._silences = Silences(
             {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}
         )
+        self._killed = KilledSessions(this_host())
 
     def start(self, *, follows_clock: bool) -> None:
         """Subscribe to health, to who is there and, if it follows them, to the clocks of the trays."""
@@ -134,15 +136,16 @@ class Receiver:
         return self.peers.awaits_last_health() or self.tracker.is_waiting
 
     def ask_again(self) -> None:
-        """Send again the requests that were not answered, as they become due."""
+        """Send again the requests that were not answered, as they become due; see which sessions were killed."""
         self._recovery.send_due()
+        for producer in self._killed.take():
+            self._silences.end(producer)
 
     def is_complete(self, tray: str) -> bool:
         """Whether the producer of a tray's main input has shown, since this was last asked, that all that it has sent
         has been processed; a replay shows it by its clock."""
-        if self._due.has(tray):
-            return False
-        return self._silences.take(tray) or self._clock.is_of_replay(tray)
+        is_shown = self._silences.take(tray)
+        return not self._due.has(tray) and (is_shown or self._clock.is_of_replay(tray))
 
     def take(self, item: FromBus | Recovered | Newest | Liveness) -> None:
         """Take an item of the inbox."""
@@ -156,6 +159,7 @@ class Receiver:
             case Liveness():
                 self.peers.update(item)
                 self._sessions.update(item.key, item.alive)
+                self._killed.update(item.key, item.alive)
                 if item.key == alive_key(self._site, REPLAY, ALL_TRAYS):
                     self._clock.set_replay_alive(item.alive)
 
@@ -215,7 +219,7 @@ class Receiver:
             return
         self.peers.add_health(alive_key(self._site, health.stage, health.instance), health)
         if health.stage == REPLAY:
-            self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
+            self._clock.add_replay_health(health.header.producer, has_ended=health.has_ended)
         self._sessions.add_health(health, self._subscriptions.keys)
         self._due.add(self.tracker.reconcile(health, self.current_keys))
         self._silences.add_health(health, self.tracker.has_all_of)
