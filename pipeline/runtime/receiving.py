@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence, Set
-from dataclasses import replace
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.config.roles import roles_of
 from pipeline.config.shards import Shard
 from pipeline.devices.host_clock import HOST_CLOCK
+from pipeline.runtime.believed_outputs import BelievedOutputs
 from pipeline.runtime.clock import REPLAY, StageClock
 from pipeline.runtime.due_messages import DueMessages
 from pipeline.runtime.health import HealthBuilder
@@ -58,7 +58,7 @@ class Receiver:
         what is received changes them."""
         self._stage = stage
         self._site = config.site
-        self._roles = {name: role for name, role in roles_of(config).items() if role.stage}
+        self._believed_outputs = BelievedOutputs(roles_of(config))
         self._shard = shard
         self._trays = frozenset(shard.trays)
         self._is_patient = stage.is_patient or (stage.joint is not None and len(shard.trays) >= MANY_TRAYS)
@@ -211,10 +211,9 @@ class Receiver:
         return not (is_ignored or self._sessions.is_stranger(envelope.key, producer))
 
     def _take_health(self, envelope: Envelope, health: Health) -> None:
-        allowed = [output for output in health.outputs if self._may_write(health, output.key)]
-        if len(allowed) < len(health.outputs):
+        said, health = health, self._believed_outputs.of(health)
+        if health is not said:
             self.counts["refused_outputs"] += 1
-            health = replace(health, outputs=tuple(allowed))
         if not self.tracker.believes(health):
             return
         self.peers.add_health(alive_key(self._site, health.stage, health.instance), health)
@@ -225,18 +224,6 @@ class Receiver:
         self._silences.add_health(health, self.tracker.has_all_of)
         if "health" in self._stage.reads and self._concerns(envelope):
             self._due.add(self.tracker.accept(envelope))
-
-    def _may_write(self, health: Health, key: str) -> bool:
-        """Whether the process of a health may have published on a key. Of a stage that this version does not know all
-        is believed: no certificate is for such a stage."""
-        role = self._roles.get(f"{health.stage}.{health.instance}") or self._roles.get(health.stage)
-        if role is None:
-            return True
-        try:
-            topic = topic_of(key).name
-        except KeyError:
-            return False
-        return topic in role.writes and (not role.trays or tray_of(key) in role.trays)
 
     def _concerns(self, envelope: Envelope) -> bool:
         """Whether a message is of a tray of this process. Health is of all trays of its process: so each recorder has
