@@ -48,8 +48,10 @@ STAGES = ("acquisition", "resampler", "twin_integrator", "scorer", "recorder")
 """in the order in which they are stopped"""
 ROUTER, ROUTERS = "10.78.0.1", 7447
 PLACES = (*STAGES, "router")
-KINDS = ("cut", "deaf", "mute", "lossy")
-"""all packets; those to the stage; those of the stage; 20 % of both"""
+KINDS = ("cut", "deaf", "mute", "lossy", "slow")
+"""all packets; those to the stage; those of the stage; 20 % of both; what is above SLOW of each"""
+SLOW = "16kb/s"
+"""less than the stages' streams need"""
 BEFORE_S, AFTER_S = 25.0, 10.0
 """the first is longer than the scorer needs to begin"""
 FAULT_S, PERIOD_S = 6.0, 15.0
@@ -257,13 +259,14 @@ class _Site:
             host.kill()
 
     def _start_router(self, number: int) -> None:
-        words = ["router", "--listen", self._routers[number]]
+        words = ["router", "--listen", self._routers[number], "--insecure"]
         for other in self._routers[:number]:
             words += ["--connect", other]
         self._running[number] = Process(words, self._folder / f"router{number}")
 
     def _up(self, stage: str) -> Process:
-        words = ["up", "-c", self._folder / "site.toml", "--json", "--set", f"launcher.stages={json.dumps([stage])}"]
+        words = ["up", "-c", self._folder / "site.toml", "--json", "--insecure"]
+        words += ["--set", f"launcher.stages={json.dumps([stage])}"]
         words += ["--set", f"run_folder='{self._folder / stage}'"]
         words += [word for setting in self._settings for word in ("--set", setting)]
         return Process(words, self._folder / stage, self._hosts[stage])
@@ -277,10 +280,12 @@ class _Site:
         if cut.kind == "cut":
             host.cut()
             return host.heal
-        chains = {"deaf": ["INPUT"], "mute": ["OUTPUT"]}.get(cut.kind, ["INPUT", "OUTPUT"])
-        share = ["-m", "statistic", "--mode", "random", "--probability", "0.2"] if cut.kind == "lossy" else []
-        for chain in chains:
-            _iptables(host, "-A", chain, *share, "-j", "DROP")
+        for chain in {"deaf": ["INPUT"], "mute": ["OUTPUT"]}.get(cut.kind, ["INPUT", "OUTPUT"]):
+            above = ["-m", "hashlimit", "--hashlimit-name", chain, "--hashlimit-above", SLOW]
+            above += ["--hashlimit-burst", SLOW.removesuffix("/s")]
+            share = ["-m", "statistic", "--mode", "random", "--probability", "0.2"]
+            which = {"slow": above, "lossy": share}.get(cut.kind, [])
+            _iptables(host, "-A", chain, *which, "-j", "DROP")
         return lambda: _iptables(host, "-F")
 
     def _is_well(self) -> bool:

@@ -26,9 +26,10 @@ MOST_HELD_BYTES = 64 << 20
 """of one stream. Beyond either limit it goes on without the messages that were requested."""
 MOST_PER_S = 100_000
 """no producer publishes more messages a second on one key"""
-PATIENCE_S, PATIENCE_WITH_ENDED_S = 30.0, 5.0
-"""how long a stage that is there, or has just left, is asked again while it does not answer: a link that has healed
-works in one direction first, or loses packets"""
+PATIENCE_S, PATIENCE_WITH_REPLACED_S = 120.0, 5.0
+"""how long a stage is asked again while it does not answer: a link may be slow, lose packets, or work in one direction
+only. The second is for one whose place another process has taken: it has ended, and its last answer may be on the way
+"""
 ASKED_AGAIN_AFTER_S = 0.5
 REFUSAL_SHOWN_S = 60.0
 """how long health names what was refused"""
@@ -214,9 +215,9 @@ class SequenceTracker:
         return [] if found is None else self._go_on(stream, waiting, found)
 
     def _patience_s(self, stream: Stream) -> float:
-        if self._sessions.is_alive(stream.producer):
+        if self._sessions.is_alive(stream.producer) or self._sessions.may_return(stream.producer):
             return PATIENCE_S
-        return PATIENCE_WITH_ENDED_S if self._sessions.has_ended(stream.producer) else 0.0
+        return PATIENCE_WITH_REPLACED_S if self._sessions.has_ended(stream.producer) else 0.0
 
     def _go_on(self, stream: Stream, waiting: Waiting, found: Found, *, may_ask_again: bool = False) -> list[Envelope]:
         """Process what was found, then what was held; or ask for the rest, if the answer was not complete."""

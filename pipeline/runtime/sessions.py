@@ -127,8 +127,8 @@ class Sessions:
         """by stage, where trays have two owners"""
         self._written: dict[str, set[str]] = {}
         """by producer of a session: the keys on which it publishes"""
-        self._ended: dict[str, None] = {}
-        """producers of sessions that have ended, the last ones: their messages may still be on the way"""
+        self._ended: dict[str, Session] = {}
+        """by producer: the last sessions that have ended, whose messages may still be on the way"""
 
     def update(self, key: str, alive: bool) -> None:
         """A token has appeared, or gone."""
@@ -144,7 +144,7 @@ class Sessions:
             self._alive.pop(key, None)
             self._by_producer.pop(session.producer, None)
             if self._written.pop(session.producer, None) is not None:
-                self._ended[session.producer] = None
+                self._ended[session.producer] = session
                 if len(self._ended) > MOST_SESSIONS:
                     del self._ended[next(iter(self._ended))]
         of_stage = _Owners(each for each in self._alive.values() if each.stage == session.stage)
@@ -160,6 +160,11 @@ class Sessions:
     def is_alive(self, producer: str) -> bool:
         """Whether this producer is a session that is alive."""
         return producer in self._written
+
+    def may_return(self, producer: str) -> bool:
+        """Whether this producer is a session that has left and may only be cut off: nobody has taken its place."""
+        session = self._ended.get(producer)
+        return session is not None and self.named(session.stage, session.instance) is None
 
     def has_ended(self, producer: str) -> bool:
         """Whether this producer is a session that has left: ended, or cut off."""
