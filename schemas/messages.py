@@ -546,6 +546,8 @@ class Health:
     Attributes:
         trays: those that it has, separated by commas; empty: all of the site. Earlier versions do not say it: there, a
             stage with a process for each tray has the one that its instance names.
+        is_last: of its session, whatever its status. Earlier versions do not say it: see `has_ended`.
+        has_unprocessed: input has arrived of which outputs may still be made, so `outputs` do not show that none came.
     """
 
     header: Header = Header()
@@ -568,6 +570,13 @@ class Health:
     notes: tuple[Note, ...] = ()
     trays: str = ""
     accepts: tuple[AcceptedSamples, ...] = ()
+    is_last: bool = False
+    has_unprocessed: bool = False
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether its session has ended, in order or with an error, and sends no more."""
+        return self.is_last or self.status == StageStatus.STOPPED
 
 
 Message: TypeAlias = (

@@ -33,7 +33,7 @@ from pipeline.bus.endpoint import (
     require_tls_with_security,
     somebody_listens,
 )
-from pipeline.bus.errors import BusError, reason
+from pipeline.bus.errors import BusError, NoAnswerError, reason
 from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept, kept_key
 from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
 from pipeline.bus.publisher import KeptBytes, Publisher
@@ -57,6 +57,8 @@ MEETING_LIMIT_S = 10.0
 _MEETING_POLL_S = 0.01
 RIGHTS_ASKED = 2
 """times that a router is asked before no answer is one: a busy host may be late"""
+_ALIVE_TIMEOUTS = 2
+"""so many times recovery_timeout_s it is asked who is there"""
 
 
 class Bus:
@@ -170,9 +172,28 @@ class Bus:
                 return
 
     def alive(self, key_expression: str) -> set[str]:
-        """The keys of the tokens that exist now."""
-        replies = self._session.liveliness().get(key_expression, timeout=self._config.recovery_timeout_s)
-        return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+        """The keys of the tokens that exist now. Asks again if there is no complete answer.
+
+        Raises:
+            NoAnswerError: nobody has answered: who is there is not known.
+        """
+        timeout_s = self._config.recovery_timeout_s
+        until_s = time.monotonic() + _ALIVE_TIMEOUTS * timeout_s
+        while True:
+            replies = list(self._session.liveliness().get(key_expression, timeout=timeout_s))
+            found = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+            if all(reply.ok is not None for reply in replies) and self._has_its_router():
+                return found
+            if time.monotonic() > until_s:
+                raise NoAnswerError(
+                    f"bus.endpoint = {self._config.endpoint!r}: who is on the bus is not known, nobody has answered "
+                    f"within {_ALIVE_TIMEOUTS * timeout_s:g} s: see that the router runs and is not overloaded"
+                )
+            time.sleep(_ROUTER_RETRY_S)
+
+    def _has_its_router(self) -> bool:
+        """Whether a client is connected; without its router it sees no token. Peers need no router."""
+        return self._config.mode == "peer" or bool(self._session.info.routers_zid())
 
     def request_missed(
         self,

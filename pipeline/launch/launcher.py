@@ -13,7 +13,7 @@ from typing import Any
 from pipeline.bus.session import Bus, credentials_of, join_bus
 from pipeline.config.models import Config
 from pipeline.config.registry import LEARNER, RECORDER, STAGES
-from pipeline.config.roles import role_names
+from pipeline.config.roles import role_names, roles_of
 from pipeline.config.shards import own_file
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.errors import UserError
@@ -133,7 +133,7 @@ class Launcher:
             if problem := bus.security_problem():
                 self._say(problem)
             before = set(self._parts())
-            self._watcher = SiteWatcher(bus, self._config.site)
+            self._watcher = SiteWatcher(bus, self._config.site, roles_of(self._config))
             try:
                 self._start_all(stop)
                 self._report = SiteReport(self._config.bus.endpoint, self._say, HOST_CLOCK.now_ns())

@@ -317,17 +317,17 @@ class Runner:
         def report() -> None:
             status = StageStatus.DEGRADED if self._ending.error else StageStatus.STOPPED
             try:
-                health = self._build_health(status)
+                health = self._build_health(status, is_last=True)
                 payload = encode(health)
             except Exception as error:  # noqa: BLE001  kept, and reported without what raised it
                 self._ending.fail(error, f"counting failed: {type(error).__name__}: {error}")
-                health = self._build_health(StageStatus.DEGRADED, with_counts=False)
+                health = self._build_health(StageStatus.DEGRADED, with_counts=False, is_last=True)
                 payload = encode(health)
             reported.append(health)
             self._health_publisher.put(payload)
 
         self._ending.run("reporting the last health", report, HEALTH_SENT)
-        return reported[0] if reported else self._build_health(StageStatus.DEGRADED, with_counts=False)
+        return reported[0] if reported else self._build_health(StageStatus.DEGRADED, with_counts=False, is_last=True)
 
     def _handle_what_waits(self) -> int:
         """Take what else is in the inbox now, so that messages of a tray are joined. Not so much that what the inbox
@@ -380,7 +380,7 @@ class Runner:
     def _lost(self) -> int:
         return stage_losses(self._tracker.inputs(), self._counters(), may_drop=self.stage.may_drop)
 
-    def _build_health(self, status: StageStatus, *, with_counts: bool = True) -> Health:
+    def _build_health(self, status: StageStatus, *, with_counts: bool = True, is_last: bool = False) -> Health:
         cores = [parts.core for parts in self._parts.values()] if with_counts else []
         health = self._health.build(
             status=status,
@@ -399,7 +399,12 @@ class Runner:
             notes=[*self._notes()] if with_counts else (),
             accepts=filter(None, (core.accepts() for core in cores)),
         )
-        return replace(health, header=Header(self.producer, self._health_publisher.published, ""))
+        return replace(
+            health,
+            header=Header(self.producer, self._health_publisher.published, ""),
+            is_last=is_last,
+            has_unprocessed=bool(self._due) or self._inbox.has_input,
+        )
 
     def _notes(self) -> Iterator[Note]:
         if note := self._receiver.note():

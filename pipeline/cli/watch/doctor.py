@@ -20,7 +20,7 @@ from rich.console import Console
 from pipeline.bus.access_rules import SiteRoles
 from pipeline.bus.certificates import of_role
 from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
-from pipeline.bus.errors import BusError
+from pipeline.bus.errors import BusError, NoAnswerError
 from pipeline.bus.session import credentials_of, join_bus
 from pipeline.cli.exposure import exposure_problem, is_exposed
 from pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
@@ -160,6 +160,8 @@ def _check_bus(settings: Config, running: list[Session]) -> Iterator[tuple[bool,
             running += running_sessions(settings)
             site = f"site {settings.site!r} runs there" if running else "fantwin answers there"
             yield True, f"bus.endpoint {endpoint}: {site}"
+        except NoAnswerError as error:
+            yield False, str(error)
         except BusError:
             yield False, foreign_program(endpoint, is_secure=config.security is not None)
 

@@ -13,6 +13,7 @@ import pytest
 from pipeline.bus.session import Bus
 from pipeline.config.models import TrayConfig
 from pipeline.launch.loss_accounting import losses
+from pipeline.runtime.runner import TICK_S
 from pipeline.runtime.stage import BuiltStage, Context, Core
 from schemas.codec import encode, type_name
 from schemas.envelope import Envelope
@@ -145,6 +146,33 @@ def test_a_producer_that_publishes_one_message_and_leaves_causes_no_loss(config)
         assert (reported.status, reported.problem, reported.lost) == (status, "", 0)
         assert [(line.received, line.missing, line.duplicated) for line in reported.inputs] == [(1, 0, 0)] * 3
     assert losses([health, last]) == {"resampler": 0}
+
+
+def test_row_16_a_stage_that_was_held_up_says_that_its_input_is_not_all_processed(config, monkeypatch):
+    monkeypatch.setattr("pipeline.runtime.runner.HEALTH_PERIOD_S", 0.0)
+    may_step, waits = threading.Semaphore(0), threading.Event()
+
+    class HeldUp(Answers):
+        def step(self, item):
+            waits.set()
+            assert may_step.acquire(timeout=20)
+            return super().step(item)
+
+    bench = Bench(toy(lambda _context: BuiltStage(HeldUp())), config)
+    try:
+        assert not bench.next(Health).has_unprocessed
+        for number in range(3):
+            bench.feed(TRAY_A, number)
+        assert waits.wait(20)
+        threading.Event().wait(2 * TICK_S)
+        may_step.release()
+        healths = [bench.next(Health)]
+        while not any(line.received for line in healths[-1].inputs):
+            healths.append(bench.next(Health))
+    finally:
+        may_step.release(2)
+    assert healths[-1].has_unprocessed
+    assert not bench.end().has_unprocessed
 
 
 def test_health_accounts_for_inputs_outputs_counters_and_losses(config):
