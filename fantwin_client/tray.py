@@ -25,7 +25,9 @@ from pipeline.bus.session import Bus
 from pipeline.devices.sample_source import limits_of_float32
 from pipeline.runtime.tray_acquisition import TrayAcquisition
 from schemas.codec import encode, type_name
-from schemas.messages import AcceptedSamples, Header, Health, PushedSamples
+from schemas.header import Header
+from schemas.health import AcceptedSamples, Health
+from schemas.messages import PushedSamples
 from schemas.topics import BY_NAME, tray_key
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
 

@@ -41,7 +41,8 @@ from pipeline.runtime.device_commands import DeviceCommands
 from pipeline.runtime.raw_messages import ReceivedReading, raw_message
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from schemas.auxiliary import AUXILIARY
-from schemas.messages import AcceptedSamples, Command, PushedSamples, Raw, StatedTacho
+from schemas.health import AcceptedSamples
+from schemas.messages import Command, PushedSamples, Raw, StatedTacho
 from schemas.tacho import Tacho
 from schemas.topics import most_samples
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT

@@ -29,7 +29,8 @@ from pipeline.learning.versions import TwinVersions, Version, VersionList, learn
 from pipeline.recordings.dates import format_utc
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
-from schemas.messages import Action, Message, NewTwin, Raw, Request, Score
+from schemas.enums import Action
+from schemas.messages import Message, NewTwin, Raw, Request, Score
 from schemas.units import NS_PER_S
 
 LOOK_NS = NS_PER_S

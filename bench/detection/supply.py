@@ -26,7 +26,9 @@ from pipeline.config.loading import parse_config
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.building import build_parts
 from pipeline.runtime.stage import Context, Core, load_stage
-from schemas.messages import Alarm, Grid, Header, Prediction, Raw, Transition
+from schemas.enums import Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Grid, Prediction, Raw
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 from simulation.faults import Fault

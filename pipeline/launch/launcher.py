@@ -28,7 +28,7 @@ from pipeline.recordings.parts import part_files, part_path
 from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.stage import load_stage
 from pipeline.runtime.tray_twin import load_tray_twin, twin_path
-from schemas.messages import StageStatus
+from schemas.enums import StageStatus
 from schemas.topics import ALL_TRAYS, alive_key
 
 _POLL_S = 0.05

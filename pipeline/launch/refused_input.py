@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 
 from pipeline.launch.loss_accounting import Launched, label
-from schemas.messages import Health
+from schemas.health import Health
 
 WORDS = {
     "refused_of_second": "messages from a second process of a stage",

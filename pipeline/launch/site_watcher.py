@@ -19,7 +19,8 @@ from pipeline.launch.watched_alarms import WatchedAlarms
 from pipeline.runtime.believed_outputs import BelievedOutputs
 from pipeline.runtime.sessions import Session
 from schemas.codec import CodecError, decode
-from schemas.messages import Alarm, Health
+from schemas.health import Health
+from schemas.messages import Alarm
 from schemas.topics import alive_key, health_key, sessions_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from pipeline.config.roles import Role
-from schemas.messages import Health
+from schemas.health import Health
 from schemas.topics import topic_of, tray_of
 
 

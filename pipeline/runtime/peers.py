@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from pipeline.runtime.inbox import Liveness
-from schemas.messages import Health
+from schemas.health import Health
 
 MOST_PEERS = 4096
 """so many sessions are remembered: those heard most recently"""

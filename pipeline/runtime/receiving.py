@@ -30,7 +30,8 @@ from pipeline.runtime.stage import Stage
 from pipeline.runtime.subscriptions import Subscriptions
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
-from schemas.messages import Clock, Health
+from schemas.health import Health
+from schemas.messages import Clock
 from schemas.topics import ALL_TRAYS, alive_key, health_key, key_in_words, sessions_key, topic_of, tray_key, tray_of
 
 MANY_TRAYS = 16

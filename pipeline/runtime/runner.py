@@ -38,8 +38,10 @@ from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Core, Stage
 from pipeline.runtime.steps import Steps
 from schemas.codec import encode, type_name
+from schemas.enums import StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import Header, Health, Note, StageStatus
+from schemas.header import Header
+from schemas.health import Health, Note
 from schemas.streams import stage_losses
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 

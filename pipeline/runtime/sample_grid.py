@@ -29,7 +29,8 @@ from pipeline.runtime.clock import is_of_replay
 from pipeline.runtime.decision_rules import DecisionRules
 from schemas.auxiliary import AUXILIARY, auxiliary_columns
 from schemas.blocks import cut, join
-from schemas.messages import Array, Grid, InvalidReason, Raw
+from schemas.enums import InvalidReason
+from schemas.messages import Array, Grid, Raw
 from schemas.side_by_side import present_columns
 from schemas.tacho import Tacho
 from schemas.topics import most_samples

@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterable, Iterator, Set
 from dataclasses import dataclass
 
 from pipeline.config.shards import Shard
-from schemas.messages import Health
+from schemas.health import Health
 from schemas.topics import ALL_TRAYS, SESSION_CHUNK, health_key, session_key, stage_label
 
 MOST_SESSIONS = 4096

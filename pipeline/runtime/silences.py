@@ -20,7 +20,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from schemas.messages import Health, StageStatus
+from schemas.enums import StageStatus
+from schemas.health import Health
 from schemas.streams import StreamId, output_streams
 from schemas.units import NS_PER_S
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from schemas.enums import InvalidReason
 from schemas.fan_numbers import fans_in_words
-from schemas.messages import Array, InvalidReason
+from schemas.messages import Array
 from schemas.units import NS_PER_S
 from scoring.samples import IDLE, among
 

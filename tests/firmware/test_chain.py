@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from pipeline.recordings.reading import read_recording
-from schemas.messages import Alarm, Array, Raw, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Array, Raw
 from schemas.units import NS_PER_S
 from schemas.wire import CommandFrame, encode
 from tests.support.fan_board import FANS

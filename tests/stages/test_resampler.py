@@ -15,7 +15,9 @@ from pydantic import ValidationError
 
 from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import join
-from schemas.messages import Grid, Header, InvalidReason, Raw, StatedTacho, TachoKind
+from schemas.enums import InvalidReason, TachoKind
+from schemas.header import Header
+from schemas.messages import Grid, Raw, StatedTacho
 from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
 from stages.resampler import ResamplerConfig, ResamplerCore

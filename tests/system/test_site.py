@@ -17,7 +17,8 @@ import pytest
 
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.reading import read_recording
-from schemas.messages import Alarm, Request, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Request
 from tests.stages.test_viewer import rows_of
 from tests.support.offline_replay import without_topics
 from tests.support.running_chain import FANS, TRAY, Chain, eventually, fantwin, is_running, published, received, view_of

@@ -30,7 +30,8 @@ from pipeline.recordings.logs.formats import LogFormat, log_format, open_log
 from pipeline.recordings.logs.samples_of_log import read_samples
 from pipeline.recordings.reading import TACHO_KEY
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Array, Header, Raw
+from schemas.header import Header
+from schemas.messages import Array, Raw
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan, tachos_to_json
 from schemas.topics import RESERVED_TRAY_NAMES, tray_key
 from schemas.units import NS_PER_S

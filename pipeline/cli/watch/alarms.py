@@ -32,7 +32,8 @@ from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.launch.stage_notes import note_lines
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
-from schemas.messages import Action, Alarm, Diagnosis, Request, Severity, Transition, newest_t_ns
+from schemas.enums import Action, Severity, Transition
+from schemas.messages import Alarm, Diagnosis, Request, newest_t_ns
 from schemas.topics import alive_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented

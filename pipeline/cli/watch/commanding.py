@@ -16,7 +16,9 @@ from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UsageError, UserError
 from pipeline.runtime.tray_acquisition import TrayAcquisition
 from schemas.codec import encode, type_name
-from schemas.messages import Command, Header, Health
+from schemas.header import Header
+from schemas.health import Health
+from schemas.messages import Command
 from schemas.topics import BY_NAME, tray_key
 from schemas.units import RAD_S_PER_UNIT
 

@@ -14,7 +14,8 @@ from pipeline.config.roles import roles_of
 from pipeline.launch.judged_fans import JudgedFans
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import decode
-from schemas.messages import FanState, InvalidReason, Score
+from schemas.enums import FanState, InvalidReason
+from schemas.messages import Score
 from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT
 

@@ -12,7 +12,8 @@ from pipeline.bus.session import Bus
 from pipeline.errors import UserError
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode, encode, type_name
-from schemas.messages import Alarm, Header, Request
+from schemas.header import Header
+from schemas.messages import Alarm, Request
 from schemas.topics import BY_NAME, tray_key
 
 _POLL_S = 0.05

@@ -31,7 +31,7 @@ from pipeline.launch.site_state import AT_WORK, StageState, Word, site_states
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.launch.stage_notes import note_lines, notes_as_json
 from pipeline.runtime.signals import stop_on_signals
-from schemas.messages import Severity
+from schemas.enums import Severity
 from schemas.streams import LOSS_PREFIX
 from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S

@@ -22,18 +22,9 @@ from pipeline.runtime.healthy_twin import ScorerConfig
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Core, Stage
 from schemas.codec import decode, encode, type_name
-from schemas.messages import (
-    Action,
-    Alarm,
-    Diagnosis,
-    Header,
-    InvalidReason,
-    Message,
-    Request,
-    Severity,
-    StageStatus,
-    Transition,
-)
+from schemas.enums import Action, InvalidReason, Severity, StageStatus, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Diagnosis, Message, Request
 from schemas.topics import BY_NAME, tray_key
 from scoring.alarms.current_alarms import CurrentAlarm, clock
 from scoring.alarms.fan_condition import AlarmState, ConditionSettings

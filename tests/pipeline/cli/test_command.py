@@ -19,7 +19,9 @@ from pipeline.cli.watch.commanding import CommandSender, command_of, share_note
 from pipeline.config.models import BusConfig, TrayConfig
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode, type_name
-from schemas.messages import Header, Health, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health
 from schemas.topics import BY_NAME, alive_key, health_key
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO, Chain, RunningCommand, eventually, fantwin

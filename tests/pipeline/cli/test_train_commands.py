@@ -11,7 +11,8 @@ import pytest
 
 from pipeline.cli.twins.training_data import TrainingData
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
 from schemas.topics import tray_key
 from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, counted_run, published_run

@@ -25,7 +25,9 @@ from pipeline.launch.launcher import Launcher, Outcome, _Slot
 from pipeline.launch.notices import Notices
 from pipeline.launch.processes import Child, StageProcess, process_list
 from pipeline.launch.site_watcher import SiteWatcher
-from schemas.messages import Header, Health, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health
 from schemas.topics import alive_key
 from tests.pipeline.launch.test_site_watcher import StubBus
 from tests.support.running_chain import DEMO, SITE, Chain, fantwin

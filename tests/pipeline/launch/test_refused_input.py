@@ -6,7 +6,8 @@ import pytest
 
 from pipeline.launch.launcher import Outcome
 from pipeline.launch.refused_input import ON_THE_DEVICE, refused, refused_lines, unusable_lines
-from schemas.messages import Counter, Health, StageStatus
+from schemas.enums import StageStatus
+from schemas.health import Counter, Health
 from schemas.wire import DEVICE_COUNTERS, FaultKind
 
 HARMLESS = {FaultKind.RESYNC, FaultKind.UNKNOWN_TYPE}

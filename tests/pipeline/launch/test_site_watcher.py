@@ -13,7 +13,10 @@ from pipeline.launch.site_watcher import MOST_UNKNOWN_SESSIONS, MOST_WATCHED_SES
 from pipeline.launch.watched_alarms import MOST_WATCHED_FANS, WATCHED_BYTES
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode
-from schemas.messages import Alarm, Diagnosis, Header, Health, Output, Severity, StageStatus, Transition
+from schemas.enums import Severity, StageStatus, Transition
+from schemas.header import Header
+from schemas.health import Health, Output
+from schemas.messages import Alarm, Diagnosis
 from schemas.topics import alive_key, health_key, sessions_key, tray_key
 from scoring.alarms import current_alarms
 from tests.support.bus_peer import alarm

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from pipeline.runtime.clock import StageClock, is_of_replay
-from schemas.messages import Clock, Header
+from schemas.header import Header
+from schemas.messages import Clock
 
 HOST_NS = 1_800_000_000_000_000_000
 

@@ -15,7 +15,8 @@ from pipeline.runtime.kept_snapshots import KeptForOthers, KeptSnapshots
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode
 from schemas.envelope import Envelope
-from schemas.messages import Header, ScorerSnapshot
+from schemas.header import Header
+from schemas.messages import ScorerSnapshot
 from schemas.topics import tray_key
 from tests.support.running_chain import eventually
 from tests.support.written_recordings import alarm

@@ -16,8 +16,11 @@ from pipeline.launch.loss_accounting import losses
 from pipeline.runtime.runner import TICK_S
 from pipeline.runtime.stage import BuiltStage, Context, Core
 from schemas.codec import encode, type_name
+from schemas.enums import StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import Command, Grid, Header, Health, InputPosition, Message, Note, Output, Raw, StageStatus
+from schemas.header import Header, InputPosition
+from schemas.health import Health, Note, Output
+from schemas.messages import Command, Grid, Message, Raw
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from schemas.units import NS_PER_S
 from tests.support.running_chain import eventually

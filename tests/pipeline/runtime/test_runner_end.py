@@ -19,7 +19,9 @@ from pipeline.errors import UserError
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Context, Stage
 from schemas.codec import decode
-from schemas.messages import Health, Message, StageStatus
+from schemas.enums import StageStatus
+from schemas.health import Health
+from schemas.messages import Message
 from schemas.topics import health_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, toy

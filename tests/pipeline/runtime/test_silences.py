@@ -11,7 +11,9 @@ import pytest
 from pipeline.runtime.killed_sessions import KilledSessions
 from pipeline.runtime.sessions import Session, this_host
 from pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, RESTART_S, Silences
-from schemas.messages import Header, Health, Output, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 

@@ -19,7 +19,8 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.viewing import band_plot
 from pipeline.viewing.band_plot import Fault, plot_bands, plot_recording, read_trace
 from pipeline.viewing.trace import trace_of
-from schemas.messages import Alarm, FanState, Score
+from schemas.enums import FanState
+from schemas.messages import Alarm, Score
 from schemas.topics import tray_key
 from tests.support.score_data import START_NS, made_up_tray
 

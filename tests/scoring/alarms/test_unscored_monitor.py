@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from schemas.messages import InvalidReason
+from schemas.enums import InvalidReason
 from schemas.units import NS_PER_S
 from scoring.alarms.unscored_monitor import REASONS, UnscoredMonitor
 
