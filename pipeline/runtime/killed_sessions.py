@@ -1,7 +1,7 @@
 """Sessions on this host that were killed.
 
-The token of a session disappears when its process dies, and also when a link is cut. Only for processes on this host
-can the two be told apart: by whether the process still runs.
+The token of a session disappears when its process dies, and also when a link is cut. The two can be distinguished
+only for processes on this host: by whether the process still runs.
 """
 
 from __future__ import annotations
