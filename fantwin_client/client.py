@@ -61,7 +61,7 @@ class Client:
         behind. timeout_s: how long to wait for its acquisition.
 
         Raises:
-            NotAllowedError: the certificate may not publish samples of this tray.
+            NotAllowedError: the certificate may not publish samples of this tray, or the router refuses it.
             NoAcquisitionError: no acquisition of this tray is at work, or its source is not `push`.
             ClientError: there is no such unit.
             ValueError: it was taken up before.

@@ -12,7 +12,7 @@ class NoAcquisitionError(ClientError):
 
 
 class NotAllowedError(ClientError):
-    """The certificate may not publish samples of the tray."""
+    """The certificate may not publish samples of the tray, or the router refuses it."""
 
 
 class FanCountError(ClientError):

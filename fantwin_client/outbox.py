@@ -50,7 +50,7 @@ class Block:
 
 
 def most_samples_joined(fans: int) -> int:
-    """The most samples of a message of so many fans; fewer than the bus accepts (`schemas.topics.most_samples`)."""
+    """The most samples in one message of `fans` fans; fewer than the bus accepts (`schemas.topics.most_samples`)."""
     return max(1, min(MOST_SAMPLES, MOST_FAN_SAMPLES // fans))
 
 

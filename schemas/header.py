@@ -1,4 +1,4 @@
-"""The header of every message: who sent it, and what it was made of."""
+"""The header of every message: its producer, and the input that it was made from."""
 
 from __future__ import annotations
 

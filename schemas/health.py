@@ -80,8 +80,8 @@ class Health:
     Attributes:
         trays: those that it has, separated by commas; empty: all of the site. Earlier versions do not say it: there, a
             stage with a process for each tray has the one that its instance names.
-        is_last: of its session, whatever its status. Earlier versions do not say it: see `has_ended`.
-        has_unprocessed: input has arrived of which outputs may still be made, so `outputs` do not show that none came.
+        is_last: the last message of its session, whatever its status. Earlier versions do not set it: see `has_ended`.
+        has_unprocessed: input waits from which outputs may still be made, so `outputs` do not show a silent source.
     """
 
     header: Header = Header()
@@ -109,5 +109,5 @@ class Health:
 
     @property
     def has_ended(self) -> bool:
-        """Whether its session has ended, in order or with an error, and sends no more."""
+        """Whether its session has ended, in order or with an error. It sends no more."""
         return self.is_last or self.status == StageStatus.STOPPED

@@ -2,7 +2,7 @@
 
 Field names, order and units are those of `fan.proto`, and a test compares the two. Codec and export take enums, shapes
 and types from the declarations below, so that a new field needs an entry here and in `fan.proto`, and nothing else.
-What all messages begin with is in `header.py`, the health of a stage in `health.py`, enumerations are in `enums.py`.
+The header of all messages is in `header.py`, the health of a stage in `health.py`, enumerations are in `enums.py`.
 """
 
 from __future__ import annotations

@@ -101,7 +101,7 @@ class DcFans:
 
 
 class FourPinTray(FourPinFans):
-    """Fans with a PWM input of their own, on one supply."""
+    """4-pin fans on one supply."""
 
     @property
     def supply_v(self) -> Array:

@@ -2,9 +2,9 @@
 
 Each fan follows a wanted speed with a first-order lag, slower downwards than upwards (it coasts). The wanted speed is a
 concave curve of the duty above `duty_min`, a plateau below it, and nothing below `duty_stop`; after standstill the fan
-is driven harder for `kick_s`. The supply of a tray gives way with the load of all its fans; the air of the room changes
-slowly; the speed wanders a little. `supply_factor` is of what is measured of the supply beside that: a fan that holds
-its speed makes up for it, until it does not suffice.
+is driven harder for `kick_s`. The supply of a tray sags with the load of all its fans; the air of the room changes
+slowly; the speed wanders a little. `supply_factor` is a further change of the supply, which can be measured. A fan that
+holds its speed compensates for it, as long as the supply suffices.
 
 What Intel's "4-Wire Pulse Width Modulation (PWM) Controlled Fans Specification", revision 1.3 (2005), says is marked
 with its section below; it leaves dynamics to the vendor. All other defaults are those of a typical 120 mm fan.
@@ -65,7 +65,7 @@ class FourPinParameters:
     air_period_s: float | Array = 3600.0
     """period of that"""
     reserve: float | Array = 0.1
-    """at the full speed, the supply may be lower by this share until it does not suffice"""
+    """share by which the fastest possible speed exceeds the full speed, at the nominal supply"""
 
 
 VARYING_PARAMETERS = ("speed_max_rad_s", "speed_min_rad_s", "bend", "up_s", "down_s")
@@ -143,9 +143,9 @@ class FourPinFans:
         self._t_s = 0.0
         self.damage = NO_DAMAGE
         self.supply_factor = 1.0
-        """of the supply voltage now"""
+        """present supply voltage over the nominal one"""
         self.supply_held = 1.0
-        """share of its change for which a fan makes up: 1 if it controls its speed, 0 if that follows the supply"""
+        """the speed is in proportion to `supply_factor ** (1 - supply_held)`: 1 holds the speed against the supply"""
         self.speed_rad_s = np.zeros(fans)
 
     def advance(self, duty: Array, duration_s: float) -> None:
@@ -179,7 +179,7 @@ class FourPinFans:
         return (1.0 - p.sag / self._per_supply * np.repeat(load, self._per_supply)) * (1.0 + air) * (1.0 + self._wander)
 
     def _fastest_rad_s(self) -> Array:
-        """(fans,) the speed for which the supply suffices: in proportion to its voltage."""
+        """(fans,) the fastest speed that the supply allows, rad/s; proportional to its voltage."""
         p = self.parameters
         return p.speed_max_rad_s * (1.0 + np.asarray(p.reserve)) * self.supply_factor
 

@@ -1,8 +1,8 @@
 """What surrounds simulated fans and changes with time: the supply of the tray and the air; and what is measured of it.
 
 The supply wanders around its nominal voltage, as one that others load (a first-order process), and the temperature of
-the air swings around its mean. Air that is warmer than 20 degrees Celsius is thinner, and drags less; a 4-pin fan
-controls its speed, and air does not change that.
+the air swings around its mean. Air that is warmer than 20 degrees Celsius is thinner, and drags less. The temperature
+does not change the speed of a 4-pin fan, which controls it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Surroundings:
     supply_wander_s: float = 20.0
     """correlation time of that"""
     supply_held: float = 1.0
-    """share of it for which 4-pin fans make up: 1 where they control their speed, 0 where that follows the supply"""
+    """of 4-pin fans: 1 if they hold their speed against the supply, 0 if it is proportional to the supply"""
     temperature_c: float = REFERENCE_C
     """mean of the air"""
     temperature_swing_c: float = 0.0

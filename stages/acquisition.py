@@ -160,9 +160,9 @@ class AcquisitionCore(Core):
         }
 
     def notes(self) -> list[str]:
-        """What the source measures beside command and speed, and which input and commands were refused."""
+        """What the source measures beside command and speed, and which input and commands were refused or lost."""
         also = ", ".join(column.title for column in AUXILIARY if column in self._plausibility.auxiliary)
-        found = [f"the source measures {also}, too"] if also else []
+        found = [f"the source also measures {also}"] if also else []
         found += [
             f"refused input: {kind} {self._counts[kind]}, the first of them: {detail}"
             for kind, detail in self._plausibility.first_refused.items()

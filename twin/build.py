@@ -91,7 +91,7 @@ def train_twin(
     drive = None
     if model_kind.knows_drives:
         drive = find_drive(recorded, validation_recorded, identification, standstill, progress)
-    if drive is not None:  # a fan that controls its own speed makes up for its supply, in a way that is not known
+    if drive is not None:  # how a fan that controls its own speed depends on its supply is not known
         conditions, runs, validation_runs, notes = None, recorded, validation_recorded, behind_a_drive(found)
     acting, validation_acting = runs, validation_runs
     if drive is not None:

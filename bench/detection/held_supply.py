@@ -1,8 +1,8 @@
-"""Whether a twin of 4-pin fans should allow for their supply: fans that hold their speed, and fans that follow it.
+"""Compare twins with and without the supply voltage: 4-pin fans that hold their speed, and ones that follow the supply.
 
-For each seed and kind, a physical twin is trained on half an hour of a thermostat's commands, with the measured supply
-voltage and temperature and without, and run freely over another half hour. Printed are its errors, what it has found,
-and the errors of physics alone (`identify`) on the training run.
+For each seed and kind of fan, two physical twins are trained on half an hour of a thermostat's commands, with and
+without the measured supply voltage and temperature. Each runs freely over another half hour. Printed are their errors,
+what the first one uses, and the errors of the physical model without a drive (`identify`) on the training run.
 
     python -m bench.detection.held_supply [--seeds 3] [--seconds 1800]
 """
@@ -56,19 +56,19 @@ def simulated(seed: int, held: float, wander: float, seconds: float) -> Run:
 
 
 def found(twin: TrainedTwin) -> str:
-    """What the twin is made of."""
+    """Whether the twin has a drive, and which columns it uses."""
     used = " and ".join(twin.card.conditions.needed) if twin.card.conditions else "no columns"
     return f"{'a drive' if twin.card.drive else 'no drive'}, {used}"
 
 
 def of_physics(run: Run, reference: ReferenceConditions | None) -> float:
-    """The free-run error of physics alone on the run that it is fitted to, rad/s."""
+    """The free-run error of the physical model without a drive on the run that it is fitted to, rad/s."""
     identified = identify(at_reference([run], reference))
     return float(np.sqrt(np.mean(identified.rmse_rad_s**2)))
 
 
 def error_rad_s(twin: TrainedTwin, run: Run) -> float:
-    """Of the free run; NaN where nothing is measured."""
+    """The error of the free run, rad/s; NaN where nothing is measured."""
     rmse_rad_s = evaluate(twin, [run]).pooled.rmse_rad_s
     return float("nan") if rmse_rad_s is None else rmse_rad_s
 

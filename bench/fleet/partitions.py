@@ -50,9 +50,9 @@ STAGES = ("acquisition", "resampler", "twin_integrator", "scorer", "recorder")
 ROUTER, ROUTERS = "10.78.0.1", 7447
 PLACES = (*STAGES, "router")
 KINDS = ("cut", "deaf", "mute", "lossy", "slow")
-"""all packets; those to the stage; those of the stage; 20 % of both; what is above SLOW of each"""
+"""which packets are dropped: all; those to the stage; those from it; 20 % of both; those above the rate SLOW"""
 SLOW = "16kb/s"
-"""less than the stages' streams need"""
+"""per direction; less than the streams of the stages need"""
 BEFORE_S, AFTER_S = 25.0, 10.0
 """the first is longer than the scorer needs to begin"""
 FAULT_S, PERIOD_S = 6.0, 15.0

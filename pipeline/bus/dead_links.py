@@ -1,8 +1,8 @@
-"""TCP connections whose other end has vanished are given up soon.
+"""Closes TCP connections whose other end has vanished.
 
-A router that has something to send to a client that was cut off waits for the kernel, which repeats it for a quarter of
-an hour. Until then Zenoh closes neither the connection nor the session, and shows the client's tokens; the client comes
-back by another connection, and nothing that it sends arrives anywhere. Zenoh has no setting for it.
+If a client is cut off while its router has data to send, the kernel of the router retransmits for a quarter of an hour.
+Until then Zenoh closes neither the connection nor the session, and still shows the client's tokens. A client that
+connects again meanwhile reaches nobody with its messages. Zenoh has no setting for this.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 UNACKNOWLEDGED_MS = 6000
-"""so long something that was sent may stay without an acknowledgement: longer than the lease, which alone ends a
-connection with nothing to send"""
+"""longest time without an acknowledgement of sent data. Longer than the lease, which ends connections with nothing to
+send"""
 _LOOK_S = 1.0
 
 
 @contextmanager
 def given_up_soon() -> Iterator[None]:
-    """Until the block ends, all TCP connections of this process are given up when what was sent is not acknowledged in
-    time. Where the system has no such setting, nothing happens."""
+    """Inside the block, the kernel closes each TCP connection of this process that does not acknowledge sent data for
+    `UNACKNOWLEDGED_MS`. A system without this setting (TCP_USER_TIMEOUT) is left as it is."""
     if not hasattr(socket, "TCP_USER_TIMEOUT"):
         yield
         return
@@ -42,7 +42,7 @@ def given_up_soon() -> Iterator[None]:
 
 
 def limit_connections() -> None:
-    """Set the limit for the TCP connections that this process has now."""
+    """Set the limit, `UNACKNOWLEDGED_MS`, for the TCP connections that this process has now."""
     for path in Path("/proc/self/fd").iterdir():
         with suppress(OSError):  # closed meanwhile, or no socket
             if path.readlink().name.startswith("socket:"):
@@ -51,4 +51,4 @@ def limit_connections() -> None:
                     if its.type == socket.SOCK_STREAM and its.family in (socket.AF_INET, socket.AF_INET6):
                         its.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNACKNOWLEDGED_MS)
                 finally:
-                    its.detach()  # it stays open
+                    its.detach()  # the descriptor is not ours to close

@@ -12,7 +12,7 @@ class BusError(UserError):
 
 
 class NoAnswerError(BusError):
-    """Who is on the bus is not known."""
+    """No complete answer came to the question who is on the bus."""
 
 
 def reason(error: zenoh.ZError) -> str:

@@ -85,7 +85,9 @@ class OwnRights:
         if self._own is None:
             return f"its certificate says {role!r}, which is no role of site {self._site.site!r}; all is refused"
         if refused := self._refused(self._own):
-            return f"its certificate says {role!r}, which may not {refused}; give it that of {self._fitting_role()}"
+            return (
+                f"its certificate says {role!r}, which may not {refused}; use the certificate of {self._fitting_role()}"
+            )
         is_connected = self._is_connected()
         with self._lock:
             granted, asked_s = self._granted, self._asked_s
@@ -95,7 +97,7 @@ class OwnRights:
                 f"site {self._site.site!r} that has this role"
             )
         if granted and (refused := self._refused(granted)):
-            return f"the router does not let {role!r} {refused}: restart it with the configuration that holds here"
+            return f"the router does not let {role!r} {refused}: restart the router with this configuration"
         return ""
 
     def wait(self, stop: threading.Event | None = None) -> str:
@@ -118,14 +120,14 @@ class OwnRights:
         return bool(routers)
 
     def _fitting_role(self) -> str:
-        """The role for all that this session declares, for people: an operator's, or that of its stage."""
+        """The role that may send all that this session declares, in words: the operator's, or that of its stage."""
         rights = self._site.rights(OPERATOR)
         is_operator = rights is not None and all(rights.allow(*claim) for claim in tuple(self._claims))
         return f"role {OPERATOR!r}" if is_operator else "its own role"
 
     def _refused(self, rights: Rights) -> str:
         refused = [(message, key) for message, key in tuple(self._claims) if not rights.allow(message, key)]
-        # who may not publish may not answer for what it has published either: that needs no words
+        # a role that may not publish may not answer for published messages either: that is not named as well
         found = [claim for claim in refused if claim[0] != "declare_queryable"] or refused
         words = list(dict.fromkeys(f"{_WORDS.get(message, message)} {key_in_words(key)}" for message, key in found))
         more = f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else ""

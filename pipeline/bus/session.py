@@ -56,9 +56,9 @@ MEETING_LIMIT_S = 10.0
 """by then a process that listens at the endpoint has answered, however busy the machine"""
 _MEETING_POLL_S = 0.01
 RIGHTS_ASKED = 2
-"""times that a router is asked before no answer is one: a busy host may be late"""
+"""so many requests must stay unanswered until a router is taken to know no such role: a busy host may be late"""
 _ALIVE_TIMEOUTS = 2
-"""so many times recovery_timeout_s it is asked who is there"""
+"""`Bus.alive` asks again for so many times `recovery_timeout_s`"""
 
 
 class Bus:
@@ -175,7 +175,7 @@ class Bus:
         """The keys of the tokens that exist now. Asks again if there is no complete answer.
 
         Raises:
-            NoAnswerError: nobody has answered: who is there is not known.
+            NoAnswerError: no complete answer came: which tokens exist is not known.
         """
         timeout_s = self._config.recovery_timeout_s
         until_s = time.monotonic() + _ALIVE_TIMEOUTS * timeout_s
@@ -186,8 +186,9 @@ class Bus:
                 return found
             if time.monotonic() > until_s:
                 raise NoAnswerError(
-                    f"bus.endpoint = {self._config.endpoint!r}: who is on the bus is not known, nobody has answered "
-                    f"within {_ALIVE_TIMEOUTS * timeout_s:g} s: see that the router runs and is not overloaded"
+                    f"bus.endpoint = {self._config.endpoint!r}: no complete answer within "
+                    f"{_ALIVE_TIMEOUTS * timeout_s:g} s to the question who is on the bus: check that the router runs "
+                    "and is not overloaded"
                 )
             time.sleep(_ROUTER_RETRY_S)
 
@@ -241,8 +242,8 @@ class Bus:
         return granted_rights(self._session, site.site, role) == site.rights(role)
 
     def why_not_published(self, site: str, key: str) -> str:
-        """Why the router lets nothing through that this session publishes on a key of a site, and what to do; empty if
-        it does, or without `bus.security`. For a program that knows no roles; it waits for the answer."""
+        """Why the router refuses what this session publishes on a key of a site; empty if it accepts it, or without
+        `bus.security`. For a program that knows no roles. Waits for the answer of the router."""
         if self.credentials is None:
             return ""
         role = self.credentials.role
@@ -250,7 +251,7 @@ class Bus:
         granted = next(filter(None, asked), None)
         whose = f"{self.credentials.certificate} is a certificate of role {role!r}"
         if granted is None:
-            return f"{whose}, which the router at {self._config.endpoint} refuses: no such role in site {site!r}"
+            return f"{whose}, which the router at {self._config.endpoint} does not know in site {site!r}"
         return "" if granted.allow("put", key) else f"{whose}, which may not publish {key_in_words(key)}"
 
     def security_problem(self) -> str:

@@ -60,7 +60,7 @@ def roles_of(config: Config) -> dict[str, Role]:
 
 
 def roles_of_stages() -> dict[str, Role]:
-    """The roles of all stages, for all trays, and that of a replay, by name: without a configuration."""
+    """By name, the roles of all stages and of a replay that hold without a configuration: for all trays."""
     return {role.name: role for role in (*(_of_stage(stage, stage, (), ()) for stage in STAGES), _of_replay())}
 
 

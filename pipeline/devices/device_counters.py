@@ -1,4 +1,4 @@
-"""What a device has counted itself, such as damaged frames: how much since the host reads its line."""
+"""How far the counters of a device, such as that of damaged frames, have advanced while the host read its line."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ class DeviceCounterSteps:
         self._was_interrupted = True
 
     def connection_interrupted(self) -> None:
-        """What the device counts until its next frame was not on this connection, unless it restarts."""
+        """Leave out what the device counts until its next frame, unless the device restarts meanwhile."""
         self._was_interrupted = True
 
     def steps(self, now: DeviceCounters) -> Mapping[str, int]:
-        """How much was counted since the frame before, by the names of `DEVICE_COUNTERS`; after an interruption 0, or
-        what was counted since the restart of the device."""
+        """The advance of each counter since the frame before, by the names of `DEVICE_COUNTERS`. If the device has
+        restarted: since the restart. Otherwise 0 for the first frame after an interruption."""
         last, self._last = self._last, now
         if last is not None and now.uptime_s <= last.uptime_s:
             before = (0,) * len(now.counts)

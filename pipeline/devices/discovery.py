@@ -17,7 +17,7 @@ from pipeline.devices.hwmon_tree import ChipFolder, chip_folders, device_words
 HIGHEST_RPM = 20_000
 MOST_IN_TRAY = 64
 _UNKNOWN = "n/a"
-"""what pyserial says of a port of which the system knows nothing"""
+"""what pyserial returns for a port of which the system knows no device"""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def discover_hwmon(root: Path = ROOT, *, writable: bool = False) -> Iterator[Fou
 
 
 def discover_serial() -> Iterator[Found]:
-    """The serial ports that have a device behind them. The system may list more: then nothing is known of them."""
+    """The serial ports with a known device, each with a guessed [[tray]]; then all other ports as one entry."""
     from serial.tools import list_ports  # noqa: PLC0415  slow to import, and needed here only
 
     listed = sorted(list_ports.comports())
@@ -86,7 +86,7 @@ def discover_serial() -> Iterator[Found]:
         note = "fans, protocol and unit are a guess: `fantwin doctor` listens and says what does not fit"
         yield Found("serial", f"{port.device}: {port.description}", keys, (note,), missing)
     if unknown := [port.device for port in listed if port not in ports]:
-        lacks = "no device is known there, left out; if one is connected, name its port in a [[tray]] yourself"
+        lacks = "no device is known there; if one is connected, name its port in a [[tray]] yourself"
         yield Found("serial", ", ".join(unknown), {}, missing=(lacks,))
     if not listed:
         yield Found("serial", "serial ports", {}, missing=("none is there: connect the device",))

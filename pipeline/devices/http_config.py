@@ -38,8 +38,8 @@ class HttpConfig(SourceConfig, frozen=True):
 
     @property
     def why_no_commands(self) -> str:
-        """Nothing sends them to the client."""
-        return "whatever posts its samples moves the fans"
+        """No command is sent to the program that posts samples."""
+        return "the program that posts its samples moves the fans"
 
     @model_validator(mode="after")
     def _is_protected(self) -> Self:

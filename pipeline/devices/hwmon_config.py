@@ -52,7 +52,7 @@ class HwmonConfig(PolledConfig, frozen=True):
 
     @property
     def why_no_commands(self) -> str:
-        """They are written only where the configuration says so."""
+        """Commands are written only if `writable` is set."""
         return "" if self.writable else "its source does not have writable = true"
 
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:

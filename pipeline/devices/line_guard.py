@@ -92,7 +92,7 @@ class LineGuard:
 
     @property
     def is_holding(self) -> bool:
-        """Whether it is undecided whether samples belong to the line."""
+        """Whether samples are held until it is decided if they belong to the line."""
         return bool(self._held)
 
     def problem(self) -> str:

@@ -86,7 +86,7 @@ class ModbusConfig(PolledConfig, frozen=True):
 
     @property
     def why_no_commands(self) -> str:
-        """They need a register."""
+        """Commands need a fan with a register `write`."""
         return "" if any(fan.write for fan in self.fan) else "no fan of its source has a register `write`"
 
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:

@@ -191,7 +191,7 @@ class ModbusDevice:
             raise self._lost(error.strerror or str(error)) from error
 
     def _lost(self, what: str) -> DeviceError:
-        """The same for a port that is unplugged, whether it was in use or is to be opened again."""
+        """The error of a lost line. For a port that no longer exists it says so, whatever failed."""
         if self._port and not Path(self._port).exists():
             what = "no such port, is it unplugged?"
         return DeviceError(f"{self.name}: {what}; waiting for it", is_lost=True)

@@ -74,7 +74,7 @@ class MqttConfig(SourceConfig, frozen=True):
 
     @property
     def why_no_commands(self) -> str:
-        """They need a topic."""
+        """Commands need `send_topic`."""
         return "" if self.send_topic else "its source names no send_topic"
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Which readings of a tray can be true: the same rules for all sources. What cannot is counted, by kind."""
+"""The plausibility of readings, by the same rules for all sources. Implausible ones are counted by kind."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Plausibility:
         quality: InputQuality,
         sequence: DeviceSequence,
     ) -> None:
-        """counts, quality, sequence: of the tray; what is refused is added to them."""
+        """counts, quality, sequence: those of the tray; readings that are refused are added to them."""
         self.limits = limits
         self._speed_unit = speed_unit
         self._counts = counts
@@ -32,7 +32,7 @@ class Plausibility:
         self.auxiliary: list[AuxiliaryColumn] = []
         """the columns beside command and speed that the source has given"""
         self.first_refused: dict[str, str] = {}
-        """by kind of refused input: what was wrong with the first"""
+        """by kind of refused input: what was wrong with the first piece"""
 
     def plausible(self, item: Reading | Rejected) -> Reading | None:
         """The reading, without implausible speeds; None, and counted, if it cannot be used."""

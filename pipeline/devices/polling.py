@@ -100,7 +100,7 @@ class _Write:
         self.command, self.set_point = command, set_point
         self.is_done = threading.Event()
         self.failure = ""
-        """why it could not be written"""
+        """why the command could not be written; empty if it was"""
         self.is_awaited = True
         """its sender still waits for the outcome"""
 

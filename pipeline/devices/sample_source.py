@@ -40,7 +40,7 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
 
     @property
     def why_no_commands(self) -> str:
-        """Why commands of `fantwin command` and `sweep` cannot reach the fans, in a few words; empty: they may."""
+        """Why no command of `fantwin command` or `sweep` can reach the fans, in a few words; empty if it can."""
         return ""
 
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
@@ -59,7 +59,7 @@ FLOAT32_TOLERANCE = 1e-6
 
 
 def limits_of_float32(low: float, high: float) -> tuple[float, float]:
-    """The limits of a range given in decimals for float32 values: 0.1 as float32 is not beyond 0.1."""
+    """The range from low to high, widened by the rounding of float32, so that 0.1 as float32 is not beyond 0.1."""
     tolerance = FLOAT32_TOLERANCE * max(abs(low), abs(high))
     return low - tolerance, high + tolerance
 
@@ -163,7 +163,7 @@ class ReadingBatch:
     tachos: tuple[Tacho, ...] = ()
     """what the device itself says that it measures, one for all fans or one for each; empty where it does not say"""
     device_counts: Mapping[str, int] = field(default_factory=dict)
-    """what the device itself has counted since it said so last, such as damaged frames"""
+    """the advance of the counters of the device itself, such as that of damaged frames, since the batch before"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,8 +203,8 @@ class SampleSource(Protocol):
         ...
 
     def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
-        """Send to the device. Returns why it was not sent, in a few words; empty: it was. Never blocks for long, never
-        raises.
+        """Send to the device. Returns why nothing was sent, in a few words; empty if it was. Never blocks for long,
+        never raises.
 
         command: in the tray's command unit; set_point: in its speed unit. Each has one value per fan, where NaN leaves
         the fan as it is, or is empty.

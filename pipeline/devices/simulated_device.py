@@ -42,7 +42,7 @@ _COUNTER_OF_FAULT = {
     wire.FaultKind.WRONG_TYPE: "wrong_kind",
     wire.FaultKind.WRONG_FAN_COUNT: "wrong_kind",
 }
-"""as a device counts a fault of its input; any other is a bad length"""
+"""the counter of a device for each fault of its input; any other fault counts as a bad length"""
 
 
 class DeviceSample(Protocol):

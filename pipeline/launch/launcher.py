@@ -125,7 +125,7 @@ class Launcher:
             UserError: a stage cannot run as configured; the others have been stopped.
         """
         self._refuse_unusable_twins()
-        for slot in self._slots:  # before one of them has made a file
+        for slot in self._slots:  # an unusable certificate ends `up` before any stage has made a file
             credentials_of(self._config.bus, role_names(slot.row.stage, slot.row.shard))
         reads = {name: load_stage(name).reads_as_configured(self._config) for name in self._config.stages}
         with join_bus(self._config, stop, say=self._say) as bus:
@@ -273,7 +273,7 @@ class Launcher:
                 continue
             if status == EXIT_CANNOT_START and not slot.was_ready:
                 slot.child.stop(0.1)
-                reason, slot.child = slot.child.last_line, None  # which ends with this error, and with no other line
+                reason, slot.child = slot.child.last_line, None  # `up` ends with this error alone
                 raise UserError(reason or f"{slot.row.label} cannot start as configured")
             self._plan_restart(slot, status, now)
         self._kill_what_hangs(now)
@@ -303,7 +303,7 @@ class Launcher:
             slot.delay_s = self._config.launcher.restart_delay_s
         how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
         if status == EXIT_CANNOT_START:
-            slot.child.stop(0.1)  # its last line may still be on its way
+            slot.child.stop(0.1)  # its last line may still be in the pipe
             how = f"cannot start: {slot.child.last_line}"
         self._say(f"{slot.row.label}: {slot.hung or how}, restarting in {slot.delay_s:.1f} s")
         slot.hung = ""

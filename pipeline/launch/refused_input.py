@@ -1,5 +1,5 @@
-"""What stages have refused, over all their sessions: messages of others, and input of devices that is no usable sample;
-and what devices themselves have refused or lost, where they count it.
+"""What stages have refused, over all their sessions: messages of others, and input of devices that is no usable sample.
+Also what devices themselves have refused or lost, if they send their counters.
 
 Refused input is shown apart from losses. A stage that has refused all that its device sent has failed.
 """
@@ -40,7 +40,7 @@ ON_THE_DEVICE = {
     "device_host_silences": "silences of the host",
     "device_watchdog_resets": "restarts by its watchdog",
 }
-"""by counter: what is lost or wrong there"""
+"""by counter of a device: what it counts"""
 _LINE = "protocol and baud of the [[tray]], and the wiring"
 _TIMES = "the times that its client gives"
 _SETTINGS = {
@@ -66,8 +66,8 @@ _SETTINGS = {
 
 
 def refused(healths: Iterable[Health]) -> dict[str, dict[str, int]]:
-    """How much each stage and its device have refused or lost, by the label of the stage and by counter; only what is
-    not 0. `refused_input` is the sum of the faults of a device's input, which are there, too.
+    """How much each stage and its device have refused or lost, by the label of the stage and by counter; only counters
+    that are not 0. `refused_input` is the sum of the faults of a device's input, whose counters are also included.
 
     healths: the last of every session.
     """

@@ -73,8 +73,8 @@ class SiteWatcher:
     """
 
     def __init__(self, bus: Bus, site: str, roles: Mapping[str, Role] | None = None) -> None:
-        """roles: those of the site, with the trays to which they are limited; None: those of all stages, for all
-        trays."""
+        """roles: those of the site, each with the trays to which it is limited. None: the roles of all stages, not
+        limited to trays."""
         self._believed_outputs = BelievedOutputs(roles_of_stages() if roles is None else roles)
         self._bus = bus
         self._site = site

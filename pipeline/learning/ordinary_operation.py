@@ -37,7 +37,7 @@ class OrdinaryOperation:
         self.how_to_move = (
             "`fantwin sweep` moves the fans" if takes_commands else "the fans' own controller must vary their commands"
         )
-        """for people"""
+        """how the fans can be moved, for messages to people"""
 
     def take(self, raw: Raw) -> None:
         """Take samples, in the order in which they were received."""

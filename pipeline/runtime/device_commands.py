@@ -1,4 +1,4 @@
-"""Commands on their way to the device of a tray: checked, sent, counted, and the reason of what was not sent."""
+"""Checks commands, sends them to the device of a tray, and counts those that were sent, refused and lost."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ class DeviceCommands:
         for values in (command, set_point):
             if len(values) not in (0, tray.fans):
                 return f"it is for {len(values)} fans, the tray has {tray.fans}"
-        for what, values, low, high in (
-            ("command", command, tray.command_min, tray.command_max),
-            (f"set-point, {tray.speed_unit},", set_point, -tray.speed_max, tray.speed_max),
+        for what, values, low, high, unit in (
+            ("command", command, tray.command_min, tray.command_max, ""),
+            ("set-point", set_point, -tray.speed_max, tray.speed_max, f" {tray.speed_unit}"),
         ):
             for fan, value in enumerate(values):
                 if not (math.isnan(value) or within(value, low, high)):
-                    return f"the {what} of fan {fan} is {value:g}, outside {low:g} to {high:g}"
+                    return f"the {what} of fan {fan} is {value:g}{unit}, outside {low:g} to {high:g}{unit}"
         return ""

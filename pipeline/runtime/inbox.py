@@ -106,7 +106,7 @@ class Inbox:
 
     @property
     def has_input(self) -> bool:
-        """Whether something waits of which a stage makes outputs: health of others and liveliness are none."""
+        """Whether an item waits from which the stage may make outputs; health of others and liveliness do not count."""
         return self._inputs > 0
 
     def close(self) -> None:

@@ -117,7 +117,7 @@ class KeptSnapshots:
         return is_there
 
     def _has_keeper(self, bus: Bus, tray: str) -> bool:
-        """False also where nobody answers: who cannot be asked does not help."""
+        """Whether such a stage is there. False also without an answer of the bus: then it cannot be asked either."""
         keepers = filter(keeps_snapshots, STAGES)
         try:
             tokens = [token for stage in keepers for token in bus.alive(sessions_key(self._site, stage))]

@@ -1,7 +1,7 @@
 """Sessions on this host that were killed.
 
-The token of a session goes when its process dies, and also when a link is cut. Which of them it was can be seen of
-processes of this host alone.
+The token of a session disappears when its process dies, and also when a link is cut. The two can be distinguished
+only for processes on this host: by whether the process still runs.
 """
 
 from __future__ import annotations
@@ -14,17 +14,18 @@ from pipeline.runtime.sessions import MOST_SESSIONS, Session
 
 @dataclass
 class KilledSessions:
-    """host: the name of this one, as sessions show it."""
+    """Finds sessions whose token has disappeared and whose process no longer runs. host: the name of this host, as
+    sessions show it."""
 
     host: str
     _seen: dict[str, Session] = field(default_factory=dict)
-    """by token: sessions whose process has been seen to run here. In a container, processes of others have numbers
-    that do not exist here, or are of another process"""
+    """by token: sessions whose process was once found to run here. The number of a process in another container may not
+    exist here, or may be that of another process"""
     _gone: dict[str, Session] = field(default_factory=dict)
-    """by token: those of them whose token has gone"""
+    """by token: those of them whose token has disappeared"""
 
     def update(self, key: str, alive: bool) -> None:
-        """A token has appeared, or gone."""
+        """A token has appeared or disappeared."""
         if not alive:
             if (session := self._seen.pop(key, None)) is not None:
                 self._gone[key] = session
@@ -37,7 +38,7 @@ class KilledSessions:
             self._seen[key] = session
 
     def take(self) -> list[str]:
-        """The producers of those whose token has gone and whose process runs no more, each once."""
+        """The producers of the sessions that were killed; each is returned once."""
         killed = {key: each for key, each in self._gone.items() if not each.may_live(self.host)}
         for key in killed:
             del self._gone[key]

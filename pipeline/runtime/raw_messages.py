@@ -1,4 +1,4 @@
-"""Readings to messages of raw samples."""
+"""Makes messages of raw samples from readings."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ MANY_TRAYS = 16
 """in a process that processes several trays in one pass: then it takes messages at its ticks, together"""
 
 MOST_UNREADABLE_KEYS = 16
-"""so many keys of messages that cannot be read are named"""
+"""the most keys that are named in the note on messages that cannot be read"""
 
 
 class Receiver:
@@ -74,9 +74,9 @@ class Receiver:
         self._health = health
         self._due = due
         self.counts: Counter[str] = Counter()
+        """of messages that could not be taken, by reason"""
         self._unreadable: Counter[str] = Counter()
-        """messages that cannot be read, by key; of the first MOST_UNREADABLE_KEYS"""
-        """of messages that could not be taken"""
+        """by key, the number of messages that cannot be read; at most MOST_UNREADABLE_KEYS keys"""
         self._recovery = Recovery(bus, inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
         self.tracker = SequenceTracker(self._recovery.ask, sessions=sessions)
         reads = stage.reads_as_configured(config)
@@ -142,7 +142,7 @@ class Receiver:
         return self.peers.awaits_last_health() or self.tracker.is_waiting
 
     def ask_again(self) -> None:
-        """Send again the requests that were not answered, as they become due; see which sessions were killed."""
+        """Repeat unanswered requests when they are due; find sessions that were killed."""
         self._recovery.send_due()
         for producer in self._killed.take():
             self._silences.end(producer)
@@ -246,7 +246,7 @@ class Receiver:
         return [envelope for envelope in decoded if envelope]
 
     def note(self) -> str:
-        """Where messages came that cannot be read, and how many; empty if there were none."""
+        """How many messages could not be read, by key; empty if there were none."""
         where = ", ".join(f"{count} on {key_in_words(key)}" for key, count in self._unreadable.most_common())
         return f"messages that cannot be read: {where}" if where else ""
 

@@ -106,7 +106,7 @@ class SampleGrid:
         for message in self._guard.admit(item, is_of_ended=item.header.producer in self._ended_producers):
             self._add(message, is_new=message.header.producer == self._guard.producer)
         if self._guard.is_holding:
-            self._silence_ns = self._shown_silence_ns = 0  # samples have come, which may be the next ones of the line
+            self._silence_ns = self._shown_silence_ns = 0  # the samples held may be the next ones of the line
         return self._published()
 
     def tick(self, now_ns: int, *, is_complete: bool = True) -> list[Grid]:

@@ -27,9 +27,9 @@ MOST_HELD_BYTES = 64 << 20
 MOST_PER_S = 100_000
 """no producer publishes more messages a second on one key"""
 PATIENCE_S, PATIENCE_WITH_REPLACED_S = 120.0, 5.0
-"""how long a stage is asked again while it does not answer: a link may be slow, lose packets, or work in one direction
-only. The second is for one whose place another process has taken: it has ended, and its last answer may be on the way
-"""
+"""how long requests to a stage without an answer are repeated: its link may be slow, lose packets, or work in one
+direction only. The second is for a stage whose place another process has taken: only its last answer may still
+arrive"""
 ASKED_AGAIN_AFTER_S = 0.5
 REFUSAL_SHOWN_S = 60.0
 """how long health names what was refused"""

@@ -110,7 +110,7 @@ class Session:
 
 
 def this_host() -> str:
-    """The name of this host, as sessions show it."""
+    """The name of this host in tokens of sessions."""
     return re.sub(r"[^A-Za-z0-9_.-]", "_", socket.gethostname()) or "unknown"
 
 
@@ -128,7 +128,7 @@ class Sessions:
         self._written: dict[str, set[str]] = {}
         """by producer of a session: the keys on which it publishes"""
         self._ended: dict[str, Session] = {}
-        """by producer: the last sessions that have ended, whose messages may still be on the way"""
+        """by producer: the last sessions whose token has disappeared; their messages may still be on the way"""
 
     def update(self, key: str, alive: bool) -> None:
         """A token has appeared, or gone."""
@@ -162,7 +162,8 @@ class Sessions:
         return producer in self._written
 
     def may_return(self, producer: str) -> bool:
-        """Whether this producer is a session that has left and may only be cut off: nobody has taken its place."""
+        """Whether the token of this producer's session has disappeared, but no other session has taken its place: the
+        link may only be cut."""
         session = self._ended.get(producer)
         return session is not None and self.named(session.stage, session.instance) is None
 

@@ -1,15 +1,15 @@
-"""Whether nothing comes because nothing is sent, or because the link to the producer may be cut.
+"""Distinguishes a producer that sends nothing from a link that may be cut.
 
-A stage that works publishes health each second, with the number of messages that it has published. So a consumer that
-has as many knows that there was no more until then, unless the producer says that it has not processed all of its
-input. Without that, a silence says nothing: what was sent may be kept by its producer, and come when the link is there
-again.
+A running stage publishes health each second, with the number of messages that it has published. A consumer that has
+received as many knows that no more were sent until then, unless the producer reports unprocessed input. Without such a
+health, the producer may be keeping messages that arrive when the link is back.
 
-A health that was long on its way, because the link was cut meanwhile, says nothing of the time since it was sent.
+Three kinds of health show no silence. One that arrived late, because the link was cut meanwhile, does not cover the
+time since it was sent. A producer with unprocessed input may still publish. A session that has just begun and has
+published nothing may still be reading what its device has kept.
 
-A session that has just begun may still read what its device has kept, so its first healths show nothing before its
-first message. After a session that has ended with an error, or was killed, the next one is waited for, which reads what
-the device keeps meanwhile.
+After a session that has ended with an error, or was killed, the consumer waits `RESTART_S` for the next session, which
+reads what the device has kept meanwhile.
 """
 
 from __future__ import annotations
@@ -26,28 +26,30 @@ from schemas.streams import StreamId, output_streams
 from schemas.units import NS_PER_S
 
 BEGINS_NS = 5 * NS_PER_S
-"""so long after its start has been reported, a session without a message has read what its device had kept"""
+"""this long after its first health that is not STARTING, a session has read what its device had kept"""
 MOST_DELAY_S = 0.4
-"""a health that was so much longer on its way than others came late: less than a resampler waits at least"""
+"""a health that took this much longer to arrive than the fastest of the last ones is late; less than a resampler
+waits"""
 _DELAYS = 16
-"""so many of the last healths are compared: it takes as long until a clock that was set does not matter any more"""
+"""number of the last healths that are compared; after as many, a step of a host clock no longer matters"""
 RESTART_S = 5.0
-"""how long after the end of a session that did not end in order the next one is waited for"""
+"""how long the next session is awaited after the end of one that did not end in order"""
 
 
 @dataclass(frozen=True, slots=True)
 class _Ended:
-    """The end of a session; at_s: when it counts, monotonic."""
+    """The end of a session. has_all: whether all that it sent has arrived. at_s: when the end counts, monotonic
+    time."""
 
     has_all: Callable[[], bool]
     at_s: float
 
 
 class Silences:
-    """Of the main inputs of a stage."""
+    """The silences of the producers of a stage's main inputs."""
 
     def __init__(self, trays: Mapping[str, str], now_s: Callable[[], float] = time.monotonic) -> None:
-        """trays: that of each key of the main input."""
+        """trays: the tray of each key of the main input."""
         self._trays = trays
         self._now_s = now_s
         self._reporting: dict[str, tuple[str, Callable[[], bool]]] = {}
@@ -56,15 +58,17 @@ class Silences:
         self._ended: dict[str, _Ended] = {}
         """by tray whose producer has ended"""
         self._unordered_s: dict[str, float] = {}
-        """by tray: when its producer ended not in order, the first time since it sent something"""
+        """by tray: when a producer first ended not in order since one last published, monotonic time"""
         self._begun: dict[str, tuple[str, int]] = {}
-        """by tray: a producer without a message, and the time of its first health after its start, ns"""
+        """by tray: a producer that has published nothing, and the time of its first health after its start, ns"""
         self._ages_s: dict[str, tuple[str, deque[float]]] = {}
-        """by tray: a producer, and the ages of its last healths when they came, plus a constant: clocks differ"""
+        """by tray: a producer, and the ages of its last healths on arrival, plus an unknown constant, because clocks
+        differ"""
         self._shown: set[str] = set()
 
     def add_health(self, health: Health, has_all_of: Callable[[StreamId, int], bool]) -> None:
-        """A stage says how many messages it has published; has_all_of: whether a stream has arrived up to a number."""
+        """A stage reports how many messages it has published. has_all_of: whether a stream has arrived up to a
+        number."""
         producer = health.header.producer
         for stream, published in output_streams(health).items():
             tray = self._trays.get(stream[0])
@@ -83,13 +87,13 @@ class Silences:
                 self._shown.add(tray)
 
     def end(self, producer: str) -> None:
-        """This producer was killed: what has not left it does not come any more."""
+        """This producer was killed: it sends no more."""
         for tray, (its_producer, _) in self._reporting.items():
             if its_producer == producer and tray not in self._ended:
                 self._end(tray, is_in_order=False)
 
     def take(self, tray: str) -> bool:
-        """Whether its producer has shown, since this was last asked, that there is no more; True also for a producer
+        """Whether the tray's producer has shown, since the last call, that there is no more; True also for a producer
         that never shows it."""
         ended = self._ended.get(tray)
         if ended and self._now_s() >= ended.at_s and ended.has_all():
@@ -112,7 +116,7 @@ class Silences:
         return ages_s[-1] - min(ages_s) > MOST_DELAY_S
 
     def _has_begun(self, tray: str, health: Health) -> bool:
-        """Whether a session has been at work for a while, though it has published nothing."""
+        """Whether a session that has published nothing has run for `BEGINS_NS` since its start."""
         producer = health.header.producer
         if health.status == StageStatus.STARTING or self._begun.get(tray, ("", 0))[0] != producer:
             self._begun[tray] = producer, health.t_ns

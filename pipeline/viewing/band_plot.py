@@ -1,8 +1,8 @@
 """bands.png: the fans of a tray beside their healthy twins, from a recording.
 
 One panel per fan shows measured speed, prediction, the band of two standard deviations, samples outside it as red dots,
-and red zones above and below the band while an alarm was active. Smaller ones below show supply voltage, current and
-temperature, if they were measured, and a lane the states and, if known, the true fault.
+and red zones above and below the band while an alarm was active. Smaller panels below it show supply voltage, current
+and temperature, if they were measured. A lane shows the states and, if known, the true fault.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from schemas.units import NS_PER_S, SpeedUnit
 MAX_PANELS = 12
 PANEL_HEIGHT_IN, BESIDE_HEIGHT_IN, LANE_HEIGHT_IN, WIDTH_IN = 2.3, 0.8, 0.2, 12.0
 LEAST_REACH = 0.02
-"""of the axis of what was measured beside, around its middle, a share of the largest value: noise looks small"""
+"""least half-height of an axis of these smaller panels, as a share of the largest value, so that noise looks small"""
 BETWEEN_IN, HEADER_IN, FOOT_IN = 0.5, 1.25, 0.6
 
 MEASURED, TWIN, BAND, ZONE, OUTSIDE, FAULT = "#454545", "#006e30", "#8fd9a8", "#f4a3a3", "#d62020", "#4a4a8a"
@@ -248,7 +248,7 @@ def _draw_panel(axes: Axes, trace: Trace, fan: int, faults: Sequence[Fault]) -> 
 
 
 def _draw_beside(axes: Axes, trace: Trace, fan: int, column: AuxiliaryColumn) -> None:
-    """Draw what was measured of the fan beside command and speed."""
+    """Draw a column that was measured beside command and speed of the fan."""
     gaps, values = _gaps(trace.t_ns), trace.auxiliary[column.name][:, fan]
     t_s = _seconds(trace, trace.t_ns)
     axes.plot(np.insert(t_s, gaps, t_s[gaps]), np.insert(values, gaps, np.nan), color=BESIDE, lw=0.7)

@@ -79,7 +79,7 @@ class FleetView:
         return self._places.taken()
 
     def history(self, tray: str) -> Sequence[Score]:
-        """The samples of a tray that were added within the last window, one a score, with `MEASURED_COLUMNS`."""
+        """The samples of a tray that were added within the last window, one score each, with `MEASURED_COLUMNS`."""
         kept = self._history[tray]
         return [score for score in kept if 0 <= int(kept[-1].t_ns[0] - score.t_ns[0]) < self._window_ns]
 

@@ -1,9 +1,8 @@
 """A fleet in Rerun: a map with a cell for every fan, the worst fans by name, alarm log, and a tab with a few plots.
 
-A cell is a point; its class says its colour and, under the mouse, its meaning. The layout of a fleet that is watched
-changes only when supply voltage, current or temperature are measured for the first time: a plot has a fixed place, and
-what the fans in it leave behind stays at its time. So nothing jumps under an operator's hands, and a file shows at each
-time what was shown then.
+A cell is a point; its class says its colour and, under the mouse, its meaning. The layout changes only when supply
+voltage, current or temperature is first measured. A plot has a fixed place, and the curves of earlier fans in it stay
+at their times. So nothing moves while an operator works, and a file shows at each time what was shown then.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ def place_lane(place: int) -> str:
 
 
 def place_auxiliary(place: int, column: str) -> str:
-    """In a fleet, the entity of what is measured beside command and speed of the fan in plot number `place`."""
+    """In a fleet, the entity of a column beside command and speed, for the fan in plot number `place`."""
     return f"{SHOWN}/{column}/plot_{place}"
 
 

@@ -1,7 +1,7 @@
 """The serial wire protocol in both directions: frames to bytes and back, without any input or output.
 
 A device sends samples; the host sends commands and set-points. There are two equivalent forms: `binary` (COBS, CRC-32)
-and `text` (lines that any sketch can print); only the binary one has a frame for what a device counts itself.
+and `text` (lines that any sketch can print); only the binary one has a frame for the counters of a device.
 Numbers are float32 in both, so that decoding inverts encoding exactly for float32 values.
 Reference: docs/reference/wire-protocol.md.
 """

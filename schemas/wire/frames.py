@@ -1,4 +1,4 @@
-"""What a frame of the serial line carries, and why a piece of the stream is no frame."""
+"""The contents of frames of the serial line, and the reasons why a piece of the stream is not a frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DEVICE_COUNTERS = (
     *("frames", "bad_length", "bad_crc", "wrong_kind", "bad_value", "line_errors", "overruns", "unsent_samples"),
     *("lost_edges", "glitches", "host_silences", "watchdog_resets"),
 )
-"""what a device counts, in the order of its frame; docs/reference/wire-protocol.md explains each"""
+"""the counters of a device, in the order of its frame; docs/reference/wire-protocol.md explains each"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +59,11 @@ class SetPointFrame:
 
 @dataclass(frozen=True, slots=True)
 class DeviceCounters:
-    """What a device has counted since it started.
+    """The counters of a device since it started.
 
     Attributes:
-        uptime_s: whole seconds since then; larger in each frame, so that a smaller one shows a restart.
-        counts: of the first ones of `DEVICE_COUNTERS`; wrap at 2^16.
+        uptime_s: whole seconds since the start; larger in each frame. A value that is not larger shows a restart.
+        counts: the first ones of `DEVICE_COUNTERS`; they wrap at 2^16.
     """
 
     uptime_s: int

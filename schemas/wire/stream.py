@@ -1,4 +1,4 @@
-"""Frames to bytes, and the bytes of a line as they arrive to frames."""
+"""Encodes frames to bytes, and decodes the bytes of a line, as they arrive, to frames."""
 
 from __future__ import annotations
 

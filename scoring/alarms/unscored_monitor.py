@@ -30,14 +30,15 @@ JUDGED_AT_REST = (InvalidReason.STOPPED, InvalidReason.STARTING)
 
 
 RARE_WINDOWS = 2
-"""so many windows in which a fan was scored, but for less than half of the time, are a problem; the end of a long time
-without a score gives one"""
+"""a fan is reported after this many windows in which it was scored, but for less than half of the time. One is not
+enough: the end of a long time without a score gives one"""
 
 
 class UnscoredMonitor:
     """How long each fan has not been scored, in the time of its samples, and why.
 
-    A fan that is scored for a sample now and then can raise no alarm either: its share is counted in windows.
+    A fan that is scored only now and then can hardly raise an alarm either. Its scored time is counted in windows of
+    `limit_ns`.
     """
 
     def __init__(self, fans: int, limit_ns: int) -> None:
@@ -47,9 +48,10 @@ class UnscoredMonitor:
         self._was_scored = np.zeros(fans, np.bool_)
         self._window = _Window(fans)
         self._rare_windows = np.zeros(fans, np.int64)
-        """windows in which it was scored rarely, since the last one in which it was scored for half of the time"""
+        """by fan: windows in which it was scored rarely, since the last one in which it was scored for half of the
+        time"""
         self._latest_reason = np.zeros(fans, np.uint8)
-        """of the last sample that was not scored"""
+        """by fan: the reason of the last sample that was not scored"""
 
     def update(self, period_ns: int, valid: Array, invalid_reason: Array) -> None:
         """Process a block; valid, invalid_reason: (n, fans)."""
@@ -65,7 +67,7 @@ class UnscoredMonitor:
         self._count_shares(period_ns, judged)
 
     def _count_shares(self, period_ns: int, judged: Array) -> None:
-        """Windows end at the same samples, whatever blocks these come in."""
+        """Count the scored time in windows. They end at the same samples, whatever the blocks."""
         while len(judged):
             rows = min(len(judged), -(-(self._limit_ns - self._window.length_ns) // period_ns))
             self._window.add(period_ns, judged[:rows])
@@ -96,14 +98,14 @@ class UnscoredMonitor:
 
 
 class _Window:
-    """How long each fan was scored since the window began."""
+    """How long each fan was scored since the window began, in ns."""
 
     def __init__(self, fans: int) -> None:
         self.length_ns = 0
         self.scored_ns = np.zeros(fans, np.int64)
 
     def add(self, period_ns: int, judged: Array) -> None:
-        """judged: (n, fans)."""
+        """Add samples. judged: (n, fans)."""
         self.length_ns += len(judged) * period_ns
         self.scored_ns += np.count_nonzero(judged, axis=0) * period_ns
 

@@ -269,7 +269,7 @@ def test_a_date_in_summer_time_is_the_moment_it_names() -> None:
         ("source.b", "is a certificate of role 'source.b', which may not publish reading of a"),
         (
             "stranger",
-            "is a certificate of role 'stranger', which the router at .* refuses: no such role in site 'site'",
+            "is a certificate of role 'stranger', which the router at .* does not know in site 'site'",
         ),
     ],
 )

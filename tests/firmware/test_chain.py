@@ -110,7 +110,7 @@ def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: C
 
 
 def spoilt_frame() -> bytes:
-    """Commands as noise on the line leaves them."""
+    """Command frames damaged by noise on the line."""
     frame = bytearray(encode("binary", CommandFrame((0.5,) * FANS)))
     frame[-3] ^= 3
     return bytes(frame)

@@ -1,4 +1,4 @@
-"""A twin learns what the supply does from the column that the board measures: the firmware in its simulator."""
+"""A twin allows for the supply voltage that the board measures: the firmware in its simulator."""
 
 from __future__ import annotations
 

@@ -391,7 +391,10 @@ def test_commands_and_set_points_are_sent_in_the_unit_of_the_tray(protocol: Prot
         (command(1.5, 0.5), "the command of fan 0 is 1.5, outside 0 to 1"),
         (command(0.5, -0.1), "the command of fan 1 is -0.1, outside 0 to 1"),
         (command(math.inf, 0.5), "the command of fan 0 is inf, outside 0 to 1"),
-        (command(0.5, 0.5, set_point=(2000.0, 0.0)), "the set-point, rad/s, of fan 0 is 2000, outside -1000 to 1000"),
+        (
+            command(0.5, 0.5, set_point=(2000.0, 0.0)),
+            "the set-point of fan 0 is 2000 rad/s, outside -1000 to 1000 rad/s",
+        ),
         (command(0.5, fans=1), "it is for 1 fans, the tray has 2"),
         (command(0.5, 0.5, 0.5, fans=3), "it is for 3 fans, the tray has 2"),
     ],
@@ -577,7 +580,7 @@ def test_columns_beside_command_and_speed_are_in_the_message_and_the_others_empt
     assert np.array_equal(raw.temperature_c, [[math.nan, 25.0]], equal_nan=True)
     assert raw.temperature_c.dtype == np.float32
     assert raw.current_a.size == 0
-    assert core.notes() == ["the source measures supply voltage, temperature, too"]
+    assert core.notes() == ["the source also measures supply voltage, temperature"]
 
 
 def test_a_column_that_some_samples_leave_out_is_unknown_there_and_splits_no_message() -> None:

@@ -528,7 +528,8 @@ def test_row_16_a_gap_is_published_once_acquisition_shows_that_it_has_sent_nothi
 
 
 def test_row_16_samples_of_the_next_session_that_are_not_admitted_yet_are_no_silence():
-    """They are more than a second away from those before; all that was sent has arrived, and waits for more of them."""
+    """The samples are over a second away from the earlier ones. All that was sent has arrived; more samples must
+    decide."""
     core = ResamplerCore(1, FIXED)
     core.step(replace(raw(at(*np.arange(0.0, 1.0, 0.01)), np.ones(100)), header=Header("acquisition-a-1", 0, "")))
     assert silent_for(core, 2.0, is_complete=False) == []

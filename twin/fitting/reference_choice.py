@@ -1,8 +1,8 @@
-"""Which measured conditions a twin allows for: those with which the physics of the fans fit.
+"""Chooses the measured conditions that a twin allows for.
 
 Torque is proportional to the supply voltage, and drag to the density of the air: this is physics and is not fitted. But
-a fan that controls its own speed makes up for both, and a column may be bad. So where a quantity varies enough to tell,
-the fans are identified without it, too, and it is left out if the free run is then better.
+a fan that controls its own speed compensates for both, and a column may be bad. So if a quantity varies enough, the
+fans are also identified without it, and it is left out if the error of the free run is then lower.
 """
 
 from collections.abc import Sequence
@@ -17,15 +17,15 @@ from twin.reference import at_reference, ratios_of, reference_of
 from twin.runs import Run
 
 LEAST_VARIATION = 0.01
-"""standard deviation of the ratio of torque, or of density, from which on the data can tell"""
+"""a quantity is tested only if the standard deviation of its ratio (of torque, or of density) exceeds this for a fan"""
 LEAST_GAIN = 0.01
-"""a quantity is left out if that lowers the free-run error by more than this share"""
+"""a quantity is left out if the free-run error is then lower by more than this share"""
 TITLES = {"supply_voltage_v": "supply voltage", "temperature_c": "temperature"}
 
 
 @dataclass(frozen=True, eq=False)
 class AtReference:
-    """What is identified. conditions: the twin's; None: no quantity counts. notes: a line for each that is left out."""
+    """The identification. conditions: those of the twin; None: no quantity is used. notes: a line for each left out."""
 
     conditions: ReferenceConditions | None
     identification: Identification
@@ -35,7 +35,7 @@ class AtReference:
 def identify_at_reference(
     runs: Sequence[Run], validation_runs: Sequence[Run] = (), *, progress: Progress = unreported
 ) -> AtReference:
-    """Identify every fan at the reference conditions of all runs. Raises TwinError as identify."""
+    """Identify every fan at the reference conditions of all runs. Raises TwinError as `identify` does."""
     conditions = reference_of([*runs, *validation_runs])
     identification = identify(at_reference(runs, conditions), progress=progress)
     notes: list[str] = []
@@ -56,7 +56,7 @@ def identify_at_reference(
 
 
 def behind_a_drive(found: AtReference) -> tuple[str, ...]:
-    """Why a twin of fans that control their own speed allows for nothing; its notes."""
+    """The notes of a twin of fans that control their own speed: why it uses none of the quantities."""
     if found.conditions is None:
         return found.notes
     unused = " and ".join(TITLES[name] for name in found.conditions.needed)

@@ -84,8 +84,8 @@ class Summary:
 @dataclass(frozen=True, eq=False)
 class FanContent(FanSummary):
     """One fan with its samples. column: of the runs. Arrays (n,) are in rad/s or command units, over all pieces one
-    after the other; predicted_rad_s, error_rad_s: as of recording_sums.FreeRun. auxiliary: what else was measured,
-    (n,) by name, NaN where not."""
+    after the other; predicted_rad_s, error_rad_s: as of recording_sums.FreeRun. auxiliary: other measured
+    columns, (n,) by name, NaN where not measured."""
 
     column: int
     command: Array
@@ -194,7 +194,7 @@ def report_content(
 
 
 def _auxiliary(pieces: Sequence[Run]) -> dict[str, Array]:
-    """(n, fans) what was measured beside command and speed, by name; NaN in pieces without it."""
+    """By name, the columns beside command and speed, (n, fans); NaN in pieces without the column."""
     names = dict.fromkeys(name for piece in pieces for name in piece.auxiliary)
     return {
         name: np.concatenate([piece.auxiliary.get(name, np.full_like(piece.command, np.nan)) for piece in pieces])

@@ -37,9 +37,9 @@ STYLE: dict[Any, Any] = {
 }
 WIDE_IN, NARROW_IN, SMALL_IN = (11.5, 5.4), (4.2, 6.0), (4.0, 2.9)
 BESIDE_IN = 0.95
-"""height of the panel of what was measured beside command and speed"""
+"""height of the panel of each column beside command and speed, inches"""
 LEAST_REACH = 0.02
-"""of its axis around the middle, a share of the largest value"""
+"""least half-height of the axis of such a panel, as a share of the largest value"""
 WIDE_COLUMNS, NARROW_COLUMNS = 500, 200
 MOST_TICKS = 5
 AROUND_PEAK_SAMPLES = 300
@@ -54,7 +54,7 @@ LINE = {"lw": 0.5, "color": MEASURED, "solid_joinstyle": "round"}
 
 
 def over_time(content: Content, fan: FanContent, *, narrow: bool) -> str:
-    """Measured speed on free run and band, the error in its band, the command, and what was measured beside."""
+    """Measured speed on free run and band, the error in its band, the command, and the other measured columns."""
     width_in, height_in = NARROW_IN if narrow else WIDE_IN
     beside = [column for column in AUXILIARY if np.isfinite(fan.auxiliary.get(column.name, np.nan)).any()]
     with _figure((width_in, height_in + BESIDE_IN * len(beside))) as figure:
@@ -249,7 +249,7 @@ def _draw_over_time(content: Content, fan: FanContent, panels: tuple[Axes, Axes,
 
 
 def _draw_beside(content: Content, axes: Axes, column: AuxiliaryColumn, values: Array, columns: int) -> None:
-    """What was measured beside command and speed, on an axis on which noise looks small."""
+    """Draw a column beside command and speed, on an axis on which noise looks small."""
     line = content.timeline
     kept = kept_samples(line.t_s, (values,), columns)
     axes.plot(*broken_at(line.starts, kept, line.t_s, values), **{**LINE, "color": COMMAND})

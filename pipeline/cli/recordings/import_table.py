@@ -213,7 +213,8 @@ def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...]
     if tachos != INSTANTANEOUS:
         metadata[f"{TACHO_KEY}.{tray}"] = tachos_to_json(tachos)
     with RecordingWriter(output, metadata, t_ns=int(table.t_ns[0]), overwrite=True) as writer:
-        # a message has the time of its last sample; the first is of one sample: the recording begins with its first
+        # A message has the time of its last sample. The first message has one sample only, so that the recording begins
+        # at the time of its first sample.
         starts = [0, *range(1, len(table.t_ns), SAMPLES_PER_MESSAGE), len(table.t_ns)]
         for sequence, (first, end) in enumerate(pairwise(starts)):
             rows = slice(first, end)

@@ -155,7 +155,7 @@ def simulate(
     supply_held: Annotated[
         float,
         typer.Option(
-            help="Share of it for which 4-pin fans make up: 1 if they control their speed, 0 if it follows the supply.",
+            help="4-pin fans: 1 if they hold their speed against the supply, 0 if it is proportional to the supply.",
             rich_help_panel=_SURROUNDINGS,
         ),
     ] = 1.0,

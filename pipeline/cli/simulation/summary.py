@@ -1,4 +1,4 @@
-"""What `fantwin simulate` says of a playback: the ground truth as JSON, and a line of counts."""
+"""The summary of a playback by `fantwin simulate`: the ground truth as JSON, and a line of counts."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def _counts(played: PlaybackCounts) -> Summary:
 
 
 def summary_of_tray(tray: SimulatedTray, played: PlaybackCounts, *, complete: bool) -> Summary:
-    """The ground truth of a simulated tray, with what became of its samples."""
+    """The ground truth of a simulated tray, and how many of its samples were sent, dropped and lost."""
     from simulation.truth import truth  # noqa: PLC0415
 
     return truth(tray, played.start_ns, complete=complete, counts=_counts(played))
 
 
 def summary_of_file(path: Path, table: TableDevice, played: PlaybackCounts, *, complete: bool) -> Summary:
-    """The same of a played file: it has no faults that are known."""
+    """The same for a played file, whose faults are not known."""
     return {
         "complete": complete,
         "start_ns": played.start_ns,
@@ -59,12 +59,12 @@ def save(path: Path | None, summary: Summary) -> None:
 
 
 def save_start(path: Path | None, summary_of: Callable[..., Summary], start_ns: int) -> None:
-    """Write when the playback has begun."""
+    """Write the summary with the start of the playback, ns since the epoch, before any sample is counted."""
     save(path, summary_of(PlaybackCounts(start_ns=start_ns), complete=False))
 
 
 def count_text(played: PlaybackCounts) -> str:
-    """What became of the samples, in one line."""
+    """How many samples were sent, dropped and lost, in one line."""
     parts = [f"{played.samples_sent} samples sent"]
     if played.samples_dropped:
         parts.append(f"{played.samples_dropped} lost as simulated")

@@ -59,8 +59,9 @@ def identify(
     """Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.
 
     Each has a 95 % interval. w is in rad/s and the command in its own unit, and so are the parameters: only their
-    ratios are mechanical quantities. Where supply voltage or temperature are recorded, they are the parameters at
-    reference values of these. A warning on stderr names what the recordings do not determine, and why.
+    ratios are mechanical quantities. Where supply voltage or temperature are recorded and the fans follow them, the
+    parameters hold at reference values of these. A warning on stderr names what the recordings do not determine, and
+    why.
 
     Example: fantwin identify REC.mcap --json
     """

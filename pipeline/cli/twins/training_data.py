@@ -58,7 +58,7 @@ IgnoreOption: TypeAlias = Annotated[
     typer.Option(
         "--ignore",
         metavar="COLUMN",
-        help="Do not use this column, because it is bad: supply_voltage_v or temperature_c. Repeatable.",
+        help="Leave out a column that is bad: supply_voltage_v or temperature_c. Repeatable.",
     ),
 ]
 ValidateOption: TypeAlias = Annotated[
@@ -183,10 +183,10 @@ def read_recording_data(path: Path, part: Part) -> TrainingData:
 
 
 def ignored_columns(names: Sequence[str] | None) -> tuple[str, ...]:
-    """The columns beside command and speed that are to be left out.
+    """The names of the columns to leave out, as given.
 
     Raises:
-        UsageError: one is not known.
+        UsageError: there is no such column.
     """
     known = [column.name for column in AUXILIARY]
     for name in names or ():

@@ -81,13 +81,13 @@ def share_note(tray: TrayConfig, command: float) -> str:
 
 
 def require_commandable(tray: TrayConfig, instead: str) -> None:
-    """Refuse a tray that takes no commands. instead: what to do, after a colon; may be empty.
+    """Refuse a tray that takes no commands. instead: what to do instead, the end of the message; may be empty.
 
     Raises:
         UserError: it takes none.
     """
     if reason := tray.source.why_no_commands:
-        raise UserError(f"tray {tray.name} takes no commands, {reason}{': ' * bool(instead)}{instead}")
+        raise UserError(f"tray {tray.name} takes no commands ({reason}){': ' * bool(instead)}{instead}")
 
 
 class CommandSender:

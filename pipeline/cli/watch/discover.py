@@ -32,8 +32,8 @@ def discover(
 ) -> None:
     """List the fans and serial ports of this computer, with a configuration to paste for each, and what is missing.
 
-    It writes nothing to a device. --write leaves out serial ports, since what is connected there is a guess, and never
-    changes a file that is there. Exit code 1 if nothing can be watched.
+    Nothing is written to a device. --write leaves out serial ports, because their devices are only guessed, and never
+    changes an existing file. Exit code 1 if nothing can be watched.
 
     Example: fantwin discover --write fantwin.toml
     """
@@ -65,10 +65,10 @@ def _show(found: Found) -> None:
 
 
 def _written(path: Path, found: Sequence[Found]) -> list[str]:
-    """Write the hwmon chips into a new file; what was done, and what was left out. A file that is there is not touched.
+    """Write the hwmon chips into a new file. Returns lines that say what was done and what was left out.
 
     Raises:
-        UserError: there is no chip to watch, the file cannot be written, or is there and lacks a chip.
+        UserError: there is no chip to watch, or the file cannot be written, or it exists and lacks a chip.
     """
     chips = [each for each in found if each.kind == "hwmon" and each.tray]
     if not chips:
@@ -79,10 +79,10 @@ def _written(path: Path, found: Sequence[Found]) -> list[str]:
     except FileExistsError:
         if lacking := [str(each.tray["name"]) for each in chips if _chip(each.tray) not in _chips_in(path)]:
             raise UserError(
-                f"{path}: exists, and was left as it is; it lacks {', '.join(lacking)}: paste what is shown, or name a "
-                "new file"
+                f"{path}: exists and was not changed; it lacks {', '.join(lacking)}: paste the [[tray]] that is shown, "
+                "or name a new file"
             ) from None
-        return [f"{path}: exists, has all hwmon chips with fans, and was left as it is"]
+        return [f"{path}: exists, has all hwmon chips with fans, and was not changed"]
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}; name another file") from error
     left_out = [f"left out: {each.title}: {_why_left_out(each)}" for each in found if each not in chips]
@@ -91,18 +91,18 @@ def _written(path: Path, found: Sequence[Found]) -> list[str]:
 
 def _why_left_out(found: Found) -> str:
     if found.tray:
-        return "what is connected there is not known; paste its [[tray]] if it is to be watched"
+        return "the device there is only guessed; paste its [[tray]] to watch it"
     return found.missing[0] if found.missing else "it cannot be watched"
 
 
 def _chip(tray: Mapping[str, Any]) -> tuple[str, ...]:
-    """Which chip a [[tray]] has: its name, its device where several have this name, and its root; empty if none."""
+    """The chip of a [[tray]]: its name, its device where several chips have this name, and its root; empty if none."""
     source = tray.get("source")
     return tuple(str(source.get(key, "")) for key in ("chip", "device", "root")) if isinstance(source, Mapping) else ()
 
 
 def _chips_in(path: Path) -> set[tuple[str, ...]]:
-    """Those of the trays in a configuration; empty if it is none."""
+    """The chips of the trays in a configuration file; empty if it cannot be read as one."""
     try:
         trays = tomllib.loads(path.read_text(encoding="utf-8")).get("tray", [])
     except (OSError, ValueError):

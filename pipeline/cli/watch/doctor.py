@@ -37,7 +37,7 @@ from pipeline.runtime.stage import Context, load_stage
 from schemas.topics import sessions_key
 
 _DEVELOPMENT_EXTRAS = {"dev", "bench"}  # used by tests and benches only
-_NOT_GRANTED = "the router does not grant it the rights of its role: restart it with this configuration"
+_NOT_GRANTED = "the router does not grant the rights of its role: restart the router with this configuration"
 _MIN_FREE_BYTES = 1 << 30
 _LOOKS = 4
 """for the sessions of a site, GOSSIP_S apart"""
@@ -46,7 +46,9 @@ _LOOKS = 4
 def doctor(
     config: Annotated[
         Path | None,
-        typer.Option("-c", "--config", help=f"The configuration to check. Default: {DEFAULT_CONFIG}, if it is here."),
+        typer.Option(
+            "-c", "--config", help=f"The configuration to check. Default: {DEFAULT_CONFIG}, if it is in this folder."
+        ),
     ] = None,
     overrides: SetOption = None,
     json_output: JsonOption = False,
@@ -207,7 +209,7 @@ def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:
 
 
 def _of_roles_together(problems: Sequence[tuple[str, str]]) -> Iterator[str]:
-    """One line for roles whose lines differ in the name of the role only."""
+    """The problems, with one line for all roles whose lines differ only in the name of the role."""
     alike: dict[str, dict[str, str]] = {}
     for role, line in problems:
         alike.setdefault(re.sub(rf"\b{re.escape(role)}\b", "ROLE", line), {})[role] = line
@@ -231,7 +233,7 @@ def _check_stages(
 ) -> Iterator[tuple[bool, str]]:
     """lines: the trays whose devices are checked."""
     found: dict[str, list[str]] = {}
-    """processes by problem"""
+    """by problem: the processes that have it"""
     for row in process_list(config):
         ours = Session.of_this_process(row.stage, row.shard, 0, "")
         session = next((s for s in running if s.stage == row.stage and s.shares_a_tray_with(ours)), None)

@@ -129,11 +129,11 @@ class Excitation:
         return constants
 
     def _say_which_read_0(self) -> None:
-        """At a lowest command at which fans are to turn."""
+        """Report the fans without speed at the lowest command, unless it is one that stops them."""
         speeds = self.line.observed().speed_rad_s[:, self.fans]
         for fan, speed_rad_s in zip(self.fans, speeds[-1] if len(speeds) else (), strict=False):
             if speed_rad_s == 0.0 and self.low > 0.0:
-                self.progress(f"fan {fan} reads 0 at command {self.low:g}; if it stands, give a higher --low")
+                self.progress(f"fan {fan} reads 0 at command {self.low:g}; if it stands still, give a higher --low")
 
     def _settle(self, command: float, words: str) -> Array:
         """Send a command and wait until all speeds have settled. Returns the time constants, (fans,)."""

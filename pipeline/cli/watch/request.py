@@ -51,8 +51,8 @@ def ask(
         if time.monotonic() > until_s or stop.is_set():
             missing = ", ".join(map(str, sorted(fans - set(answers))))
             raise UserError(
-                f"tray {tray}: no answer for fan {missing} within {timeout_s:g} s: nothing watches its alarms now, "
-                "for example because it has no twin yet: see `fantwin status`"
+                f"tray {tray}: no answer for fan {missing} within {timeout_s:g} s: perhaps no scorer runs, "
+                "for example because the tray has no twin yet: see `fantwin status`"
             )
         try:
             alarm = decode(Alarm, received.get(timeout=_POLL_S))

@@ -35,7 +35,7 @@ from schemas.units import NS_PER_S
 
 _FIRST_SAMPLE_S = 5.0
 LEAST_SHARE = 0.2
-"""of the range: 4-pin fans turn there, though some no slower than at 30 %"""
+"""of the range: 4-pin fans turn there, some of them already at their minimum speed"""
 
 
 def sweep(
@@ -44,7 +44,7 @@ def sweep(
     fans: Annotated[str, typer.Option(metavar="all|N,N,...", help="The fans that are moved.")] = "all",
     low: Annotated[
         float | None,
-        typer.Option(help="Lowest command; without it a fifth of the tray's range, where healthy fans keep turning."),
+        typer.Option(help="Lowest command; without it a fifth of the tray's range, where 4-pin fans keep turning."),
     ] = None,
     high: Annotated[float | None, typer.Option(help="Highest command; without it command_max of the tray.")] = None,
     safe: Annotated[
@@ -89,7 +89,7 @@ def sweep(
         left_at = ", ".join(f"fan {fan} {value:g}" for fan, value in at_end.items())
         progress(_range_in_words(chosen, lowest, highest))
         if low is None and lowest > chosen.command_min:
-            progress(f"without --low no fan is to stop; --low {chosen.command_min:g} moves them over the whole range")
+            progress(f"the lowest command should keep fans turning; --low {chosen.command_min:g} uses the whole range")
         progress(f"at the end and after Ctrl-C the fans get these commands: {left_at}")
         is_stopped, constants_s = False, dict[int, float]()
         try:
@@ -118,9 +118,8 @@ def sweep(
 def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: float | None) -> tuple[float, float]:
     """The commands of a sweep, lowest and highest.
 
-    Without --low no fan is to stop, which may be cooling something: the lowest is a fifth of the range of the tray. A
-    tray that turns its fans both ways has no such command, and is swept from its lowest. Without --high it is
-    command_max.
+    Without --low the lowest is a fifth of the tray's range, at which most fans turn: a fan that stops does not cool. A
+    tray that turns its fans both ways is swept from command_min. Without --high the highest is command_max.
 
     Raises:
         UsageError: one of them, or the safe command, is outside those limits.
@@ -135,7 +134,7 @@ def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: 
 
 
 def lowest_turning(tray: TrayConfig) -> float:
-    """The command of a tray at which healthy fans keep turning, as far as can be said without asking them."""
+    """The lowest command at which fans are expected to turn; command_min for a tray that turns them both ways."""
     both_ways = tray.command_min < 0.0
     return tray.command_min if both_ways else tray.command_min + LEAST_SHARE * (tray.command_max - tray.command_min)
 

@@ -1,4 +1,4 @@
-"""A router gives a connection up whose other end has vanished, also if it has something to send there."""
+"""A router closes a connection whose other end has vanished, also if it has data to send on it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason=
 
 
 def limits_ms(port: int) -> list[int]:
-    """Of the connections of this process to which others have connected at a port."""
+    """The limits of the connections that this process has accepted at a port, ms."""
     found: list[int] = []
     for path in Path("/proc/self/fd").iterdir():
         with suppress(OSError, TypeError, IndexError):

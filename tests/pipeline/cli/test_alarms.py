@@ -334,7 +334,7 @@ def test_a_scorer_that_does_not_answer_is_reported_after_the_timeout(site):
     site.core.deaf = True
     error = site.refused("ack", TRAY, 3, "--timeout", 0.5)
     assert error == (
-        f"tray {TRAY}: no answer for fan 3 within 0.5 s: nothing watches its alarms now, for example because it has no "
+        f"tray {TRAY}: no answer for fan 3 within 0.5 s: perhaps no scorer runs, for example because the tray has no "
         "twin yet: see `fantwin status`"
     )
 

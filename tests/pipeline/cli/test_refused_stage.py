@@ -48,7 +48,7 @@ def test_whoever_may_not_command_is_told_the_role_that_may_in_words_of_the_docum
         given = ("--tray", "a", "--fan", "0", "0.5", "--set", source, *(w for word in words for w in ("--set", word)))
         done = called("command", "-c", site.config.path, *given)
     assert str(done.exception) == (
-        "its certificate says 'viewer', which may not publish command of a; give it that of role 'operator'"
+        "its certificate says 'viewer', which may not publish command of a; use the certificate of role 'operator'"
     )
 
 
@@ -90,7 +90,7 @@ def test_doctor_says_of_each_certificate_whether_the_router_grants_its_rights(si
         good, problems = examined(site)
     assert "certificate of viewer: the router grants its rights" in good
     assert problems == [
-        "certificate of resampler: the router does not grant it the rights of its role: restart it with this "
+        "certificate of resampler: the router does not grant the rights of its role: restart the router with this "
         "configuration"
     ]
 

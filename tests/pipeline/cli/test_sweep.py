@@ -155,7 +155,7 @@ def test_what_the_tray_cannot_do_is_refused_in_one_line(words: str, expected: st
 
 UNCOMMANDED = [
     ('kind = "push"', "the program that pushes its samples moves the fans"),
-    ('kind = "http"', "whatever posts its samples moves the fans"),
+    ('kind = "http"', "the program that posts its samples moves the fans"),
     ('kind = "mqtt", host = "broker", topic = "t"', "its source names no send_topic"),
     ('kind = "hwmon", chip = "nct6798"', "its source does not have writable = true"),
     ('kind = "redfish", url = "https://bmc"', "fans behind Redfish are only read"),
@@ -179,7 +179,7 @@ def test_a_tray_that_takes_no_commands_is_not_swept_and_one_line_says_what_to_do
         (("command", "--fan", "0", "0.5"), ""),
     ):
         error = error_of(words[0], "-c", path, *words[1:])
-        assert f"tray tray1 takes no commands, {reason}" in error
+        assert f"tray tray1 takes no commands ({reason})" in error
         assert instead in error
 
 
@@ -210,6 +210,6 @@ def test_a_fan_that_reads_0_at_the_lowest_command_is_named_at_once() -> None:
             return seen._replace(speed_rad_s=np.where(seen.command < 0.3, 0.0, seen.speed_rad_s))
 
     _, said = swept(StandsBelow([0.5]))
-    assert said[1] == "fan 0 reads 0 at command 0.2; if it stands, give a higher --low"
+    assert said[1] == "fan 0 reads 0 at command 0.2; if it stands still, give a higher --low"
     _, said = swept(StandsBelow([0.5]), low=0.0)
-    assert not [line for line in said if "reads 0" in line], "it is meant to stand"
+    assert not [line for line in said if "reads 0" in line], "it is meant to stand still"

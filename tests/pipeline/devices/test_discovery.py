@@ -74,11 +74,11 @@ def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_
     text = file.read_text(encoding="utf-8")
     again = CliRunner().invoke(command_line.app, words)
     assert again.exit_code == 0
-    assert f"{file}: exists, has all hwmon chips with fans, and was left as it is" in again.stderr
+    assert f"{file}: exists, has all hwmon chips with fans, and was not changed" in again.stderr
     add_chip(root, 9, "emc2305", "i2c-3/3-0020", {"fan1_input": 3000, "pwm1": 128})
     lacking = CliRunner().invoke(command_line.app, words)
     assert isinstance(lacking.exception, UserError)
-    assert "it lacks emc2305: paste what is shown" in str(lacking.exception)
+    assert "it lacks emc2305: paste the [[tray]] that is shown" in str(lacking.exception)
     assert file.read_text(encoding="utf-8") == text
     file.write_text("no configuration [", encoding="utf-8")
     unreadable = CliRunner().invoke(command_line.app, words)
@@ -93,9 +93,13 @@ def test_a_port_of_which_nothing_is_known_is_no_tray_and_what_is_not_written_is_
     monkeypatch.setattr(list_ports, "comports", lambda: ports)
     known, unknown = discover_serial()
     assert known.tray["source"]["port"] == "/dev/ttyUSB0"
-    assert not unknown.tray and unknown.title == "/dev/ttyS0" and "left out" in unknown.missing[0]
+    assert not unknown.tray and unknown.title == "/dev/ttyS0" and "no device is known" in unknown.missing[0]
     command_line._register(["discover"] if not command_line.app.registered_commands else ["discover", "info"])
     words = ["discover", "--root", str(root), "--write", str(tmp_path / "fantwin.toml")]
     lines = CliRunner().invoke(command_line.app, words).stdout.splitlines()
-    assert [line for line in lines if line.startswith("left out: /dev/ttyUSB0: FT232R USB UART: what is connected")]
+    assert [
+        line
+        for line in lines
+        if line.startswith("left out: /dev/ttyUSB0: FT232R USB UART: the device there is only guessed")
+    ]
     assert [line for line in lines if line.startswith("left out: /dev/ttyS0: no device is known there")]

@@ -102,7 +102,7 @@ def test_row_11_an_alarm_of_a_stranger_is_not_shown_while_the_scorer_is_alive(bu
     ids=["of a stage that writes nothing", "of another stage", "of another tray"],
 )
 def test_row_17_a_health_is_not_believed_about_what_its_stage_may_not_write(bus, stage, claimed):
-    """Otherwise whoever may show a session of a viewer makes the alarms of the scorer those of a stranger."""
+    """Otherwise a session of a viewer could make the alarms of the scorer those of a stranger."""
     limited = {"resampler.all": replace(roles_of_stages()["resampler"], trays=("tray",))}
     watcher = SiteWatcher(bus, "s", roles_of_stages() | limited)
     thief = session(stage, 7)

@@ -22,7 +22,7 @@ STARTING, OK, DEGRADED, STOPPED = StageStatus.STARTING, StageStatus.OK, StageSta
 
 
 class Consumer:
-    """A stage with one main input; a health is on its way for no time, unless it says when it was sent."""
+    """A stage with one main input. A health arrives at once, unless its time of sending is given."""
 
     def __init__(self) -> None:
         self.now_s = 1e6
