@@ -172,18 +172,22 @@ class Bus:
                 return
 
     def alive(self, key_expression: str) -> set[str]:
-        """The keys of the tokens that exist now. Asks again if there is no complete answer.
+        """The keys of the tokens that exist now. Asks again if there is no complete answer. That there is none must be
+        answered twice: a client that has just lost its router gets that answer, too, until it has noticed.
 
         Raises:
             NoAnswerError: no complete answer came: which tokens exist is not known.
         """
         timeout_s = self._config.recovery_timeout_s
         until_s = time.monotonic() + _ALIVE_TIMEOUTS * timeout_s
+        was_empty = self._config.mode == "peer"
         while True:
             replies = list(self._session.liveliness().get(key_expression, timeout=timeout_s))
             found = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
-            if all(reply.ok is not None for reply in replies) and self._has_its_router():
+            is_complete = all(reply.ok is not None for reply in replies) and self._has_its_router()
+            if is_complete and (found or was_empty):
                 return found
+            was_empty = is_complete
             if time.monotonic() > until_s:
                 raise NoAnswerError(
                     f"bus.endpoint = {self._config.endpoint!r}: no complete answer within "

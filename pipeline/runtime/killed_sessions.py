@@ -22,13 +22,15 @@ class KilledSessions:
     """by token: sessions whose process was once found to run here. The number of a process in another container may not
     exist here, or may be that of another process"""
     _gone: dict[str, Session] = field(default_factory=dict)
-    """by token: those of them whose token has disappeared"""
+    """by token: those of them whose token has disappeared, the last ones"""
 
     def update(self, key: str, alive: bool) -> None:
         """A token has appeared or disappeared."""
         if not alive:
             if (session := self._seen.pop(key, None)) is not None:
                 self._gone[key] = session
+                if len(self._gone) > MOST_SESSIONS:
+                    del self._gone[next(iter(self._gone))]
             return
         self._gone.pop(key, None)
         session = Session.of_key(key)

@@ -203,6 +203,19 @@ def test_row_11_a_session_without_a_token_was_killed_if_its_process_runs_no_more
     assert sessions.take() == []
 
 
+def test_row_11_sessions_that_come_and_go_are_remembered_up_to_a_limit(monkeypatch):
+    monkeypatch.setattr("pipeline.runtime.killed_sessions.MOST_SESSIONS", 3)
+    sessions = KilledSessions(this_host())
+    processes = [subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) for _ in range(5)]
+    for process in processes:
+        sessions.update(token(process.pid), alive=True)
+        sessions.update(token(process.pid), alive=False)
+    for process in processes:
+        process.kill()
+        process.communicate()
+    assert len(sessions.take()) == 3
+
+
 def test_row_11_whether_a_process_elsewhere_runs_is_not_known():
     sessions = KilledSessions(this_host())
     process = subprocess.Popen([sys.executable, "-c", ""])
