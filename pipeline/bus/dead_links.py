@@ -43,7 +43,11 @@ def given_up_soon() -> Iterator[None]:
 
 def limit_connections() -> None:
     """Set the limit, `UNACKNOWLEDGED_MS`, for the TCP connections that this process has now."""
-    for path in Path("/proc/self/fd").iterdir():
+    try:
+        paths = list(Path("/proc/self/fd").iterdir())
+    except OSError:  # no descriptor is free to list them with, or there is no such folder
+        return
+    for path in paths:
         with suppress(OSError):  # closed meanwhile, or no socket
             if path.readlink().name.startswith("socket:"):
                 its = socket.socket(fileno=int(path.name))

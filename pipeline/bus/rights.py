@@ -38,7 +38,8 @@ _WORDS = {
 
 
 def granted_rights(session: zenoh.Session, site: str, role: str) -> Rights | None:
-    """What the router grants a role; None if it does not answer: it does not know the role. Waits for the answer."""
+    """What the router grants a role; None if it does not answer: it does not know the role, has just started, or is
+    overloaded. Waits for the answer."""
     replies = session.get(rights_key(site, role), timeout=ANSWER_LIMIT_S, consolidation=zenoh.ConsolidationMode.NONE)
     return next(filter(None, (_rights_in(reply, session) for reply in replies)), None)
 

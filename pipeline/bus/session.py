@@ -38,7 +38,7 @@ from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept,
 from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
-from pipeline.bus.rights import OwnRights, granted_rights
+from pipeline.bus.rights import UNANSWERED_LIMIT_S, OwnRights, granted_rights
 from pipeline.bus.settings import Settings
 from pipeline.bus.spool import Spool
 from pipeline.config.models import BusConfig, Config
@@ -55,8 +55,6 @@ SAID_AFTER_S = 3.0
 MEETING_LIMIT_S = 10.0
 """by then a process that listens at the endpoint has answered, however busy the machine"""
 _MEETING_POLL_S = 0.01
-RIGHTS_ASKED = 2
-"""so many requests must stay unanswered until a router is taken to know no such role: a busy host may be late"""
 _ALIVE_TIMEOUTS = 2
 """`Bus.alive` asks again for so many times `recovery_timeout_s`"""
 
@@ -247,15 +245,23 @@ class Bus:
 
     def why_not_published(self, site: str, key: str) -> str:
         """Why the router refuses what this session publishes on a key of a site; empty if it accepts it, or without
-        `bus.security`. For a program that knows no roles. Waits for the answer of the router."""
+        `bus.security`. For a program that knows no roles. Waits for the answer of the router.
+
+        Raises:
+            NoAnswerError: there is no router.
+        """
         if self.credentials is None:
             return ""
         role = self.credentials.role
-        asked = (granted_rights(self._session, site, role) for _ in range(RIGHTS_ASKED))
-        granted = next(filter(None, asked), None)
+        until_s = time.monotonic() + UNANSWERED_LIMIT_S
+        while (granted := granted_rights(self._session, site, role)) is None and time.monotonic() < until_s:
+            time.sleep(_ROUTER_RETRY_S)
         whose = f"{self.credentials.certificate} is a certificate of role {role!r}"
+        if granted is None and not self._has_its_router():
+            raise NoAnswerError(f"no router answers at {self._config.endpoint}")
         if granted is None:
-            return f"{whose}, which the router at {self._config.endpoint} does not know in site {site!r}"
+            no_answer = f"the router at {self._config.endpoint} does not say what it may do"
+            return f"{whose}: {no_answer}; it has no such role in site {site!r}, or is overloaded"
         return "" if granted.allow("put", key) else f"{whose}, which may not publish {key_in_words(key)}"
 
     def security_problem(self) -> str:

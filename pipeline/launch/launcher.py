@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline.bus.errors import NoAnswerError
 from pipeline.bus.session import Bus, credentials_of, join_bus
 from pipeline.config.models import Config
 from pipeline.config.registry import LEARNER, RECORDER, STAGES
@@ -172,8 +173,17 @@ class Launcher:
         ours = {alive_key(self._config.site, slot.row.stage, slot.row.instance): slot.row.label for slot in self._slots}
         bus.wait_for_others(stop)
         until_s = time.monotonic() + _SEARCH_S
+        has_said = False
         while True:
-            alive = bus.alive(alive_key(self._config.site, "*", "*"))
+            try:
+                alive = bus.alive(alive_key(self._config.site, "*", "*"))
+            except NoAnswerError as error:
+                if not has_said:
+                    self._say(f"{error}; asking again")
+                has_said = True
+                if stop.wait(_POLL_S):
+                    return
+                continue
             if running := [label for key, label in ours.items() if key in alive]:
                 raise UserError(
                     f"site {self._config.site!r} already runs at {self._config.bus.endpoint} ({', '.join(running)}): "

@@ -57,7 +57,7 @@ MOST_DUE_BYTES = 8 << 20
 """of messages that are taken from the inbox to be joined: more than ever come together"""
 PRODUCERS_END_LIMIT_S = 10.0  # how long a stage whose launcher has gone waits for its producers to end
 # When each part of the end must be over, as shares of launcher.stop_timeout_s: the rest is for the process itself.
-CAUGHT_UP, DRAINED, WORK_ENDED = 0.4, 0.7, 0.75
+CAUGHT_UP, ANSWERED, DRAINED, WORK_ENDED = 0.4, 0.55, 0.7, 0.75
 SOURCES_STOPPED, CORES_CLOSED, HEALTH_SENT, BUS_LEFT = 0.78, 0.88, 0.9, 0.95
 
 
@@ -281,6 +281,8 @@ class Runner:
             if self._ending.left_s(DRAINED) < 0:
                 self._discard_waiting()
                 return
+            if self._tracker.is_waiting and self._ending.left_s(ANSWERED) < 0:
+                self._due.add(self._tracker.give_up())
             if self._due:
                 self._step_once()
                 continue

@@ -132,6 +132,14 @@ class SequenceTracker:
             return []  # the stream went on without the answer
         return self._go_on(stream, stream.waiting, found, may_ask_again=True)
 
+    def give_up(self) -> list[Envelope]:
+        """Go on without the answers that are due: the messages to process now."""
+        due: list[Envelope] = []
+        for stream in self._streams:
+            while stream.waiting is not None:
+                due += self._go_on(stream, stream.waiting, Found())
+        return due
+
     def believes(self, health: Health) -> bool:
         """Whether its producer can have published what a health says. If not, the health is counted as refused."""
         for (key, producer), published in output_streams(health).items():

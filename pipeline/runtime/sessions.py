@@ -129,6 +129,8 @@ class Sessions:
         """by producer of a session: the keys on which it publishes"""
         self._ended: dict[str, Session] = {}
         """by producer: the last sessions whose token has disappeared; their messages may still be on the way"""
+        self._said_last: dict[str, None] = {}
+        """producers of sessions that have sent their last health, the last ones"""
 
     def update(self, key: str, alive: bool) -> None:
         """A token has appeared, or gone."""
@@ -153,7 +155,12 @@ class Sessions:
 
     def add_health(self, health: Health, read_keys: Set[str]) -> None:
         """A stage has said what it publishes; `read_keys`: the keys that matter here."""
-        written = self._written.get(health.header.producer)
+        producer = health.header.producer
+        written = self._written.get(producer)
+        if health.has_ended and (written is not None or producer in self._ended):
+            self._said_last[producer] = None
+            if len(self._said_last) > MOST_SESSIONS:
+                del self._said_last[next(iter(self._said_last))]
         if written is not None:
             written.update(output.key for output in health.outputs if output.key in read_keys)
 
@@ -162,10 +169,12 @@ class Sessions:
         return producer in self._written
 
     def may_return(self, producer: str) -> bool:
-        """Whether the token of this producer's session has disappeared, but no other session has taken its place: the
-        link may only be cut."""
+        """Whether the token of this producer's session has disappeared, but it has not sent its last health, and no
+        other session has taken its place: the link may only be cut."""
         session = self._ended.get(producer)
-        return session is not None and self.named(session.stage, session.instance) is None
+        if session is None or producer in self._said_last:
+            return False
+        return self.named(session.stage, session.instance) is None
 
     def has_ended(self, producer: str) -> bool:
         """Whether this producer is a session that has left: ended, or cut off."""

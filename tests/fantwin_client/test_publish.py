@@ -269,7 +269,8 @@ def test_a_date_in_summer_time_is_the_moment_it_names() -> None:
         ("source.b", "is a certificate of role 'source.b', which may not publish reading of a"),
         (
             "stranger",
-            "is a certificate of role 'stranger', which the router at .* does not know in site 'site'",
+            "is a certificate of role 'stranger': the router at .* does not say what it may do; it has no such role in "
+            "site 'site', or is overloaded",
         ),
     ],
 )

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from pipeline.bus.errors import NoAnswerError
 from pipeline.cli.exposure import InsecureOption, checked_exposure
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.config.loading import load_config
@@ -76,6 +77,11 @@ def _run(
                 problems.report(runner.refusal if until_stdin_closes else health.problem)
 
             runner = Runner(load_stage(stage), settings, chosen, stop, report)
+    except NoAnswerError as error:  # the bus may answer the next time
+        if not until_stdin_closes:
+            raise
+        typer.echo(error, err=True)
+        raise typer.Exit(1) from error
     except UserError as error:
         if not until_stdin_closes:
             raise

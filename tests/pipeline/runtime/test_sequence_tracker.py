@@ -250,6 +250,39 @@ def test_row_16_what_a_stage_does_not_answer_for_long_is_lost_and_the_stream_goe
     assert len(slow.asked) == 1
 
 
+def test_row_16_a_stage_that_has_said_that_it_ends_does_not_return():
+    slow, sessions = SlowProducer(), Sessions()
+    token = Session("scorer", "all", 1, PRODUCER, "host", 1).key("site")
+    sessions.update(token, alive=True)
+    tracker = SequenceTracker(slow.ask, lambda: slow.now_s, sessions)
+    assert sequences(tracker.accept(packet(0))) == [0]
+    last = Health(
+        header=Header(PRODUCER, 1, ""),
+        stage="scorer",
+        instance="all",
+        status=StageStatus.STOPPED,
+        t_ns=0,
+        uptime_s=1.0,
+        is_last=True,
+    )
+    sessions.add_health(last, {KEY})
+    sessions.update(token, alive=False)
+    assert tracker.accept(packet(4)) == []
+    slow.now_s = 5.0
+    assert sequences(tracker.answer(slow.asked[-1], Found())) == [4]
+
+
+def test_row_16_whoever_ends_goes_on_without_the_answers_that_are_due():
+    slow = SlowProducer()
+    tracker = tracker_of_session(slow, alive=False)
+    assert tracker.accept(packet(4)) == []
+    assert tracker.accept(packet(5)) == []
+    assert tracker.accept(packet(8)) == []
+    assert sequences(tracker.give_up()) == [4, 5, 8]
+    assert not tracker.is_waiting
+    assert tracker.inputs()[0].missing == 5
+
+
 def test_row_16_the_rest_of_an_answer_that_was_not_complete_is_asked_for_at_once():
     slow = SlowProducer()
     tracker = tracker_of_session(slow, alive=True)
