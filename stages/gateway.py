@@ -14,14 +14,14 @@ from pathlib import Path
 
 from pipeline.config.models import TrayConfig
 from pipeline.errors import UserError
-from pipeline.gateway.alarm_store import AlarmStore
 from pipeline.gateway.config import GatewayConfig
-from pipeline.gateway.fan_history import curves_of
 from pipeline.gateway.live_feed import LiveFeed
-from pipeline.gateway.requests import RequestDesk
-from pipeline.gateway.shown import alarm_json, curves_json, fleet_json, stages_json
-from pipeline.gateway.site_model import SiteModel
 from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.fan_history import curves_of
+from pipeline.presenting.request_desk import RequestDesk
+from pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stages_json
+from pipeline.presenting.site_model import SiteModel
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from pipeline.viewing.fleet import Fan
 from schemas.envelope import Envelope

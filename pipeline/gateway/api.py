@@ -16,12 +16,12 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from pipeline.config.models import TrayConfig
 from pipeline.gateway.access import Access, Visitor, require_own_page, require_token
-from pipeline.gateway.fan_history import HISTORY_S
 from pipeline.gateway.forms import LoginForm, RequestForm
 from pipeline.gateway.live_feed import LiveFeed, encoded
 from pipeline.gateway.metrics import metrics_text
-from pipeline.gateway.requests import RequestDesk
-from pipeline.gateway.shown import (
+from pipeline.presenting.fan_history import HISTORY_S
+from pipeline.presenting.request_desk import RequestDesk
+from pipeline.presenting.shown import (
     alarm_json,
     curves_json,
     fan_in_full,
@@ -31,7 +31,7 @@ from pipeline.gateway.shown import (
     stages_json,
     transition_json,
 )
-from pipeline.gateway.site_model import SiteModel
+from pipeline.presenting.site_model import SiteModel
 from pipeline.viewing.fleet import Fan
 from schemas.messages import Request as OperatorRequest
 from schemas.messages import Transition

@@ -14,8 +14,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import generate_latest
 from prometheus_client.registry import Collector
 
-from pipeline.gateway.site_model import SiteModel
 from pipeline.launch.site_state import AT_WORK, StageState
+from pipeline.presenting.site_model import SiteModel
 from schemas.messages import Severity
 from schemas.units import RAD_S_PER_UNIT
 from scoring.alarms.alarm_flags import is_presented

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.config.models import TrayConfig
-from pipeline.gateway.fan_history import Curves
-from pipeline.gateway.site_model import SiteModel
 from pipeline.launch.site_state import StageState
+from pipeline.presenting.fan_history import Curves
+from pipeline.presenting.site_model import SiteModel
 from pipeline.viewing.fleet import Fan, FanNow, class_names
 from schemas.messages import Alarm, Array, ModelCard
 from schemas.units import RAD_S_PER_UNIT

@@ -15,11 +15,11 @@ import numpy as np
 
 from pipeline.config.models import TrayConfig
 from pipeline.config.registry import STAGES
-from pipeline.gateway.alarm_store import AlarmStore
-from pipeline.gateway.fan_history import COLUMNS, Curves, FanHistory, values_of
 from pipeline.launch.site_state import StageState, stage_states
 from pipeline.launch.site_watcher import StageView
 from pipeline.launch.watched_alarms import WatchedAlarms
+from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.fan_history import COLUMNS, Curves, FanHistory, values_of
 from pipeline.viewing.fleet import Fan, FanNow, Fleet
 from pipeline.viewing.fleet_view import last_sample
 from schemas.codec import CodecError, decode_columns, encode
