@@ -26,7 +26,7 @@ _STAGE = ["site", "stage"]
 
 
 class SiteMetrics(Collector):
-    """Collected anew for each scrape."""
+    """Collected for each scrape."""
 
     def __init__(self, model: SiteModel, readers: int = 0) -> None:
         """readers: pages that are open."""
