@@ -63,6 +63,8 @@ class Topic:
     """a producer keeps so many for consumers that were cut off, if these are more than `history`"""
     is_needed_first: bool = False
     """a consumer that begins needs its last message before those of other topics"""
+    is_of_people: bool = False
+    """people and programs that are no stage publish it too"""
     is_of_session: bool = False
     """about a session of a stage: a live replay does not publish it, since that session does not run"""
 
@@ -87,16 +89,25 @@ CATCH_UP_MESSAGES = 4096
 
 TOPICS: tuple[Topic, ...] = (
     Topic("raw", Raw, "as the device sends, often 100 Hz", True, 8192, 16 * MIB, "samples as the device sent them"),
-    Topic("reading", PushedSamples, "as the client sends", False, CATCH_UP_MESSAGES, 16 * MIB, "samples of a client"),
+    Topic(
+        "reading",
+        PushedSamples,
+        "as the client sends",
+        False,
+        CATCH_UP_MESSAGES,
+        16 * MIB,
+        "samples of a client",
+        is_of_people=True,
+    ),
     Topic("grid", Grid, "the grid's rate over the block size", True, 8192, 16 * MIB, "samples on a uniform grid"),
     Topic("prediction", Prediction, "as grid", True, 8192, 32 * MIB, "the healthy twin beside the measurement"),
     Topic("score", Score, "as prediction", True, 8192, 64 * MIB, "scored samples, ready to draw"),
     Topic("alarm", Alarm, ON_CHANGE, True, CATCH_UP_MESSAGES, MIB, "transitions of alarms"),
-    Topic("request", Request, ON_CHANGE, True, 64, 64 * KIB, "requests of operators about alarms"),
+    Topic("request", Request, ON_CHANGE, True, 64, 64 * KIB, "requests of operators about alarms", is_of_people=True),
     Topic(
         "snapshot", ScorerSnapshot, "on change, and regularly", True, 4, 96 * MIB, "a scorer's state for a restart", 64
     ),
-    Topic("command", Command, ON_CHANGE, True, 64, 64 * KIB, "commands and set-points for the fans"),
+    Topic("command", Command, ON_CHANGE, True, 64, 64 * KIB, "commands and set-points for the fans", is_of_people=True),
     Topic("twin", ModelCard, ON_CHANGE, True, 8, 16 * MIB, "the twin in force", is_needed_first=True),
     Topic(
         "new_twin", NewTwin, ON_CHANGE, False, 2, 16 * MIB, "a learned twin that is to take over", is_needed_first=True

@@ -33,6 +33,7 @@ COMMANDS = {
     "selftest": "watch.selftest",
     "router": "watch.router",
     "certs": "watch.certs",
+    "users": "watch.users",
     "replay": "recordings.replay",
     "info": "recordings.info",
     "recover": "recordings.recover",

@@ -111,5 +111,13 @@ STAGES: dict[str, StageRow] = {
             reads=("score", "alarm", "twin", "health"),
             writes=(),
         ),
+        StageRow(
+            "gateway",
+            "stages.gateway:STAGE",
+            has_common_shards=False,
+            may_drop=True,
+            reads=("score", "alarm", "twin", "health"),
+            writes=("request",),
+        ),
     )
 }

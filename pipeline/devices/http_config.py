@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import ipaddress
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from pipeline.devices.host_address import is_of_this_host_only
 from pipeline.devices.sample_source import SourceConfig
 
 
@@ -31,10 +31,7 @@ class HttpConfig(SourceConfig, frozen=True):
     @property
     def is_local(self) -> bool:
         """Whether only this host can reach it."""
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
+        return is_of_this_host_only(self.host)
 
     @property
     def why_no_commands(self) -> str:

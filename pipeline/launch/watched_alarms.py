@@ -33,9 +33,10 @@ class _Fan:
 class WatchedAlarms:
     """Not thread-safe."""
 
-    def __init__(self, is_known: Callable[[str], bool]) -> None:
+    def __init__(self, is_known: Callable[[str], bool], most_fans: int = MOST_WATCHED_FANS) -> None:
         """is_known: whether a producer is a stage."""
         self._is_known = is_known
+        self._most_fans = most_fans
         self._fans: dict[tuple[str, int], _Fan] = {}
         """by tray and fan; those heard last come last"""
         self._bytes = 0
@@ -47,7 +48,7 @@ class WatchedAlarms:
         messages = [each for each in before.messages if _name(each) != _name(alarm)] if before else []
         sizes = (before.sizes if before else {}) | {_name(alarm): size}
         self._put(fan, needed(in_sequence([*messages, alarm])), sizes)
-        while len(self._fans) > MOST_WATCHED_FANS or self._bytes > WATCHED_BYTES:
+        while len(self._fans) > self._most_fans or self._bytes > WATCHED_BYTES:
             strangers = (of for of, each in self._fans.items() if not self._is_known(_producer(each)))
             self._put(next(strangers, next(iter(self._fans))), [], {})
 
@@ -61,6 +62,11 @@ class WatchedAlarms:
     def current(self) -> list[CurrentAlarm]:
         """The current alarm of each fan that had one, by tray and fan."""
         return [self._fans[fan].current for fan in sorted(self._fans)]
+
+    def of(self, tray: str, fan: int) -> CurrentAlarm | None:
+        """The current alarm of a fan; None: it had none."""
+        found = self._fans.get((tray, fan))
+        return found.current if found else None
 
     def _put(self, fan: tuple[str, int], messages: list[Alarm], sizes: dict[_Name, int]) -> None:
         before = self._fans.pop(fan, None)

@@ -40,7 +40,7 @@ def build_and_join(
     kept = KeptSnapshots(bus, config.site, stop, refuse_others, timeout_s, is_one_expected=is_one_expected)
     parts: dict[str, BuiltStage] = {}
     try:
-        parts = build_parts(stage, _context_of(stage, config, shard, session.started_t_ns, kept))
+        parts = build_parts(stage, _context_of(stage, config, shard, session, kept))
         refuse_others()
         return bus(), parts
     except BaseException:
@@ -74,7 +74,7 @@ def abort(parts: dict[str, BuiltStage]) -> None:
         each.core.abort()
 
 
-def _context_of(stage: Stage, config: Config, shard: Shard, started_t_ns: int, kept: Kept) -> Context:
+def _context_of(stage: Stage, config: Config, shard: Shard, session: Session, kept: Kept) -> Context:
     """What a process of a stage is built from. kept: what others keep of its state."""
     return Context(
         site=config.site,
@@ -82,8 +82,9 @@ def _context_of(stage: Stage, config: Config, shard: Shard, started_t_ns: int, k
         config=config.sections[stage.name],
         folder=config.folder,
         run_folder=config.run_folder,
-        started_t_ns=started_t_ns,
+        started_t_ns=session.started_t_ns,
         instance=shard.name,
+        producer=session.producer,
         shard_number=shard.number,
         snapshot_folder=config.run_folder,
         kept=kept,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from pipeline.config.shards import Shard
 from schemas.health import Health
-from schemas.topics import ALL_TRAYS, SESSION_CHUNK, health_key, session_key, stage_label
+from schemas.topics import ALL_TRAYS, SESSION_CHUNK, health_key, session_key, stage_label, topic_of
 
 MOST_SESSIONS = 4096
 _BETWEEN_TRAYS = "+"
@@ -162,7 +162,8 @@ class Sessions:
             if len(self._said_last) > MOST_SESSIONS:
                 del self._said_last[next(iter(self._said_last))]
         if written is not None:
-            written.update(output.key for output in health.outputs if output.key in read_keys)
+            outputs = (output.key for output in health.outputs if output.key in read_keys)
+            written.update(key for key in outputs if not topic_of(key).is_of_people)
 
     def is_alive(self, producer: str) -> bool:
         """Whether this producer is a session that is alive."""

@@ -160,6 +160,8 @@ class Context:
     started_t_ns: int
     instance: str = ALL_TRAYS
     """the name of the process"""
+    producer: str = ""
+    """with which this process signs what it publishes; empty where it publishes nothing, as in a check"""
     shard_number: int = 1
     """of a numbered shard"""
     snapshot_folder: Path | None = None

@@ -136,6 +136,23 @@ class Fleet:
         order = np.lexsort((-score, -rank, ~listed))[:most]
         return [self._now(int(index), bool(in_alarm[index])) for index in order if listed[index]]
 
+    def every_fan(self) -> list[FanNow]:
+        """All fans, the worst first, those that are not judged and not in alarm last."""
+        order = [self.index(each.fan) for each in self.worst(len(self.fans))]
+        listed = set(order)
+        order += [index for index in range(len(self.fans)) if index not in listed]
+        in_alarm = self.in_alarm()
+        return [self._now(index, bool(in_alarm[index])) for index in order]
+
+    def fan_now(self, fan: Fan) -> FanNow:
+        """One fan of the site."""
+        index = self.index(fan)
+        return self._now(index, bool(self.in_alarm()[index]))
+
+    def scores(self) -> Array:
+        """The score of each fan, (fans,) float32: 1 is at the limit; NaN if the newest sample is not scored."""
+        return self._score.copy()
+
     def alarms(self) -> list[Fan]:
         """The fans in alarm whose alarm is not silenced, the highest score first."""
         indexes = np.flatnonzero(self.in_alarm() & ~self._silenced)

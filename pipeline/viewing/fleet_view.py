@@ -91,7 +91,7 @@ class FleetView:
         for score in scores:
             tray = score.header.tray
             self._heard_ns[tray] = now_ns
-            newest = _last_sample(score)
+            newest = last_sample(score, COLUMNS)
             self._history[tray].append(newest)
             self._fleet.update(newest)
         newest_t_ns = max((int(score.t_ns[-1]) for score in scores), default=self._t_ns)
@@ -133,7 +133,7 @@ class FleetView:
         )
 
 
-def _last_sample(score: Score) -> Score:
-    """Its own copy: a view would keep the whole message in memory."""
-    columns = {name: getattr(score, name)[-1:].copy() for name in ("t_ns", *COLUMNS)}
-    return Score(header=score.header, fans=score.fans, period_ns=score.period_ns, **columns)
+def last_sample(score: Score, columns: Sequence[str]) -> Score:
+    """The last sample of a score with these columns. It is a copy: a view would keep the whole message in memory."""
+    values = {name: getattr(score, name)[-1:].copy() for name in ("t_ns", *columns)}
+    return Score(header=score.header, fans=score.fans, period_ns=score.period_ns, **values)

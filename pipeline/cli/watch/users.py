@@ -1,0 +1,94 @@
+"""`fantwin users`: the users of the gateway."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from pipeline.config.loading import load_config
+from pipeline.errors import UsageError, UserError
+from pipeline.gateway.config import GatewayConfig
+from pipeline.gateway.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
+from pipeline.optional_dependencies import how_to_install, is_installed
+
+
+class UserAction(StrEnum):
+    """The actions, as they are typed."""
+
+    ADD = "add"
+    REMOVE = "remove"
+    LIST = "list"
+
+
+def users(
+    action: Annotated[UserAction, typer.Argument(metavar="ACTION", help=f"{', '.join(UserAction)}.")] = UserAction.LIST,
+    name: Annotated[str | None, typer.Argument(help="Letters, digits, `.`, `_`, `@` and `-`.")] = None,
+    role: Annotated[str, typer.Option(help="viewer: may look; operator: may act, too.")] = "viewer",
+    config: ConfigOption = DEFAULT_CONFIG,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """List the users of the gateway, who may log in to the operators' page; add one, or remove one.
+
+    `add` asks for the password, or reads it from a pipe; it also gives a user another password and role.
+
+    Example: fantwin users add ann --role operator
+
+    Example: fantwin users remove ann
+    """
+    settings = load_config(config, overrides or (), stages=("gateway",))
+    if not is_installed("argon2"):
+        raise UserError(f"users need the extra `gateway`: {how_to_install('gateway')}")
+    section = settings.sections["gateway"]
+    assert isinstance(section, GatewayConfig)
+    if section.users is None:
+        raise UserError(f'{config}: [gateway] names no file of users: add users = "users.toml"')
+    path = settings.folder / section.users
+    found = read_users(path) if path.exists() else {}
+    if action == UserAction.LIST:
+        _list(path, found, json_output=json_output)
+        return
+    if name is None:
+        raise UsageError(f"name a user: fantwin users {action} NAME")
+    if action == UserAction.REMOVE:
+        if found.pop(name, None) is None:
+            raise UserError(f"{path}: no user {name!r}: there is {', '.join(found) or 'none'}")
+        done = "removed"
+    else:
+        found[name] = _asked_for(name, role)
+        done = f"{found[name].role} now"
+    write_users(path, found)
+    if json_output:
+        typer.echo(json.dumps({"name": name, "done": done}))
+    else:
+        typer.echo(f"{path}: {name}: {done}")
+
+
+def _list(path: Path, found: Mapping[str, User], *, json_output: bool) -> None:
+    if json_output:
+        typer.echo(json.dumps([{"name": user.name, "role": str(user.role)} for user in found.values()]))
+        return
+    for user in found.values():
+        typer.echo(f"{user.name}  {user.role}")
+    if not found:
+        typer.echo(f"{path}: no users: add one with `fantwin users add NAME`")
+
+
+def _asked_for(name: str, role: str) -> User:
+    if not NAME.fullmatch(name):
+        raise UsageError(f"{name!r} is no name: letters, digits, `.`, `_`, `@` and `-`, at most 64")
+    roles = [each.value for each in UserRole]
+    if role not in roles:
+        raise UsageError(f"--role {role}: {' or '.join(roles)}")
+    if sys.stdin.isatty():
+        password = typer.prompt("Password", hide_input=True, confirmation_prompt=True)
+    else:
+        password = sys.stdin.readline().rstrip("\n")
+    return User(name, UserRole(role), hasher().hash(checked_password(password)))

@@ -1,0 +1,13 @@
+"""Addresses to listen on."""
+
+from __future__ import annotations
+
+import ipaddress
+
+
+def is_of_this_host_only(host: str) -> bool:
+    """Whether only this host can reach what listens there."""
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,1 @@
+"""The web server of a site: operators' page, API, live events and metrics."""

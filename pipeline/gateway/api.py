@@ -1,0 +1,251 @@
+"""The API, version 1: everything that the page shows and does, as JSON. `openapi.json` describes it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from functools import wraps
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+
+from pipeline.config.models import TrayConfig
+from pipeline.gateway.access import Access, Visitor, require_own_page, require_token
+from pipeline.gateway.forms import LoginForm, RequestForm
+from pipeline.gateway.live_feed import LiveFeed, encoded
+from pipeline.gateway.metrics import metrics_text
+from pipeline.presenting.fan_history import HISTORY_S
+from pipeline.presenting.request_desk import RequestDesk
+from pipeline.presenting.shown import (
+    alarm_json,
+    curves_json,
+    fan_in_full,
+    fan_json,
+    fleet_json,
+    site_json,
+    stages_json,
+    transition_json,
+)
+from pipeline.presenting.site_model import SiteModel
+from pipeline.viewing.fleet import Fan
+from schemas.enums import Transition
+from schemas.messages import Request as OperatorRequest
+from schemas.units import NS_PER_S
+
+MOST_LISTED = 500
+LARGEST_BODY_BYTES = 16_384
+METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+ALL_FANS = "all"
+
+Form = TypeVar("Form", bound=BaseModel)
+Handler = Callable[[Any, Request], Awaitable[Response]]
+
+
+def reads(handler: Handler) -> Handler:
+    """A handler of whoever may read."""
+
+    @wraps(handler)
+    async def checked(api: Api, request: Request) -> Response:
+        api.access.reader(request)
+        return await handler(api, request)
+
+    return checked
+
+
+@dataclass(frozen=True, eq=False)
+class Api:
+    """The handlers."""
+
+    model: SiteModel
+    access: Access
+    feed: LiveFeed
+    desk: RequestDesk
+    viewer_url: str = ""
+    """of Rerun's web viewer; empty: there is none"""
+
+    @reads
+    async def site(self, request: Request) -> Response:
+        """Trays, fans and what the classes of cells mean."""
+        return JSONResponse({**site_json(self.model), "viewer_url": self.viewer_url})
+
+    @reads
+    async def fans(self, request: Request) -> Response:
+        """All fans, the worst first; ?tray=NAME, ?state=WORD and ?limit=N choose."""
+        tray, state = request.query_params.get("tray", ""), request.query_params.get("state", "")
+        most = _number(request, "limit", 10_000_000)
+        found = [each for each in self.model.every_fan() if not tray or each.fan.tray == tray]
+        return JSONResponse({"fans": [fan_json(each) for each in found if state in each.state][:most]})
+
+    @reads
+    async def fan(self, request: Request) -> Response:
+        """One fan with its alarm and its twin."""
+        return JSONResponse(fan_in_full(self.model, self._fan(request)))
+
+    @reads
+    async def curves(self, request: Request) -> Response:
+        """The last hour of a fan, or its last ?seconds=N."""
+        fan = self._fan(request)
+        since_t_ns = self.model.newest_t_ns(fan.tray) - round(_number(request, "seconds", HISTORY_S) * NS_PER_S)
+        tray = self._tray(fan.tray)
+        return JSONResponse(curves_json(self.model.history(fan, since_t_ns), tray))
+
+    @reads
+    async def alarms(self, request: Request) -> Response:
+        """The current alarms; ?all=1 also those that are over."""
+        found = [alarm_json(each) for each in self.model.current_alarms()]
+        everything = request.query_params.get("all", "") == "1"
+        return JSONResponse({"alarms": [each for each in found if everything or each["listed"]]})
+
+    @reads
+    async def alarm_history(self, request: Request) -> Response:
+        """The last transitions, newest first; ?tray=, ?fan=, ?limit=, and ?before=NUMBER for the next page."""
+        found = self.model.past_alarms(
+            min(MOST_LISTED, _number(request, "limit", 100)),
+            tray=request.query_params.get("tray", ""),
+            fan=_number(request, "fan", -1),
+            before=_number(request, "before", 0),
+        )
+        return JSONResponse({"transitions": [transition_json(number, alarm) for number, alarm in found]})
+
+    @reads
+    async def stages(self, request: Request) -> Response:
+        """The stages: state, rates, losses, latency."""
+        return JSONResponse({"stages": stages_json(self.model.stages())})
+
+    @reads
+    async def events(self, request: Request) -> Response:
+        """Live events (text/event-stream); ?fan=TRAY/NUMBER adds the samples of a fan."""
+        fan = None
+        if name := request.query_params.get("fan", ""):
+            fan = self._named(*name.rpartition("/")[::2])
+        first = encoded("fleet", fleet_json(self.model))
+        return StreamingResponse(
+            self.feed.events(first, fan), media_type="text/event-stream", headers={"X-Accel-Buffering": "no"}
+        )
+
+    @reads
+    async def metrics(self, request: Request) -> Response:
+        """For Prometheus."""
+        return Response(metrics_text(self.model, self.feed.readers), media_type=METRICS_TYPE)
+
+    async def me(self, request: Request) -> Response:
+        """Who asks, and what he may do; the token that a page sends with what it changes."""
+        return JSONResponse(self._me(self.access.visitor(request)))
+
+    async def log_in(self, request: Request) -> Response:
+        """Begin a session."""
+        require_own_page(request)
+        form = await _form(request, LoginForm)
+        address = request.client.host if request.client else ""
+        cookie, session = self.access.log_in(form.name, form.password, address)
+        answer = JSONResponse({"name": session.user, "csrf_token": session.csrf_token})
+        answer.set_cookie(
+            self.access.cookie_name,
+            cookie,
+            httponly=True,
+            samesite="strict",
+            secure=self.access.cookie_name.startswith("__Host-"),
+        )
+        return answer
+
+    async def log_out(self, request: Request) -> Response:
+        """End the session."""
+        require_own_page(request)
+        visitor = self.access.visitor(request)
+        if visitor.session is not None:
+            require_token(request, visitor.session)
+            self.access.sessions.end(request.cookies[self.access.cookie_name])
+        answer = JSONResponse({})
+        answer.delete_cookie(self.access.cookie_name)
+        return answer
+
+    async def act(self, request: Request) -> Response:
+        """Send an operator's request about a fan, or all fans of a tray, and answer what the scorer says."""
+        visitor = self.access.operator(request)
+        form = await _form(request, RequestForm)
+        name = request.path_params["tray"]
+        tray = self._tray(name)
+        is_all = request.path_params["fan"] == ALL_FANS
+        fan = -1 if is_all else self._fan(request).number
+        asked = OperatorRequest(
+            t_ns=time.time_ns(),
+            action=form.message_action,
+            fan=fan,
+            duration_s=form.duration_s,
+            operator_name=visitor.name,
+            comment=form.comment,
+        )
+        try:
+            answers = await self.desk.ask(name, asked, range(tray.fans) if is_all else [fan])
+        except TimeoutError as error:
+            raise HTTPException(504, str(error) or f"tray {name}: no scorer has answered") from error
+        refused = [each for each in answers if each.transition == Transition.REFUSED]
+        body = {
+            "answers": [
+                {"fan": each.fan, "transition": each.transition.name.lower(), "message": each.message}
+                for each in answers
+            ]
+        }
+        if len(refused) == len(answers):
+            return JSONResponse({"error": refused[0].message, **body}, 409)
+        return JSONResponse(body)
+
+    def _me(self, visitor: Visitor) -> dict[str, Any]:
+        return {
+            "name": visitor.name,
+            "may_read": visitor.may_read,
+            "may_act": visitor.may_act,
+            "has_login": self.access.has_login,
+            "csrf_token": visitor.session.csrf_token if visitor.session else "",
+        }
+
+    def _fan(self, request: Request) -> Fan:
+        return Fan(*self._named(request.path_params["tray"], request.path_params["fan"]))
+
+    def _named(self, tray: str, fan: str) -> tuple[str, int]:
+        found = self._tray(tray)
+        if not (fan.isascii() and fan.isdigit() and len(fan) < 6 and int(fan) < found.fans):
+            raise HTTPException(404, f"no such fan: {tray} has fans 0 to {found.fans - 1}")
+        return tray, int(fan)
+
+    def _tray(self, name: str) -> TrayConfig:
+        found = self.model.tray(name)
+        if found is None:
+            raise HTTPException(404, "no such tray")
+        return found
+
+
+async def failed(_request: Request, error: Exception) -> Response:
+    """The answer to what cannot be done: {"error": why}."""
+    assert isinstance(error, HTTPException)
+    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+
+
+async def _form(request: Request, kind: type[Form]) -> Form:
+    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+        raise HTTPException(415, "send application/json")
+    body = bytearray()
+    async for piece in request.stream():
+        body += piece
+        if len(body) > LARGEST_BODY_BYTES:
+            raise HTTPException(413, f"at most {LARGEST_BODY_BYTES} bytes are accepted")
+    try:
+        return kind.model_validate_json(bytes(body))
+    except ValidationError as error:
+        found = json.loads(error.json(include_url=False, include_input=False))[0]
+        where = ".".join(map(str, found["loc"]))
+        raise HTTPException(422, f"{where}: {found['msg']}" if where else found["msg"]) from error
+
+
+def _number(request: Request, name: str, default: int) -> int:
+    text = request.query_params.get(name, "")
+    if not text:
+        return default
+    if not (text.isascii() and text.isdigit() and len(text) < 16):
+        raise HTTPException(422, f"{name}: a whole number, please")
+    return int(text)

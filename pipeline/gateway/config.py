@@ -1,0 +1,63 @@
+"""Section `[gateway]`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field, model_validator
+
+from pipeline.devices.host_address import is_of_this_host_only
+from pipeline.runtime.stage import StageConfig
+
+
+class GatewayConfig(StageConfig):
+    """Where the page is served, and who may see it and act.
+
+    Beyond loopback it needs TLS, and users or a proxy that knows them.
+    """
+
+    host: str = Field(default="127.0.0.1", description="address to listen on")
+    port: int = Field(default=8080, ge=1, le=65535, description="port; of shard K the K-th from here on")
+    certificate: Path | None = Field(default=None, description="PEM file: serve https with this certificate")
+    key: Path | None = Field(default=None, description="PEM file: its private key")
+    users: Path | None = Field(
+        default=None, description="file of users, written by `fantwin users`; without it nobody can act from the page"
+    )
+    user_header: str = Field(
+        default="",
+        pattern=r"^[A-Za-z0-9-]*$",
+        description='header in which a proxy passes the name of the user that it has authenticated; "": none',
+    )
+    proxies: tuple[str, ...] = Field(
+        default=("127.0.0.1", "::1"), description="addresses of that proxy; the header of others is refused"
+    )
+    operators: tuple[str, ...] = Field(
+        default=(), description="users of the proxy who may act; all others may only look"
+    )
+    hosts: tuple[str, ...] = Field(
+        default=("localhost", "127.0.0.1", "[::1]"),
+        description='names under which browsers may ask for the page on loopback; add that of a proxy, "*": any',
+    )
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this host reaches it."""
+        return is_of_this_host_only(self.host)
+
+    @model_validator(mode="after")
+    def _check(self) -> GatewayConfig:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together: give both, or none")
+        if self.user_header and self.users:
+            raise ValueError("users and user_header exclude each other: either this file or a proxy knows the users")
+        if self.operators and not self.user_header:
+            raise ValueError("operators are users of a proxy: they need user_header")
+        if not self.is_loopback:
+            if self.certificate is None:
+                raise ValueError(f"host {self.host} is beyond loopback: that needs certificate and key")
+            if not (self.users or self.user_header):
+                raise ValueError(
+                    f"host {self.host} is beyond loopback: that needs users (`fantwin users add NAME`), or a proxy's "
+                    "user_header"
+                )
+        return self

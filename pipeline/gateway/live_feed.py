@@ -1,0 +1,108 @@
+"""Live events for many pages at once: each event is encoded once, and whoever does not keep up misses some.
+
+The stage publishes from its own thread and never waits: each reader has a bounded queue. A reader that misses events is
+sent `missed` instead, and asks for the state again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+MOST_WAITING = 64
+"""events of one reader"""
+KEEP_ALIVE_S = 10.0
+"""a reader without events is sent a comment, so that a connection that is dead is noticed at both ends"""
+
+FanName = tuple[str, int]
+
+
+@dataclass(eq=False)
+class _Reader:
+    loop: asyncio.AbstractEventLoop
+    fan: FanName | None
+    waiting: asyncio.Queue[bytes] = field(default_factory=lambda: asyncio.Queue(MOST_WAITING))
+    has_missed: bool = False
+
+    def put(self, event: bytes) -> None:
+        """From the loop."""
+        if self.has_missed:
+            return
+        try:
+            self.waiting.put_nowait(event)
+        except asyncio.QueueFull:
+            self.has_missed = True
+
+
+class LiveFeed:
+    """The readers, and what is sent to them."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._readers: list[_Reader] = []
+        self._ended = False
+
+    def publish(self, name: str, data: Any, about: FanName | None = None) -> None:
+        """Send an event to all readers, or to those that look at one fan."""
+        with self._lock:
+            readers = [each for each in self._readers if about is None or each.fan == about]
+        if not readers:
+            return
+        event = encoded(name, data)
+        for each in readers:
+            each.loop.call_soon_threadsafe(each.put, event)
+
+    @property
+    def readers(self) -> int:
+        """How many there are."""
+        return len(self._readers)
+
+    def looked_at(self) -> set[FanName]:
+        """The fans that somebody looks at."""
+        with self._lock:
+            return {each.fan for each in self._readers if each.fan is not None}
+
+    def end(self) -> None:
+        """No more events: the readers are sent away."""
+        with self._lock:
+            self._ended = True
+            readers = list(self._readers)
+        for each in readers:
+            each.loop.call_soon_threadsafe(each.put, b"")
+
+    async def events(self, first: bytes, fan: FanName | None) -> AsyncIterator[bytes]:
+        """The events of one reader as they are sent, `first` at once. fan: the one that it looks at."""
+        with self._joined(fan) as reader:
+            yield first
+            while not self._ended:
+                try:
+                    event = await asyncio.wait_for(reader.waiting.get(), KEEP_ALIVE_S)
+                except TimeoutError:
+                    yield b": alive\n\n"
+                    continue
+                if event:
+                    yield event
+                if reader.has_missed and reader.waiting.empty():
+                    reader.has_missed = False
+                    yield encoded("missed", {})
+
+    @contextmanager
+    def _joined(self, fan: FanName | None) -> Iterator[_Reader]:
+        reader = _Reader(asyncio.get_running_loop(), fan)
+        with self._lock:
+            self._readers.append(reader)
+        try:
+            yield reader
+        finally:
+            with self._lock:
+                self._readers.remove(reader)
+
+
+def encoded(name: str, data: Any) -> bytes:
+    """An event of a text/event-stream."""
+    return f"event: {name}\ndata: {json.dumps(data, separators=(',', ':'), allow_nan=False)}\n\n".encode()

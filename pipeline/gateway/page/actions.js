@@ -1,0 +1,94 @@
+// What an operator does: log in, and ask a scorer something about a fan.
+
+import { element, notice } from "./dom.js";
+import { learnWhoIAm, me, Refused, send } from "./server.js";
+
+export const ACTIONS = {
+  acknowledge: { title: "Acknowledge", about: "I have seen it." },
+  confirm: { title: "Confirm", about: "It is over, and dealt with." },
+  shelve: { title: "Shelve", about: "Hide it for a while.", lasts: true },
+  unshelve: { title: "Unshelve", about: "Show it again." },
+  suppress: { title: "Suppress", about: "Hide it until it is unsuppressed." },
+  unsuppress: { title: "Unsuppress", about: "Show it again." },
+  out_of_service: { title: "Out of service", about: "The fan is being worked on." },
+  in_service: { title: "In service", about: "The fan is back." },
+  reset: { title: "Reset", about: "Release an alarm that is latched." },
+  commission: { title: "Commission", about: "The fan was replaced or repaired: learn its offset again." },
+};
+const SHELVED_FOR = [["30 minutes", 1800], ["2 hours", 7200], ["8 hours", 28800], ["1 day", 86400], ["7 days", 604800], ["until it clears", 0]];
+
+// Those that make sense in the state of an alarm.
+export function possible(alarm) {
+  if (!alarm) return ["out_of_service", "suppress", "commission"];
+  return [
+    alarm.retained && !alarm.acknowledged ? "acknowledge" : "",
+    alarm.acknowledged && !alarm.confirmed ? "confirm" : "",
+    alarm.latched ? "reset" : "",
+    alarm.shelved_until_t_ns ? "unshelve" : "shelve",
+    alarm.suppressed ? "unsuppress" : "suppress",
+    alarm.out_of_service ? "in_service" : "out_of_service",
+    "commission",
+  ].filter(Boolean);
+}
+
+export function buttons(tray, fan, alarm) {
+  if (!me.may_act) return element("p", { class: "muted" }, hint());
+  return element("div", { class: "actions" }, ...possible(alarm).map((action, number) => element("button", {
+    type: "button", class: number === 0 && action === "acknowledge" ? "primary" : "", onclick: () => askFor(action, tray, fan),
+    "data-action": action }, ACTIONS[action].title)));
+}
+
+function hint() {
+  if (me.name) return `${me.name} may look, and not act.`;
+  return me.has_login ? "Log in to act." : "To act from this page, make a user: fantwin users add NAME";
+}
+
+function askFor(action, tray, fan) {
+  const { title, about, lasts } = ACTIONS[action];
+  const duration = lasts ? element("select", { id: "duration" }, ...SHELVED_FOR.map(([text, s]) => element("option", { value: s }, text))) : null;
+  const comment = element("input", { id: "comment", maxlength: 500, autocomplete: "off" });
+  dialog(`${title}: ${tray} fan ${fan}`, element("div", {}, element("p", {}, about),
+    duration && element("label", { for: "duration" }, "How long"), duration ?? "",
+    element("label", { for: "comment" }, "Why (for the record)"), comment), title, async () => {
+    const body = { action, comment: comment.value };
+    if (duration) body.duration_s = Number(duration.value);
+    const { answers } = await send(`/fans/${encodeURIComponent(tray)}/${fan}/requests`, body);
+    notice(answers.map((answer) => answer.message).join("; "));
+  });
+}
+
+export function showLogin(onDone) {
+  const name = element("input", { id: "name", autocomplete: "username", required: true });
+  const password = element("input", { id: "password", type: "password", autocomplete: "current-password", required: true });
+  dialog("Log in", element("div", {}, element("label", { for: "name" }, "Name"), name,
+    element("label", { for: "password" }, "Password"), password), "Log in", async () => {
+    await send("/login", { name: name.value, password: password.value });
+    await learnWhoIAm();
+    onDone();
+  });
+}
+
+export async function logOut(onDone) {
+  await send("/logout", {});
+  await learnWhoIAm();
+  onDone();
+}
+
+function dialog(title, content, button, onDone) {
+  const root = document.getElementById("dialog");
+  const error = element("p", { class: "error", role: "alert" });
+  const form = element("form", { method: "dialog", "aria-labelledby": "dialog-title", onsubmit: async (event) => {
+    event.preventDefault();
+    error.textContent = "";
+    try {
+      await onDone();
+      root.close();
+    } catch (failure) {
+      error.textContent = failure instanceof Refused ? failure.message : "The server cannot be reached.";
+    }
+  } }, element("h2", { id: "dialog-title" }, title), content, error, element("div", { class: "actions" },
+    element("button", { type: "button", onclick: () => root.close() }, "Cancel"),
+    element("button", { type: "submit", class: "primary" }, button)));
+  root.replaceChildren(form);
+  root.showModal();
+}

@@ -1,0 +1,116 @@
+// The page: which view is shown, and what reaches it.
+
+import { AlarmsView, HistoryView } from "./alarms.js";
+import { logOut, showLogin } from "./actions.js";
+import { element, notice } from "./dom.js";
+import { FanView } from "./fan.js";
+import { FansView } from "./fans.js";
+import { StagesView } from "./stages.js";
+import { ask, Events, learnWhoIAm, me, Refused } from "./server.js";
+
+const content = document.getElementById("content");
+const alarms = new Map();
+let site = null, view = null, fleet = null, stages = [], shownHash = null;
+
+const events = new Events({
+  connected: (isThere) => showConnection(isThere),
+  fleet: (data) => { fleet = data; showSummary(); if (view instanceof FansView) view.update(fleet); },
+  alarm: (alarm) => { alarms.set(`${alarm.tray}/${alarm.fan}`, alarm); showAlarms(alarm); },
+  stages: (data) => { stages = data.stages; if (view instanceof StagesView) view.update(stages); },
+  samples: (data) => { if (view instanceof FanView) view.add(data); },
+  missed: () => learnState(),
+});
+let wasConnected = false;
+
+function showConnection(isThere) {
+  const shown = document.getElementById("connection");
+  shown.textContent = isThere ? "● live" : "✖ no connection: what is shown is old";
+  shown.className = isThere ? "muted" : "lost";
+  if (isThere && !wasConnected) learnState();
+  wasConnected = isThere;
+}
+
+async function learnState() {
+  try {
+    await learnWhoIAm();
+    const [found, now] = await Promise.all([ask("/alarms"), ask("/stages")]);
+    alarms.clear();
+    found.alarms.forEach((alarm) => alarms.set(`${alarm.tray}/${alarm.fan}`, alarm));
+    stages = now.stages;
+    showUser();
+    showAlarms(null);
+    if (view instanceof StagesView) view.update(stages);
+  } catch (failure) {
+    if (failure instanceof Refused && failure.status === 401) start();
+  }
+}
+
+function showSummary() {
+  const { in_alarm, suspect, not_judged } = fleet.counts;
+  document.getElementById("summary").textContent = `${in_alarm} in alarm, ${suspect} suspect, ${not_judged} not judged`;
+  document.title = in_alarm ? `(${in_alarm}) ${site.site} - fantwin` : `${site.site} - fantwin`;
+}
+
+function showAlarms(changed) {
+  const presented = [...alarms.values()].filter((alarm) => alarm.presented).length;
+  document.getElementById("alarm-count").textContent = presented ? `(${presented})` : "";
+  if (view instanceof AlarmsView) view.update();
+  if (view instanceof FanView && (!changed || (changed.tray === view.tray && changed.fan === view.fan))) {
+    view.updateAlarm(alarms.get(`${view.tray}/${view.fan}`));
+  }
+}
+
+function showUser() {
+  const button = (text, onclick) => element("button", { type: "button", onclick }, text);
+  const shown = me.name ? [`${me.name} `, me.has_login ? button("Log out", () => logOut(start)) : ""]
+    : me.has_login ? [button("Log in", () => showLogin(start))] : [];
+  document.getElementById("user").replaceChildren(...shown);
+}
+
+function showView() {
+  if (!site || location.hash === shownHash) return;
+  shownHash = location.hash;
+  const [kind, tray, fan] = location.hash.replace(/^#\//, "").split("/").map(decodeURIComponent);
+  view?.close?.();
+  const isFan = kind === "fan" && site.trays.some((each) => each.name === tray && Number(fan) < each.fans);
+  const wanted = isFan ? `${tray}/${fan}` : "";
+  if (events.fan !== wanted || !events.source) events.open(wanted);
+  if (isFan) view = new FanView(tray, Number(fan), alarms.get(wanted), site.viewer_url);
+  else if (kind === "alarms") view = new AlarmsView(alarms);
+  else if (kind === "history") view = new HistoryView();
+  else if (kind === "stages") view = new StagesView();
+  else view = new FansView(site);
+  content.replaceChildren(view.root);
+  if (view instanceof FansView && fleet) view.update(fleet);
+  if (view instanceof StagesView) view.update(stages);
+  const current = isFan || !["alarms", "history", "stages"].includes(kind) ? "fans" : kind;
+  for (const link of document.querySelectorAll("nav a")) {
+    if (link.getAttribute("href") === `#/${current}`) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+}
+
+async function start() {
+  shownHash = null;
+  try {
+    await learnWhoIAm();
+    showUser();
+    if (!me.may_read) {
+      events.close();
+      content.replaceChildren(element("p", {}, me.has_login ? "Log in to see the fans." : "The proxy has not said who you are."));
+      if (me.has_login) showLogin(start);
+      return;
+    }
+    site = await ask("/site");
+    document.getElementById("site").textContent = site.site;
+    showView();
+    await learnState();
+  } catch (failure) {
+    showConnection(false);
+    if (failure instanceof Refused) notice(failure.message);
+    setTimeout(start, 1000);
+  }
+}
+
+window.addEventListener("hashchange", () => { showView(); content.focus(); });
+start();

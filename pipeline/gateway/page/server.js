@@ -1,0 +1,65 @@
+// The server: questions, requests and live events. The page comes back by itself when the server does.
+
+const PREFIX = "/api/v1";
+const RETRY_MS = 1000;
+
+export let me = { name: "", may_read: false, may_act: false, has_login: false, csrf_token: "" };
+
+export class Refused extends Error {
+  constructor(status, text) {
+    super(text);
+    this.status = status;
+  }
+}
+
+export async function ask(path) {
+  return answered(await fetch(PREFIX + path));
+}
+
+export async function send(path, body) {
+  const headers = { "Content-Type": "application/json", "X-CSRF-Token": me.csrf_token };
+  return answered(await fetch(PREFIX + path, { method: "POST", headers, body: JSON.stringify(body) }));
+}
+
+export async function learnWhoIAm() {
+  me = await ask("/me");
+  return me;
+}
+
+async function answered(response) {
+  const body = await response.json().catch(() => ({}));
+  if (!response.ok) throw new Refused(response.status, body.error || `the server answers ${response.status}`);
+  return body;
+}
+
+// Events of the site, and the samples of one fan if its name is given. on: a handler for each kind of event, and
+// `connected` with whether the server is there.
+export class Events {
+  constructor(on) {
+    this.on = on;
+    this.fan = "";
+    this.source = null;
+    this.timer = 0;
+  }
+
+  open(fan = "") {
+    this.close();
+    this.fan = fan;
+    this.source = new EventSource(`${PREFIX}/events${fan ? `?fan=${encodeURIComponent(fan)}` : ""}`);
+    this.source.onopen = () => this.on.connected(true);
+    this.source.onerror = () => {
+      this.on.connected(false);
+      this.close();
+      this.timer = setTimeout(() => this.open(this.fan), RETRY_MS);
+    };
+    for (const name of ["fleet", "alarm", "stages", "samples", "missed"]) {
+      this.source.addEventListener(name, (event) => this.on[name]?.(JSON.parse(event.data)));
+    }
+  }
+
+  close() {
+    clearTimeout(this.timer);
+    this.source?.close();
+    this.source = null;
+  }
+}

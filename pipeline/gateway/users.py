@@ -1,0 +1,157 @@
+"""The users of the gateway: a file with a role and the hash of a password for each.
+
+Passwords are hashed with argon2id, whose parameters are those of the library (RFC 9106, low-memory profile).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    from argon2 import PasswordHasher
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
+SHORTEST_PASSWORD, LONGEST_PASSWORD = 12, 128
+"""characters (ASVS 2.1.1, 2.1.2)"""
+_OTHERS = 0o077
+_ENTRIES = {"role", "password_hash"}
+
+
+class UserRole(StrEnum):
+    """What a user may do."""
+
+    VIEWER = "viewer"
+    OPERATOR = "operator"
+
+
+@dataclass(frozen=True)
+class User:
+    """One of them."""
+
+    name: str
+    role: UserRole
+    password_hash: str
+
+
+class Users:
+    """The file, read again when it changes."""
+
+    def __init__(self, path: Path) -> None:
+        """Read it.
+
+        Raises:
+            UserError: it cannot be read, others may read it, or it is no such file.
+        """
+        self._path = path
+        self._hasher = hasher()
+        self._nobody_hash = self._hasher.hash("nobody has this password")
+        self._stamp: tuple[int, int] = (0, 0)
+        self._users: Mapping[str, User] = {}
+        self.problem = ""
+        """why the file could not be read again; empty if it was. The users are then those of before."""
+        self._read()
+
+    def of(self, name: str) -> User | None:
+        """A user; None: there is none of this name."""
+        try:
+            self._read()
+            self.problem = ""
+        except UserError as error:
+            self.problem = str(error)
+        return self._users.get(name)
+
+    def verified(self, name: str, password: str) -> User | None:
+        """The user with this name and password; None: there is none. It takes as long for a name that is not there."""
+        from argon2.exceptions import Argon2Error, InvalidHashError  # noqa: PLC0415  an extra
+
+        user = self.of(name)
+        try:
+            self._hasher.verify(user.password_hash if user else self._nobody_hash, password[:LONGEST_PASSWORD])
+        except (Argon2Error, InvalidHashError):
+            return None
+        return user
+
+    def _read(self) -> None:
+        try:
+            found = self._path.stat()
+        except OSError as error:
+            raise UserError(f"{self._path}: {error.strerror}: make users with `fantwin users add NAME`") from error
+        stamp = (found.st_mtime_ns, found.st_ino)
+        if stamp != self._stamp:
+            self._users = read_users(self._path)
+            self._stamp = stamp
+
+
+def hasher() -> PasswordHasher:
+    """What hashes passwords."""
+    from argon2 import PasswordHasher  # noqa: PLC0415  an extra
+
+    return PasswordHasher()
+
+
+def read_users(path: Path) -> dict[str, User]:
+    """All users of a file, by name.
+
+    Raises:
+        UserError: as `Users`.
+    """
+    try:
+        with path.open("rb") as file:
+            if os.fstat(file.fileno()).st_mode & _OTHERS:
+                raise UserError(f"{path}: others may read it: chmod 600 {path}")
+            tables = tomllib.load(file)
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: the users cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    return {name: _user(path, name, table) for name, table in tables.items()}
+
+
+def write_users(path: Path, users: Mapping[str, User]) -> None:
+    """Replace the file as a whole; only its owner may read it.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    lines = ["# users of the gateway: `fantwin users`\n"]
+    for name, user in sorted(users.items()):
+        lines.append(f"\n[{json.dumps(name)}]\nrole = {json.dumps(user.role)}\n")
+        lines.append(f"password_hash = {json.dumps(user.password_hash)}\n")
+    beside = path.with_name(f".{path.name}.new")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
+            file.writelines(lines)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except OSError as error:
+        raise UserError(f"{path}: the users cannot be written: {error.strerror}") from error
+
+
+def checked_password(password: str) -> str:
+    """The password, if it is one.
+
+    Raises:
+        UserError: it is too short or too long.
+    """
+    if not SHORTEST_PASSWORD <= len(password) <= LONGEST_PASSWORD:
+        raise UserError(
+            f"the password has {len(password)} characters: {SHORTEST_PASSWORD} to {LONGEST_PASSWORD}, please"
+        )
+    return password
+
+
+def _user(path: Path, name: str, table: Any) -> User:
+    known = [role.value for role in UserRole]
+    if not (isinstance(table, dict) and set(table) == _ENTRIES and table["role"] in known and NAME.fullmatch(name)):
+        raise UserError(f"{path}: [{name}] is no user: it needs role ({' or '.join(known)}) and password_hash")
+    return User(name, UserRole(table["role"]), str(table["password_hash"]))

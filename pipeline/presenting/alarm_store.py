@@ -1,0 +1,99 @@
+"""The history of alarms: each transition that was heard, in a file that survives a restart of the gateway.
+
+The bus keeps the last transitions too, and a gateway that starts asks for them: each is kept once.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.errors import UserError
+from schemas.codec import CodecError, decode, encode
+from schemas.messages import Alarm
+
+MOST_TRANSITIONS = 200_000
+"""those that are older are deleted"""
+_DELETED_EVERY = 1000
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS transition (
+    number INTEGER PRIMARY KEY,
+    tray TEXT NOT NULL,
+    fan INTEGER NOT NULL,
+    t_ns INTEGER NOT NULL,
+    producer TEXT NOT NULL,
+    sequence INTEGER NOT NULL,
+    alarm BLOB NOT NULL,
+    UNIQUE (producer, tray, sequence)
+);
+CREATE INDEX IF NOT EXISTS of_fan ON transition (tray, fan, number);
+"""
+
+
+class AlarmStore:
+    """Not thread-safe: whoever shares it locks it."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file, or make it.
+
+        Raises:
+            UserError: it cannot be read or written.
+        """
+        self._path = path
+        self._added = 0
+        self.problem = ""
+        """why the last transition could not be kept; empty if it was"""
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+            self._file.executescript(f"PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; {_SCHEMA}")
+        except (OSError, sqlite3.Error) as error:
+            raise UserError(f"{path}: the history of alarms cannot be kept there: {error}") from error
+
+    def add(self, alarm: Alarm) -> bool:
+        """Keep a transition; returns whether it is new. A full disk is a problem and no loss of what was kept."""
+        row = (alarm.header.tray, alarm.fan, alarm.t_ns, alarm.header.producer, alarm.header.sequence, encode(alarm))
+        try:
+            done = self._file.execute(
+                "INSERT OR IGNORE INTO transition (tray, fan, t_ns, producer, sequence, alarm)"
+                " VALUES (?, ?, ?, ?, ?, ?)",
+                row,
+            )
+            self._added += done.rowcount
+            if self._added >= _DELETED_EVERY:
+                self._added = 0
+                self._file.execute(
+                    "DELETE FROM transition WHERE number <= (SELECT MAX(number) FROM transition) - ?",
+                    (MOST_TRANSITIONS,),
+                )
+        except sqlite3.Error as error:
+            self.problem = f"{self._path}: {error}: this alarm is not kept in the history"
+            return True
+        self.problem = ""
+        return done.rowcount > 0
+
+    def newest(self, most: int, *, tray: str = "", fan: int = -1, before: int = 0) -> Sequence[tuple[int, Alarm]]:
+        """The last transitions, newest first, each with its number, by which the next page is asked for.
+
+        tray, fan: of these only. before: only those with a lower number; 0: all.
+        """
+        rows = self._file.execute(
+            "SELECT number, alarm FROM transition WHERE (?1 = '' OR tray = ?1) AND (?2 < 0 OR fan = ?2)"
+            " AND (?3 = 0 OR number < ?3) ORDER BY number DESC LIMIT ?4",
+            (tray, fan, before, most),
+        )
+        return [(number, alarm) for number, data in rows if (alarm := _decoded(data)) is not None]
+
+    def close(self) -> None:
+        """Leave a complete file."""
+        self._file.close()
+
+
+def _decoded(data: bytes) -> Alarm | None:
+    try:
+        alarm = decode(Alarm, data)
+    except CodecError:
+        return None
+    return alarm if isinstance(alarm, Alarm) else None

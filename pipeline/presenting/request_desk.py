@@ -1,0 +1,81 @@
+"""Requests of operators on their way: from a page to the scorer of a tray, and its answers back."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+
+from schemas.header import Header
+from schemas.messages import Alarm, Request
+
+ANSWERED_WITHIN_S = 10.0
+MOST_UNDER_WAY = 256
+
+
+@dataclass(eq=False)
+class _UnderWay:
+    fans: frozenset[int]
+    sent_s: float
+    answers: dict[int, Alarm] = field(default_factory=dict)
+    done: Future[list[Alarm]] = field(default_factory=Future)
+
+
+class RequestDesk:
+    """Thread-safe. The stage takes what is to be sent and adds the answers; pages wait for them."""
+
+    def __init__(self, producer: str) -> None:
+        """producer: of this process, by which answers name the request."""
+        self._producer = producer
+        self._lock = threading.Lock()
+        self._waiting: list[tuple[Request, _UnderWay]] = []
+        self._sent: Counter[str] = Counter()
+        """requests sent, by tray: the next one has this number"""
+        self._under_way: dict[str, _UnderWay] = {}
+        """by the name of the request"""
+
+    async def ask(self, tray: str, request: Request, fans: Sequence[int]) -> list[Alarm]:
+        """Send a request and wait for the answers of its fans, in the order of their numbers.
+
+        Raises:
+            TimeoutError: an answer is missing after ANSWERED_WITHIN_S, or too many requests are under way.
+        """
+        under_way = _UnderWay(frozenset(fans), time.monotonic())
+        with self._lock:
+            if len(self._under_way) + len(self._waiting) >= MOST_UNDER_WAY:
+                raise TimeoutError(f"{MOST_UNDER_WAY} requests are waiting for their scorers")
+            self._waiting.append((replace(request, header=Header(tray=tray)), under_way))
+        return await asyncio.wait_for(asyncio.wrap_future(under_way.done), ANSWERED_WITHIN_S)
+
+    def take(self) -> list[Request]:
+        """The requests to be sent now."""
+        now_s = time.monotonic()
+        with self._lock:
+            for name, each in list(self._under_way.items()):
+                if each.done.done() or now_s - each.sent_s > ANSWERED_WITHIN_S:
+                    del self._under_way[name]
+            taken, self._waiting = self._waiting, []
+            for request, under_way in taken:
+                tray = request.header.tray
+                self._under_way[f"{self._producer}/{tray}/{self._sent[tray]}"] = under_way
+                self._sent[tray] += 1
+        return [request for request, _ in taken]
+
+    def add(self, alarm: Alarm) -> None:
+        """An alarm has been heard, which may be an answer."""
+        producer, _, number = alarm.request.rpartition("/")
+        if producer != self._producer:
+            return
+        with self._lock:
+            under_way = self._under_way.get(f"{producer}/{alarm.header.tray}/{number}")
+            if under_way is None or alarm.fan not in under_way.fans:
+                return
+            under_way.answers[alarm.fan] = alarm
+            if under_way.answers.keys() < under_way.fans or under_way.done.done():
+                return
+        if under_way.done.set_running_or_notify_cancel():
+            under_way.done.set_result([under_way.answers[fan] for fan in sorted(under_way.fans)])

@@ -1,0 +1,148 @@
+"""What is known about the site, as JSON: what the page, the API and the live events send."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.config.models import TrayConfig
+from pipeline.launch.site_state import StageState
+from pipeline.presenting.fan_history import Curves
+from pipeline.presenting.site_model import SiteModel
+from pipeline.viewing.fleet import Fan, FanNow, class_names
+from schemas.messages import Alarm, Array, ModelCard
+from schemas.twin_card import CardError, TwinCard
+from schemas.units import RAD_S_PER_UNIT
+from scoring.alarms.alarm_flags import is_listed
+from scoring.alarms.current_alarms import CurrentAlarm, words_of
+from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES
+
+LEVELS, NO_LEVEL = 250, 255
+"""a score of 1, at the limit, is level 100; what is not judged has none"""
+_ADVICE = ("move the command", "check ")
+_SPEEDS = 3
+"""the first curves are speeds"""
+
+
+def site_json(model: SiteModel) -> dict[str, Any]:
+    """What does not change while the gateway runs: the trays in the order of the cells, and what their classes mean."""
+    trays = [{"name": tray.name, "fans": tray.fans, "speed_unit": tray.speed_unit} for tray in model.trays]
+    return {"site": model.site, "trays": trays, "classes": class_names(), "level_at_limit": 100}
+
+
+def fleet_json(model: SiteModel) -> dict[str, Any]:
+    """All fans at a glance: class and level of each cell, a byte each, in base64."""
+    now = model.fans_now()
+    level = np.where(np.isnan(now.score), NO_LEVEL, (np.nan_to_num(now.score, posinf=9.0) * 100).clip(0, LEVELS))
+    return {
+        "classes": _packed(now.classes),
+        "levels": _packed(level.astype(np.uint8)),
+        "counts": {name.replace(" ", "_"): count for name, count in model.counts().items()},
+    }
+
+
+def fan_json(now: FanNow) -> dict[str, Any]:
+    """One fan in a list."""
+    return {
+        "tray": now.fan.tray,
+        "fan": now.fan.number,
+        "state": now.state,
+        "score": None if math.isnan(now.score) else round(now.score, 4),
+        "since_t_ns": now.since_t_ns,
+        "in_alarm": now.is_in_alarm,
+    }
+
+
+def fan_in_full(model: SiteModel, fan: Fan) -> dict[str, Any]:
+    """One fan with its alarm and its twin."""
+    alarm, twin = model.current_alarm(fan), model.twin(fan.tray)
+    return {
+        **fan_json(model.fan_now(fan)),
+        "newest_t_ns": model.newest_t_ns(fan.tray),
+        "alarm": alarm_json(alarm) if alarm else None,
+        "twin": twin_json(twin, fan.number) if twin else None,
+    }
+
+
+def twin_json(card: ModelCard, fan: int) -> dict[str, Any]:
+    """The twin in force, and the parameters of one fan that it uses."""
+    try:
+        found = TwinCard.from_json(card.card_json)
+    except CardError:  # of a version that this one does not know
+        shown = {}
+    else:
+        values = found.parameters[fan if fan < found.fans else 0]
+        used = found.used_parameters or found.parameter_names
+        shown = {name: value for name, value in zip(found.parameter_names, values, strict=True) if name in used}
+    return {"name": card.twin, "kind": card.kind, "sha256": card.sha256, "since_t_ns": card.t_ns, "parameters": shown}
+
+
+def curves_json(curves: Curves, tray: TrayConfig) -> dict[str, Any]:
+    """Columns by name; speeds in the unit of the tray, null where nothing was measured or judged."""
+    values = curves.values.astype(np.float64)
+    values[:, :_SPEEDS] /= RAD_S_PER_UNIT[tray.speed_unit]
+    names = ("measured", "predicted", "half_width", "torque_balance_command", "score")
+    columns = {name: _or_null(values[:, number]) for number, name in enumerate(names)}
+    return {"speed_unit": tray.speed_unit, "t_s": (curves.t_ns / 1e9).round(3).tolist(), **columns}
+
+
+def alarm_json(current: CurrentAlarm) -> dict[str, Any]:
+    """A current alarm with what the page says of it."""
+    first = current.causes[0] if current.causes else None
+    return {
+        **current.as_json(),
+        "listed": is_listed(current.newest),
+        "states": current.states(),
+        "cause": CAUSES.get(first.cause, first.cause) if first else "",
+        "probability": first.probability if first and first.cause != CANNOT_TELL else None,
+    }
+
+
+def transition_json(number: int, alarm: Alarm) -> dict[str, Any]:
+    """A transition of the history."""
+    return {
+        "number": number,
+        "t_ns": alarm.t_ns,
+        "tray": alarm.header.tray,
+        "fan": alarm.fan,
+        "onset_t_ns": alarm.onset_t_ns,
+        "transition": alarm.transition.name.lower(),
+        "severity": alarm.severity.name.lower(),
+        "active": alarm.active,
+        "message": words_of(alarm),
+        "operator_name": alarm.operator_name,
+        "comment": alarm.comment,
+    }
+
+
+def stages_json(states: Iterable[StageState]) -> list[dict[str, Any]]:
+    """The stages, in the order of the data flow."""
+    return [_stage_json(state) for state in states]
+
+
+def _stage_json(state: StageState) -> dict[str, Any]:
+    view = state.view
+    health = view.health if view else None
+    return {
+        "name": state.label,
+        "state": str(state.word),
+        "detail": state.detail or (health.problem if health else ""),
+        "in_hz": round(view.rate_in_hz, 1) if view else 0.0,
+        "out_hz": round(view.rate_out_hz, 1) if view else 0.0,
+        "lost": health.lost if health else 0,
+        "latency_p50_ms": round(health.latency_p50_ms, 1) if health else 0.0,
+        "latency_p99_ms": round(health.latency_p99_ms, 1) if health else 0.0,
+        "uptime_s": round(health.uptime_s) if health else 0,
+    }
+
+
+def _or_null(values: Array) -> Sequence[float | None]:
+    return [None if math.isnan(value) else float(f"{value:.5g}") for value in values.tolist()]
+
+
+def _packed(values: Array) -> str:
+    return base64.b64encode(values.tobytes()).decode()

@@ -1,0 +1,228 @@
+"""What the gateway knows about its site now: the newest sample and the alarm of every fan, the stages, the twins.
+
+The stage fills it in, and the web server reads it, each in a thread of its own.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.config.models import TrayConfig
+from pipeline.config.registry import STAGES
+from pipeline.launch.site_state import StageState, stage_states
+from pipeline.launch.site_watcher import StageView
+from pipeline.launch.watched_alarms import WatchedAlarms
+from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.fan_history import COLUMNS, Curves, FanHistory, values_of
+from pipeline.viewing.fleet import Fan, FanNow, Fleet
+from pipeline.viewing.fleet_view import last_sample
+from schemas.codec import CodecError, decode_columns, encode
+from schemas.enums import StageStatus, Transition
+from schemas.envelope import Envelope
+from schemas.health import Health
+from schemas.messages import Alarm, Array, ModelCard, Score
+from scoring.alarms.current_alarms import CurrentAlarm
+from scoring.alarms.unscored_monitor import JUDGED_AT_REST
+
+SILENT_AFTER_S = 5.0
+"""a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus"""
+
+
+@dataclass(frozen=True, eq=False)
+class FleetNow:
+    """Of all fans, tray after tray in the order of the configuration: the class of each fan's cell, (fans,) uint8, and
+    its score, (fans,) float32, NaN where it is not judged."""
+
+    classes: Array
+    score: Array
+
+
+@dataclass(frozen=True, slots=True)
+class NewestSample:
+    """Of one fan; speeds in rad/s. The twin's speed and the score are NaN where the sample is not judged."""
+
+    tray: str
+    fan: int
+    measured_rad_s: float
+    predicted_rad_s: float
+    score: float
+    is_judged: bool
+
+
+@dataclass(slots=True)
+class _Heard:
+    health: Health
+    previous: Health | None
+    heard_s: float
+
+
+class SiteModel:
+    """Thread-safe."""
+
+    def __init__(self, site: str, trays: Sequence[TrayConfig], store: AlarmStore) -> None:
+        self.site = site
+        self.trays = tuple(trays)
+        self._by_name = {tray.name: tray for tray in trays}
+        self._lock = threading.Lock()
+        self._fleet = Fleet(trays)
+        self._history = FanHistory(trays)
+        self._heard_s: dict[str, float] = {}
+        self._newest: dict[str, Score] = {}
+        """by tray, its last sample alone"""
+        self._raised: Counter[tuple[str, int, str]] = Counter()
+        """by tray, fan and severity"""
+        fans = sum(tray.fans for tray in trays)
+        self._alarms = WatchedAlarms(lambda _producer: True, most_fans=fans)
+        self._store = store
+        self._stages: dict[tuple[str, str], _Heard] = {}
+        self._twins: dict[str, ModelCard] = {}
+        self.refused_scores = 0
+        """with another number of fans than the configuration says, or not to be decoded"""
+
+    def add_score(self, envelope: Envelope) -> Score | None:
+        """A score of a known tray has arrived; returns it, or None if it cannot be shown."""
+        tray = self._by_name[envelope.header.tray]
+        try:
+            score = decode_columns(Score, envelope.payload, COLUMNS)
+        except CodecError:
+            self.refused_scores += 1
+            return None
+        if score.fans != tray.fans or not len(score.t_ns):
+            self.refused_scores += score.fans != tray.fans
+            return None
+        with self._lock:
+            self._heard_s[tray.name] = time.monotonic()
+            self._newest[tray.name] = last_sample(score, COLUMNS)
+            self._fleet.update(score)
+            self._history.add(score)
+        return score
+
+    def add_alarm(self, alarm: Alarm) -> bool:
+        """A transition has arrived; returns whether it is new."""
+        with self._lock:
+            self._alarms.add(alarm, len(encode(alarm)))
+            self._fleet.add_alarm(alarm)
+            is_new = self._store.add(alarm)
+            if is_new and alarm.transition == Transition.RAISED:
+                self._raised[alarm.header.tray, alarm.fan, alarm.severity.name.lower()] += 1
+            return is_new
+
+    def add_health(self, health: Health) -> None:
+        """A stage has reported."""
+        name = (health.stage, health.instance)
+        with self._lock:
+            before = self._stages.get(name)
+            previous = before.health if before and before.health.header.producer == health.header.producer else None
+            self._stages[name] = _Heard(health, previous, time.monotonic())
+
+    def add_twin(self, card: ModelCard) -> None:
+        """A tray has another twin."""
+        with self._lock:
+            self._twins[card.header.tray] = card
+
+    def notice_silence(self) -> None:
+        """Trays that have sent no score for long are silent."""
+        before_s = time.monotonic() - SILENT_AFTER_S
+        with self._lock:
+            for tray, heard_s in self._heard_s.items():
+                if heard_s < before_s:
+                    self._fleet.silence(tray, int(self._newest[tray].t_ns[-1]))
+
+    def tray(self, name: str) -> TrayConfig | None:
+        """None: there is no such tray."""
+        return self._by_name.get(name)
+
+    def fans_now(self) -> FleetNow:
+        """All fans at a glance."""
+        with self._lock:
+            return FleetNow(self._fleet.classes(), self._fleet.scores())
+
+    def every_fan(self) -> list[FanNow]:
+        """All fans in words, the worst first."""
+        with self._lock:
+            return self._fleet.every_fan()
+
+    def fan_now(self, fan: Fan) -> FanNow:
+        """One of them."""
+        with self._lock:
+            return self._fleet.fan_now(fan)
+
+    def counts(self) -> dict[str, int]:
+        """How many fans are in alarm, suspect and not judged."""
+        with self._lock:
+            return self._fleet.counts()
+
+    def history(self, fan: Fan, since_t_ns: int) -> Curves:
+        """The last hour of a fan."""
+        with self._lock:
+            return self._history.of(fan.tray, fan.number, since_t_ns)
+
+    def newest_t_ns(self, tray: str) -> int:
+        """Time of the newest sample of a tray; 0: there was none."""
+        with self._lock:
+            newest = self._newest.get(tray)
+        return int(newest.t_ns[-1]) if newest else 0
+
+    def newest_samples(self) -> list[NewestSample]:
+        """Of every fan whose tray is heard now."""
+        after_s = time.monotonic() - SILENT_AFTER_S
+        with self._lock:
+            heard = [(tray, score) for tray, score in self._newest.items() if self._heard_s[tray] >= after_s]
+        found: list[NewestSample] = []
+        for tray, score in heard:
+            values = values_of(score)[-1].tolist()
+            judged = (score.valid[-1] | np.isin(score.invalid_reason[-1], JUDGED_AT_REST)).tolist()
+            for fan, (measured, predicted, _, _, ratio) in enumerate(values):
+                found.append(NewestSample(tray, fan, measured, predicted, ratio, judged[fan]))
+        return found
+
+    def raised(self) -> dict[tuple[str, int, str], int]:
+        """How many alarms were raised since the gateway began, by tray, fan and severity."""
+        with self._lock:
+            return dict(self._raised)
+
+    def current_alarms(self) -> list[CurrentAlarm]:
+        """The alarm of each fan that had one, by tray and fan."""
+        with self._lock:
+            return self._alarms.current()
+
+    def current_alarm(self, fan: Fan) -> CurrentAlarm | None:
+        """That of one fan; None: it had none."""
+        with self._lock:
+            return self._alarms.of(fan.tray, fan.number)
+
+    def past_alarms(self, most: int, *, tray: str = "", fan: int = -1, before: int = 0) -> Sequence[tuple[int, Alarm]]:
+        """The last transitions: `AlarmStore.newest`."""
+        with self._lock:
+            return self._store.newest(most, tray=tray, fan=fan, before=before)
+
+    def twin(self, tray: str) -> ModelCard | None:
+        """The twin in force; None: it has not been heard."""
+        return self._twins.get(tray)
+
+    def stages(self) -> list[StageState]:
+        """The stages that have been heard. One that is silent for long may have left the bus."""
+        now_s = time.monotonic()
+        with self._lock:
+            views = [
+                StageView(each.health, each.previous, each.health.status != StageStatus.STOPPED, now_s - each.heard_s)
+                for each in self._stages.values()
+            ]
+        alive = {(view.health.stage, view.health.instance) for view in views if view.alive}
+        rank = {name: number for number, name in enumerate(STAGES)}
+        return sorted(stage_states(views, alive, ()), key=lambda state: rank.get(state.stage, len(rank)))
+
+    def problem(self) -> str:
+        """What is wrong with the history of alarms; empty if nothing is."""
+        return self._store.problem
+
+    def close(self) -> None:
+        """Leave complete files."""
+        with self._lock:
+            self._store.close()

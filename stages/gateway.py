@@ -1,0 +1,222 @@
+"""Gateway: the web server of a site: operators' page, API, live events and metrics (docs/how-to/gateway.md).
+
+Reads `score`, `alarm`, `twin` and `health`, and writes `request`. One core serves all trays. With many fans, the newest
+score of each tray is asked for once a second; all samples arrive only of those trays that somebody looks at.
+
+The server runs in a thread of its own: it reads what the core has collected, and leaves requests for the core to send.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence, Set
+from pathlib import Path
+
+from pipeline.config.models import TrayConfig
+from pipeline.errors import UserError
+from pipeline.gateway.config import GatewayConfig
+from pipeline.gateway.live_feed import LiveFeed
+from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.fan_history import curves_of
+from pipeline.presenting.request_desk import RequestDesk
+from pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stages_json
+from pipeline.presenting.site_model import SiteModel
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from pipeline.viewing.fleet import Fan
+from schemas.envelope import Envelope
+from schemas.health import Health
+from schemas.messages import Alarm, Message, ModelCard
+from schemas.units import NS_PER_S
+
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "argon2")
+NOT_INSTALLED = f"the gateway needs its extra: take [gateway] out of the configuration, or {how_to_install('gateway')}"
+FLEET_PERIOD_NS = NS_PER_S
+STAGES_PERIOD_NS = 2 * NS_PER_S
+ALL_FOLLOWED = 64
+"""with no more fans than this, all samples of all trays arrive"""
+MOST_FOLLOWED = 32
+"""trays that somebody looks at; of more, the samples come once a second"""
+HISTORY = "alarms.sqlite"
+
+
+class GatewayCore(Core):
+    """Collects what the server shows, and sends what operators ask."""
+
+    def __init__(self, model: SiteModel, feed: LiveFeed, desk: RequestDesk, serve: Server) -> None:
+        self._model = model
+        self._feed = feed
+        self._desk = desk
+        self._server = serve
+        self._counts: Counter[str] = Counter()
+        self._is_small = sum(tray.fans for tray in model.trays) <= ALL_FOLLOWED
+        self._fleet_ns = self._stages_ns = 0
+        self._requests = 0
+
+    def step(self, item: Message | Envelope) -> Sequence[Message]:
+        """Keep what has arrived, and send it to the pages that show it."""
+        if isinstance(item, Health):
+            self._model.add_health(item)
+            return ()
+        tray = self._model.tray(item.header.tray)
+        if tray is None:
+            self._counts["unknown_tray"] += 1
+        elif isinstance(item, Envelope):
+            self._add_score(tray, item)
+        elif isinstance(item, Alarm):
+            self._add_alarm(tray, item)
+        elif isinstance(item, ModelCard):
+            self._model.add_twin(item)
+        return ()
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        """Send the pages the state of the fleet, and the scorers what operators ask."""
+        if abs(now_ns - self._fleet_ns) >= FLEET_PERIOD_NS:
+            self._fleet_ns = now_ns
+            self._model.notice_silence()
+            if self._feed.readers:
+                self._feed.publish("fleet", fleet_json(self._model))
+        if abs(now_ns - self._stages_ns) >= STAGES_PERIOD_NS:
+            self._stages_ns = now_ns
+            if self._feed.readers:
+                self._feed.publish("stages", {"stages": stages_json(self._model.stages())})
+        requests = self._desk.take()
+        self._requests += len(requests)
+        return requests
+
+    def close(self) -> Sequence[Message]:
+        """Stop the server, and close the history."""
+        self._server.stop()
+        self._model.close()
+        return ()
+
+    def abort(self) -> None:
+        """The same after a crash."""
+        self.close()
+
+    def counters(self) -> Mapping[str, int]:
+        """Requests sent, pages that are open, and what could not be shown."""
+        return {
+            "requests_sent": self._requests,
+            "pages_open": self._feed.readers,
+            "refused_scores": self._model.refused_scores,
+            **self._counts,
+        }
+
+    def followed(self) -> Set[str] | None:
+        """The trays that somebody looks at; None: all."""
+        if self._is_small:
+            return None
+        return set(sorted({tray for tray, _ in self._feed.looked_at()})[:MOST_FOLLOWED])
+
+    def problem(self) -> str:
+        """Of the server, the users and the history."""
+        return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
+
+    def _add_score(self, tray: TrayConfig, envelope: Envelope) -> None:
+        score = self._model.add_score(envelope)
+        if score is None:
+            return
+        for name, fan in self._feed.looked_at():
+            if name == tray.name:
+                self._feed.publish("samples", curves_json(curves_of(score, fan), tray), about=(name, fan))
+
+    def _add_alarm(self, tray: TrayConfig, alarm: Alarm) -> None:
+        if alarm.fan >= tray.fans:
+            self._counts["unknown_fan"] += 1
+            return
+        is_new = self._model.add_alarm(alarm)
+        self._desk.add(alarm)
+        current = self._model.current_alarm(Fan(tray.name, alarm.fan))
+        if is_new and current is not None:
+            self._feed.publish("alarm", alarm_json(current))
+
+
+class Server:
+    """What the core needs of the web server."""
+
+    def stop(self) -> None:
+        """End it."""
+
+    def problem(self) -> str:
+        """What is wrong; empty if nothing is."""
+        return ""
+
+
+class _Running(Server):
+    def __init__(self, context: Context, model: SiteModel, feed: LiveFeed, desk: RequestDesk) -> None:
+        from pipeline.gateway.access import Access  # noqa: PLC0415  the extra may not be installed
+        from pipeline.gateway.api import Api  # noqa: PLC0415
+        from pipeline.gateway.app import application  # noqa: PLC0415
+        from pipeline.gateway.server import WebServer, check_certificate, listen  # noqa: PLC0415
+        from pipeline.gateway.users import Users  # noqa: PLC0415
+
+        config: GatewayConfig = context.config
+        tls = None
+        if config.certificate and config.key:
+            tls = (context.resolve(config.certificate), context.resolve(config.key))
+            check_certificate(*tls)
+        self._access = Access(config, Users(context.resolve(config.users)) if config.users else None)
+        listening = listen(config.host, config.port + context.shard_number - 1)
+        app = application(Api(model, self._access, feed, desk), config)
+        self._server = WebServer(app, listening, tls, feed.end)
+
+    def stop(self) -> None:
+        self._server.stop()
+
+    def problem(self) -> str:
+        return "; ".join(filter(None, (self._server.problem, self._access.problem)))
+
+
+def build(context: Context) -> BuiltStage:
+    """Open the history and listen.
+
+    Raises:
+        StageError: the extra is not installed, the port is taken, or a file cannot be read or written.
+    """
+    if not all(map(is_installed, NEEDED)):
+        raise StageError(NOT_INSTALLED)
+    model = SiteModel(context.site, context.trays, AlarmStore(context.own_file(Path(HISTORY))))
+    feed, desk = LiveFeed(), RequestDesk(context.producer)
+    return BuiltStage(GatewayCore(model, feed, desk, _Running(context, model, feed, desk)))
+
+
+def check(context: Context) -> list[str]:
+    """Report a missing extra, a port that another program has taken, and files that cannot be read."""
+    if not all(map(is_installed, NEEDED)):
+        return [NOT_INSTALLED]
+    from pipeline.gateway.server import check_certificate, listen  # noqa: PLC0415  the extra may not be installed
+    from pipeline.gateway.users import read_users  # noqa: PLC0415
+
+    config: GatewayConfig = context.config
+    problems: list[str] = []
+
+    def attempt(check: Callable[[], object]) -> None:
+        try:
+            check()
+        except UserError as error:
+            problems.append(str(error))
+
+    if config.certificate and config.key:
+        certificate, key = context.resolve(config.certificate), context.resolve(config.key)
+        attempt(lambda: check_certificate(certificate, key))
+    if config.users:
+        users = context.resolve(config.users)
+        attempt(lambda: read_users(users))
+    if not context.is_running:
+        attempt(lambda: listen(config.host, config.port + context.shard_number - 1).close())
+    return problems
+
+
+STAGE = Stage(
+    name="gateway",
+    about="serves the operators' page, the API, live events and metrics by HTTP",
+    reads=("score", "alarm", "twin", "health"),
+    writes=("request",),
+    config=GatewayConfig,
+    build=build,
+    core_per_tray=False,
+    undecoded=("score",),
+    may_drop=True,
+    check=check,
+)

@@ -1,0 +1,285 @@
+"""The gateway by HTTP: what it shows, and who may do what."""
+
+from __future__ import annotations
+
+import http.client
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from pipeline.gateway.config import GatewayConfig
+from pipeline.gateway.users import User, UserRole, hasher, write_users
+from schemas.enums import Action, FanState, InvalidReason, Severity, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Diagnosis, Request, Score
+from schemas.units import RAD_S_PER_UNIT
+from tests.support.running_chain import eventually
+from tests.support.running_gateway import FANS, SITE, TRAY, Client, RunningGateway
+
+NOW_NS = 1_790_000_000_000_000_000
+STEP_NS = 10_000_000
+PASSWORD = "correct horse battery"
+SCRIPT = "<script>alert(1)</script>"
+
+
+def score(seconds: float = 0.0, *, state: FanState = FanState.NORMAL, samples: int = 5) -> Score:
+    """Of fans at 1000 rpm, 10 rpm below their twins; `state` is that of fan 2, and fan 3 is not judged."""
+    shape = (samples, FANS)
+    states = np.full(shape, FanState.NORMAL, np.uint8)
+    states[:, 2], states[:, 3] = state, FanState.UNKNOWN
+    valid = states != FanState.UNKNOWN
+    rpm = RAD_S_PER_UNIT["rpm"]
+    return Score(
+        header=Header("scorer-all-1", round(seconds * 100), TRAY),
+        fans=FANS,
+        period_ns=STEP_NS,
+        t_ns=NOW_NS + round(seconds * 1e9) + STEP_NS * np.arange(samples),
+        command=np.full(shape, 0.5, np.float32),
+        measured_speed_rad_s=np.full(shape, 1000 * rpm, np.float32),
+        predicted_speed_rad_s=np.full(shape, 1010 * rpm, np.float32),
+        band_variance=np.full(shape, (20 * rpm) ** 2, np.float32),
+        smoothed_residual_rad_s=np.zeros(shape, np.float32),
+        state=states,
+        valid=valid,
+        invalid_reason=np.where(valid, 0, InvalidReason.GAP).astype(np.uint8),
+        torque_balance_command=np.full(shape, 0.01, np.float32),
+        speed_baseline_rad_s=np.zeros(shape, np.float32),
+        balance_baseline_command=np.zeros(shape, np.float32),
+        score=np.full(shape, 0.5, np.float32),
+        statistic=np.zeros(shape, np.uint8),
+    )
+
+
+def alarm(transition: Transition = Transition.RAISED, sequence: int = 0, **more: object) -> Alarm:
+    values = {
+        "fan": 2,
+        "active": True,
+        "severity": Severity.ALARM,
+        "t_ns": NOW_NS,
+        "onset_t_ns": NOW_NS,
+        "residual_rad_s": 9.0,
+        "limit_rad_s": 5.0,
+        "message": "fan 2: 90 rpm below the twin (limit 50)",
+        "transition": transition,
+        "causes": (Diagnosis(cause="drag", probability=0.8, evidence="drag +20 %"),),
+        **more,
+    }
+    return Alarm(header=Header("scorer-all-1", sequence, TRAY), **values)
+
+
+def granted(request: Request) -> list[Alarm]:
+    """A scorer that grants everything, and repeats the operator's words."""
+    return [
+        alarm(
+            Transition.ACKNOWLEDGED,
+            acknowledged=True,
+            operator_name=request.operator_name,
+            comment=request.comment,
+            message=f"acknowledged by {request.operator_name}",
+        )
+    ]
+
+
+@pytest.fixture
+def users(tmp_path: Path) -> Path:
+    path = tmp_path / "users.toml"
+    hashed = hasher().hash(PASSWORD)
+    write_users(path, {n: User(n, r, hashed) for n, r in (("ann", UserRole.OPERATOR), ("vic", UserRole.VIEWER))})
+    return path
+
+
+@pytest.fixture
+def gateway(tmp_path: Path, users: Path) -> Iterator[RunningGateway]:
+    running = RunningGateway(tmp_path, granted, users=users)
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(gateway):
+    gateway.feed(score(), score(1.0, state=FanState.ALARM), alarm())
+    client = Client(gateway)
+    fans = client.ask("GET", "/api/v1/fans")[1]["fans"]
+    assert [(each["fan"], each["state"]) for each in fans] == [
+        (2, "alarm"),
+        (0, "normal"),
+        (1, "normal"),
+        (3, "unknown: gap"),
+    ]
+    assert fans[1]["score"] == 0.5
+    assert client.ask("GET", "/api/v1/fans?state=alarm")[1]["fans"] == fans[:1]
+    (found,) = client.ask("GET", "/api/v1/alarms")[1]["alarms"]
+    assert (found["fan"], found["presented"], found["probability"]) == (2, True, 0.8)
+    assert found["causes"][0]["evidence"] == "drag +20 %"
+    curves = client.ask("GET", f"/api/v1/fans/{TRAY}/0/curves")[1]
+    assert curves["speed_unit"] == "rpm"
+    assert curves["t_s"] == [(NOW_NS + 4 * STEP_NS) / 1e9, (NOW_NS + 10**9 + 4 * STEP_NS) / 1e9]
+    assert curves["measured"] == [1000.0, 1000.0]
+    assert curves["half_width"] == [20.0, 20.0]
+    unjudged = client.ask("GET", f"/api/v1/fans/{TRAY}/3/curves")[1]
+    assert unjudged["predicted"] == [None, None], "where nothing is judged, there is no twin to see"
+    assert client.ask("GET", f"/api/v1/fans/{TRAY}/{FANS}")[0] == 404
+    assert client.ask("GET", "/api/v1/fans/nowhere/0")[0] == 404
+
+
+def test_live_events_bring_an_alarm_and_the_samples_of_the_fan_that_is_looked_at(gateway):
+    gateway.feed(score())
+    connection = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=20)
+    connection.request("GET", f"/api/v1/events?fan={TRAY}/1")
+    stream = connection.getresponse()
+
+    def event(wanted: str) -> dict[str, object]:
+        while True:
+            line = stream.readline().decode()
+            if line == f"event: {wanted}\n":
+                return json.loads(stream.readline().decode().removeprefix("data: "))
+
+    assert event("fleet")["counts"] == {"in_alarm": 0, "suspect": 0, "not_judged": 1}
+    gateway.feed(score(1.0), alarm())
+    assert event("samples")["measured"] == [1000.0] * 5
+    assert event("alarm")["fan"] == 2
+    connection.close()
+
+
+def test_metrics_are_those_of_prometheus_and_an_unjudged_fan_has_no_score(gateway):
+    gateway.feed(score(state=FanState.ALARM), alarm())
+    text = Client(gateway).ask("GET", "/metrics")[1]
+    samples = {
+        (s.name, s.labels.get("fan"), s.labels.get("severity")): s.value
+        for family in text_string_to_metric_families(text)
+        for s in family.samples
+    }
+    assert samples["fantwin_fan_speed_rpm", "0", None] == pytest.approx(1000.0, rel=1e-6)
+    assert samples["fantwin_fan_score_ratio", "0", None] == 0.5
+    assert ("fantwin_fan_score_ratio", "3", None) not in samples
+    assert samples["fantwin_fan_scored", "3", None] == 0.0
+    assert samples["fantwin_fan_alarm_active", "2", "alarm"] == 1.0
+    assert samples["fantwin_fan_alarm_active", "2", "warning"] == 0.0
+    assert samples["fantwin_alarms_total", "2", "alarm"] == 1.0
+
+
+def test_an_operator_acts_under_his_own_name_and_nobody_else_acts(gateway):
+    gateway.feed(score(), alarm())
+    path, asked = f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge", "comment": SCRIPT}
+    stranger, viewer, operator = Client(gateway), Client(gateway), Client(gateway)
+    assert stranger.ask("POST", path, asked)[0] == 401
+    assert stranger.log_in("ann", "wrong wrong wrong") == 401
+    assert viewer.log_in("vic", PASSWORD) == 200
+    assert viewer.ask("POST", path, asked)[0] == 403
+    assert operator.log_in("ann", PASSWORD) == 200
+    assert operator.ask("POST", path, asked | {"operator_name": "root"})[0] == 422, "nobody chooses his name"
+    assert gateway.sent == []
+    status, body, _ = operator.ask("POST", path, asked)
+    assert (status, body["answers"][0]["transition"]) == (200, "acknowledged")
+    (sent,) = gateway.sent
+    assert (sent.action, sent.fan, sent.operator_name, sent.comment) == (Action.ACKNOWLEDGE, 2, "ann", SCRIPT)
+    (found,) = operator.ask("GET", "/api/v1/alarms")[1]["alarms"]
+    assert found["acknowledged_by"] == "ann"
+
+
+def test_forged_sessions_and_posts_from_other_sites_get_nowhere(gateway):
+    path, asked = f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"}
+    operator = Client(gateway)
+    assert operator.log_in("ann", PASSWORD) == 200
+    forged = Client(gateway)
+    forged.cookie, forged.token = operator.cookie[:-4] + "AAAA", operator.token
+    assert forged.ask("POST", path, asked)[0] == 401
+    for headers in (
+        {"X-CSRF-Token": "another"},
+        {"Origin": "http://evil.example"},
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "same-site"},
+    ):
+        assert operator.ask("POST", path, asked, headers)[0] == 403, headers
+    assert operator.ask("POST", path, asked, {"Content-Type": "text/plain"})[0] == 415
+    assert operator.ask("GET", "/api/v1/site", None, {"Host": "evil.example"})[0] == 400, "a name bound to loopback"
+    assert gateway.sent == []
+    assert operator.ask("POST", "/api/v1/logout", {})[0] == 200
+    assert operator.ask("POST", path, asked)[0] == 401, "the session is over on the server, too"
+
+
+def test_wrong_passwords_are_counted(gateway):
+    client = Client(gateway)
+    assert [client.log_in("ann", "wrong wrong wrong") for _ in range(6)] == [401] * 5 + [429]
+    assert client.log_in("ann", PASSWORD) == 429
+
+
+def test_every_answer_forbids_foreign_scripts_and_the_cookie_is_for_the_server_only(gateway):
+    client = Client(gateway)
+    _, _, headers = client.ask("POST", "/api/v1/login", {"name": "ann", "password": PASSWORD})
+    cookie = headers["set-cookie"].lower()
+    assert "httponly" in cookie
+    assert "samesite=strict" in cookie
+    for path in ("/", "/page/main.js", "/api/v1/site", "/api/v1/nothing", "/metrics"):
+        _, _, headers = client.ask("GET", path)
+        assert "default-src 'none'" in headers["content-security-policy"], path
+        assert headers["x-content-type-options"] == "nosniff"
+    assert client.ask("GET", "/page/../app.py")[0] == 404
+
+
+def test_the_history_survives_a_restart_and_keeps_each_transition_once(tmp_path):
+    first = RunningGateway(tmp_path)
+    first.feed(alarm(), alarm(Transition.CLEARED, 1, active=False, t_ns=NOW_NS + 1))
+    first.close()
+    second = RunningGateway(tmp_path)
+    try:
+        second.feed(alarm(), alarm(Transition.ACKNOWLEDGED, 2, active=False, acknowledged=True, operator_name="ann"))
+        found = Client(second).ask("GET", "/api/v1/alarms/history")[1]["transitions"]
+        assert [each["transition"] for each in found] == ["acknowledged", "cleared", "raised"]
+        page = Client(second).ask("GET", f"/api/v1/alarms/history?limit=1&before={found[0]['number']}")[1]
+        assert page["transitions"] == found[1:2]
+    finally:
+        second.close()
+
+
+def test_openapi_names_every_path_and_the_forms(gateway):
+    document = Client(gateway).ask("GET", "/api/v1/openapi.json")[1]
+    assert document["openapi"] == "3.1.0"
+    assert "/api/v1/fans/{tray}/{fan}/requests" in document["paths"]
+    form = document["components"]["schemas"]["RequestForm"]
+    assert "shelve" in form["properties"]["action"]["enum"]
+
+
+def test_a_proxy_names_the_user_and_others_cannot(tmp_path):
+    gateway = RunningGateway(tmp_path, granted, user_header="X-User", operators=("ann",))
+    try:
+        client, path, asked = Client(gateway), f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"}
+        assert client.ask("GET", "/api/v1/site")[0] == 401
+        assert client.ask("GET", "/api/v1/site", None, {"X-User": "vic"})[1]["site"] == SITE
+        assert client.ask("POST", path, asked, {"X-User": "vic"})[0] == 403
+        assert client.ask("POST", path, asked, {"X-User": "ann"})[0] == 200
+        assert gateway.sent[0].operator_name == "ann"
+    finally:
+        gateway.close()
+    other = RunningGateway(tmp_path / "other", user_header="X-User", operators=("ann",), proxies=("192.0.2.1",))
+    try:
+        assert Client(other).ask("GET", "/api/v1/site", None, {"X-User": "ann"})[0] == 401
+    finally:
+        other.close()
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"host": "0.0.0.0"}, "certificate and key"),
+        ({"host": "0.0.0.0", "certificate": "c.pem", "key": "k.pem"}, "needs users"),
+        ({"certificate": "c.pem"}, "belong together"),
+        ({"operators": ("ann",)}, "user_header"),
+    ],
+)
+def test_beyond_loopback_it_needs_tls_and_users(settings, why):
+    with pytest.raises(ValueError, match=why):
+        GatewayConfig(**settings)
+
+
+def test_nothing_of_a_fan_is_shown_as_now_once_its_tray_is_silent(gateway, monkeypatch):
+    monkeypatch.setattr("pipeline.presenting.site_model.SILENT_AFTER_S", 0.0)
+    gateway.feed(score())
+    client = Client(gateway)
+    eventually(lambda: client.ask("GET", "/api/v1/fans")[1]["fans"][0]["state"] == "silent", "the tray is silent")
+    assert "fantwin_fan_speed_rpm{" not in client.ask("GET", "/metrics")[1]
