@@ -15,8 +15,8 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.config.loading import load_config
 from pipeline.errors import UsageError, UserError
 from pipeline.gateway.config import GatewayConfig
-from pipeline.gateway.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
 from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.presenting.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
 
 
 class UserAction(StrEnum):
