@@ -9,6 +9,7 @@ import contextlib
 import logging
 import socket
 import threading
+import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,11 +34,11 @@ from pipeline.presenting.site_model import SiteModel
 from pipeline.runtime.stage import StageError
 
 UPDATE_PERIOD_S = 1.0
-START_LIMIT_S, STOP_LIMIT_S = 60.0, 5.0
+START_LIMIT_S, STOP_LIMIT_S = 120.0, 5.0
 MOST_PENDING = 20_000
-"""transitions that wait to become events; of more, the oldest are left out, and clients are told to refresh"""
-LARGEST_BACKLOG_BYTES = 64 << 20
-"""what waits in the socket of a client that does not read; with more it is cut off"""
+"""transitions that wait to become events; of more, the oldest are left out, and clients are asked to refresh"""
+LARGEST_BACKLOG_BYTES, LONGEST_BACKLOG_S = 16 << 20, 30.0
+"""answers that wait because a client does not read them; with more, or after so long, it is cut off"""
 _LARGEST_REQUEST_BYTES = 4 << 20
 _CHUNK_BYTES = 65_535
 _AT_ONCE = 200
@@ -70,7 +71,8 @@ class OpcuaServer:
         """Raises:
         StageError: it cannot listen there, or does not start.
         """
-        logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+        for name in ("asyncua", "asyncio"):  # of each client that leaves without a word they say a lot
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         self._listening, self._model, self._book, self._desk = listening, model, book, desk
         self._log_in, self._trusted = log_in, trusted
         self._site: str = model.site
@@ -81,6 +83,8 @@ class OpcuaServer:
         self._error = ""
         self._is_ready = threading.Event()
         self.events_sent = self.events_lost = self.clients = self.cut_off = 0
+        self._waiting_since_s: dict[asyncio.Transport, float] = {}
+        """since when answers wait for a client that does not read them"""
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = threading.Thread(target=self._run, name="OPC UA server", daemon=True)
         self._thread.start()
@@ -201,10 +205,12 @@ class OpcuaServer:
 
     def _cut_off(self, server: Server) -> None:
         """Clients that send requests and read no answers."""
-        transports = list(server.iserver.asyncio_transports)
+        now_s, transports = time.monotonic(), list(server.iserver.asyncio_transports)
         self.clients = len(transports)
-        for transport in transports:
-            if transport.get_write_buffer_size() > LARGEST_BACKLOG_BYTES:
+        waiting = {each: size for each in transports if (size := each.get_write_buffer_size())}
+        self._waiting_since_s = {each: self._waiting_since_s.get(each, now_s) for each in waiting}
+        for transport, size in waiting.items():
+            if size > LARGEST_BACKLOG_BYTES or now_s - self._waiting_since_s[transport] > LONGEST_BACKLOG_S:
                 transport.abort()
                 self.cut_off += 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -214,3 +215,36 @@ def test_the_history_holds_each_transition(opcua, new_client):
     ]
     assert client("history", node=f"ns=2;s={TRAY}/0", start=start, end=end) == []
     assert len(client("history", node=SERVER, start=NOW_NS // 10**6 + 1, end=end)) == 1
+
+
+def test_a_client_that_hangs_holds_nobody_up(opcua, new_client, monkeypatch):
+    monkeypatch.setattr("pipeline.opcua.sessions.EVENT_QUEUE", 50)
+    opcua.feed(score())
+    hanging, other = new_client(), new_client()
+    for client in (hanging, other):
+        client.connect(opcua.url, VIEWER, PASSWORD)
+        client("watch", nodes=[f"ns=2;s={TRAY}/0/Speed"], notifier=SERVER)
+    hanging.pause(is_paused=True)
+    began_s = time.process_time()
+    transitions = [alarm(Transition.DIAGNOSED, number, message=f"fan 2: {number}") for number in range(1, 501)]
+    for first in range(0, 500, 50):
+        opcua.feed(*transitions[first : first + 50], score(first + 1.0))
+    messages: list[str] = []
+
+    def last_has_come() -> bool:
+        messages.extend(each["Message"] for each in other("events"))
+        return "fan 2: 500" in messages
+
+    eventually(last_has_come, "the other client gets the last event")
+    eventually(lambda: other("values")[f"ns=2;s={TRAY}/0/Speed"][-1]["t_ms"] > (NOW_NS // 10**6 + 400_000), "values")
+    assert opcua.core.counters()["events_sent"] == 500
+    assert opcua.core.counters()["events_left_out"] == 0
+    assert time.process_time() - began_s < 30
+    hanging.pause(is_paused=False)
+    seen: list[str] = []
+
+    def catches_up() -> bool:
+        seen.extend(each["Message"] for each in hanging("events"))
+        return "fan 2: 500" in seen
+
+    eventually(catches_up, "it gets the last ones that its queue holds")

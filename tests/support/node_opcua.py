@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ def node_modules() -> Path:
 
 
 class NodeOpcua:
-    """A client that does what it is told."""
+    """A client that does what a test asks."""
 
     def __init__(self, folder: Path) -> None:
         """folder: for its certificate."""
@@ -70,12 +71,17 @@ class NodeOpcua:
                 return answer["result"]
         raise RuntimeError("the client has ended")
 
+    def pause(self, *, is_paused: bool) -> None:
+        """Let it hang, or go on."""
+        self._process.send_signal(signal.SIGSTOP if is_paused else signal.SIGCONT)
+
     def connect(self, url: str, user: str = "", password: str = "", *, encrypted: bool = True) -> Any:
         folder = str(self._folder / "pki")
         return self("connect", url=url, user=user, password=password, encrypted=encrypted, folder=folder)
 
     def close(self) -> None:
         if self._process.poll() is None:
+            self.pause(is_paused=False)
             try:
                 self("close")
                 self._process.wait(10)
