@@ -21,8 +21,9 @@ from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.site_model import SiteModel
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from pipeline.viewing.fleet import Fan
+from schemas.enums import Transition
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Message, ModelCard, Transition
+from schemas.messages import Alarm, Message, ModelCard
 from schemas.units import NS_PER_S
 
 NEEDED = ("asyncua", "argon2")
@@ -118,8 +119,8 @@ class OpcuaCore(Core):
 class _Running(Server):
     def __init__(self, context: Context, model: SiteModel, book: ConditionBook, desk: RequestDesk) -> None:
         from pipeline.opcua.certificate import check_certificate, make_certificate  # noqa: PLC0415  an extra
+        from pipeline.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
         from pipeline.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
-        from pipeline.opcua.sessions import LogIn, TrustedClients  # noqa: PLC0415
         from pipeline.presenting.users import Users  # noqa: PLC0415
 
         config: OpcuaConfig = context.config

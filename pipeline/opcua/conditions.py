@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 from pipeline.opcua.identifiers import FAN_ALARM_TYPE, condition_identifier
 from pipeline.opcua.requests import MAX_TIME_SHELVED_S
 from pipeline.viewing.fleet import Fan
-from schemas.messages import Alarm, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.messages import Alarm
 from scoring.alarms.alarm_flags import is_retained, is_silenced
 from scoring.alarms.current_alarms import CurrentAlarm, words_of
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS

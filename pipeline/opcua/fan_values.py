@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from pipeline.presenting.fan_history import CURVES
 from pipeline.presenting.site_model import TrayNow
 from pipeline.viewing.fleet import SILENT, Fan, FanNow
-from schemas.messages import InvalidReason
+from schemas.enums import InvalidReason
 from schemas.units import RAD_S_PER_UNIT
 
 GOOD, SILENT_TRAY, OLD = "Good", "UncertainNoCommunicationLastUsableValue", "UncertainLastUsableValue"

@@ -16,7 +16,8 @@ from pipeline.opcua.encoding import time_of
 from pipeline.opcua.events import SiteEvent, condition_event
 from pipeline.opcua.identifiers import fan_of
 from pipeline.presenting.site_model import SiteModel
-from schemas.messages import Alarm, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm
 
 _PAGE = 1000
 MOST_EVENTS = 10_000

@@ -36,7 +36,8 @@ from pipeline.opcua.templates import method_nodes
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.site_model import SiteModel
 from pipeline.viewing.fleet import Fan
-from schemas.messages import Action, Request
+from schemas.enums import Action
+from schemas.messages import Request
 
 _SEARCHED = 200
 """transitions of a fan, among which an event is looked for"""

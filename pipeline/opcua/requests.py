@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from schemas.messages import Action, Alarm, Severity, Transition
+from schemas.enums import Action, Severity, Transition
+from schemas.messages import Alarm
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
 LONGEST_COMMENT = 500

@@ -25,8 +25,9 @@ from pipeline.opcua.conditions import Condition, ConditionBook
 from pipeline.opcua.events import EventDelivery, system_event
 from pipeline.opcua.history import AlarmHistory
 from pipeline.opcua.identifiers import NAMESPACE
+from pipeline.opcua.log_in import LogIn, Permissions, TrustedClients
 from pipeline.opcua.methods import Methods
-from pipeline.opcua.sessions import LogIn, Permissions, SiteServer, TrustedClients
+from pipeline.opcua.sessions import SiteServer
 from pipeline.opcua.site_nodes import SiteNode, SiteNodes
 from pipeline.opcua.site_values import SiteValues
 from pipeline.presenting.request_desk import RequestDesk

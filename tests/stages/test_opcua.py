@@ -1,5 +1,7 @@
 """The OPC UA stage: who connects, what floods it, what survives a restart. Clients are those of the same library."""
 
+# pyright: reportPrivateImportUsage=false, reportArgumentType=false
+# (the library declares its names and integers otherwise than it uses them)
 from __future__ import annotations
 
 import asyncio
@@ -30,7 +32,8 @@ from cryptography import x509
 from pipeline.opcua.certificate import make_certificate
 from pipeline.opcua.config import OpcuaConfig
 from pipeline.runtime.stage import Context, StageError
-from schemas.messages import Alarm, Request, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Request
 from stages.opcua import STAGE, check
 from tests.stages.test_gateway import alarm, score
 from tests.support.running_chain import eventually
@@ -221,7 +224,7 @@ def test_history_certificate_and_events_survive_a_restart(tmp_path):
             client = await encrypted(second, tmp_path, OPERATOR)
             node = client.get_node(ua.NodeId(ua.ObjectIds.Server))
             past = await node.read_event_history(datetime(2020, 1, 1, tzinfo=UTC), datetime(2100, 1, 1, tzinfo=UTC))
-            event = ua.Variant(past[0].EventId, ua.VariantType.ByteString)
+            event = ua.Variant(past[0].__dict__["EventId"], ua.VariantType.ByteString)
             comment = ua.Variant(ua.LocalizedText("seen"), ua.VariantType.LocalizedText)
             request = ua.CallMethodRequest(
                 ObjectId=ua.NodeId.from_string(ALARM),

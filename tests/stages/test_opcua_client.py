@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from schemas.messages import Action, Alarm, FanState, Request, Transition
+from schemas.enums import Action, FanState, Transition
+from schemas.messages import Alarm, Request
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, alarm, score
 from tests.support.node_opcua import NodeOpcua, node_modules

@@ -13,7 +13,8 @@ from pipeline.opcua.config import OpcuaConfig
 from pipeline.presenting.users import User, UserRole, hasher, write_users
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Header, Message, Request, Score
+from schemas.header import Header
+from schemas.messages import Alarm, Message, Request, Score
 from schemas.topics import tray_key
 from stages.opcua import OpcuaCore, build
 from tests.support.running_gateway import free_port

@@ -13,7 +13,9 @@ from asyncua.ua.ua_binary import variant_to_binary
 from pipeline.opcua.conditions import ALL_FIELDS, Condition, ConditionBook, event_id, past_condition
 from pipeline.opcua.events import condition_event, system_event
 from pipeline.viewing.fleet import Fan
-from schemas.messages import Alarm, Header, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.header import Header
+from schemas.messages import Alarm
 from scoring.alarms.current_alarms import current_alarms
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, TRAY, alarm

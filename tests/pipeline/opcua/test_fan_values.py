@@ -8,7 +8,7 @@ import pytest
 from pipeline.opcua.fan_values import NO_VALUE, NONE_YET, OLD, SILENT_TRAY, FanValues
 from pipeline.presenting.site_model import TrayNow
 from pipeline.viewing.fleet import Fan, FanNow
-from schemas.messages import InvalidReason
+from schemas.enums import InvalidReason
 from schemas.units import RAD_S_PER_UNIT
 
 RPM = RAD_S_PER_UNIT["rpm"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from pipeline.opcua.requests import FAN_METHODS, METHODS, SHELVING_METHODS, status_of
-from schemas.messages import Action, Alarm, Transition
+from schemas.enums import Action, Transition
+from schemas.messages import Alarm
 from scoring.alarms.fan_condition import ConditionSettings, FanCondition
 from tests.stages.test_gateway import alarm
 
