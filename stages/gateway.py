@@ -149,7 +149,7 @@ class _Running(Server):
         from pipeline.gateway.api import Api  # noqa: PLC0415
         from pipeline.gateway.app import application  # noqa: PLC0415
         from pipeline.gateway.server import WebServer, check_certificate, listen  # noqa: PLC0415
-        from pipeline.gateway.users import Users  # noqa: PLC0415
+        from pipeline.presenting.users import Users  # noqa: PLC0415
 
         config: GatewayConfig = context.config
         tls = None
@@ -186,7 +186,7 @@ def check(context: Context) -> list[str]:
     if not all(map(is_installed, NEEDED)):
         return [NOT_INSTALLED]
     from pipeline.gateway.server import check_certificate, listen  # noqa: PLC0415  the extra may not be installed
-    from pipeline.gateway.users import read_users  # noqa: PLC0415
+    from pipeline.presenting.users import read_users  # noqa: PLC0415
 
     config: GatewayConfig = context.config
     problems: list[str] = []

@@ -119,5 +119,13 @@ STAGES: dict[str, StageRow] = {
             reads=("score", "alarm", "twin", "health"),
             writes=("request",),
         ),
+        StageRow(
+            "opcua",
+            "stages.opcua:STAGE",
+            has_common_shards=False,
+            may_drop=True,
+            reads=("score", "alarm", "twin"),
+            writes=("request",),
+        ),
     )
 }

@@ -17,7 +17,8 @@ from starlette.requests import Request
 
 from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.sessions import LoginSessions, Session
-from pipeline.gateway.users import NAME, UserRole, Users
+from pipeline.presenting.login_failures import LoginFailures
+from pipeline.presenting.users import NAME, UserRole, Users
 
 COOKIE, SECURE_COOKIE = "fantwin", "__Host-fantwin"
 CSRF_HEADER = "X-CSRF-Token"
@@ -42,6 +43,7 @@ class Access:
         self._config = config
         self._users = users
         self.sessions = LoginSessions()
+        self._failures = LoginFailures()
 
     @property
     def has_login(self) -> bool:
@@ -108,13 +110,13 @@ class Access:
         if self._users is None:
             raise HTTPException(404, "nobody logs in here")
         counted = (f"name {name}", f"address {address}")
-        if wait_s := self.sessions.wait_s(*counted):
+        if wait_s := self._failures.wait_s(*counted):
             raise HTTPException(429, "too many wrong passwords: try again later", {"Retry-After": f"{wait_s:.0f}"})
         user = self._users.verified(name, password)
         if user is None:
-            self.sessions.add_failure(*counted)
+            self._failures.add(*counted)
             raise HTTPException(401, "no such user, or another password")
-        self.sessions.forget_failures(*counted)
+        self._failures.forget(*counted)
         return self.sessions.begin(user.name)
 
     def _of_proxy(self, request: Request) -> Visitor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import secrets
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,9 +13,6 @@ IDLE_S = 30 * 60.0
 """a session without a request for so long is over (ASVS 3.3.2)"""
 LONGEST_S = 12 * 3600.0
 MOST_SESSIONS = 1000
-FAILURES, FAILURES_WITHIN_S = 5, 60.0
-"""so many wrong passwords for one name, or from one address: then nobody logs in so until the first is that old"""
-MOST_COUNTED = 4096
 
 
 @dataclass(slots=True)
@@ -35,7 +32,6 @@ class LoginSessions:
         self._now_s = now_s
         self._sessions: OrderedDict[str, Session] = OrderedDict()
         """by the hash of the cookie; the ones seen last come last"""
-        self._failures: OrderedDict[str, deque[float]] = OrderedDict()
 
     def begin(self, user: str) -> tuple[str, Session]:
         """A new session and its cookie."""
@@ -61,29 +57,6 @@ class LoginSessions:
     def end(self, cookie: str) -> None:
         """Log out."""
         self._sessions.pop(_hashed(cookie), None)
-
-    def wait_s(self, *names: str) -> float:
-        """How long nobody may log in under one of these names, or from one of these addresses; 0: at once."""
-        now_s = self._now_s()
-        waits = [
-            FAILURES_WITHIN_S - (now_s - failures[0])
-            for name in names
-            if len(failures := self._failures.get(name, deque[float]())) == FAILURES
-        ]
-        return max(0.0, *waits) if waits else 0.0
-
-    def add_failure(self, *names: str) -> None:
-        """A password was wrong."""
-        for name in names:
-            self._failures.setdefault(name, deque(maxlen=FAILURES)).append(self._now_s())
-            self._failures.move_to_end(name)
-        while len(self._failures) > MOST_COUNTED:
-            self._failures.popitem(last=False)
-
-    def forget_failures(self, *names: str) -> None:
-        """A password was right."""
-        for name in names:
-            self._failures.pop(name, None)
 
 
 def _hashed(cookie: str) -> str:

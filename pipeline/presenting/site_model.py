@@ -55,6 +55,21 @@ class NewestSample:
     is_judged: bool
 
 
+@dataclass(frozen=True, eq=False)
+class TrayNow:
+    """The newest sample of a tray: values (fans, len(CURVES)) and whether each fan is judged (fans,).
+
+    is_heard: False: it has sent none for long, and this is an old one.
+    """
+
+    tray: str
+    t_ns: int
+    values: Array
+    is_judged: Array
+    invalid_reason: Array
+    is_heard: bool
+
+
 @dataclass(slots=True)
 class _Heard:
     health: Health
@@ -181,6 +196,23 @@ class SiteModel:
             for fan, (measured, predicted, _, _, ratio) in enumerate(values):
                 found.append(NewestSample(tray, fan, measured, predicted, ratio, judged[fan]))
         return found
+
+    def trays_now(self) -> list[TrayNow]:
+        """The newest sample of each tray that was ever heard."""
+        after_s = time.monotonic() - SILENT_AFTER_S
+        with self._lock:
+            newest = [(tray, score, self._heard_s[tray] >= after_s) for tray, score in self._newest.items()]
+        return [
+            TrayNow(
+                tray,
+                int(score.t_ns[-1]),
+                values_of(score)[-1],
+                score.valid[-1] | np.isin(score.invalid_reason[-1], JUDGED_AT_REST),
+                score.invalid_reason[-1],
+                is_heard,
+            )
+            for tray, score, is_heard in newest
+        ]
 
     def raised(self) -> dict[tuple[str, int, str], int]:
         """How many alarms were raised since the gateway began, by tray, fan and severity."""

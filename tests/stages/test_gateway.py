@@ -12,7 +12,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from pipeline.gateway.config import GatewayConfig
-from pipeline.gateway.users import User, UserRole, hasher, write_users
+from pipeline.presenting.users import User, UserRole, hasher, write_users
 from schemas.enums import Action, FanState, InvalidReason, Severity, Transition
 from schemas.header import Header
 from schemas.messages import Alarm, Diagnosis, Request, Score

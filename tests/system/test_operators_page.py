@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-from pipeline.gateway.users import User, UserRole, hasher, write_users
+from pipeline.presenting.users import User, UserRole, hasher, write_users
 from tests.support.browser import browser as browser_path
 from tests.support.running_chain import DEADLINE_S, SITE, TRAY, Chain, eventually, view_of
 from tests.support.running_gateway import free_port

@@ -1,4 +1,4 @@
-"""`fantwin users`: the users of the gateway."""
+"""`fantwin users`: the users of the gateway and of OPC UA."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.config.loading import load_config
 from pipeline.errors import UsageError, UserError
 from pipeline.gateway.config import GatewayConfig
-from pipeline.gateway.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
+from pipeline.opcua.config import OpcuaConfig
 from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.presenting.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
 
 
 class UserAction(StrEnum):
@@ -35,7 +36,7 @@ def users(
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """List the users of the gateway, who may log in to the operators' page; add one, or remove one.
+    """List the users, who may log in to the operators' page and by OPC UA; add one, or remove one.
 
     `add` asks for the password, or reads it from a pipe; it also gives a user another password and role.
 
@@ -43,14 +44,16 @@ def users(
 
     Example: fantwin users remove ann
     """
-    settings = load_config(config, overrides or (), stages=("gateway",))
+    settings = load_config(config, overrides or (), stages=("gateway", "opcua"))
     if not is_installed("argon2"):
         raise UserError(f"users need the extra `gateway`: {how_to_install('gateway')}")
-    section = settings.sections["gateway"]
-    assert isinstance(section, GatewayConfig)
-    if section.users is None:
-        raise UserError(f'{config}: [gateway] names no file of users: add users = "users.toml"')
-    path = settings.folder / section.users
+    gateway, opcua = settings.sections["gateway"], settings.sections["opcua"]
+    assert isinstance(gateway, GatewayConfig)
+    assert isinstance(opcua, OpcuaConfig)
+    named = gateway.users or opcua.users
+    if named is None:
+        raise UserError(f'{config}: neither [gateway] nor [opcua] names a file of users: add users = "users.toml"')
+    path = settings.folder / named
     found = read_users(path) if path.exists() else {}
     if action == UserAction.LIST:
         _list(path, found, json_output=json_output)

@@ -1,4 +1,4 @@
-"""The users of the gateway: a file with a role and the hash of a password for each.
+"""The users of a site, who look and act on the page or by OPC UA: a file with role and password hash of each.
 
 Passwords are hashed with argon2id, whose parameters are those of the library (RFC 9106, low-memory profile).
 """
@@ -121,7 +121,7 @@ def write_users(path: Path, users: Mapping[str, User]) -> None:
     Raises:
         UserError: it cannot be written.
     """
-    lines = ["# users of the gateway: `fantwin users`\n"]
+    lines = ["# users of the site: `fantwin users`\n"]
     for name, user in sorted(users.items()):
         lines.append(f"\n[{json.dumps(name)}]\nrole = {json.dumps(user.role)}\n")
         lines.append(f"password_hash = {json.dumps(user.password_hash)}\n")

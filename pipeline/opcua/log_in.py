@@ -1,0 +1,108 @@
+"""Who logs in, and what he may do."""
+
+# pyright: reportPrivateImportUsage=false, reportArgumentType=false
+# (the library declares its names and integers otherwise than it uses them)
+from __future__ import annotations
+
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from asyncua import ua
+from asyncua.common.utils import ServiceError
+from asyncua.crypto.permission_rules import USER_TYPES, PermissionRuleset, UserRole
+from asyncua.crypto.permission_rules import User as LibraryUser
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from pipeline.presenting.login_failures import LoginFailures
+from pipeline.presenting.users import UserRole as SiteRole
+from pipeline.presenting.users import Users
+
+
+@dataclass
+class SessionUser(LibraryUser):
+    """may_act: whether he is an operator. name: empty for whoever is not logged in."""
+
+    may_act: bool = False
+
+
+class Permissions(PermissionRuleset):
+    """Which services are open: nobody writes, and nobody changes the address space."""
+
+    def __init__(self, log_in: LogIn) -> None:
+        self._log_in = log_in
+        refused = {ua.ObjectIds.WriteRequest_Encoding_DefaultBinary}
+        self._open = {ua.NodeId(kind) for kind in USER_TYPES if kind not in refused}
+
+    def check_validity(self, user: Any, action_type: ua.NodeId, body: Any) -> bool:
+        """Whether a service is open to a user, who may have been removed since he logged in."""
+        return action_type in self._open and self._log_in.may_read(str(getattr(user, "name", "") or ""))
+
+
+class TrustedClients:
+    """The certificates in a folder, read again when somebody connects."""
+
+    def __init__(self, folder: Path | None) -> None:
+        """folder: None: all clients are trusted."""
+        self._folder = folder
+
+    def trusts(self, certificate: bytes) -> bool:
+        """Whether a client's certificate (DER) is among them."""
+        if self._folder is None:
+            return True
+        for path in sorted(self._folder.glob("*")):
+            try:
+                found = path.read_bytes()
+                is_pem = found.startswith(b"-----")
+                der = x509.load_pem_x509_certificate(found).public_bytes(Encoding.DER) if is_pem else found
+            except (OSError, ValueError):
+                continue
+            if secrets.compare_digest(der, certificate):
+                return True
+        return False
+
+
+class LogIn:
+    """Who has which password."""
+
+    def __init__(self, users: Users | None, *, is_open: bool) -> None:
+        """is_open: whoever does not log in may read."""
+        self._users = users
+        self._is_open = is_open
+        self._failures = LoginFailures()
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the file of users; empty if nothing is."""
+        return self._users.problem if self._users else ""
+
+    def is_operator(self, name: str) -> bool:
+        """Whether he is one now: the file may have changed since he logged in."""
+        user = self._users.of(name) if self._users and name else None
+        return user is not None and user.role == SiteRole.OPERATOR
+
+    def may_read(self, name: str) -> bool:
+        """Whether he may still read. name: empty for whoever is not logged in."""
+        return self._is_open or (self._users is not None and self._users.of(name) is not None)
+
+    def user(self, name: str | None, password: str | None, address: str) -> SessionUser | None:
+        """Who logs in; None: nobody does.
+
+        Raises:
+            ServiceError: he has guessed too often.
+        """
+        if name is None:
+            return SessionUser(UserRole.User, "") if self._is_open else None
+        if self._users is None:
+            return None
+        counted = (f"name {name}", f"address {address}")
+        if self._failures.wait_s(*counted):
+            raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
+        user = self._users.verified(name, password or "")
+        if user is None:
+            self._failures.add(*counted)
+            return None
+        self._failures.forget(*counted)
+        return SessionUser(UserRole.User, user.name, user.role == SiteRole.OPERATOR)

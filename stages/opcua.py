@@ -1,0 +1,216 @@
+"""OPC UA: a server with each fan as an object and each alarm as a condition of Part 9 (docs/how-to/opcua.md).
+
+Reads `score`, `alarm` and `twin`, and writes `request`. One core serves all trays, and asks for the newest
+score of each tray once a second.
+
+The server runs in a thread of its own: it reads what the core has collected, and leaves requests for the core to send.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence, Set
+from pathlib import Path
+
+from pipeline.errors import UserError
+from pipeline.opcua.conditions import Condition, ConditionBook
+from pipeline.opcua.config import OpcuaConfig
+from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.request_desk import RequestDesk
+from pipeline.presenting.site_model import SiteModel
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from pipeline.viewing.fleet import Fan
+from schemas.enums import Transition
+from schemas.envelope import Envelope
+from schemas.messages import Alarm, Message, ModelCard
+from schemas.units import NS_PER_S
+
+NEEDED = ("asyncua", "argon2")
+NOT_INSTALLED = f"OPC UA needs its extra: take [opcua] out of the configuration, or {how_to_install('opcua')}"
+SILENCE_PERIOD_NS = NS_PER_S
+HISTORY = Path("opcua-alarms.sqlite")
+CERTIFICATE, KEY = Path("opcua-certificate.der"), Path("opcua-key.pem")
+
+
+class Server:
+    """What the core needs of the OPC UA server."""
+
+    def publish(self, condition: Condition) -> None:
+        """Send the event of a transition; never waits."""
+
+    def stop(self) -> None:
+        """End it."""
+
+    def problem(self) -> str:
+        """What is wrong; empty if nothing is."""
+        return ""
+
+    def counters(self) -> Mapping[str, int]:
+        """What it counts."""
+        return {}
+
+
+class OpcuaCore(Core):
+    """Collects what the server shows, and sends what operators ask."""
+
+    def __init__(self, model: SiteModel, book: ConditionBook, desk: RequestDesk, server: Server) -> None:
+        self._model, self._book, self._desk = model, book, desk
+        self._server = server
+        self._counts: Counter[str] = Counter()
+        self._silence_ns = 0
+
+    def step(self, item: Message | Envelope) -> Sequence[Message]:
+        """Keep what has arrived; a transition becomes an event."""
+        tray = self._model.tray(item.header.tray)
+        if tray is None:
+            self._counts["unknown_tray"] += 1
+        elif isinstance(item, Envelope):
+            self._model.add_score(item)
+        elif isinstance(item, ModelCard):
+            self._model.add_twin(item)
+        elif isinstance(item, Alarm):
+            self._counts["unknown_fan"] += item.fan >= tray.fans
+            if item.fan < tray.fans:
+                self._add_alarm(item)
+        return ()
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        """Send the scorers what operators ask."""
+        if abs(now_ns - self._silence_ns) >= SILENCE_PERIOD_NS:
+            self._silence_ns = now_ns
+            self._model.notice_silence()
+        requests = self._desk.take()
+        self._counts["requests_sent"] += len(requests)
+        return requests
+
+    def close(self) -> Sequence[Message]:
+        """Stop the server, and close the history."""
+        self._server.stop()
+        self._model.close()
+        return ()
+
+    def abort(self) -> None:
+        """The same after a crash."""
+        self.close()
+
+    def counters(self) -> Mapping[str, int]:
+        """Requests and events sent, clients, and what could not be shown."""
+        return {"refused_scores": self._model.refused_scores, **self._counts, **self._server.counters()}
+
+    def followed(self) -> Set[str] | None:
+        """No tray in full: the newest score of each, once a second, is enough."""
+        return set()
+
+    def problem(self) -> str:
+        """Of the server, the users and the history."""
+        return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
+
+    def _add_alarm(self, alarm: Alarm) -> None:
+        is_new = self._model.add_alarm(alarm)
+        current = self._model.current_alarm(Fan(alarm.header.tray, alarm.fan))
+        if current is not None:
+            condition = self._book.add(alarm, current)
+            if is_new and alarm.transition != Transition.REFUSED:
+                self._server.publish(condition)
+        self._desk.add(alarm)
+
+
+class _Running(Server):
+    def __init__(self, context: Context, model: SiteModel, book: ConditionBook, desk: RequestDesk) -> None:
+        from pipeline.opcua.certificate import check_certificate, make_certificate  # noqa: PLC0415  an extra
+        from pipeline.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
+        from pipeline.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
+        from pipeline.presenting.users import Users  # noqa: PLC0415
+
+        config: OpcuaConfig = context.config
+        if config.certificate and config.key:
+            certificate, key = context.resolve(config.certificate), context.resolve(config.key)
+        else:
+            names = (*config.names, "localhost", *([config.host] if config.is_loopback else []))
+            certificate, key = context.own_file(CERTIFICATE), context.own_file(KEY)
+            make_certificate(certificate, key, application_uri(context.site), names)
+        check_certificate(certificate, key)
+        users = Users(context.resolve(config.users)) if config.users else None
+        self._server = OpcuaServer(
+            Listening(config.host, config.port + context.shard_number - 1, certificate, key, config.is_loopback),
+            model,
+            book,
+            desk,
+            LogIn(users, is_open=config.is_loopback),
+            TrustedClients(context.resolve(config.trusted) if config.trusted else None),
+        )
+
+    def publish(self, condition: Condition) -> None:
+        self._server.publish(condition)
+
+    def stop(self) -> None:
+        self._server.stop()
+
+    def problem(self) -> str:
+        return self._server.problem
+
+    def counters(self) -> Mapping[str, int]:
+        server = self._server
+        return {
+            "clients": server.clients,
+            "events_sent": server.events_sent,
+            "events_left_out": server.events_lost,
+            "clients_cut_off": server.cut_off,
+        }
+
+
+def build(context: Context) -> BuiltStage:
+    """Open the history and listen.
+
+    Raises:
+        StageError: the extra is not installed, the port is taken, or a file cannot be read or written.
+    """
+    if not all(map(is_installed, NEEDED)):
+        raise StageError(NOT_INSTALLED)
+    model = SiteModel(context.site, context.trays, AlarmStore(context.own_file(HISTORY)))
+    book, desk = ConditionBook(), RequestDesk(context.producer)
+    return BuiltStage(OpcuaCore(model, book, desk, _Running(context, model, book, desk)))
+
+
+def check(context: Context) -> list[str]:
+    """Report a missing extra, a port that another program has taken, and files that cannot be read."""
+    if not all(map(is_installed, NEEDED)):
+        return [NOT_INSTALLED]
+    from pipeline.opcua.certificate import check_certificate, check_port  # noqa: PLC0415  the extra may not be installed
+    from pipeline.presenting.users import read_users  # noqa: PLC0415
+
+    config: OpcuaConfig = context.config
+    problems: list[str] = []
+
+    def attempt(check: Callable[[], object]) -> None:
+        try:
+            check()
+        except UserError as error:
+            problems.append(str(error))
+
+    if config.certificate and config.key:
+        certificate, key = context.resolve(config.certificate), context.resolve(config.key)
+        attempt(lambda: check_certificate(certificate, key))
+    if config.users:
+        users = context.resolve(config.users)
+        attempt(lambda: read_users(users))
+    if config.trusted and not context.resolve(config.trusted).is_dir():
+        problems.append(f"opcua.trusted = {str(config.trusted)!r}: there is no such folder")
+    if not context.is_running:
+        attempt(lambda: check_port(config.host, config.port + context.shard_number - 1))
+    return problems
+
+
+STAGE = Stage(
+    name="opcua",
+    about="serves fans and alarms by OPC UA",
+    reads=("score", "alarm", "twin"),
+    writes=("request",),
+    config=OpcuaConfig,
+    build=build,
+    core_per_tray=False,
+    undecoded=("score",),
+    may_drop=True,
+    check=check,
+)

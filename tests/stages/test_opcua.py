@@ -1,0 +1,271 @@
+"""The OPC UA stage: who connects, what floods it, what survives a restart. Clients are those of the same library."""
+
+# pyright: reportPrivateImportUsage=false, reportArgumentType=false
+# (the library declares its names and integers otherwise than it uses them)
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("asyncua")
+
+from asyncua import Client, ua
+from asyncua.common.connection import SecureConnection, TransportLimits
+from asyncua.common.utils import Buffer
+from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256, SecurityPolicyNone
+from asyncua.ua.ua_binary import (
+    header_from_binary,
+    struct_from_binary,
+    struct_to_binary,
+    uatcp_to_binary,
+)
+from cryptography import x509
+
+from pipeline.opcua.certificate import make_certificate
+from pipeline.opcua.config import OpcuaConfig
+from pipeline.runtime.stage import Context, StageError
+from schemas.enums import Transition
+from schemas.messages import Alarm, Request
+from stages.opcua import STAGE, check
+from tests.stages.test_gateway import alarm, score
+from tests.support.running_chain import eventually
+from tests.support.running_opcua import OPERATOR, PASSWORD, SITE, TRAY, VIEWER, RunningOpcua
+
+ALARM = f"ns=2;s={TRAY}/2/Alarm"
+SUPPRESS = ua.NodeId(ua.ObjectIds.AlarmConditionType_Suppress)
+
+
+@pytest.fixture
+def opcua(tmp_path: Path) -> Iterator[RunningOpcua]:
+    running = RunningOpcua(tmp_path / "site", lambda _request: [alarm(Transition.SUPPRESSED, suppressed=True)])
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+async def encrypted(running: RunningOpcua, folder: Path, user: str, password: str = PASSWORD) -> Client:
+    """A client that is logged in."""
+    certificate, key = folder / "client.der", folder / "client.pem"
+    client = Client(running.url)
+    make_certificate(certificate, key, client.application_uri, ("localhost",))
+    client.set_user(user)
+    client.set_password(password)
+    await client.set_security(SecurityPolicyBasic256Sha256, str(certificate), str(key))
+    await client.connect()
+    return client
+
+
+async def status_of_suppress(client: Client) -> str:
+    request = ua.CallMethodRequest(ObjectId=ua.NodeId.from_string(ALARM), MethodId=SUPPRESS)
+    (result,) = await client.uaclient.call([request])
+    return result.StatusCode.name
+
+
+def test_an_operator_acts_under_the_name_he_has_logged_in_with(opcua, tmp_path):
+    opcua.feed(score(), alarm())
+
+    async def acts() -> str:
+        client = await encrypted(opcua, tmp_path, OPERATOR)
+        try:
+            return await status_of_suppress(client)
+        finally:
+            await client.disconnect()
+
+    assert asyncio.run(acts()) == "Good"
+    (sent,) = opcua.sent
+    assert (sent.operator_name, sent.fan) == (OPERATOR, 2)
+
+
+def test_a_scorer_that_does_not_answer_is_a_timeout_and_others_are_served_meanwhile(tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.presenting.request_desk.ANSWERED_WITHIN_S", 3.0)
+    running = RunningOpcua(tmp_path / "site")
+    running.feed(score(), alarm())
+
+    async def acts() -> tuple[str, str]:
+        client = await encrypted(running, tmp_path, OPERATOR)
+        async with Client(running.url) as other:
+            waiting = asyncio.create_task(status_of_suppress(client))
+            await asyncio.sleep(0.5)
+            message = await other.get_node(f"{ALARM}/Message").read_value()
+            assert not waiting.done()
+            status = await waiting
+        await client.disconnect()
+        return status, message.Text
+
+    try:
+        status, message = asyncio.run(acts())
+    finally:
+        running.close()
+    assert status == "BadTimeout"
+    assert message.startswith("fan 2: 90 rpm")
+
+
+def test_only_trusted_clients_connect_encrypted(tmp_path):
+    trusted = tmp_path / "trusted"
+    trusted.mkdir()
+    running = RunningOpcua(tmp_path / "site", trusted=trusted)
+
+    async def connects() -> None:
+        client = await encrypted(running, tmp_path, VIEWER)
+        await client.disconnect()
+
+    try:
+        with pytest.raises(ua.UaStatusCodeError) as refused:
+            asyncio.run(connects())
+        assert refused.value.code == ua.StatusCodes.BadCertificateUntrusted
+        (trusted / "client.der").write_bytes((tmp_path / "client.der").read_bytes())
+        asyncio.run(connects())
+    finally:
+        running.close()
+
+
+def test_wrong_passwords_are_counted(opcua, tmp_path):
+    async def log_in(password: str) -> bool:
+        try:
+            client = await encrypted(opcua, tmp_path, VIEWER, password)
+        except ua.UaStatusCodeError:
+            return False
+        await client.disconnect()
+        return True
+
+    assert [asyncio.run(log_in("wrong wrong wrong")) for _ in range(5)] == [False] * 5
+    assert not asyncio.run(log_in(PASSWORD)), "not even with the right one, for a minute"
+
+
+def test_a_session_cannot_be_guessed_and_nobody_refreshes_the_subscription_of_another(opcua):
+    opcua.feed(alarm())
+
+    class Ignores:
+        def event_notification(self, event: Any) -> None: ...
+
+    async def tries() -> tuple[str, int]:
+        async with Client(opcua.url) as one, Client(opcua.url) as other:
+            subscription = await one.create_subscription(500, Ignores())
+            refresh = ua.CallMethodRequest(
+                ObjectId=ua.NodeId(ua.ObjectIds.ConditionType),
+                MethodId=ua.NodeId(ua.ObjectIds.ConditionType_ConditionRefresh),
+                InputArguments=[ua.Variant(subscription.subscription_id, ua.VariantType.UInt32)],
+            )
+            (of_another,) = await other.uaclient.call([refresh])
+            token = one.uaclient.protocol.authentication_token  # type: ignore[union-attr]
+            return of_another.StatusCode.name, len(token.Identifier)
+
+    assert asyncio.run(tries()) == ("BadSubscriptionIdInvalid", 32)
+
+
+def test_a_client_that_asks_and_does_not_read_is_cut_off(opcua, monkeypatch):
+    monkeypatch.setattr("pipeline.opcua.server.LARGEST_BACKLOG_BYTES", 1 << 20)
+    monkeypatch.setattr("pipeline.opcua.server.LONGEST_BACKLOG_S", 5.0)
+    with socket.create_connection(("127.0.0.1", opcua.port)) as client:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        threading.Thread(target=_flood, args=(client, opcua.url), daemon=True).start()
+        eventually(lambda: opcua.core.counters()["clients_cut_off"] == 1, "it is cut off")
+
+    async def served() -> int:
+        async with Client(opcua.url) as other:
+            return len(await other.nodes.objects.get_children())
+
+    assert asyncio.run(served()) > 1
+
+
+def _flood(client: socket.socket, url: str) -> None:
+    """Ask for the endpoints, again and again, without a session and without reading."""
+    limits = TransportLimits()
+    channel = SecureConnection(SecurityPolicyNone(), limits)
+    client.sendall(uatcp_to_binary(ua.MessageType.Hello, ua.Hello(EndpointUrl=url)))
+    client.recv(8192)
+    opening = ua.OpenSecureChannelRequest()
+    opening.Parameters.RequestType = ua.SecurityTokenRequestType.Issue
+    opening.Parameters.SecurityMode = ua.MessageSecurityMode.None_
+    opening.Parameters.RequestedLifetime = 3_600_000
+    client.sendall(channel.message_to_binary(struct_to_binary(opening), ua.MessageType.SecureOpen, 1))
+    received = Buffer(client.recv(8192))
+    answer = channel.receive_from_header_and_body(header_from_binary(received), received)
+    opened = struct_from_binary(ua.OpenSecureChannelResponse, answer.body())
+    channel.set_channel(opened.Parameters, ua.SecurityTokenRequestType.Issue, opening.Parameters.ClientNonce)
+    asking = ua.GetEndpointsRequest()
+    asking.Parameters.EndpointUrl = url
+    try:
+        for number in range(2, 100_000):
+            client.sendall(channel.message_to_binary(struct_to_binary(asking), ua.MessageType.SecureMessage, number))
+            if number % 50 == 0:
+                time.sleep(0.02)  # faster, and the server would end it because of the requests that wait
+    except OSError:
+        return
+
+
+def test_history_certificate_and_events_survive_a_restart(tmp_path):
+    first = RunningOpcua(tmp_path)
+    first.feed(alarm(), alarm(Transition.SEVERITY, 1))
+    certificate = (tmp_path / "opcua-certificate.der").read_bytes()
+    first.close()
+    asked: list[Request] = []
+
+    def answer(request: Request) -> list[Alarm]:
+        asked.append(request)
+        return [alarm(Transition.ACKNOWLEDGED, acknowledged=True)]
+
+    second = RunningOpcua(tmp_path, answer)
+    try:
+        assert (tmp_path / "opcua-certificate.der").read_bytes() == certificate
+        assert (tmp_path / "opcua-key.pem").stat().st_mode & 0o077 == 0
+        second.feed(alarm(Transition.SEVERITY, 1))
+
+        async def acknowledges() -> tuple[int, str]:
+            client = await encrypted(second, tmp_path, OPERATOR)
+            node = client.get_node(ua.NodeId(ua.ObjectIds.Server))
+            past = await node.read_event_history(datetime(2020, 1, 1, tzinfo=UTC), datetime(2100, 1, 1, tzinfo=UTC))
+            event = ua.Variant(past[0].__dict__["EventId"], ua.VariantType.ByteString)
+            comment = ua.Variant(ua.LocalizedText("seen"), ua.VariantType.LocalizedText)
+            request = ua.CallMethodRequest(
+                ObjectId=ua.NodeId.from_string(ALARM),
+                MethodId=ua.NodeId(ua.ObjectIds.AcknowledgeableConditionType_Acknowledge),
+                InputArguments=[event, comment],
+            )
+            (result,) = await client.uaclient.call([request])
+            await client.disconnect()
+            return len(past), result.StatusCode.name
+
+        assert asyncio.run(acknowledges()) == (2, "Good"), "by the event that was sent before the restart"
+        assert asked[0].comment == "seen"
+    finally:
+        second.close()
+
+
+def test_the_certificate_that_it_makes_is_one_for_opc_ua(tmp_path):
+    certificate, key = tmp_path / "c.der", tmp_path / "k.pem"
+    make_certificate(certificate, key, "urn:here:fantwin:hall", ("localhost", "127.0.0.1", "plant.example"))
+    found = x509.load_der_x509_certificate(certificate.read_bytes())
+    names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.UniformResourceIdentifier) == ["urn:here:fantwin:hall"]
+    assert "plant.example" in names.get_values_for_type(x509.DNSName)
+    usage = found.extensions.get_extension_for_class(x509.KeyUsage).value
+    assert usage.digital_signature
+    assert usage.data_encipherment
+
+
+def test_a_port_that_is_taken_is_said_by_the_check_and_at_the_start(opcua, tmp_path):
+    config = OpcuaConfig(port=opcua.port, certificate=Path("no.der"), key=Path("no.pem"))
+    context = Context(SITE, (), config, tmp_path, tmp_path, 0)
+    problems = check(context)
+    assert [each.partition(" = ")[0] for each in problems] == ["opcua.certificate", "opcua.host"]
+    with pytest.raises(StageError, match="choose another one"):
+        STAGE.build(Context(SITE, (), OpcuaConfig(port=opcua.port), tmp_path, tmp_path, 0))
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [({"host": "0.0.0.0"}, "needs users"), ({"certificate": "c.pem"}, "belong together")],
+)
+def test_beyond_loopback_it_needs_users(settings, why):
+    with pytest.raises(ValueError, match=why):
+        OpcuaConfig(**settings)
