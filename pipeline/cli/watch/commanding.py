@@ -90,6 +90,10 @@ def require_commandable(tray: TrayConfig, instead: str) -> None:
         raise UserError(f"tray {tray.name} takes no commands ({reason}){': ' * bool(instead)}{instead}")
 
 
+class NotReceivedError(UserError):
+    """No acquisition has received a command."""
+
+
 class CommandSender:
     """Sends commands to one tray."""
 
@@ -102,7 +106,7 @@ class CommandSender:
         key = tray_key(site, tray, "command")
         self._publisher = bus.publisher(key, BY_NAME["command"], type_name(Command), self._producer)
         self._before: Health | None = None
-        """the last health before the first command"""
+        """the last health before the commands that are not confirmed"""
 
     def connect(self) -> None:
         """Wait for the tray's acquisition.
@@ -123,9 +127,11 @@ class CommandSender:
         """Wait until acquisition has received all commands.
 
         Raises:
-            UserError: it has not, or could not send one to the device.
+            NotReceivedError: it has not.
+            UserError: it could not send one to the device that was not confirmed before.
         """
         after, before = self._wait(self._received), self._before
+        self._before = after
         is_same = before is not None and after.header.producer == before.header.producer
         if _not_sent(after) > (_not_sent(before) if before and is_same else 0):
             known = before.notes if before and is_same else ()
@@ -141,7 +147,9 @@ class CommandSender:
         until_s = time.monotonic() + _ANSWER_S
         while (found := find()) is None:
             if time.monotonic() > until_s or self.stop.wait(_POLL_S):
-                raise UserError(f"no acquisition of tray {self._tray} received the command: is `fantwin up` running?")
+                raise NotReceivedError(
+                    f"no acquisition of tray {self._tray} received the command: is `fantwin up` running?"
+                )
         return found
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.cli.watch import sweep as sweep_module
+from pipeline.cli.watch.commanding import NotReceivedError
 from pipeline.cli.watch.excitation import (
     LEVELS,
     SETTLING,
@@ -24,6 +27,11 @@ from pipeline.config.models import TrayConfig
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.errors import UserError
 from pipeline.learning.ordinary_operation import OrdinaryOperation
+from schemas.codec import decode
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Counter, Health, Input
+from schemas.messages import Command
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO
 
@@ -213,3 +221,143 @@ def test_a_fan_that_reads_0_at_the_lowest_command_is_named_at_once() -> None:
     assert said[1] == "fan 0 reads 0 at command 0.2; if it stands still, give a higher --low"
     _, said = swept(StandsBelow([0.5]), low=0.0)
     assert not [line for line in said if "reads 0" in line], "it is meant to stand still"
+
+
+class AcquisitionOfRefusals:
+    """The bus and the acquisition of a tray at once: it refuses each command that moves fan 4."""
+
+    def __init__(self) -> None:
+        self.published = self.refused = 0
+        self.is_there = True
+
+    def publisher(self, *_: object) -> AcquisitionOfRefusals:
+        return self
+
+    def subscribe(self, *_: object) -> None: ...
+
+    def watch_alive(self, *_: object) -> None: ...
+
+    def put(self, payload: bytes) -> None:
+        command = decode(Command, payload)
+        assert isinstance(command, Command)
+        self.producer, self.published = command.header.producer, self.published + 1
+        self.refused += bool(np.isfinite(command.command[4]))
+
+    def health(self) -> Health | None:
+        received = Input(
+            key="", producer=self.producer, received=self.published, missing=0, duplicated=0, next_sequence=0
+        )
+        if not self.is_there:
+            return None
+        return Health(
+            header=Header("acquisition-1", 1, ""),
+            stage="acquisition",
+            instance="all",
+            status=StageStatus.OK,
+            t_ns=1,
+            uptime_s=0.0,
+            inputs=(received,),
+            counters=(Counter(name="lost_commands", value=self.refused),),
+        )
+
+
+def line_to(acquisition: AcquisitionOfRefusals, monkeypatch: pytest.MonkeyPatch) -> sweep_module._BusLine:
+    monkeypatch.setattr("pipeline.cli.watch.commanding.TrayAcquisition", lambda *_: acquisition)
+    tray = TrayConfig(name="tray1", fans=6, source=SerialConfig(port="line"))
+    return sweep_module._BusLine(acquisition, "plant", tray, threading.Event())  # type: ignore[arg-type]
+
+
+def test_a_refused_command_is_no_failure_of_those_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    acquisition = AcquisitionOfRefusals()
+    line = line_to(acquisition, monkeypatch)
+    with pytest.raises(UserError, match="send these by hand: fan 4 0.5 "):
+        sweep_module._leave(line, dict.fromkeys(range(6), 0.5), "")
+    assert acquisition.published == 7, "all at once, then each by itself"
+
+
+def test_ctrl_c_while_a_command_is_on_its_way_is_no_missing_acquisition(monkeypatch: pytest.MonkeyPatch) -> None:
+    acquisition = AcquisitionOfRefusals()
+    line = line_to(acquisition, monkeypatch)
+    acquisition.is_there = False
+    line.stop.set()
+    with pytest.raises(StoppedError):
+        line.send({0: 0.5})
+
+
+class SweptTray(FirstOrderFans):
+    """Six fans whose device carries out the commands of a message in turn, up to the first that it refuses."""
+
+    def __init__(self, refuses: Callable[[int], str] = lambda _fan: "", swept_s: float = 20.0) -> None:
+        super().__init__([0.5] * 6)
+        self.refuses, self.swept_s = refuses, swept_s
+        self.stop = threading.Event()
+        self.is_gone = False
+
+    def connect(self) -> np.ndarray:
+        return self.command.copy()
+
+    def send(self, values: Mapping[int, float]) -> None:
+        if self.now_s > self.swept_s:
+            for fan, value in values.items():
+                if self.is_gone:
+                    raise NotReceivedError("no acquisition of tray tray1 received the command")
+                if why := self.refuses(fan):
+                    raise UserError(why)
+                super().send({fan: value})
+        else:
+            super().send(values)
+
+
+def swept_by_command(tray: SweptTray, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The error of the command; the bus is left out."""
+
+    class NoBus:
+        def __enter__(self) -> NoBus:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def alive(self, _key: str) -> set[str]:
+            return set()
+
+        def declare_alive(self, _key: str) -> None: ...
+
+    monkeypatch.setattr(sweep_module, "join_bus", lambda *_, **__: NoBus())
+    monkeypatch.setattr(sweep_module, "_BusLine", lambda *_: tray)
+    return error_of("sweep", "-c", DEMO / "demo.toml", "--fans", "0,1,2,3,4,5", "--rounds", "1")
+
+
+def test_one_fan_that_refuses_its_command_keeps_no_other_from_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    tray = SweptTray(lambda fan: "unit 1 refuses 97" if fan == 4 else "")
+    error = swept_by_command(tray, monkeypatch)
+    assert list(tray.command) == [0.4, 0.4, 0.4, 0.4, tray.command[4], 0.4]
+    assert tray.command[4] != 0.4
+    by_hand = "THESE FANS KEEP THE LAST COMMAND; send these by hand: fan 4 0.4 (unit 1 refuses 97); "
+    assert error == f"{by_hand}the sweep has ended: unit 1 refuses 97"
+
+
+def test_why_a_sweep_has_ended_is_said_also_where_all_fans_have_their_commands_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    refusals = iter(["unit 1 refuses 97"])
+    tray = SweptTray(lambda fan: next(refusals, "") if fan == 4 else "")
+    error = swept_by_command(tray, monkeypatch)
+    assert error.startswith("the sweep has ended: unit 1 refuses 97; the fans are left at these commands: fan 0 0.4, ")
+    assert list(tray.command) == [0.4] * 6
+
+
+def test_another_controller_is_named_also_where_the_device_refuses_the_commands_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tray = SweptTray(lambda fan: "unit 1 refuses 0.4" if fan > 3 else "", swept_s=0.0)
+    tray.forced = 0.5
+    error = swept_by_command(tray, monkeypatch)
+    assert "send these by hand: fan 4 0.4, fan 5 0.4 (unit 1 refuses 0.4); the sweep has ended: " in error
+    assert "fan 0 has command 0.5 and not 0.2: something else sets it" in error
+
+
+def test_without_acquisition_all_fans_are_named_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tray = SweptTray()
+    tray.is_gone = True
+    error = swept_by_command(tray, monkeypatch)
+    assert "fan 5 0.4 (no acquisition of tray tray1 received the command); the sweep has ended: no acq" in error
