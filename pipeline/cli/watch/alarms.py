@@ -102,7 +102,7 @@ def alarms(
         if duration or comment or operator:
             raise UsageError("--for, --comment and --operator need an action: fantwin alarms ack TRAY FAN")
         stop_on_signals(stop)
-        with join_bus(settings, stop, listens=False) as bus:
+        with join_bus(settings, listens=False) as bus:
             _list(bus, settings, stop, show_all=show_all, watch=watch, json_output=json_output)
         return
     if show_all or watch:
@@ -117,7 +117,7 @@ def alarms(
         comment=comment,
     )
     stop_on_signals(stop)
-    with join_bus(settings, stop, listens=False, roles=(OPERATOR,)) as bus:
+    with join_bus(settings, listens=False, roles=(OPERATOR,)) as bus:
         watcher = SiteWatcher(bus, settings.site, roles_of(settings))
         wait_for_stages(bus, watcher, settings, stop, tray=name)
         fans = set(range(settings.tray(name).fans)) if number < 0 else {number}

@@ -79,7 +79,7 @@ def sweep(
         if not json_output:
             typer.echo(line)
 
-    with join_bus(settings, stop, listens=False, roles=(OPERATOR,)) as bus:
+    with join_bus(settings, listens=False, roles=(OPERATOR,)) as bus:
         line = _BusLine(bus, settings.site, chosen, stop)
         before = line.connect()
         key = sweep_key(settings.site, chosen.name)

@@ -92,6 +92,17 @@ def test_clients_that_start_before_the_router_connect_once_it_runs(endpoint, sta
         assert exchange(one, other) == b"hello"
 
 
+@pytest.mark.parametrize(
+    "words",
+    ["status --once", "alarms", "alarms ack tray1 0 --timeout 1", "wear", "command --fan 0 0.5", "sweep"],
+)
+def test_a_question_to_a_site_whose_router_is_down_is_answered_soon(words, endpoint):
+    settings = ("--set", "bus.mode='client'", "--set", f"bus.endpoint='{endpoint}'")
+    done = fantwin(*words.split(), "-c", DEMO / "demo.toml", *settings, timeout_s=30.0)  # a stage waits for ever
+    assert done.returncode == 1
+    assert "no router answers" in done.stderr and done.stderr.count("\n") == 1
+
+
 def test_waiting_for_a_router_ends_on_stop(endpoint, started):
     """In another process, by a signal: it must not be deaf to it."""
     words = ["run", "scorer", "-c", DEMO / "demo.toml", "--set", "bus.mode=client", "--set"]
