@@ -10,6 +10,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from datetime import datetime
 from enum import StrEnum
 from typing import Annotated
@@ -39,7 +40,7 @@ from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until, words_of
 from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
-from scoring.wear.slow_change import WEAR_HINT
+from scoring.wear.slow_change import is_of_slow_change
 
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time
 _SCORES_S = 3.0  # a score of every tray arrives in this time
@@ -205,8 +206,11 @@ def _identity(alarm: Alarm) -> tuple[str, int, str]:
 
 def _slow_changes(watcher: SiteWatcher) -> list[str]:
     """What scorers say about fans that change slowly, which is no alarm yet."""
-    notes = note_lines(view.health for view in watcher.stages() if view.alive)
-    return [line for line in notes if line.endswith(WEAR_HINT)]
+    healths = (view.health for view in watcher.stages() if view.alive)
+    return note_lines(
+        replace(health, notes=tuple(note for note in health.notes if is_of_slow_change(note.text)))
+        for health in healths
+    )
 
 
 def _wait_until_judged(
