@@ -418,7 +418,7 @@ def test_a_command_that_was_not_written_is_counted_as_lost() -> None:
     core = make_core(link)
     core.step(command(0.5, 0.5))
     assert core.counters()["lost_commands"] == 1
-    assert core.notes()[0].startswith("1 command lost on the way to the device: ")
+    assert core.notes()[0].startswith("1 command not taken by the device: ")
 
 
 def test_a_command_that_changes_nothing_is_not_sent() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UsageError, UserError
+from pipeline.runtime.device_commands import reason_in
 from pipeline.runtime.tray_acquisition import TrayAcquisition
 from schemas.codec import encode, type_name
 from schemas.header import Header
@@ -135,8 +136,9 @@ class CommandSender:
         is_same = before is not None and after.header.producer == before.header.producer
         if _not_sent(after) > (_not_sent(before) if before and is_same else 0):
             known = before.notes if before and is_same else ()
-            reasons = "; ".join(note.text for note in after.notes if note.tray == self._tray and note not in known)
-            raise UserError(f"tray {self._tray}: {reasons or 'the command was not sent'}")
+            notes = [note for note in after.notes if note.tray == self._tray and note not in known]
+            reasons = filter(None, (reason_in(note.text) for note in notes))
+            raise UserError(": ".join((f"tray {self._tray}: the command failed", *reasons)))
 
     def _received(self) -> Health | None:
         health, sent = self._acquisition.health(), self._publisher.published

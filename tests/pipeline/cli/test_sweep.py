@@ -27,10 +27,11 @@ from pipeline.config.models import TrayConfig
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.errors import UserError
 from pipeline.learning.ordinary_operation import OrdinaryOperation
+from pipeline.runtime.device_commands import DeviceCommands
 from schemas.codec import decode
 from schemas.enums import StageStatus
 from schemas.header import Header
-from schemas.health import Counter, Health, Input
+from schemas.health import Counter, Health, Input, Note
 from schemas.messages import Command
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO
@@ -223,12 +224,25 @@ def test_a_fan_that_reads_0_at_the_lowest_command_is_named_at_once() -> None:
     assert not [line for line in said if "reads 0" in line], "it is meant to stand still"
 
 
+TRAY_OF_SIX = TrayConfig(name="tray1", fans=6, source=SerialConfig(port="line"))
+
+
+class RefusesFan4:
+    """A source whose device refuses each command that moves fan 4."""
+
+    name = "line"
+
+    def send(self, command: tuple[float, ...], _set_point: tuple[float, ...]) -> str:
+        return "unit 1 refuses 97" if np.isfinite(command[4]) else ""
+
+
 class AcquisitionOfRefusals:
-    """The bus and the acquisition of a tray at once: it refuses each command that moves fan 4."""
+    """The bus and the acquisition of a tray at once."""
 
     def __init__(self) -> None:
-        self.published = self.refused = 0
+        self.published = 0
         self.is_there = True
+        self.commands = DeviceCommands(TRAY_OF_SIX, RefusesFan4())  # type: ignore[arg-type]
 
     def publisher(self, *_: object) -> AcquisitionOfRefusals:
         return self
@@ -241,14 +255,15 @@ class AcquisitionOfRefusals:
         command = decode(Command, payload)
         assert isinstance(command, Command)
         self.producer, self.published = command.header.producer, self.published + 1
-        self.refused += bool(np.isfinite(command.command[4]))
+        self.commands.send(command, None)
 
     def health(self) -> Health | None:
+        if not self.is_there:
+            return None
         received = Input(
             key="", producer=self.producer, received=self.published, missing=0, duplicated=0, next_sequence=0
         )
-        if not self.is_there:
-            return None
+        texts = (f"refused input: garbage {self.published}", *self.commands.notes())
         return Health(
             header=Header("acquisition-1", 1, ""),
             stage="acquisition",
@@ -257,21 +272,23 @@ class AcquisitionOfRefusals:
             t_ns=1,
             uptime_s=0.0,
             inputs=(received,),
-            counters=(Counter(name="lost_commands", value=self.refused),),
+            counters=tuple(Counter(name=name, value=value) for name, value in self.commands.counts.items()),
+            notes=tuple(Note(tray="tray1", text=text) for text in texts),
         )
 
 
 def line_to(acquisition: AcquisitionOfRefusals, monkeypatch: pytest.MonkeyPatch) -> sweep_module._BusLine:
     monkeypatch.setattr("pipeline.cli.watch.commanding.TrayAcquisition", lambda *_: acquisition)
-    tray = TrayConfig(name="tray1", fans=6, source=SerialConfig(port="line"))
-    return sweep_module._BusLine(acquisition, "plant", tray, threading.Event())  # type: ignore[arg-type]
+    return sweep_module._BusLine(acquisition, "plant", TRAY_OF_SIX, threading.Event())  # type: ignore[arg-type]
 
 
 def test_a_refused_command_is_no_failure_of_those_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
     acquisition = AcquisitionOfRefusals()
     line = line_to(acquisition, monkeypatch)
-    with pytest.raises(UserError, match="send these by hand: fan 4 0.5 "):
+    why = "tray tray1: the command failed: unit 1 refuses 97"
+    with pytest.raises(UserError, match=rf"send these by hand: fan 4 0.5 \({why}\)$"):
         sweep_module._leave(line, dict.fromkeys(range(6), 0.5), "")
+    assert acquisition.commands.notes() == ["2 commands not taken by the device, the last one: unit 1 refuses 97"]
     assert acquisition.published == 7, "all at once, then each by itself"
 
 
