@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
+from collections.abc import Mapping
 
 from pipeline.config.models import TrayConfig
 from pipeline.devices.sample_source import SampleSource, within
@@ -11,7 +13,18 @@ from schemas.messages import Command
 from schemas.units import RAD_S_PER_UNIT
 
 REFUSED, LOST, SENT = "refused_commands", "lost_commands", "sent_commands"
-NOT_SENT = (REFUSED, LOST)
+_NOT_SENT = {REFUSED: "refused", LOST: "lost on the way to the device"}
+"""by counter of commands that were not sent: what became of them, in notes"""
+
+
+def not_sent(counters: Mapping[str, int]) -> int:
+    """How many commands an acquisition has not sent. counters: its own, by name."""
+    return sum(counters.get(name, 0) for name in _NOT_SENT)
+
+
+def is_of_commands(note: str) -> bool:
+    """Whether a note of acquisition says why commands were not sent."""
+    return bool(re.match(rf"\d+ commands? (?:{'|'.join(_NOT_SENT.values())})", note))
 
 
 class DeviceCommands:
@@ -42,11 +55,10 @@ class DeviceCommands:
 
     def note(self) -> str:
         """How many commands were not sent, and why; empty if all were."""
-        words = {REFUSED: "refused", LOST: "lost on the way to the device"}
         found: list[str] = []
         for counter, reason in self._reasons.items():
             count = self.counts[counter]
-            commands = f"{count} command{'s' * (count > 1)} {words[counter]}"
+            commands = f"{count} command{'s' * (count > 1)} {_NOT_SENT[counter]}"
             found.append(f"{commands}: {reason}" if count == 1 else f"{commands}, the last one: {reason}")
         return "; ".join(found)
 

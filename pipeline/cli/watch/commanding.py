@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UsageError, UserError
+from pipeline.runtime.device_commands import is_of_commands, not_sent
 from pipeline.runtime.tray_acquisition import TrayAcquisition
 from schemas.codec import encode, type_name
 from schemas.header import Header
@@ -125,12 +126,8 @@ class CommandSender:
         Raises:
             UserError: it has not, or could not send one to the device.
         """
-        after, before = self._wait(self._received), self._before
-        is_same = before is not None and after.header.producer == before.header.producer
-        if _not_sent(after) > (_not_sent(before) if before and is_same else 0):
-            known = before.notes if before and is_same else ()
-            reasons = "; ".join(note.text for note in after.notes if note.tray == self._tray and note not in known)
-            raise UserError(f"tray {self._tray}: {reasons or 'the command was not sent'}")
+        if reason := why_not_sent(self._tray, self._before, self._wait(self._received)):
+            raise UserError(f"tray {self._tray}: {reason}")
 
     def _received(self) -> Health | None:
         health, sent = self._acquisition.health(), self._publisher.published
@@ -145,5 +142,17 @@ class CommandSender:
         return found
 
 
+def why_not_sent(tray: str, before: Health | None, after: Health) -> str:
+    """Why acquisition has not sent a command of a tray to its device; empty if it has sent all. before, after: its
+    healths before the first command and after the last."""
+    if before and after.header.producer != before.header.producer:
+        before = None
+    if _not_sent(after) <= (_not_sent(before) if before else 0):
+        return ""
+    known = before.notes if before else ()
+    notes = [note for note in after.notes if note.tray == tray and note not in known]
+    return "; ".join(note.text for note in notes if is_of_commands(note.text)) or "the command was not sent"
+
+
 def _not_sent(health: Health) -> int:
-    return sum(c.value for c in health.counters if c.name in ("lost_commands", "refused_commands"))
+    return not_sent({counter.name: counter.value for counter in health.counters})
