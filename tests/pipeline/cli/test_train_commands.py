@@ -84,6 +84,8 @@ def test_a_supply_voltage_that_is_ignored_is_as_if_it_were_not_there(folder, tmp
     for options, needed in (((), ("supply_voltage_v",)), (("--ignore", "supply_voltage_v"), ())):
         done = fantwin("train", good, "--model", "physical", *options, "-o", twin)
         assert done.exit_code == 0, done.output
+        says = "allows for supply voltage (reference 12 V), and needs the column supply_voltage_v\n"
+        assert (says in done.stdout) == bool(needed)
         conditions = OnnxTwin(twin).card.conditions
         assert (conditions.needed if conditions else ()) == needed
 
