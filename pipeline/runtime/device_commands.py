@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from collections.abc import Mapping
 
 from pipeline.config.models import TrayConfig
 from pipeline.devices.sample_source import SampleSource, within
@@ -12,9 +13,14 @@ from schemas.messages import Command
 from schemas.units import RAD_S_PER_UNIT
 
 REFUSED, LOST, SENT = "refused_commands", "lost_commands", "sent_commands"
-NOT_SENT = (REFUSED, LOST)
-_IN_WORDS = {REFUSED: "refused", LOST: "not taken by the device"}
-_NOTE = re.compile(rf"\d+ commands? (?:{'|'.join(_IN_WORDS.values())})(?:, the last one)?: (.+)")
+_NOT_SENT = {REFUSED: "refused", LOST: "not taken by the device"}
+"""by counter of commands that were not sent: what became of them, in notes"""
+_NOTE = re.compile(rf"\d+ commands? (?:{'|'.join(_NOT_SENT.values())})(?:, the last one)?: (.+)")
+
+
+def not_sent(counters: Mapping[str, int]) -> int:
+    """How many commands an acquisition has not sent. counters: its own, by name."""
+    return sum(counters.get(name, 0) for name in _NOT_SENT)
 
 
 def reason_in(note: str) -> str:
@@ -54,7 +60,7 @@ class DeviceCommands:
         found: list[str] = []
         for counter, reason in self._reasons.items():
             count = self.counts[counter]
-            commands = f"{count} command{'s' * (count > 1)} {_IN_WORDS[counter]}"
+            commands = f"{count} command{'s' * (count > 1)} {_NOT_SENT[counter]}"
             found.append(f"{commands}: {reason}" if count == 1 else f"{commands}, the last one: {reason}")
         return found
 

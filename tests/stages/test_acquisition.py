@@ -105,6 +105,17 @@ def test_refused_input_is_named_by_kind_with_what_was_wrong_with_the_first() -> 
     ]
 
 
+def test_a_long_piece_is_quoted_in_part_only() -> None:
+    core = make_core(protocol="text")
+    for piece in (b"\n", b"S 1 2 0.5 " + b"x" * 4900 + b"\n"):
+        core.step(ReceivedBytes(piece, 3 * S))
+    (note,) = core.notes()
+    core.tick(3 * S)
+    assert "bad_number: b'xxx" in core.problem()
+    for text in (note, core.problem()):
+        assert "xxx..." in text and len(text) < 250
+
+
 def feed_times(core: SerialCore, times_ms: Iterable[int]) -> list[tuple[int, list[int]]]:
     """Feed a sample at each of these times; returns when messages came out, and the samples in each."""
     return [

@@ -126,15 +126,27 @@ def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: 
     tray that turns its fans both ways is swept from command_min. Without --high the highest is command_max.
 
     Raises:
-        UsageError: one of them, or the safe command, is outside those limits.
+        UsageError: one of them, or the safe command, is outside those limits; or --high alone is given, not above the
+            lowest: the user must say how low commands may go.
     """
     lowest, highest = lowest_turning(tray) if low is None else low, tray.command_max if high is None else high
     if not tray.command_min <= lowest < highest <= tray.command_max:
-        limits = f"{tray.command_min:g} to {tray.command_max:g}"
-        raise UsageError(f"--low {lowest:g} --high {highest:g}: name a range within {limits} of tray {tray.name}")
+        raise UsageError(_wrong_range(tray, low, high, lowest))
     if safe is not None:
         require_within_limits(tray, safe, "--safe")
     return lowest, highest
+
+
+def _wrong_range(tray: TrayConfig, low: float | None, high: float | None, lowest: float) -> str:
+    """What is wrong with the options that were given."""
+    if low is None and high is not None and tray.command_min < high <= lowest:
+        return (
+            f"--high {high:g}: name --low, too: without it tray {tray.name} is swept from {lowest:g}, because fans may "
+            "stop below"
+        )
+    given = " ".join(f"{name} {value:g}" for name, value in (("--low", low), ("--high", high)) if value is not None)
+    limits = f"{tray.command_min:g} to {tray.command_max:g}"
+    return f"{given}: name a range within {limits} of tray {tray.name}"
 
 
 def lowest_turning(tray: TrayConfig) -> float:
