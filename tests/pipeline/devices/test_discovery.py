@@ -41,6 +41,8 @@ def test_each_chip_with_fans_is_a_tray_that_reads_what_is_there(root: Path) -> N
     first = found[0]
     assert first.tray["source"]["device"] == "1-002f" and first.tray["source"]["fans"] == [1, 2]
     assert "fan3 at 0 rpm although commanded to turn, left out: not connected?" in first.missing
+    assert first.notes[:2] == ("fan 0 is fan1_input: 900 rpm", "fan 1 is fan2_input: 1200 rpm")
+    assert "# fan 0 is fan1_input: 900 rpm\n" in first.toml
     assert any(note.startswith("measures average over 0.05 s") for note in first.notes)
     assert found[2].missing[0].startswith("fan2 has no pwm2, so its command is not known")
     assert any("not known" in note for note in found[2].notes)
