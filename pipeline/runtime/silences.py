@@ -1,12 +1,12 @@
 """Distinguishes a producer that sends nothing from a link that may be cut.
 
 A running stage publishes health each second, with the number of messages that it has published. A consumer that has
-received as many knows that no more were sent until then, unless the producer reports unprocessed input. Without such a
+received as many knows that no more were sent until then, unless input of the tray waits in the producer. Without such a
 health, the producer may be keeping messages that arrive when the link is back.
 
 Three kinds of health show no silence. One that arrived late, because the link was cut meanwhile, does not cover the
-time since it was sent. A producer with unprocessed input may still publish. A session that has just begun and has
-published nothing may still be reading what its device has kept.
+time since it was sent. A producer in which input of the tray waits may still publish. A session that has just begun and
+has published nothing may still be reading what its device has kept.
 
 After a session that has ended with an error, or was killed, the consumer waits `RESTART_S` for the next session, which
 reads what the device has kept meanwhile.
@@ -22,7 +22,7 @@ from functools import partial
 
 from schemas.enums import StageStatus
 from schemas.health import Health
-from schemas.streams import StreamId, output_streams
+from schemas.streams import StreamId
 from schemas.units import NS_PER_S
 
 BEGINS_NS = 5 * NS_PER_S
@@ -70,11 +70,11 @@ class Silences:
         """A stage reports how many messages it has published. has_all_of: whether a stream has arrived up to a
         number."""
         producer = health.header.producer
-        for stream, published in output_streams(health).items():
-            tray = self._trays.get(stream[0])
+        for output in health.outputs:
+            tray, published = self._trays.get(output.key), output.published
             if tray is None:
                 continue
-            has_all = partial(has_all_of, stream, published)
+            has_all = partial(has_all_of, (output.key, producer), published)
             self._reporting[tray] = producer, has_all
             if health.has_ended:
                 self._end(tray, is_in_order=health.status == StageStatus.STOPPED)
@@ -83,7 +83,7 @@ class Silences:
             if published:
                 self._unordered_s.pop(tray, None)
             is_late, has_begun = self._is_late(tray, health), bool(published) or self._has_begun(tray, health)
-            if has_begun and has_all() and not (is_late or health.has_unprocessed):
+            if has_begun and has_all() and not (is_late or output.has_more):
                 self._shown.add(tray)
 
     def end(self, producer: str) -> None:

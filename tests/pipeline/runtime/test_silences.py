@@ -29,7 +29,15 @@ class Consumer:
         self.arrived = 0
         self.silences = Silences({KEY: "a"}, lambda: self.now_s)
 
-    def hear(self, published: int, status: StageStatus = OK, producer: str = "p", **fields: object) -> None:
+    def hear(
+        self,
+        published: int,
+        status: StageStatus = OK,
+        producer: str = "p",
+        *,
+        has_more: bool = False,
+        **fields: object,
+    ) -> None:
         health = Health(
             header=Header(producer, 0, ""),
             stage="acquisition",
@@ -37,7 +45,10 @@ class Consumer:
             status=status,
             t_ns=round(self.now_s * NS_PER_S),
             uptime_s=0.0,
-            outputs=(Output(key=KEY, published=published), Output(key="another", published=9)),
+            outputs=(
+                Output(key=KEY, published=published, has_more=has_more),
+                Output(key="another", published=9, has_more=True),
+            ),
         )
         self.silences.add_health(replace(health, **fields), self._has_all_of)  # type: ignore[arg-type]
 
@@ -67,7 +78,7 @@ def test_row_16_a_silence_is_shown_once_by_each_health_that_says_that_all_has_ar
 
 def test_row_16_a_producer_that_has_not_processed_its_input_shows_nothing(consumer):
     consumer.arrived = 5
-    consumer.hear(5, has_unprocessed=True)
+    consumer.hear(5, has_more=True)
     assert not consumer.is_shown(), "it could not send for a while, and samples wait in it"
     consumer.hear(5)
     assert consumer.is_shown()
