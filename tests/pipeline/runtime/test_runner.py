@@ -15,6 +15,7 @@ from pipeline.bus.session import Bus
 from pipeline.config.models import TrayConfig
 from pipeline.launch.loss_accounting import losses
 from pipeline.runtime.runner import TICK_S
+from pipeline.runtime.sessions import Sessions
 from pipeline.runtime.silences import Silences
 from pipeline.runtime.stage import BuiltStage, Context, Core
 from schemas.codec import encode, type_name
@@ -223,7 +224,7 @@ def test_row_16_a_tray_whose_source_is_silent_shows_it_although_input_of_other_t
 
     config = replace(config, trays=tuple(TrayConfig(name=name, fans=1) for name in sources))
     bench = Bench(toy(build, name="acquisition", reads=()), config)
-    silences = Silences({tray_key("s", name, "grid"): name for name in sources})
+    silences = Silences({tray_key("s", name, "grid"): name for name in sources}, Sessions())
     shown: set[str] = set()
     for _ in range(5):
         health = bench.next(Health)
