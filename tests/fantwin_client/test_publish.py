@@ -184,6 +184,14 @@ def test_a_program_may_start_before_the_site(endpoint: str, client: Client, raws
         assert tray.check().received == 1
 
 
+def test_trying_again_and_again_leaves_nothing_on_the_bus(endpoint: str, client: Client, raws: Raws) -> None:
+    before = len(client._bus._declared)
+    for _ in range(3):
+        with pytest.raises(NoAcquisitionError):
+            client.tray(TRAY, timeout_s=0.1)
+    assert len(client._bus._declared) == before
+
+
 def test_every_error_of_the_client_is_explained_on_its_page() -> None:
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "sources.md").read_text(encoding="utf-8")
     errors = [name for name in fantwin_client.__all__ if name.endswith("Error")]
