@@ -252,10 +252,13 @@ def test_row_16_what_a_stage_does_not_answer_for_long_is_lost_and_the_stream_goe
 
 def test_row_16_a_stage_that_is_left_alone_because_it_did_not_answer_is_asked_later():
     slow = SlowProducer()
-    tracker = tracker_of_session(slow, alive=True)
-    ask = slow.ask
-    slow.ask = lambda request: Found() if not request.not_before_s else ask(request)
-    tracker = SequenceTracker(slow.ask, lambda: slow.now_s, tracker._sessions)
+    sessions = Sessions()
+    sessions.update(Session("scorer", "all", 1, PRODUCER, "host", 1).key("site"), alive=True)
+
+    def ask(request: Request) -> Found | None:
+        return slow.ask(request) if request.not_before_s else Found()
+
+    tracker = SequenceTracker(ask, lambda: slow.now_s, sessions)
     assert sequences(tracker.accept(packet(0))) == [0]
     assert tracker.accept(packet(4)) == []
     (later,) = slow.asked
