@@ -27,8 +27,10 @@ from fantwin_client.errors import (
 )
 from fantwin_client.losses import Losses
 from fantwin_client.tray import Tray
+from pipeline.bus.errors import BusError
 
 __all__ = [
+    "BusError",
     "Client",
     "ClientError",
     "CommandError",

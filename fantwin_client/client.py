@@ -58,7 +58,7 @@ class Client:
         """Take up a tray, to publish its samples.
 
         speed_unit: of the speeds given to `publish`. kept_samples: so many are kept while acquisition is away or
-        behind. timeout_s: how long to wait for its acquisition.
+        behind. timeout_s: how long to wait for its acquisition; `math.inf`: until it is there.
 
         Raises:
             NotAllowedError: the certificate may not publish samples of this tray, or the router refuses it.

@@ -71,7 +71,11 @@ class Tray:
         self._producer = f"client-{name}-{secrets.token_hex(4)}"
         self._key = tray_key(site, name, READING)
         self._acquisition = TrayAcquisition(bus, site, name, self._on_change)
-        first, self._accepts = self._first_health(timeout_s)
+        try:
+            first, self._accepts = self._first_health(timeout_s)
+        except BaseException:
+            self._acquisition.close()  # a program may try for as long as it runs
+            raise
         self._counts = CountsOfAcquisition(first)
         self._publisher = bus.publisher(self._key, BY_NAME[READING], type_name(PushedSamples), self._producer)
         self._thread = threading.Thread(target=self._send_all, name=f"send {name}", daemon=True)

@@ -42,6 +42,18 @@ AUXILIARY = (
 """in the order of their bits in a binary frame: never reorder, only append"""
 
 
+TITLES = {column.name: column.title for column in AUXILIARY}
+_LEAST_REACH = 0.02
+"""least half-height of the axis of a plot, as a share of the largest value"""
+
+
+def axis_range(lowest: float, highest: float) -> tuple[float, float]:
+    """The range of an axis for values from lowest to highest, on which noise looks small."""
+    middle = (lowest + highest) / 2.0
+    reach = max(0.55 * (highest - lowest), _LEAST_REACH * max(abs(lowest), abs(highest)))
+    return middle - reach, middle + reach
+
+
 def auxiliary_columns(message: Any) -> dict[str, Any]:
     """The columns that a message, or a record with the same names, has, by name; those that are empty are left out.
 

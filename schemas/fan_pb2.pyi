@@ -610,12 +610,14 @@ class Input(_message.Message):
     def __init__(self, key: _Optional[str] = ..., producer: _Optional[str] = ..., received: _Optional[int] = ..., missing: _Optional[int] = ..., duplicated: _Optional[int] = ..., next_sequence: _Optional[int] = ..., missing_at_start: _Optional[int] = ..., refused: _Optional[int] = ..., unsaved: _Optional[int] = ...) -> None: ...
 
 class Output(_message.Message):
-    __slots__ = ("key", "published")
+    __slots__ = ("key", "published", "has_more")
     KEY_FIELD_NUMBER: _ClassVar[int]
     PUBLISHED_FIELD_NUMBER: _ClassVar[int]
+    HAS_MORE_FIELD_NUMBER: _ClassVar[int]
     key: str
     published: int
-    def __init__(self, key: _Optional[str] = ..., published: _Optional[int] = ...) -> None: ...
+    has_more: bool
+    def __init__(self, key: _Optional[str] = ..., published: _Optional[int] = ..., has_more: _Optional[bool] = ...) -> None: ...
 
 class AwaitedInput(_message.Message):
     __slots__ = ("key", "since_t_ns")
@@ -648,7 +650,7 @@ class AcceptedSamples(_message.Message):
     def __init__(self, tray: _Optional[str] = ..., fans: _Optional[int] = ..., command_min: _Optional[float] = ..., command_max: _Optional[float] = ..., speed_max_rad_s: _Optional[float] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays", "accepts", "is_last", "has_unprocessed")
+    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays", "accepts", "is_last")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STAGE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
@@ -670,7 +672,6 @@ class Health(_message.Message):
     TRAYS_FIELD_NUMBER: _ClassVar[int]
     ACCEPTS_FIELD_NUMBER: _ClassVar[int]
     IS_LAST_FIELD_NUMBER: _ClassVar[int]
-    HAS_UNPROCESSED_FIELD_NUMBER: _ClassVar[int]
     header: Header
     stage: str
     instance: str
@@ -692,5 +693,4 @@ class Health(_message.Message):
     trays: str
     accepts: _containers.RepeatedCompositeFieldContainer[AcceptedSamples]
     is_last: bool
-    has_unprocessed: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ..., accepts: _Optional[_Iterable[_Union[AcceptedSamples, _Mapping]]] = ..., is_last: _Optional[bool] = ..., has_unprocessed: _Optional[bool] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ..., accepts: _Optional[_Iterable[_Union[AcceptedSamples, _Mapping]]] = ..., is_last: _Optional[bool] = ...) -> None: ...

@@ -40,10 +40,17 @@ class Input:
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    """One output of a stage; `published` is also the next sequence number."""
+    """One output of a stage.
+
+    Attributes:
+        published: the number of messages, which is also the next sequence number.
+        has_more: input of its tray waits from which more may still be made, so `published` does not show a silent
+            source.
+    """
 
     key: str
     published: int
+    has_more: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +88,6 @@ class Health:
         trays: those that it has, separated by commas; empty: all of the site. Earlier versions do not say it: there, a
             stage with a process for each tray has the one that its instance names.
         is_last: the last message of its session, whatever its status. Earlier versions do not set it: see `has_ended`.
-        has_unprocessed: input waits from which outputs may still be made, so `outputs` do not show a silent source.
     """
 
     header: Header = Header()
@@ -105,7 +111,6 @@ class Health:
     trays: str = ""
     accepts: tuple[AcceptedSamples, ...] = ()
     is_last: bool = False
-    has_unprocessed: bool = False
 
     @property
     def has_ended(self) -> bool:

@@ -167,7 +167,7 @@ class AcquisitionCore(Core):
             f"refused input: {kind} {self._counts[kind]}, the first of them: {detail}"
             for kind, detail in self._plausibility.first_refused.items()
         ]
-        return [*found, *filter(None, [self._commands.note()])]
+        return [*found, *self._commands.notes()]
 
     def samples_in(self, item: Item) -> int:
         """The readings in a block."""

@@ -150,14 +150,21 @@ class Bus:
         self._claim("liveliness_token", key)
         self._declared.append(self._session.liveliness().declare_token(key))
 
-    def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> None:
-        """Call `on_change(key, alive)` for every token that exists, appears or disappears."""
+    def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> Callable[[], None]:
+        """Call `on_change(key, alive)` for every token that exists, appears or disappears. Returns what ends that."""
 
         def receive(sample: zenoh.Sample) -> None:
             on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         handler = zenoh.handlers.Callback(receive, indirect=False)
-        self._declared.append(self._session.liveliness().declare_subscriber(key_expression, handler, history=True))
+        subscriber = self._session.liveliness().declare_subscriber(key_expression, handler, history=True)
+        self._declared.append(subscriber)
+
+        def unsubscribe() -> None:
+            self._declared.remove(subscriber)
+            subscriber.undeclare()
+
+        return unsubscribe
 
     def wait_for_others(self, stop: threading.Event) -> None:
         """Wait until another process is connected, or `stop` is set; not at all where none listened before.

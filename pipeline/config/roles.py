@@ -71,8 +71,10 @@ def role_names(stage: str, shard: Shard) -> tuple[str, ...]:
 
 
 def default_roles(config: Config) -> list[str]:
-    """The roles that a site needs: its stages, its router, people who look and people who act."""
-    return list(dict.fromkeys((*config.stages, ROUTER, OPERATOR, VIEWER)))
+    """The roles that a site needs: its stages, its router, people who look and people who act; programs that push
+    samples only where a tray takes them."""
+    sources = (SOURCE,) if any(tray.source.takes_pushed for tray in config.trays) else ()
+    return list(dict.fromkeys((*config.stages, ROUTER, OPERATOR, VIEWER, *sources)))
 
 
 def _roles_of_stages(config: Config) -> Iterator[Role]:

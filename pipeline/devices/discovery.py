@@ -112,7 +112,9 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
         numbers = ", ".join(f"pwm{fan}" for fan in closed)
         missing.append(f"this user may not write {numbers}, which only commands need: run as root, or add a udev rule")
     row = chip_of(chip.name)
-    notes = [f"fan{fan}{_label(chip, fan)}: {readings[fan]} rpm" for fan in fans]
+    notes = [
+        f"fan {number} is fan{fan}_input{_label(chip, fan)}: {readings[fan]} rpm" for number, fan in enumerate(fans)
+    ]
     notes.append(f"measures {row.tacho} ({row.source})" if row and row.tacho else _unknown(chip.name))
     if row and row.note:
         notes.append(row.note)

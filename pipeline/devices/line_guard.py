@@ -48,6 +48,7 @@ class LineGuard:
         self._held: deque[Raw] = deque()  # one sample each, of one producer
         self._line_moved_ns = self._held_moved_ns = 0  # since samples are held, and since the line's last one
         self._apart_ns = 0  # how far they are from the line
+        self._advance_ns: int | None = None
         self._report, self._report_until_t_ns = "", 0
         self.counts: Counter[str] = Counter()
         """`refused_other_time`: samples that were refused; `lost_other_time`: too many were held;
@@ -91,9 +92,10 @@ class LineGuard:
         return []
 
     @property
-    def is_holding(self) -> bool:
-        """Whether samples are held until it is decided if they belong to the line."""
-        return bool(self._held)
+    def advance_ns(self) -> int | None:
+        """How much time the samples that were held since the line's last one cover, but no more than decides whether
+        samples are the next ones of the line; None: none were."""
+        return None if self._advance_ns is None else min(self._advance_ns, self._established_ns)
 
     def problem(self) -> str:
         """What happened in the last minute of the line, in one line."""
@@ -110,7 +112,7 @@ class LineGuard:
         return self._hold(sample)
 
     def _of_line(self, sample: Raw) -> Raw:
-        t_ns = _time_of(sample)
+        t_ns, self._advance_ns = _time_of(sample), None
         moved_ns = min(max(t_ns - self._newest_t_ns, 0), LONGEST_STEP_NS)
         self._steps_ns = (self._steps_ns[-1], moved_ns)
         if self._held:
@@ -128,11 +130,13 @@ class LineGuard:
             moved_ns = _time_of(sample) - _time_of(self._held[-1])
             if self._held[-1].header.producer == sample.header.producer and abs(moved_ns) <= LONGEST_STEP_NS:
                 self._held_moved_ns += max(moved_ns, 0)
+                self._advance_ns = (self._advance_ns or 0) + max(moved_ns, 0)
             else:
                 self._refuse(self._taken())
         if not self._held:
             self._line_moved_ns = self._held_moved_ns = 0
             self._apart_ns = _time_of(sample) - self._newest_t_ns
+            self._advance_ns = self._advance_ns or 0
         self._held.append(sample)
         if len(self._held) > MAX_HELD:
             self._held.popleft()
@@ -150,7 +154,7 @@ class LineGuard:
 
     def _continue_with(self, held: Sequence[Raw]) -> list[Raw]:
         """The line goes on with these samples."""
-        first = held[0]
+        first, self._advance_ns = held[0], None
         back_ns = self._newest_t_ns - _time_of(first)
         self.producer, self._newest_t_ns = first.header.producer, _time_of(held[-1])
         if back_ns > 0:

@@ -185,7 +185,7 @@ class ModbusDevice:
             raise self._lost("the connection is gone") from error
         except ModbusException as error:
             raise DeviceError(
-                f"{self.name}: unit {unit} does not answer within {self._config.timeout_s:g} s; check unit and wiring"
+                f"unit {unit} does not answer within {self._config.timeout_s:g} s; check unit and wiring"
             ) from error
         except OSError as error:
             raise self._lost(error.strerror or str(error)) from error
@@ -194,7 +194,7 @@ class ModbusDevice:
         """The error of a lost line. For a port that no longer exists it says so, whatever failed."""
         if self._port and not Path(self._port).exists():
             what = "no such port, is it unplugged?"
-        return DeviceError(f"{self.name}: {what}; waiting for it", is_lost=True)
+        return DeviceError(f"{what}; waiting for it", is_lost=True)
 
     def _connected(self) -> ModbusBaseSyncClient:
         if self._client is None:

@@ -11,6 +11,9 @@ from pipeline.devices.input_quality import InputQuality
 from pipeline.devices.sample_source import Reading, ReadingLimits, Rejected
 from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
 
+LONGEST_DETAIL = 120
+"""characters of what was wrong with a refused piece, which may quote the piece: each health names it"""
+
 
 class Plausibility:
     """Checks the readings of one tray."""
@@ -48,6 +51,7 @@ class Plausibility:
         self._sequence.refused += rejected.is_sample
         if not rejected.harmless:
             self._counts["refused_input"] += 1
+            rejected = replace(rejected, detail=_shortened(rejected.detail))
             self._quality.add_fault(rejected)
             self.first_refused.setdefault(rejected.kind, rejected.detail)
         return None
@@ -105,3 +109,7 @@ class Plausibility:
                 self._counts[f"absurd_{column.name.rpartition('_')[0]}"] += absurd
                 changed[column.name] = tuple(value if column.is_plausible(value) else math.nan for value in values)
         return replace(reading, **changed) if changed else reading
+
+
+def _shortened(detail: str) -> str:
+    return detail if len(detail) <= LONGEST_DETAIL else f"{detail[:LONGEST_DETAIL]}..."

@@ -96,7 +96,7 @@ class RedfishDevice:
         if all(map(math.isnan, command)):
             return Rejected(
                 "unknown_command",
-                f"{self.name}: no fan has a number at {self._config.command}: say where its command is",
+                f"no fan has a number at {self._config.command}: say where its command is",
                 is_sample=True,
                 setting="source.command",
             )
@@ -151,18 +151,18 @@ class RedfishDevice:
         try:
             return request()
         except exceptions.AccessError as error:
-            raise DeviceError(f"{self.name}: user or password is refused, or lacks rights", is_lost=True) from error
+            raise DeviceError("user or password is refused, or lacks rights", is_lost=True) from error
         except exceptions.HTTPError as error:
-            raise DeviceError(f"{self.name}: refused with HTTP status {error.status_code}") from error
+            raise DeviceError(f"refused with HTTP status {error.status_code}") from error
         except exceptions.ConnectionError as error:
             text = str(error)
             if "CERTIFICATE_VERIFY_FAILED" in text or "certificate" in text.lower():
                 why = "its certificate cannot be verified: name the authority by source.ca"
             else:
                 why = f"does not answer within {self._config.timeout_s:g} s, or cannot be reached"
-            raise DeviceError(f"{self.name}: {why}; waiting for it", is_lost=True) from error
+            raise DeviceError(f"{why}; waiting for it", is_lost=True) from error
         except (exceptions.SushyError, ValueError) as error:
-            raise DeviceError(f"{self.name}: no Redfish service: {type(error).__name__}") from error
+            raise DeviceError(f"no Redfish service: {type(error).__name__}") from error
 
     def _get(self, path: str) -> Json:
         root = self._root
@@ -171,7 +171,7 @@ class RedfishDevice:
         # The connection of sushy, which knows the fans of the older schema only.
         found = self._asked(lambda: root._conn.get(path).json())
         if not isinstance(found, Mapping):
-            raise DeviceError(f"{self.name}: {path} is no object")
+            raise DeviceError(f"{path} is no object")
         return found
 
     def _find_chassis(self) -> Json:
@@ -188,7 +188,7 @@ class RedfishDevice:
         if not wanted and len(found) == 1:
             return next(iter(found.values()))
         which = f"no chassis {wanted!r} with fans" if wanted else f"{len(found)} chassis with fans"
-        raise DeviceError(f"{self.name}: {which}; there are: {names}; name one by source.chassis", is_lost=True)
+        raise DeviceError(f"{which}; there are: {names}; name one by source.chassis", is_lost=True)
 
     def _fan_objects(self) -> list[Json]:
         subsystem = _link(self._chassis.get("ThermalSubsystem"))
@@ -205,12 +205,10 @@ class RedfishDevice:
                 if name := fan.get(key):
                     by_name.setdefault(str(name), fan)
         if lacking := [name for name in wanted if name not in by_name]:
-            raise DeviceError(f"{self.name}: no fan {lacking[0]!r}; there are: {', '.join(by_name)}")
+            raise DeviceError(f"no fan {lacking[0]!r}; there are: {', '.join(by_name)}")
         chosen = [by_name[name] for name in wanted] if wanted else list(fans)
         if len(chosen) != self._fans:
-            raise DeviceError(
-                f"{self.name}: {len(chosen)} fans, this tray has {self._fans}: correct fans, or source.fans"
-            )
+            raise DeviceError(f"{len(chosen)} fans, this tray has {self._fans}: correct fans, or source.fans")
         return chosen
 
     def _temperature_c(self) -> float:

@@ -173,7 +173,7 @@ class LinkUp:
 
 @dataclass(frozen=True, slots=True)
 class LinkDown:
-    """The source is not connected; `reason` says why and what to do, in one line."""
+    """The source is not connected; `reason` says why and what to do, in one line, without the name of the source."""
 
     reason: str
 

@@ -13,34 +13,34 @@ from pipeline.launch.loss_accounting import Launched, label
 from schemas.health import Health
 
 WORDS = {
-    "refused_of_second": "messages from a second process of a stage",
-    "refused_of_replay": "commands of a replay",
-    "refused_clocks": "clock messages from others than the replay",
-    "refused_of_other_key": "messages of another tray or process than their key",
-    "refused_outputs": "healths that claim outputs which their stage may not write",
-    "refused_numbers": "messages with impossible numbers",
-    "refused_producers": "messages from unknown or too many producers",
-    "refused_too_large": "messages that are too large",
-    "refused_commands": "commands that the tray does not take",
-    "refused_other_time": "samples of another time",
-    "refused_input": "pieces of input that are no usable sample",
-    "absurd_speed": "speeds beyond speed_max",
-    "undecodable": "messages that cannot be read",
+    "refused_of_second": "message{s} from a second process of a stage",
+    "refused_of_replay": "command{s} of a replay",
+    "refused_clocks": "clock message{s} from others than the replay",
+    "refused_of_other_key": "message{s} of another tray or process than the key names",
+    "refused_outputs": "health{s} with outputs that the stage may not write",
+    "refused_numbers": "message{s} with impossible numbers",
+    "refused_producers": "message{s} from unknown or too many producers",
+    "refused_too_large": "message{s} that {are} too large",
+    "refused_commands": "command{s} that the tray does not take",
+    "refused_other_time": "sample{s} of another time",
+    "refused_input": "piece{s} of input that {are} no usable sample",
+    "absurd_speed": "speed{s} beyond speed_max",
+    "undecodable": "message{s} that cannot be read",
 }
-"""by counter"""
+"""by counter; see `_counted`"""
 ON_THE_DEVICE = {
-    "device_bad_length": "frames of a wrong length",
-    "device_bad_crc": "frames with a wrong checksum",
-    "device_wrong_kind": "frames of another version, type or number of fans",
-    "device_bad_value": "commands out of range",
-    "device_line_errors": "bytes with framing errors",
-    "device_overruns": "bytes that came too fast",
-    "device_unsent_samples": "samples for which the line had no room",
-    "device_lost_edges": "tacho edges that came too fast",
-    "device_host_silences": "silences of the host",
-    "device_watchdog_resets": "restarts by its watchdog",
+    "device_bad_length": "frame{s} of a wrong length",
+    "device_bad_crc": "frame{s} with a wrong checksum",
+    "device_wrong_kind": "frame{s} of another version, type or number of fans",
+    "device_bad_value": "command{s} out of range",
+    "device_line_errors": "byte{s} with framing errors",
+    "device_overruns": "byte{s} that came too fast",
+    "device_unsent_samples": "sample{s} for which the line had no room",
+    "device_lost_edges": "tacho edge{s} that came too fast",
+    "device_host_silences": "silence{s} of the host",
+    "device_watchdog_resets": "restart{s} by its watchdog",
 }
-"""by counter of a device: what it counts"""
+"""by counter of a device: what it counts; see `_counted`"""
 _LINE = "protocol and baud of the [[tray]], and the wiring"
 _TIMES = "the times that its client gives"
 _SETTINGS = {
@@ -83,10 +83,12 @@ def refused_lines(found: Mapping[str, Mapping[str, int]]) -> list[str]:
         kinds = ", ".join(
             f"{kind} {count}" for kind, count in counts.items() if kind in _SETTINGS and kind not in WORDS
         )
-        words = [f"{count} {WORDS[counter]}" for counter, count in counts.items() if counter in WORDS]
+        words = [_counted(count, WORDS[counter]) for counter, count in counts.items() if counter in WORDS]
         if words:
             lines.append(f"{name}: refused: {', '.join(words)}" + (f" ({kinds})" if kinds else ""))
-        there = [f"{count} {ON_THE_DEVICE[counter]}" for counter, count in counts.items() if counter in ON_THE_DEVICE]
+        there = [
+            _counted(count, ON_THE_DEVICE[counter]) for counter, count in counts.items() if counter in ON_THE_DEVICE
+        ]
         if there:
             lines.append(f"{name}: counted by the device itself: {', '.join(there)}")
     return lines
@@ -104,10 +106,17 @@ def unusable_lines(healths: Iterable[Health], launched: Collection[Launched]) ->
         if pieces and counts["samples"] == counts["absurd_samples"]:
             why = ", ".join(f"{kind} {count}" for kind, count in kinds)
             check = f"check {_SETTINGS[kinds[0][0]]}" if kinds else "check source of the [[tray]]"
+            were = "was" if pieces == 1 else "were"
             lines.append(
-                f"{name}: no sample could be used, {pieces} were refused ({why or 'of unknown kind'}): {check}"
+                f"{name}: no sample could be used, {pieces} {were} refused ({why or 'of unknown kind'}): {check}"
             )
     return lines
+
+
+def _counted(count: int, words: str) -> str:
+    """A count with its words, in which {s} ends a plural and {are} is a verb."""
+    is_one = count == 1
+    return f"{count} {words.format(s='' if is_one else 's', are='is' if is_one else 'are')}"
 
 
 def _sums(healths: Iterable[Health]) -> dict[str, Counter[str]]:

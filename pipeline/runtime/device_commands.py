@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
+from collections.abc import Mapping
 
 from pipeline.config.models import TrayConfig
 from pipeline.devices.sample_source import SampleSource, within
@@ -11,7 +13,20 @@ from schemas.messages import Command
 from schemas.units import RAD_S_PER_UNIT
 
 REFUSED, LOST, SENT = "refused_commands", "lost_commands", "sent_commands"
-NOT_SENT = (REFUSED, LOST)
+_NOT_SENT = {REFUSED: "refused", LOST: "not taken by the device"}
+"""by counter of commands that were not sent: what became of them, in notes"""
+_NOTE = re.compile(rf"\d+ commands? (?:{'|'.join(_NOT_SENT.values())})(?:, the last one)?: (.+)")
+
+
+def not_sent(counters: Mapping[str, int]) -> int:
+    """How many commands an acquisition has not sent. counters: its own, by name."""
+    return sum(counters.get(name, 0) for name in _NOT_SENT)
+
+
+def reason_in(note: str) -> str:
+    """Why the last command that a note counts was not sent; empty if it is no note on commands."""
+    found = _NOTE.fullmatch(note)
+    return found[1] if found else ""
 
 
 class DeviceCommands:
@@ -40,15 +55,14 @@ class DeviceCommands:
         else:
             self.counts[SENT] += 1
 
-    def note(self) -> str:
-        """How many commands were not sent, and why; empty if all were."""
-        words = {REFUSED: "refused", LOST: "lost on the way to the device"}
+    def notes(self) -> list[str]:
+        """How many commands were not sent, and why the last one was not: a line for each counter of them."""
         found: list[str] = []
         for counter, reason in self._reasons.items():
             count = self.counts[counter]
-            commands = f"{count} command{'s' * (count > 1)} {words[counter]}"
+            commands = f"{count} command{'s' * (count > 1)} {_NOT_SENT[counter]}"
             found.append(f"{commands}: {reason}" if count == 1 else f"{commands}, the last one: {reason}")
-        return "; ".join(found)
+        return found
 
     def _add(self, counter: str, reason: str) -> None:
         self.counts[counter] += 1

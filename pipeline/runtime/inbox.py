@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -69,7 +69,9 @@ class Inbox:
 
     def __init__(self, drops_oldest: bool) -> None:
         self._items: deque[Item] = deque()
-        self._bytes = self._inputs = 0
+        self._bytes = self._blocked = 0
+        self._inputs: Counter[str] = Counter()
+        """by tray: the items that wait from which the stage may make outputs"""
         self._changed = threading.Condition()
         self._drops_oldest = drops_oldest
         self._closed = False
@@ -84,8 +86,10 @@ class Inbox:
         with self._changed:
             while self._drops_oldest and self._is_full() and self._drop_oldest():
                 self.dropped += 1
+            self._blocked += 1
             while self._is_full() and not self._closed:
                 self._changed.wait(_BLOCKED_CHECK_S)
+            self._blocked -= 1
             return self._add(item, is_urgent=is_urgent or len(self._items) >= MOST_PATIENT)
 
     def put_at_once(self, item: Item) -> None:
@@ -104,10 +108,11 @@ class Inbox:
         """How many items wait now."""
         return len(self._items)
 
-    @property
-    def has_input(self) -> bool:
-        """Whether an item waits from which the stage may make outputs; health of others and liveliness do not count."""
-        return self._inputs > 0
+    def has_input(self, tray: str) -> bool:
+        """Whether an item of this tray may wait from which the stage may make outputs; an empty tray: of any tray.
+        Health of others and liveliness do not count. While a `put` is blocked, it is not known what waits behind it."""
+        with self._changed:
+            return self._blocked > 0 or (tray in self._inputs if tray else bool(self._inputs))
 
     def close(self) -> None:
         """Release any thread blocked in `put`: the bus cannot close while one of its threads is blocked."""
@@ -123,7 +128,7 @@ class Inbox:
             return False
         self._items.append(item)
         self._bytes += _size(item)
-        self._inputs += _is_input(item)
+        self._count(item, 1)
         if is_urgent:
             self._changed.notify_all()
         return True
@@ -134,14 +139,22 @@ class Inbox:
             if isinstance(item, FromBus):
                 del self._items[place]
                 self._bytes -= _size(item)
-                self._inputs -= _is_input(item)
+                self._count(item, -1)
                 return True
         return False
+
+    def _count(self, item: Item, by: int) -> None:
+        tray = _tray_of(item)
+        if tray is None:
+            return
+        self._inputs[tray] += by
+        if not self._inputs[tray]:
+            del self._inputs[tray]
 
     def _take_first(self) -> Item:
         item = self._items.popleft()
         self._bytes -= _size(item)
-        self._inputs -= _is_input(item)
+        self._count(item, -1)
         self._changed.notify_all()
         return item
 
@@ -150,7 +163,17 @@ def _size(item: Item) -> int:
     return len(item.payload) if isinstance(item, FromBus) else 0
 
 
-def _is_input(item: Item) -> bool:
-    if isinstance(item, FromBus):
-        return item.key.split("/", 3)[2:3] != [HEALTH_CHUNK]
-    return isinstance(item, FromSource | Recovered)
+def _tray_of(item: Item) -> str | None:
+    """The tray of an item from which outputs may be made, as its key or its source names it; None: none are made from
+    it."""
+    match item:
+        case FromSource():
+            return item.core
+        case FromBus():
+            key = item.key
+        case Recovered():
+            key = item.request.key
+        case _:
+            return None
+    _, _, tray, *_ = (*key.split("/", 3), "", "", "")
+    return None if tray == HEALTH_CHUNK else tray

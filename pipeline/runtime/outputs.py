@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from pipeline.bus.session import Bus
@@ -70,9 +70,14 @@ class Outputs:
             header = replace(report.header, sequence=publisher.published)
             publisher.put(encode(replace(report, header=header)))
 
-    def counts(self) -> list[Output]:
-        """How many messages have been published on each key."""
-        return [Output(key=each.key, published=each.published) for each in self._publishers.values()]
+    def counts(self, has_more: Callable[[str], bool]) -> list[Output]:
+        """How many messages have been published on each key. has_more: whether input of a tray waits from which more
+        may still be made."""
+        waits = {tray: has_more(tray) for tray, _ in self._publishers}
+        return [
+            Output(key=each.key, published=each.published, has_more=waits[tray])
+            for (tray, _), each in self._publishers.items()
+        ]
 
     def _refusal(self, tray: str, message: Message) -> str:
         name, topic = self._stage.name, _TOPIC_NAMES[type(message)]

@@ -86,7 +86,7 @@ class Receiver:
         self._newest = NewestMessages(bus, inbox)
         self.peers = Peers(self._subscriptions.keys)
         self._silences = Silences(
-            {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}
+            {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}, sessions
         )
         self._killed = KilledSessions(this_host())
 

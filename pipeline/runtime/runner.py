@@ -384,6 +384,11 @@ class Runner:
     def _lost(self) -> int:
         return stage_losses(self._tracker.inputs(), self._counters(), may_drop=self.stage.may_drop)
 
+    def _has_more(self, tray: str) -> bool:
+        """Whether input waits from which more outputs of a tray may be made. A core that serves all trays takes any."""
+        name = tray if tray in self._parts else ""
+        return self._inbox.has_input(name) or (self._due.has(name) if name else bool(self._due))
+
     def _build_health(self, status: StageStatus, *, with_counts: bool = True, is_last: bool = False) -> Health:
         cores = [parts.core for parts in self._parts.values()] if with_counts else []
         health = self._health.build(
@@ -397,18 +402,14 @@ class Runner:
                 *(core.problem() for core in cores),
             ],
             inputs=self._tracker.inputs(self._unsaved(cores)) if with_counts else (),
-            outputs=self._outputs.counts() if with_counts else (),
+            outputs=self._outputs.counts(self._has_more) if with_counts else (),
             counters=self._counters() if with_counts else {},
             now_ns=HOST_CLOCK.now_ns(),
             notes=[*self._notes()] if with_counts else (),
             accepts=filter(None, (core.accepts() for core in cores)),
         )
-        return replace(
-            health,
-            header=Header(self.producer, self._health_publisher.published, ""),
-            is_last=is_last,
-            has_unprocessed=bool(self._due) or self._inbox.has_input,
-        )
+        header = Header(self.producer, self._health_publisher.published, "")
+        return replace(health, header=header, is_last=is_last)
 
     def _notes(self) -> Iterator[Note]:
         if note := self._receiver.note():

@@ -103,10 +103,10 @@ class SampleGrid:
         if self._guard is None or is_of_replay(item.header.producer) or self._is_repeated(item):
             self._add(item, self._is_new(item))
             return self._published()
+        before_ns = self._guard.advance_ns
         for message in self._guard.admit(item, is_of_ended=item.header.producer in self._ended_producers):
             self._add(message, is_new=message.header.producer == self._guard.producer)
-        if self._guard.is_holding:
-            self._silence_ns = self._shown_silence_ns = 0  # the samples held may be the next ones of the line
+        self._end_silence(before_ns, self._guard.advance_ns)
         return self._published()
 
     def tick(self, now_ns: int, *, is_complete: bool = True) -> list[Grid]:
@@ -162,6 +162,15 @@ class SampleGrid:
             samples = Samples(np.array(times, np.int64), item.command, item.speed_rad_s, self._auxiliary_of(item))
             self._held = self._held.extended(samples if len(accepted) == len(times) else samples.rows(accepted))
             self._fill(self._newest_t_ns, final=False)
+
+    def _end_silence(self, before_ns: int | None, advance_ns: int | None) -> None:
+        """Samples that are held may be the next ones of the line. The silence before the first of them has ended, and
+        the time that they cover is none. Those whose time does not advance must not hide that the line is silent."""
+        if advance_ns is None:
+            return
+        ended_ns = self._silence_ns if before_ns is None else max(0, advance_ns - before_ns)
+        self._silence_ns = max(0, self._silence_ns - ended_ns)
+        self._shown_silence_ns = min(self._shown_silence_ns, self._silence_ns)
 
     def _auxiliary_of(self, item: Raw) -> Array:
         """The columns of a message beside command and speed, as Samples has them."""

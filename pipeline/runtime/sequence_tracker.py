@@ -208,7 +208,7 @@ class SequenceTracker:
         request = Request(stream.key, stream.producer, first, until - 1)
         stream.waiting = waiting = Waiting(request, until, shown_by, self._now_s())
         found = self._ask(request)
-        return [] if found is None else self._go_on(stream, waiting, found)
+        return [] if found is None else self._go_on(stream, waiting, found, may_ask_again=True)
 
     def _ask_again(self, stream: Stream, waiting: Waiting, *, is_at_once: bool) -> list[Envelope]:
         """Request the rest of what was requested."""

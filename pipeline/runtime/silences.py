@@ -1,12 +1,14 @@
 """Distinguishes a producer that sends nothing from a link that may be cut.
 
 A running stage publishes health each second, with the number of messages that it has published. A consumer that has
-received as many knows that no more were sent until then, unless the producer reports unprocessed input. Without such a
+received as many knows that no more were sent until then, unless input of the tray waits in the producer. Without such a
 health, the producer may be keeping messages that arrive when the link is back.
 
 Three kinds of health show no silence. One that arrived late, because the link was cut meanwhile, does not cover the
-time since it was sent. A producer with unprocessed input may still publish. A session that has just begun and has
-published nothing may still be reading what its device has kept.
+time since it was sent. A producer in which input of the tray waits may still publish. A session that has just begun and
+has published nothing may still be reading what its device has kept.
+
+Where two sessions have a tray, only the health of its owner counts: the other says nothing about what the owner keeps.
 
 After a session that has ended with an error, or was killed, the consumer waits `RESTART_S` for the next session, which
 reads what the device has kept meanwhile.
@@ -17,12 +19,13 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
+from pipeline.runtime.sessions import Sessions
 from schemas.enums import StageStatus
 from schemas.health import Health
-from schemas.streams import StreamId, output_streams
+from schemas.streams import StreamId
 from schemas.units import NS_PER_S
 
 BEGINS_NS = 5 * NS_PER_S
@@ -30,6 +33,8 @@ BEGINS_NS = 5 * NS_PER_S
 MOST_DELAY_S = 0.4
 """a health that took this much longer to arrive than the fastest of the last ones is late; less than a resampler
 waits"""
+MOST_HEARD = 8
+"""producers of a tray whose earlier health is remembered"""
 _DELAYS = 16
 """number of the last healths that are compared; after as many, a step of a host clock no longer matters"""
 RESTART_S = 5.0
@@ -45,12 +50,24 @@ class _Ended:
     at_s: float
 
 
+@dataclass(slots=True)
+class _Heard:
+    """The earlier health of a producer. begun_t_ns: time of its first health after its start, ns. ages_s: of its last
+    healths on arrival, plus an unknown constant, because clocks differ."""
+
+    begun_t_ns: int
+    ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
+
+
 class Silences:
     """The silences of the producers of a stage's main inputs."""
 
-    def __init__(self, trays: Mapping[str, str], now_s: Callable[[], float] = time.monotonic) -> None:
-        """trays: the tray of each key of the main input."""
+    def __init__(
+        self, trays: Mapping[str, str], sessions: Sessions, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        """trays: the tray of each key of the main input. sessions: those on the bus."""
         self._trays = trays
+        self._sessions = sessions
         self._now_s = now_s
         self._reporting: dict[str, tuple[str, Callable[[], bool]]] = {}
         """by tray whose producer publishes health, and has not ended with all that it sent: the producer, and whether
@@ -59,22 +76,19 @@ class Silences:
         """by tray whose producer has ended"""
         self._unordered_s: dict[str, float] = {}
         """by tray: when a producer first ended not in order since one last published, monotonic time"""
-        self._begun: dict[str, tuple[str, int]] = {}
-        """by tray: a producer that has published nothing, and the time of its first health after its start, ns"""
-        self._ages_s: dict[str, tuple[str, deque[float]]] = {}
-        """by tray: a producer, and the ages of its last healths on arrival, plus an unknown constant, because clocks
-        differ"""
+        self._heard: dict[str, dict[str, _Heard]] = {}
+        """by tray and producer"""
         self._shown: set[str] = set()
 
     def add_health(self, health: Health, has_all_of: Callable[[StreamId, int], bool]) -> None:
         """A stage reports how many messages it has published. has_all_of: whether a stream has arrived up to a
         number."""
         producer = health.header.producer
-        for stream, published in output_streams(health).items():
-            tray = self._trays.get(stream[0])
-            if tray is None:
+        for output in health.outputs:
+            tray, published = self._trays.get(output.key), output.published
+            if tray is None or not self._is_of_owner(health, output.key, tray):
                 continue
-            has_all = partial(has_all_of, stream, published)
+            has_all = partial(has_all_of, (output.key, producer), published)
             self._reporting[tray] = producer, has_all
             if health.has_ended:
                 self._end(tray, is_in_order=health.status == StageStatus.STOPPED)
@@ -82,8 +96,10 @@ class Silences:
             self._ended.pop(tray, None)
             if published:
                 self._unordered_s.pop(tray, None)
-            is_late, has_begun = self._is_late(tray, health), bool(published) or self._has_begun(tray, health)
-            if has_begun and has_all() and not (is_late or health.has_unprocessed):
+            heard = self._heard_of(tray, health)
+            is_late = self._is_late(heard, health)
+            has_begun = bool(published) or health.t_ns - heard.begun_t_ns >= BEGINS_NS
+            if has_begun and has_all() and not (is_late or output.has_more):
                 self._shown.add(tray)
 
     def end(self, producer: str) -> None:
@@ -107,17 +123,25 @@ class Silences:
         at_s = now_s if is_in_order else self._unordered_s.setdefault(tray, now_s) + RESTART_S
         self._ended[tray] = _Ended(self._reporting[tray][1], at_s)
 
-    def _is_late(self, tray: str, health: Health) -> bool:
-        producer, ages_s = self._ages_s.get(tray, ("", deque[float]()))
-        if producer != health.header.producer:
-            ages_s = deque(maxlen=_DELAYS)
-            self._ages_s[tray] = health.header.producer, ages_s
-        ages_s.append(self._now_s() - health.t_ns / NS_PER_S)
-        return ages_s[-1] - min(ages_s) > MOST_DELAY_S
+    def _is_of_owner(self, health: Health, key: str, tray: str) -> bool:
+        """Whether a health is of the session that owns the tray in its stage; where there is none, of any producer that
+        is no stranger on this key."""
+        owner = self._sessions.owner(health.stage, tray)
+        if owner is not None:
+            return owner.producer == health.header.producer
+        return not self._sessions.is_stranger(key, health.header.producer)
 
-    def _has_begun(self, tray: str, health: Health) -> bool:
-        """Whether a session that has published nothing has run for `BEGINS_NS` since its start."""
-        producer = health.header.producer
-        if health.status == StageStatus.STARTING or self._begun.get(tray, ("", 0))[0] != producer:
-            self._begun[tray] = producer, health.t_ns
-        return health.t_ns - self._begun[tray][1] >= BEGINS_NS
+    def _heard_of(self, tray: str, health: Health) -> _Heard:
+        """What is remembered of the producer of a health; while it is starting, it begins with this one."""
+        of_tray, producer = self._heard.setdefault(tray, {}), health.header.producer
+        if producer not in of_tray:
+            of_tray[producer] = _Heard(health.t_ns)
+            if len(of_tray) > MOST_HEARD:
+                del of_tray[next(iter(of_tray))]
+        elif health.status == StageStatus.STARTING:
+            of_tray[producer].begun_t_ns = health.t_ns
+        return of_tray[producer]
+
+    def _is_late(self, heard: _Heard, health: Health) -> bool:
+        heard.ages_s.append(self._now_s() - health.t_ns / NS_PER_S)
+        return heard.ages_s[-1] - min(heard.ages_s) > MOST_DELAY_S

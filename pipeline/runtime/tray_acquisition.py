@@ -41,8 +41,16 @@ class TrayAcquisition:
         """by producer, in the order heard"""
         self._watched: set[str] = set()
         """the keys of healths that are listened to"""
-        bus.watch_alive(alive_key(site, STAGE, "*"), self._on_token)
-        bus.watch_alive(sessions_key(site, STAGE), self._on_session)
+        self._ends = [
+            bus.watch_alive(alive_key(site, STAGE, "*"), self._on_token),
+            bus.watch_alive(sessions_key(site, STAGE), self._on_session),
+        ]
+        """what ends each subscription"""
+
+    def close(self) -> None:
+        """Watch no longer. Not to be called from a thread of the bus."""
+        while self._ends:
+            self._ends.pop()()
 
     def at_work(self) -> Session | None:
         """The session that has the tray, once it is at work."""
@@ -60,7 +68,7 @@ class TrayAcquisition:
         key = health_key(self._site, STAGE, session.instance)
         if key not in self._watched:
             self._watched.add(key)
-            self._bus.subscribe(key, self._on_health)
+            self._ends.append(self._bus.subscribe(key, self._on_health))
             for its_key, payload in self._bus.recover(key):
                 self._on_health(its_key, payload)
         return session

@@ -26,14 +26,12 @@ from pipeline.recordings.dates import format_utc, has_date
 from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.viewing.trace import Trace, state_changes, trace_of
-from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
+from schemas.auxiliary import AUXILIARY, AuxiliaryColumn, axis_range
 from schemas.messages import Array, Score
 from schemas.units import NS_PER_S, SpeedUnit
 
 MAX_PANELS = 12
 PANEL_HEIGHT_IN, BESIDE_HEIGHT_IN, LANE_HEIGHT_IN, WIDTH_IN = 2.3, 0.8, 0.2, 12.0
-LEAST_REACH = 0.02
-"""least half-height of an axis of these smaller panels, as a share of the largest value, so that noise looks small"""
 BETWEEN_IN, HEADER_IN, FOOT_IN = 0.5, 1.25, 0.6
 
 MEASURED, TWIN, BAND, ZONE, OUTSIDE, FAULT = "#454545", "#006e30", "#8fd9a8", "#f4a3a3", "#d62020", "#4a4a8a"
@@ -253,9 +251,7 @@ def _draw_beside(axes: Axes, trace: Trace, fan: int, column: AuxiliaryColumn) ->
     t_s = _seconds(trace, trace.t_ns)
     axes.plot(np.insert(t_s, gaps, t_s[gaps]), np.insert(values, gaps, np.nan), color=BESIDE, lw=0.7)
     if np.isfinite(values).any():
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
-        reach = max(0.55 * (high - low), LEAST_REACH * max(abs(low), abs(high)))
-        axes.set_ylim((low + high) / 2 - reach, (low + high) / 2 + reach)
+        axes.set_ylim(axis_range(float(np.nanmin(values)), float(np.nanmax(values))))
     axes.locator_params(axis="y", nbins=3)
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.grid(axis="y", color="#e6e6e6", lw=0.6, zorder=0)

@@ -62,7 +62,7 @@ class DeviceCounters:
     """The counters of a device since it started.
 
     Attributes:
-        uptime_s: whole seconds since the start; larger in each frame. A value that is not larger shows a restart.
+        uptime_s: whole seconds since the start. A smaller one than in the frame before shows a restart, or a wrap.
         counts: the first ones of `DEVICE_COUNTERS`; they wrap at 2^16.
     """
 

@@ -7,7 +7,7 @@ import numpy as np
 from schemas.messages import Array
 from scoring.baseline.baseline import Baseline
 from scoring.detectors.alarm_units import AlarmUnits
-from scoring.wear.slow_change import WEAR_HINT
+from scoring.wear.slow_change import MOST_FANS, WEAR_HINT
 
 FOLLOWED_FAR = 0.5
 """of its adaptation limit"""
@@ -36,6 +36,6 @@ def shared_by_all(share: float, limit: float) -> list[str]:
     shown = 10.0 * limit * int(10.0 * abs(share) / limit)
     direction = "slower" if share < 0.0 else "faster"
     return [
-        f"most fans turn {shown:.1f} % {direction} than when they were commissioned: the air, the supply, or a "
+        f"{MOST_FANS} {shown:.1f} % {direction} than when they were commissioned: the air, the supply, or a "
         f"filter in front of them all; beyond {100 * limit:.1f} % every fan raises an alarm"
     ]

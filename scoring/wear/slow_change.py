@@ -20,12 +20,19 @@ if TYPE_CHECKING:  # it loads scipy, which a command that shows alarms does not 
 
 WEAR_HINT = "see fantwin wear"
 """each notice ends with it"""
+MOST_FANS = "most fans turn"
+"""the line on a change that the fans of a tray share begins with it (scoring.wear.followed)"""
 MIN_CHANGE = 0.03
 """relative; smaller changes are those of any healthy fan"""
 MIN_INTERVALS = 2.0
 BESIDE_NS = 1800 * NS_PER_S
 """fans are compared whose first points are at most so far apart"""
 HOURS_PER_DAY = 24.0
+
+
+def is_of_slow_change(note: str) -> bool:
+    """Whether a note of a scorer is about fans that change slowly, one of them or most of a tray."""
+    return note.endswith(WEAR_HINT) or note.startswith(MOST_FANS)
 
 
 def slow_changes(parameter: str, trends: Sequence[Trend | None]) -> list[str]:

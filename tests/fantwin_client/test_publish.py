@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import threading
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -12,6 +14,7 @@ import pytest
 
 import fantwin_client
 from fantwin_client import (
+    BusError,
     Client,
     ClientError,
     CommandError,
@@ -20,12 +23,12 @@ from fantwin_client import (
     NotKeptError,
     SendError,
     TimeOrderError,
+    Tray,
 )
 from fantwin_client.outbox import MOST_SENT_MESSAGES
 from fantwin_client.times import times_ns
 from pipeline.bus.access_rules import SiteRoles
 from pipeline.bus.certificates import checked_credentials
-from pipeline.bus.errors import BusError
 from pipeline.bus.router import open_router
 from pipeline.config.loading import parse_config
 from schemas.topics import BY_NAME
@@ -166,6 +169,34 @@ def test_without_such_a_tray_one_line_says_so(endpoint: str, client: Client, raw
         pytest.raises(NoAcquisitionError, match='takes no pushed samples: write source = { kind = "push" }'),
     ):
         client.tray(TRAY)
+
+
+def test_a_program_may_start_before_the_site(endpoint: str, client: Client, raws: Raws, tmp_path: Path) -> None:
+    taken: list[Tray] = []
+    program = threading.Thread(target=lambda: taken.append(client.tray(TRAY, speed_unit="rpm", timeout_s=math.inf)))
+    program.start()
+    time.sleep(0.5)
+    assert not taken
+    with acquisition(push_config(endpoint, tmp_path)):
+        program.join(30.0)
+        (tray,) = taken
+        tray.publish(T_S, [0.5, 0.5], [1500.0, 1500.0])
+        assert tray.check().received == 1
+
+
+def test_trying_again_and_again_leaves_nothing_on_the_bus(endpoint: str, client: Client, raws: Raws) -> None:
+    before = len(client._bus._declared)
+    for _ in range(3):
+        with pytest.raises(NoAcquisitionError):
+            client.tray(TRAY, timeout_s=0.1)
+    assert len(client._bus._declared) == before
+
+
+def test_every_error_of_the_client_is_explained_on_its_page() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "sources.md").read_text(encoding="utf-8")
+    errors = [name for name in fantwin_client.__all__ if name.endswith("Error")]
+    assert "BusError" in errors
+    assert [name for name in errors if f"`{name}`" not in page] == []
 
 
 def test_what_acquisition_refuses_is_counted_by_reason_and_raised_by_check(

@@ -105,6 +105,17 @@ def test_refused_input_is_named_by_kind_with_what_was_wrong_with_the_first() -> 
     ]
 
 
+def test_a_long_piece_is_quoted_in_part_only() -> None:
+    core = make_core(protocol="text")
+    for piece in (b"\n", b"S 1 2 0.5 " + b"x" * 4900 + b"\n"):
+        core.step(ReceivedBytes(piece, 3 * S))
+    (note,) = core.notes()
+    core.tick(3 * S)
+    assert "bad_number: b'xxx" in core.problem()
+    for text in (note, core.problem()):
+        assert "xxx..." in text and len(text) < 250
+
+
 def feed_times(core: SerialCore, times_ms: Iterable[int]) -> list[tuple[int, list[int]]]:
     """Feed a sample at each of these times; returns when messages came out, and the samples in each."""
     return [
@@ -418,7 +429,7 @@ def test_a_command_that_was_not_written_is_counted_as_lost() -> None:
     core = make_core(link)
     core.step(command(0.5, 0.5))
     assert core.counters()["lost_commands"] == 1
-    assert core.notes()[0].startswith("1 command lost on the way to the device: ")
+    assert core.notes()[0].startswith("1 command not taken by the device: ")
 
 
 def test_a_command_that_changes_nothing_is_not_sent() -> None:

@@ -543,6 +543,41 @@ def test_row_16_samples_of_the_next_session_that_are_not_admitted_yet_are_no_sil
     assert seconds_of(found.t_ns[found.valid.all(axis=1)])[0] == pytest.approx(3.0)
 
 
+@pytest.mark.parametrize(
+    "times_s",
+    [
+        pytest.param(lambda _number: [-100.0], id="one time"),
+        pytest.param(lambda number: [-100.0 + number * 1e-6], id="hardly any advance"),
+        pytest.param(lambda number: [-100.0 + 6.0 * number], id="far apart"),
+        pytest.param(lambda number: [-100.0 * (1 + number % 2), -99.9 * (1 + number % 2)], id="two producers by turns"),
+    ],
+)
+def test_row_16_samples_of_another_time_do_not_hide_a_silence_of_the_line(times_s: Callable[[int], list[float]]):
+    core = ResamplerCore(1, FIXED)
+    core.step(replace(raw(at(*np.arange(0.0, 1.0, 0.01)), np.ones(100)), header=Header("acquisition-a-1", 0, "")))
+    grids: list[Grid] = []
+    for number in range(40):
+        sent = raw(at(*times_s(number)), np.ones(len(times_s(number))))
+        grids += core.step(replace(sent, header=Header(f"acquisition-a-{2 + number % 2}", number // 2, "")))
+        grids += silent_for(core, 0.2, is_complete=True, from_s=1.0 + 0.2 * number)
+    found = joined(grids)
+    assert not found.valid[found.t_ns > at(1.0)].any()
+    assert found.t_ns[-1] > at(3.0)
+    assert "no raw samples for more than 0.5 s" in core.problem()
+
+
+def test_row_16_the_silence_before_the_next_session_is_not_shown_while_its_first_samples_are_not_admitted_yet():
+    """The link was cut for 50 s. All that was sent has then arrived, and more samples must decide."""
+    core = ResamplerCore(1, FIXED)
+    core.step(replace(raw(at(*np.arange(0.0, 1.0, 0.01)), np.ones(100)), header=Header("acquisition-a-1", 0, "")))
+    assert silent_for(core, 50.0, is_complete=False) == []
+    for number in range(20):
+        times_s = 3.0 + 0.1 * number + np.arange(0.0, 0.1, 0.01)
+        core.step(replace(raw(at(*times_s), np.ones(10)), header=Header("acquisition-a-2", number, "")))
+        silent_for(core, 0.1, is_complete=True, from_s=51.0 + 0.1 * number)
+    assert "lost_too_late" not in core.counters()
+
+
 def test_row_16_a_gap_is_published_when_the_link_has_been_in_doubt_for_too_long():
     core = ResamplerCore(1, ResamplerConfig(rate_hz=100.0, link_wait_s=20.0))
     core.step(raw(at(*np.arange(0.0, 1.0, 0.01)), np.ones(100)))

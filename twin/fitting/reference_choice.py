@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from schemas.auxiliary import TITLES
 from schemas.reference_conditions import ReferenceConditions
 from twin.fitting.identification import Identification, identify
 from twin.progress import Progress, unreported, within
@@ -20,7 +21,6 @@ LEAST_VARIATION = 0.01
 """a quantity is tested only if the standard deviation of its ratio (of torque, or of density) exceeds this for a fan"""
 LEAST_GAIN = 0.01
 """a quantity is left out if the free-run error is then lower by more than this share"""
-TITLES = {"supply_voltage_v": "supply voltage", "temperature_c": "temperature"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
+from schemas.auxiliary import AUXILIARY, AuxiliaryColumn, axis_range
 from schemas.model_uncertainty import ModelUncertainty
 from twin.report.content import Content, FanContent
 from twin.report.steady_states import StaticCurve
@@ -38,8 +38,6 @@ STYLE: dict[Any, Any] = {
 WIDE_IN, NARROW_IN, SMALL_IN = (11.5, 5.4), (4.2, 6.0), (4.0, 2.9)
 BESIDE_IN = 0.95
 """height of the panel of each column beside command and speed, inches"""
-LEAST_REACH = 0.02
-"""least half-height of the axis of such a panel, as a share of the largest value"""
 WIDE_COLUMNS, NARROW_COLUMNS = 500, 200
 MOST_TICKS = 5
 AROUND_PEAK_SAMPLES = 300
@@ -253,9 +251,7 @@ def _draw_beside(content: Content, axes: Axes, column: AuxiliaryColumn, values: 
     line = content.timeline
     kept = kept_samples(line.t_s, (values,), columns)
     axes.plot(*broken_at(line.starts, kept, line.t_s, values), **{**LINE, "color": COMMAND})
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    reach = max(0.55 * (high - low), LEAST_REACH * max(abs(low), abs(high)))
-    axes.set_ylim((low + high) / 2.0 - reach, (low + high) / 2.0 + reach)
+    axes.set_ylim(axis_range(float(np.nanmin(values)), float(np.nanmax(values))))
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.set_ylabel(f"{column.title.replace(' ', chr(10))}\n({column.unit})")
 

@@ -13,7 +13,7 @@ from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.errors import UserError
 from pipeline.recordings.checksum import sha256_of
 from pipeline.replay.offline.alarm_episodes import episodes
-from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.replay.offline.healthy_runs import HealthyPart
 from pipeline.replay.offline.rescoring import rescore
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
 from scoring.calibration.alarm_rate import poisson_interval
@@ -104,7 +104,7 @@ def check_declared_rate(
 def _count_alarms(path: Path, twin: Path, overrides: tuple[str, ...], tray: str | None) -> tuple[int, float]:
     """Alarms of one recording, and the fan-hours that could be scored."""
     alarms, fan_hours = 0, 0.0
-    with open_replay_input([path], None, overrides, twin, tray=tray) as replay_input:
+    with HealthyPart(twin, overrides, tray=tray).opened(path) as replay_input:
         for each, rescored in zip(replay_input.trays, rescore(replay_input, None, False), strict=True):
             if rescored.problem:
                 raise UserError(f"{path}: {rescored.problem}")

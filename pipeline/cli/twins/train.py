@@ -38,6 +38,7 @@ from pipeline.cli.twins.training_data import (
 )
 
 if TYPE_CHECKING:
+    from schemas.reference_conditions import ReferenceConditions
     from twin.finishing import TrainedTwin
     from twin.networks import ForEachNetwork
     from twin.progress import Progress
@@ -149,17 +150,18 @@ def train(
     if json_output:
         typer.echo(json.dumps(result | pool.as_json()))
     else:
-        _print(result, training_data)
+        _print(result, training_data, trained.card.conditions)
     pool.end()
 
 
-def _print(result: dict[str, Any], training_data: TrainingData) -> None:
+def _print(result: dict[str, Any], training_data: TrainingData, conditions: ReferenceConditions | None) -> None:
     networks = f"{result['network_parameters']} network parameters"
     typer.echo(f"{result['twin']}: {result['model']} of {result['fans']} fan(s), {networks}")
     typer.echo(f"  {result['evaluated_on']} data, {sentence(result, training_data.speed_unit)}")
     typer.echo(f"  {balance_sentence(result)}")
-    if result["allows_for"]:
-        typer.echo(f"  allows for {result['allows_for']}, and needs these columns")
+    if conditions:
+        columns = f"column{'s' * (len(conditions.needed) > 1)} {' and '.join(conditions.needed)}"
+        typer.echo(f"  allows for {conditions.in_words}, and needs the {columns}")
     for warning in result["warnings"]:
         typer.echo(warning, err=True)
 

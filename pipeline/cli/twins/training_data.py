@@ -23,7 +23,7 @@ from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.checksum import sha256_of
 from pipeline.recordings.remote import matching, recording_path
 from pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
-from schemas.auxiliary import AUXILIARY
+from schemas.reference_conditions import HOLD_S
 from schemas.tacho import Tacho
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ IgnoreOption: TypeAlias = Annotated[
     typer.Option(
         "--ignore",
         metavar="COLUMN",
-        help="Leave out a column that is bad: supply_voltage_v or temperature_c. Repeatable.",
+        help=f"Leave out a column that is bad: {' or '.join(HOLD_S)}. Repeatable.",
     ),
 ]
 ValidateOption: TypeAlias = Annotated[
@@ -140,7 +140,7 @@ def _rounded(value: float) -> str:
 @dataclass(frozen=True)
 class Part:
     """Which part of each recording is read; see the options. windows_s: of tachos, in place of the recordings' own.
-    ignored: columns beside command and speed that are left out."""
+    ignored: columns that a twin can use, and that are left out."""
 
     tray: str | None = None
     fans: str | None = None
@@ -186,12 +186,11 @@ def ignored_columns(names: Sequence[str] | None) -> tuple[str, ...]:
     """The names of the columns to leave out, as given.
 
     Raises:
-        UsageError: there is no such column.
+        UsageError: there is no such column, or no twin uses it.
     """
-    known = [column.name for column in AUXILIARY]
     for name in names or ():
-        if name not in known:
-            raise UsageError(f"--ignore {name}: known are {', '.join(known)}")
+        if name not in HOLD_S:
+            raise UsageError(f"--ignore {name}: known are {', '.join(HOLD_S)}, the columns that a twin can use")
     return tuple(names or ())
 
 

@@ -10,6 +10,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from datetime import datetime
 from enum import StrEnum
 from typing import Annotated
@@ -39,7 +40,7 @@ from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until, words_of
 from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
-from scoring.wear.slow_change import WEAR_HINT
+from scoring.wear.slow_change import is_of_slow_change
 
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time
 _SCORES_S = 3.0  # a score of every tray arrives in this time
@@ -102,7 +103,7 @@ def alarms(
         if duration or comment or operator:
             raise UsageError("--for, --comment and --operator need an action: fantwin alarms ack TRAY FAN")
         stop_on_signals(stop)
-        with join_bus(settings, stop, listens=False) as bus:
+        with join_bus(settings, listens=False) as bus:
             _list(bus, settings, stop, show_all=show_all, watch=watch, json_output=json_output)
         return
     if show_all or watch:
@@ -117,7 +118,7 @@ def alarms(
         comment=comment,
     )
     stop_on_signals(stop)
-    with join_bus(settings, stop, listens=False, roles=(OPERATOR,)) as bus:
+    with join_bus(settings, listens=False, roles=(OPERATOR,)) as bus:
         watcher = SiteWatcher(bus, settings.site, roles_of(settings))
         wait_for_stages(bus, watcher, settings, stop, tray=name)
         fans = set(range(settings.tray(name).fans)) if number < 0 else {number}
@@ -205,8 +206,11 @@ def _identity(alarm: Alarm) -> tuple[str, int, str]:
 
 def _slow_changes(watcher: SiteWatcher) -> list[str]:
     """What scorers say about fans that change slowly, which is no alarm yet."""
-    notes = note_lines(view.health for view in watcher.stages() if view.alive)
-    return [line for line in notes if line.endswith(WEAR_HINT)]
+    healths = (view.health for view in watcher.stages() if view.alive)
+    return note_lines(
+        replace(health, notes=tuple(note for note in health.notes if is_of_slow_change(note.text)))
+        for health in healths
+    )
 
 
 def _wait_until_judged(

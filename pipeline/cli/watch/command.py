@@ -43,7 +43,7 @@ def command(
     message = command_of(chosen, {number: value}, is_set_point=set_point)
     stop = threading.Event()
     stop_on_signals(stop)
-    with join_bus(settings, stop, listens=False, roles=(OPERATOR,)) as bus:
+    with join_bus(settings, listens=False, roles=(OPERATOR,)) as bus:
         sender = CommandSender(bus, settings.site, chosen.name, stop)
         sender.connect()
         sender.send(message)

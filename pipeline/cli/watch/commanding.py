@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UsageError, UserError
+from pipeline.runtime.device_commands import not_sent, reason_in
 from pipeline.runtime.tray_acquisition import TrayAcquisition
 from schemas.codec import encode, type_name
 from schemas.header import Header
@@ -90,6 +91,10 @@ def require_commandable(tray: TrayConfig, instead: str) -> None:
         raise UserError(f"tray {tray.name} takes no commands ({reason}){': ' * bool(instead)}{instead}")
 
 
+class NotReceivedError(UserError):
+    """No acquisition has received a command."""
+
+
 class CommandSender:
     """Sends commands to one tray."""
 
@@ -102,7 +107,7 @@ class CommandSender:
         key = tray_key(site, tray, "command")
         self._publisher = bus.publisher(key, BY_NAME["command"], type_name(Command), self._producer)
         self._before: Health | None = None
-        """the last health before the first command"""
+        """the last health before the commands that are not confirmed"""
 
     def connect(self) -> None:
         """Wait for the tray's acquisition.
@@ -123,14 +128,12 @@ class CommandSender:
         """Wait until acquisition has received all commands.
 
         Raises:
-            UserError: it has not, or could not send one to the device.
+            NotReceivedError: it has not.
+            UserError: it could not send one to the device that was not confirmed before.
         """
-        after, before = self._wait(self._received), self._before
-        is_same = before is not None and after.header.producer == before.header.producer
-        if _not_sent(after) > (_not_sent(before) if before and is_same else 0):
-            known = before.notes if before and is_same else ()
-            reasons = "; ".join(note.text for note in after.notes if note.tray == self._tray and note not in known)
-            raise UserError(f"tray {self._tray}: {reasons or 'the command was not sent'}")
+        before, self._before = self._before, self._wait(self._received)
+        if reason := why_not_sent(self._tray, before, self._before):
+            raise UserError(f"tray {self._tray}: the command failed: {reason}")
 
     def _received(self) -> Health | None:
         health, sent = self._acquisition.health(), self._publisher.published
@@ -141,9 +144,23 @@ class CommandSender:
         until_s = time.monotonic() + _ANSWER_S
         while (found := find()) is None:
             if time.monotonic() > until_s or self.stop.wait(_POLL_S):
-                raise UserError(f"no acquisition of tray {self._tray} received the command: is `fantwin up` running?")
+                raise NotReceivedError(
+                    f"no acquisition of tray {self._tray} received the command: is `fantwin up` running?"
+                )
         return found
 
 
+def why_not_sent(tray: str, before: Health | None, after: Health) -> str:
+    """Why acquisition has not sent a command of a tray to its device; empty if it has sent all. before, after: its
+    healths before the commands in question and after them."""
+    if before and after.header.producer != before.header.producer:
+        before = None
+    if _not_sent(after) <= (_not_sent(before) if before else 0):
+        return ""
+    known = before.notes if before else ()
+    notes = [note for note in after.notes if note.tray == tray and note not in known]
+    return "; ".join(filter(None, (reason_in(note.text) for note in notes))) or "acquisition does not say why"
+
+
 def _not_sent(health: Health) -> int:
-    return sum(c.value for c in health.counters if c.name in ("lost_commands", "refused_commands"))
+    return not_sent({counter.name: counter.value for counter in health.counters})

@@ -68,7 +68,8 @@ def _written(path: Path, found: Sequence[Found]) -> list[str]:
     """Write the hwmon chips into a new file. Returns lines that say what was done and what was left out.
 
     Raises:
-        UserError: there is no chip to watch, or the file cannot be written, or it exists and lacks a chip.
+        UserError: there is no chip to watch, or the file cannot be written, or it exists and lacks a chip or is no
+            configuration.
     """
     chips = [each for each in found if each.kind == "hwmon" and each.tray]
     if not chips:
@@ -77,7 +78,8 @@ def _written(path: Path, found: Sequence[Found]) -> list[str]:
         with path.open("x", encoding="utf-8") as file:
             file.write("\n".join(['site = "site"\n', *(each.toml for each in chips)]))
     except FileExistsError:
-        if lacking := [str(each.tray["name"]) for each in chips if _chip(each.tray) not in _chips_in(path)]:
+        known = _chips_in(path)
+        if lacking := [str(each.tray["name"]) for each in chips if _chip(each.tray) not in known]:
             raise UserError(
                 f"{path}: exists and was not changed; it lacks {', '.join(lacking)}: paste the [[tray]] that is shown, "
                 "or name a new file"
@@ -102,9 +104,16 @@ def _chip(tray: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _chips_in(path: Path) -> set[tuple[str, ...]]:
-    """The chips of the trays in a configuration file; empty if it cannot be read as one."""
+    """The chips of the trays in a configuration file.
+
+    Raises:
+        UserError: it cannot be read as one.
+    """
     try:
         trays = tomllib.loads(path.read_text(encoding="utf-8")).get("tray", [])
-    except (OSError, ValueError):
-        return set()
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise UserError(
+            f"{path}: exists, cannot be read as a configuration ({reason}), and was not changed: name a new file"
+        ) from error
     return {_chip(tray) for tray in trays if isinstance(tray, Mapping)} if isinstance(trays, list) else set()

@@ -1,7 +1,8 @@
 """Listens to the line of one tray and says what does not fit its configuration: rate, range, fans, unit, tachos.
 
 Acquisition's own core reads the source, so that the samples are those that a running site would get. If acquisition
-runs already, its samples are taken from the bus instead.
+runs already, its samples are taken from the bus instead. The samples of a tray whose clients push them are on the bus
+only: they are listened to while acquisition runs, as clients need it to begin.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ RATE_TOLERANCE = 0.01
 LISTEN_FOR_TACHOS_S = 60
 SLOWEST_S = 1.0
 """between two samples of the slowest line that can be judged"""
+PUSHED_LATER = "clients push its samples: they are checked only while `fantwin up` runs; run doctor again then"
 Finding = tuple[bool, str]
 """in order or not, and one line"""
 
@@ -45,6 +47,8 @@ def check_line(context: Context, config: Config, seconds: float, *, is_running: 
     context: of acquisition and one tray. is_running: acquisition runs already.
     """
     tray = context.tray
+    if tray.source.takes_pushed and not is_running:
+        return [(True, f"{tray.name}: {PUSHED_LATER}")]
     samples, problem = _from_bus(config, tray, seconds) if is_running else _from_source(context, seconds)
     found = [(False, f"{tray.name}: {problem}")] if problem else []
     if not samples:

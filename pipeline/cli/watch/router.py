@@ -13,7 +13,7 @@ from pipeline.bus.access_rules import SiteRoles
 from pipeline.bus.router import open_router
 from pipeline.bus.session import credentials_of
 from pipeline.cli.exposure import InsecureOption, checked_exposure
-from pipeline.cli.options import JsonOption, SetOption
+from pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from pipeline.config.loading import load_config
 from pipeline.config.models import BusConfig, Config
 from pipeline.config.roles import ROUTER
@@ -26,10 +26,16 @@ _WARN_AGAIN_S = 86_400.0
 
 def router(
     config: Annotated[
-        Path | None, typer.Option("-c", "--config", help="Configuration of the site: certificates and roles.")
+        Path | None,
+        typer.Option(
+            "-c",
+            "--config",
+            help="Configuration of the site: certificates and roles. Default: "
+            f"{DEFAULT_CONFIG}, if it is in this folder.",
+        ),
     ] = None,
     listen: Annotated[
-        str | None, typer.Option(help=f"Where to listen; default bus.endpoint, or without -c {_LOOPBACK}.")
+        str | None, typer.Option(help=f"Where to listen; default bus.endpoint, or without a configuration {_LOOPBACK}.")
     ] = None,
     connect: Annotated[
         list[str] | None, typer.Option(help="Where another router of the site listens. Repeatable.")
@@ -50,8 +56,10 @@ def router(
 
     Example: fantwin router -c fantwin.toml --listen tls/0.0.0.0:7447 --connect tls/other.example:7447
     """
+    if config is None and DEFAULT_CONFIG.exists():
+        config = DEFAULT_CONFIG
     if overrides and config is None:
-        raise UsageError("--set needs a configuration: give one with -c FILE")
+        raise UsageError(f"--set needs a configuration: give one with -c FILE, there is no {DEFAULT_CONFIG} here")
     settings = load_config(config, overrides or (), stages=()) if config else None
     bus = _bus(settings, listen)
     credentials = credentials_of(bus, (ROUTER,))

@@ -17,6 +17,7 @@ from pipeline.bus.session import Bus, join_bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.watch.commanding import (
     CommandSender,
+    NotReceivedError,
     chosen_tray,
     command_of,
     require_commandable,
@@ -78,7 +79,7 @@ def sweep(
         if not json_output:
             typer.echo(line)
 
-    with join_bus(settings, stop, listens=False, roles=(OPERATOR,)) as bus:
+    with join_bus(settings, listens=False, roles=(OPERATOR,)) as bus:
         line = _BusLine(bus, settings.site, chosen, stop)
         before = line.connect()
         key = sweep_key(settings.site, chosen.name)
@@ -86,18 +87,21 @@ def sweep(
             raise UserError(f"another sweep moves the fans of tray {chosen.name}: wait until it has ended")
         bus.declare_alive(key)
         at_end = {fan: float(before[fan]) if safe is None else safe for fan in numbers}
-        left_at = ", ".join(f"fan {fan} {value:g}" for fan, value in at_end.items())
+        left_at = _in_words(at_end)
         progress(_range_in_words(chosen, lowest, highest))
         if low is None and lowest > chosen.command_min:
             progress(f"the lowest command should keep fans turning; --low {chosen.command_min:g} uses the whole range")
         progress(f"at the end and after Ctrl-C the fans get these commands: {left_at}")
-        is_stopped, constants_s = False, dict[int, float]()
+        is_stopped, constants_s, ended = False, dict[int, float](), ""
         try:
             constants_s = Excitation(line, numbers, lowest, highest, rounds, progress).run()
         except StoppedError:
             is_stopped = True
+        except UserError as error:
+            ended = f"the sweep has ended: {error}"
+            raise UserError(f"{ended}; the fans are left at these commands: {left_at}") from error
         finally:
-            _leave(line, at_end, left_at)
+            _leave(line, at_end, ended)
     if json_output:
         known = {str(fan): value if math.isfinite(value) else None for fan, value in constants_s.items()}
         left = {str(fan): value for fan, value in at_end.items()}
@@ -122,15 +126,27 @@ def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: 
     tray that turns its fans both ways is swept from command_min. Without --high the highest is command_max.
 
     Raises:
-        UsageError: one of them, or the safe command, is outside those limits.
+        UsageError: one of them, or the safe command, is outside those limits; or --high alone is given, not above the
+            lowest: the user must say how low commands may go.
     """
     lowest, highest = lowest_turning(tray) if low is None else low, tray.command_max if high is None else high
     if not tray.command_min <= lowest < highest <= tray.command_max:
-        limits = f"{tray.command_min:g} to {tray.command_max:g}"
-        raise UsageError(f"--low {lowest:g} --high {highest:g}: name a range within {limits} of tray {tray.name}")
+        raise UsageError(_wrong_range(tray, low, high, lowest))
     if safe is not None:
         require_within_limits(tray, safe, "--safe")
     return lowest, highest
+
+
+def _wrong_range(tray: TrayConfig, low: float | None, high: float | None, lowest: float) -> str:
+    """What is wrong with the options that were given."""
+    if low is None and high is not None and tray.command_min < high <= lowest:
+        return (
+            f"--high {high:g}: name --low, too: without it tray {tray.name} is swept from {lowest:g}, because fans may "
+            "stop below"
+        )
+    given = " ".join(f"{name} {value:g}" for name, value in (("--low", low), ("--high", high)) if value is not None)
+    limits = f"{tray.command_min:g} to {tray.command_max:g}"
+    return f"{given}: name a range within {limits} of tray {tray.name}"
 
 
 def lowest_turning(tray: TrayConfig) -> float:
@@ -145,13 +161,42 @@ def _range_in_words(tray: TrayConfig, lowest: float, highest: float) -> str:
     return f"tray {tray.name}: commands from {lowest:g} to {highest:g}, {low:.0%} to {high:.0%} of its range"
 
 
-def _leave(line: _BusLine, at_end: Mapping[int, float], left_at: str) -> None:
-    """Send the safe command, whatever happened before."""
+def _leave(line: _BusLine, at_end: Mapping[int, float], ended: str) -> None:
+    """Send the safe commands, whatever happened before: together, or one by one if that fails. ended: why the sweep has
+    ended; empty if it was done or stopped by the user.
+
+    Raises:
+        UserError: some were not sent; it names these.
+    """
     line.stop = threading.Event()
     try:
         line.send(at_end)
-    except UserError as error:
-        raise UserError(f"THE FANS KEEP THE LAST COMMAND; send these by hand: {left_at} ({error})") from error
+    except NotReceivedError as error:
+        failed = dict.fromkeys(at_end, str(error))
+    except UserError:  # a device may have refused one fan and ignored those after it
+        failed = _failed_one_by_one(line, at_end)
+    else:
+        return
+    if failed:
+        by_hand = _in_words({fan: at_end[fan] for fan in failed})
+        reasons = "; ".join(dict.fromkeys(failed.values()))
+        kept = f"THESE FANS KEEP THE LAST COMMAND; send these by hand: {by_hand} ({reasons})"
+        raise UserError("; ".join(filter(None, (kept, ended))))
+
+
+def _failed_one_by_one(line: _BusLine, at_end: Mapping[int, float]) -> dict[int, str]:
+    """Send the command of each fan by itself; returns why it failed, by fan."""
+    failed: dict[int, str] = {}
+    for fan, value in at_end.items():
+        try:
+            line.send({fan: value})
+        except UserError as error:
+            failed[fan] = str(error)
+    return failed
+
+
+def _in_words(commands: Mapping[int, float]) -> str:
+    return ", ".join(f"fan {fan} {value:g}" for fan, value in commands.items())
 
 
 def _fans(words: str, tray: TrayConfig) -> list[int]:
@@ -188,10 +233,20 @@ class _BusLine:
         return self._samples[-1].command[-1]
 
     def send(self, values: Mapping[int, float]) -> None:
-        """Send commands, by fan."""
+        """Send commands, by fan.
+
+        Raises:
+            StoppedError: the user wants to stop.
+            UserError: they were not sent.
+        """
         self._sender.stop = self.stop
         self._sender.send(command_of(self._tray, dict(values), named="fan"))
-        self._sender.confirm()
+        try:
+            self._sender.confirm()
+        except NotReceivedError as error:
+            if self.stop.is_set():
+                raise StoppedError from error
+            raise
         self._take()
         self._samples = self._samples[-1:]  # the speed from which the step begins
 

@@ -63,7 +63,7 @@ def wear(
         settings, damage = load_config(config, overrides or (), stages=()), []
         stop = threading.Event()
         stop_on_signals(stop)
-        with join_bus(settings, stop, listens=False) as bus:
+        with join_bus(settings, listens=False) as bus:
             watcher = SiteWatcher(bus, settings.site, roles_of(settings))
             wait_for_stages(bus, watcher, settings, stop, what="wear")
             answers = bus.recover(tray_key(settings.site, "*", "snapshot"))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+from pipeline.config.models import TrayConfig
 from pipeline.errors import UserError
 from pipeline.recordings.checksum import sha256_of
 from pipeline.recordings.length import longest_s
@@ -58,9 +59,32 @@ class HealthyPart:
     to_s: float = math.inf
     tray: str | None = None
 
-    def opened(self, path: Path) -> AbstractContextManager[ReplayInput]:
-        """A recording. Raises as `open_replay_input`."""
-        return open_replay_input([path], None, self.overrides, self.twin, self.from_s, self.to_s, self.tray)
+    @contextmanager
+    def opened(self, path: Path) -> Iterator[ReplayInput]:
+        """A recording. Raises as `open_replay_input`.
+
+        Raises:
+            UserError: no tray is chosen, and the twin fits some of the trays only.
+        """
+        with open_replay_input(
+            [path], None, self.overrides, self.twin, self.from_s, self.to_s, self.tray
+        ) as replay_input:
+            _require_that_all_fit(self.twin, path, replay_input.trays)
+            yield replay_input
+
+
+def _require_that_all_fit(twin: Path, path: Path, trays: Sequence[TrayConfig]) -> None:
+    """Refuse trays of which the twin fits some only: its limits are those of one kind of tray."""
+    if len(trays) < 2:
+        return
+    fans = load_tray_twin(twin).fans
+    if fans > 1 and len({tray.fans == fans for tray in trays}) > 1:
+        found = ", ".join(f"{tray.name} of {_fans(tray.fans)}" for tray in trays)
+        raise UserError(f"{path}: several trays, {found}, and a twin of {_fans(fans)}: choose one with --tray")
+
+
+def _fans(count: int) -> str:
+    return f"{count} fan{'s' * (count != 1)}"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A router closes a connection whose other end has vanished, also if it has data to send on it."""
+"""The limit of the system after which a router closes a connection that acknowledges no data."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def limits_ms(port: int) -> list[int]:
     return found
 
 
-def test_row_16_a_router_gives_up_each_connection_that_acknowledges_nothing(endpoint):
+def test_row_16_each_connection_to_a_router_has_the_limit_for_data_without_acknowledgement(endpoint):
     port = int(endpoint.rpartition(":")[2])
     with open_router(endpoint), Bus(BusConfig(mode="client", endpoint=endpoint), threading.Event()):
         eventually(lambda: limits_ms(port) == [UNACKNOWLEDGED_MS], "it has the limit")

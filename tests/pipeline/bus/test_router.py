@@ -20,6 +20,7 @@ from pipeline.bus.session import Bus, _zenoh_config, join_bus
 from pipeline.config.loading import load_config
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, tray_key
+from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO, RunningCommand, eventually, fantwin
 
 KEY = tray_key("site", "tray", "alarm")
@@ -90,6 +91,17 @@ def test_clients_that_start_before_the_router_connect_once_it_runs(endpoint, sta
             never.set()
     with one, other:
         assert exchange(one, other) == b"hello"
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["status --once", "alarms", "alarms ack tray1 0 --timeout 1", "wear", "command --fan 0 0.5", "sweep"],
+)
+def test_a_question_to_a_site_whose_router_is_down_is_answered_soon(words, endpoint):
+    settings = ("--set", "bus.mode='client'", "--set", f"bus.endpoint='{endpoint}'")
+    done = fantwin(*words.split(), "-c", DEMO / "demo.toml", *settings, timeout_s=30.0)  # a stage waits for ever
+    assert done.returncode == 1
+    assert "no router answers" in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_waiting_for_a_router_ends_on_stop(endpoint, started):
@@ -180,3 +192,13 @@ def test_row_16_a_client_and_its_router_notice_a_dead_connection_after_four_seco
     assert client.get_json("transport/link/tx/lease") == LEASE_MS == "4000"
     peer = _zenoh_config(BusConfig(), listens=True)
     assert peer.get_json("transport/link/tx/lease") == "10000"
+
+
+def test_without_c_the_configuration_in_this_folder_holds(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ("router", "--listen", "tls/0.0.0.0:7447")
+    assert "write a section [bus.security]" in error_of(*words)
+    assert "there is no fantwin.toml here" in error_of(*words, "--set", "site='b'")
+    Path("fantwin.toml").write_text('[bus]\nmode = "client"\n[bus.security]\n[[tray]]\nname = "a"\nfans = 1\n')
+    missing = error_of(*words)
+    assert "router.pem" in missing and "fantwin certs issue" in missing

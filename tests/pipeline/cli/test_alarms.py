@@ -29,6 +29,8 @@ from schemas.topics import BY_NAME, tray_key
 from scoring.alarms.current_alarms import CurrentAlarm, clock
 from scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from scoring.alarms.tray_conditions import TrayConditions
+from scoring.wear.followed import shared_by_all
+from scoring.wear.slow_change import WEAR_HINT
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
 from tests.support.score_data import one_sample
@@ -48,7 +50,11 @@ class AlarmOnRequestScorer(Core):
         self.ratio: dict[int, float] = {}
         self.deaf = False
         self.not_judged: tuple[InvalidReason, ...] = ()
+        self.noted: list[str] = []
         self._now_ns = 0
+
+    def notes(self) -> list[str]:
+        return self.noted
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         self._now_ns = now_ns
@@ -194,6 +200,16 @@ def test_the_list_says_when_a_message_was_true_and_that_the_fan_is_stopped_by_it
     assert re.fullmatch(r"    at \d\d:\d\d:\d\d: too slow", message)
     at_rest = [{"tray": TRAY, "fans": [1], "state": "stopped"}, {"tray": TRAY, "fans": [0], "state": "starting"}]
     assert json.loads(site.ask("--json"))["at_rest"] == at_rest
+
+
+def test_what_most_fans_of_a_tray_share_is_listed_beside_the_slow_changes_of_single_fans(site):
+    (shared,) = shared_by_all(-0.024, 0.03)
+    one = f"fan 2: drag +5.1 % in 3.0 h, +1.7 % an hour: {WEAR_HINT}"
+    site.core.noted = ["98.0 % of the fans' samples judged", one, shared]
+    lines = [f"scorer, {TRAY}: {one}", f"scorer, {TRAY}: {shared}"]
+    eventually(lambda: json.loads(site.ask("--json"))["slow_changes"] == lines, "the notes are heard")
+    assert site.ask().splitlines() == [*lines, "no alarms"]
+    assert shared.startswith("most fans turn 2.4 % slower than")
 
 
 def test_row_01_no_alarms_is_not_said_while_a_fan_is_not_judged(site):

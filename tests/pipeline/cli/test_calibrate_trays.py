@@ -19,9 +19,9 @@ from tests.support.fantwin_command import error_of, fantwin
 RATE = ("--false-alarms-per-day", 3000)
 
 
-def simulated(path: Path, seed: int, seconds: float) -> Path:
-    """Of one fan, which differs from those of other seeds."""
-    words = ("--fans", 1, "--profile", "multisine", "--seed", seed, "--fans-seed", seed, "--fan-variation", 0.2)
+def simulated(path: Path, seed: int, seconds: float, fans: int = 1) -> Path:
+    """Of fans that differ from those of other seeds."""
+    words = ("--fans", fans, "--profile", "multisine", "--seed", seed, "--fans-seed", seed, "--fan-variation", 0.2)
     result = fantwin("simulate", *words, "--duration", seconds, "--epoch-ns", 0, "--recording", path)
     assert result.exit_code == 0, result.output
     return path
@@ -97,3 +97,17 @@ def test_a_tray_that_a_recording_lacks_is_named(folder: Path, command: str) -> N
         "calibrate": (folder / "twin.onnx", recording, *RATE, "--tray", "c"),
     }
     assert f"{recording}: no raw samples of tray 'c'" in error_of(command, *words[command])
+
+
+def test_where_the_twin_fits_only_some_of_the_trays_one_must_be_chosen(folder: Path) -> None:
+    two, one = simulated(folder / "two.mcap", 7, 60, fans=2), simulated(folder / "one.mcap", 8, 60)
+    both, twin = together(folder / "both.mcap", a=two, b=one), folder / "of-two.onnx"
+    training = simulated(folder / "training-two.mcap", 9, 60, fans=2)
+    made = fantwin("train", training, "--model", "physical", "-o", twin)
+    assert made.exit_code == 0, made.output
+    expected = f"{both}: several trays, a of 2 fans, b of 1 fan, and a twin of 2 fans: choose one with --tray"
+    assert error_of("calibrate", twin, both, *RATE) == expected
+    words = ("calibrate", twin, two, *RATE, "--extrapolate")
+    assert error_of(*words, "--verify", both) == expected
+    words = ("calibrate", twin, both, *RATE, "--extrapolate", "--tray", "a", "-o", folder / "chosen.onnx")
+    assert fantwin(*words).exit_code == 0

@@ -83,6 +83,13 @@ def test_from_nothing_to_certificates_that_every_process_can_use(path):
     assert date.fromisoformat(until) - datetime.now(UTC).date() == timedelta(days=int(days)) == timedelta(days=397)
 
 
+@pytest.mark.parametrize("is_pushed", [False, True])
+def test_a_program_that_pushes_samples_gets_a_certificate_where_a_tray_takes_them(path, is_pushed):
+    path.write_text(CONFIG + ('source = { kind = "push" }\n' if is_pushed else ""))
+    certs(path, "init")
+    assert ("source" in made(certs(path, "issue", "--json"))) == is_pushed
+
+
 def test_nothing_is_replaced_without_being_asked(path):
     certs(path, "init")
     certs(path, "issue")

@@ -15,13 +15,17 @@ import pytest
 
 from pipeline.bus.publisher import Publisher
 from pipeline.bus.session import Bus
-from pipeline.cli.watch.commanding import CommandSender, command_of, share_note
+from pipeline.cli.watch.commanding import CommandSender, command_of, share_note, why_not_sent
 from pipeline.config.models import BusConfig, TrayConfig
+from pipeline.devices.sample_source import SourceContext
+from pipeline.devices.serial_config import SerialConfig
+from pipeline.devices.source_kinds import build_source
+from pipeline.runtime.device_commands import DeviceCommands
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode, type_name
 from schemas.enums import StageStatus
 from schemas.header import Header
-from schemas.health import Health
+from schemas.health import Counter, Health, Note
 from schemas.topics import BY_NAME, alive_key, health_key
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO, Chain, RunningCommand, eventually, fantwin
@@ -45,7 +49,7 @@ def test_a_command_that_the_line_did_not_take_is_one_line_that_says_why(chain, a
     done = fantwin(*chain.words("command"), "--fan", 3, 0.5)  # there is no tray
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
-    assert "tray tray1: 1 command lost on the way to the device: " in done.stderr
+    assert "tray tray1: the command failed: " in done.stderr
     assert str(chain.port) in done.stderr
 
 
@@ -90,6 +94,39 @@ def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
         answers = sender._acquisition.health()
     assert answers
     assert answers.header.producer == "acquisition-1-of-2-1"
+
+
+def test_only_the_new_note_on_commands_of_the_tray_says_why_a_command_was_not_sent():
+    def health(lost: int, *notes: Note) -> Health:
+        return Health(
+            header=Header("acquisition-all-1", 1, ""),
+            stage="acquisition",
+            instance="all",
+            status=StageStatus.OK,
+            t_ns=1,
+            uptime_s=0.0,
+            counters=(Counter(name="lost_commands", value=lost),),
+            notes=notes,
+        )
+
+    tray = TrayConfig(name="a", fans=1, source=SerialConfig(port="line"))
+    commands = DeviceCommands(tray, build_source(tray.source, SourceContext(1, tray.speed_unit, Path())))
+
+    def lose() -> str:
+        commands.send(command_of(tray, {0: 0.5}), "no such port")
+        return commands.notes()[0]
+
+    first, second = lose(), lose()
+    others = (
+        Note(tray="a", text="the source also measures temperature"),
+        Note(tray="a", text="refused input: garbage 1"),
+        Note(tray="b", text=second),
+    )
+    before = health(1, Note(tray="a", text=first))
+    assert why_not_sent("a", before, health(2, *others, Note(tray="a", text=second))) == "line: no such port"
+    assert why_not_sent("a", before, health(2, *others)) == "acquisition does not say why"
+    assert why_not_sent("a", before, health(1, *others, Note(tray="a", text=first))) == ""
+    assert why_not_sent("a", None, health(1, Note(tray="a", text=first))) == "line: no such port"
 
 
 def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():

@@ -90,6 +90,14 @@ def test_each_problem_is_one_line_that_says_what_to_do(capsys, tmp_path, port, s
         assert word in line
 
 
+def test_a_site_whose_samples_are_pushed_is_fine_before_it_runs(tmp_path, endpoint):
+    path = tmp_path / "fantwin.toml"
+    text = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "push" }\n[launcher]\nstages = ["acquisition"]\n'
+    path.write_text(f'run_folder = "{tmp_path}"\n[bus]\nendpoint = "{endpoint}"\n{text}', encoding="utf-8")
+    found = fantwin("doctor", "-c", path, "--json")
+    assert (found.exit_code, json.loads(found.stdout)["problems"]) == (0, [])
+
+
 def test_only_the_lines_of_the_named_trays_are_checked(tmp_path, port):
     path = tmp_path / "fantwin.toml"
     text = "".join(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 import tty
 from collections.abc import Iterable
 from itertools import count, repeat
@@ -12,12 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import fantwin_client
 from pipeline.cli.watch.line_check import _findings, check_line, listening_settings, refusal
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config
 from pipeline.runtime.stage import Context
 from schemas.messages import Raw
 from schemas.units import NS_PER_S
+from tests.support.running_acquisition import SITE, acquisition, push_config
 
 TOML = """
 [[tray]]
@@ -190,3 +193,38 @@ def test_a_line_that_sends_once_a_second_is_not_silent_between_two_samples() -> 
     settings = listening_settings(config_of().sections["acquisition"], 2.0)
     assert settings.silence_s >= 2.0 + 1.0
     assert settings.block_s == 0.0
+
+
+def of_push(config: Config, *, is_running: bool) -> list:
+    """What is found of a tray whose samples are pushed."""
+    context = Context(
+        site=SITE, trays=config.trays, config=config.sections["acquisition"], folder=Path(), run_folder=Path(),
+        started_t_ns=0,
+    )  # fmt: skip
+    return check_line(context, config, 1.0, is_running=is_running)
+
+
+def test_before_a_site_runs_pushed_samples_are_no_problem_and_are_said_to_be_checked_later(
+    endpoint: str, tmp_path: Path
+) -> None:
+    ((is_fine, line),) = of_push(push_config(endpoint, tmp_path), is_running=False)
+    assert is_fine
+    assert line.startswith("tray1: clients push its samples: they are checked only while `fantwin up` runs;")
+
+
+def test_while_a_site_runs_pushed_samples_are_listened_to(endpoint: str, tmp_path: Path) -> None:
+    config, stop = push_config(endpoint, tmp_path), threading.Event()
+
+    def push(tray: fantwin_client.Tray) -> None:
+        while not stop.wait(0.05):
+            tray.publish(time.time(), [0.25, 0.5], [1500.0, 20_000.0 * 2])
+
+    with acquisition(config), fantwin_client.connect(endpoint, site=SITE) as client:
+        sender = threading.Thread(target=push, args=(client.tray("tray1", speed_unit="rpm"),))
+        sender.start()
+        try:
+            lines = of_push(config, is_running=True)
+        finally:
+            stop.set()
+            sender.join()
+    assert [line for ok, line in lines if not ok] == ["tray1: no speed of fan 1: is its tacho connected?"]

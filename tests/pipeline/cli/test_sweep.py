@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.cli.watch import sweep as sweep_module
+from pipeline.cli.watch.commanding import NotReceivedError
 from pipeline.cli.watch.excitation import (
     LEVELS,
     SETTLING,
@@ -24,7 +27,13 @@ from pipeline.config.models import TrayConfig
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.errors import UserError
 from pipeline.learning.ordinary_operation import OrdinaryOperation
-from tests.support.fantwin_command import error_of
+from pipeline.runtime.device_commands import DeviceCommands
+from schemas.codec import decode
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Counter, Health, Input, Note
+from schemas.messages import Command
+from tests.support.fantwin_command import error_of, usage_error_of
 from tests.support.running_chain import DEMO
 
 PERIOD_S = 0.1
@@ -143,7 +152,7 @@ def test_where_something_else_sets_the_command_it_says_so() -> None:
     ("words", "expected"),
     [
         ("--low 0.5 --high 0.4", "name a range within 0 to 1 of tray tray1"),
-        ("--high 255", "name a range within 0 to 1 of tray tray1"),
+        ("--high 255", "--high 255: name a range within 0 to 1 of tray tray1"),
         ("--fans 0,8", "tray tray1 has fans 0 to 7"),
         ("--fans both", "write all, or numbers with commas"),
         ("--safe 2", "--safe 2: the command must be within 0 to 1"),
@@ -151,6 +160,25 @@ def test_where_something_else_sets_the_command_it_says_so() -> None:
 )
 def test_what_the_tray_cannot_do_is_refused_in_one_line(words: str, expected: str) -> None:
     assert expected in error_of("sweep", "-c", DEMO / "demo.toml", *words.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        ("--low 1", "--low 1: name a range within 0 to 1 of tray tray1"),
+        ("--high 0", "--high 0: name a range within 0 to 1 of tray tray1"),
+        (
+            "--high 0.1",
+            "--high 0.1: name --low, too: without it tray tray1 is swept from 0.2, because fans may stop below",
+        ),
+        (
+            "--high 0.2",
+            "--high 0.2: name --low, too: without it tray tray1 is swept from 0.2, because fans may stop below",
+        ),
+    ],
+)
+def test_only_options_that_were_given_are_refused(words: str, error: str) -> None:
+    assert usage_error_of("sweep", "-c", DEMO / "demo.toml", *words.split()) == error
 
 
 UNCOMMANDED = [
@@ -213,3 +241,159 @@ def test_a_fan_that_reads_0_at_the_lowest_command_is_named_at_once() -> None:
     assert said[1] == "fan 0 reads 0 at command 0.2; if it stands still, give a higher --low"
     _, said = swept(StandsBelow([0.5]), low=0.0)
     assert not [line for line in said if "reads 0" in line], "it is meant to stand still"
+
+
+TRAY_OF_SIX = TrayConfig(name="tray1", fans=6, source=SerialConfig(port="line"))
+
+
+class RefusesFan4:
+    """A source whose device refuses each command that moves fan 4."""
+
+    name = "line"
+
+    def send(self, command: tuple[float, ...], _set_point: tuple[float, ...]) -> str:
+        return "unit 1 refuses 97" if np.isfinite(command[4]) else ""
+
+
+class AcquisitionOfRefusals:
+    """The bus and the acquisition of a tray at once."""
+
+    def __init__(self) -> None:
+        self.published = 0
+        self.is_there = True
+        self.commands = DeviceCommands(TRAY_OF_SIX, RefusesFan4())  # type: ignore[arg-type]
+
+    def publisher(self, *_: object) -> AcquisitionOfRefusals:
+        return self
+
+    def subscribe(self, *_: object) -> None: ...
+
+    def watch_alive(self, *_: object) -> None: ...
+
+    def put(self, payload: bytes) -> None:
+        command = decode(Command, payload)
+        assert isinstance(command, Command)
+        self.producer, self.published = command.header.producer, self.published + 1
+        self.commands.send(command, None)
+
+    def health(self) -> Health | None:
+        if not self.is_there:
+            return None
+        received = Input(
+            key="", producer=self.producer, received=self.published, missing=0, duplicated=0, next_sequence=0
+        )
+        texts = (f"refused input: garbage {self.published}", *self.commands.notes())
+        return Health(
+            header=Header("acquisition-1", 1, ""),
+            stage="acquisition",
+            instance="all",
+            status=StageStatus.OK,
+            t_ns=1,
+            uptime_s=0.0,
+            inputs=(received,),
+            counters=tuple(Counter(name=name, value=value) for name, value in self.commands.counts.items()),
+            notes=tuple(Note(tray="tray1", text=text) for text in texts),
+        )
+
+
+def line_to(acquisition: AcquisitionOfRefusals, monkeypatch: pytest.MonkeyPatch) -> sweep_module._BusLine:
+    monkeypatch.setattr("pipeline.cli.watch.commanding.TrayAcquisition", lambda *_: acquisition)
+    return sweep_module._BusLine(acquisition, "plant", TRAY_OF_SIX, threading.Event())  # type: ignore[arg-type]
+
+
+def test_a_refused_command_is_no_failure_of_those_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    acquisition = AcquisitionOfRefusals()
+    line = line_to(acquisition, monkeypatch)
+    why = "tray tray1: the command failed: unit 1 refuses 97"
+    with pytest.raises(UserError, match=rf"send these by hand: fan 4 0.5 \({why}\)$"):
+        sweep_module._leave(line, dict.fromkeys(range(6), 0.5), "")
+    assert acquisition.commands.notes() == ["2 commands not taken by the device, the last one: unit 1 refuses 97"]
+    assert acquisition.published == 7, "all at once, then each by itself"
+
+
+def test_ctrl_c_while_a_command_is_on_its_way_is_no_missing_acquisition(monkeypatch: pytest.MonkeyPatch) -> None:
+    acquisition = AcquisitionOfRefusals()
+    line = line_to(acquisition, monkeypatch)
+    acquisition.is_there = False
+    line.stop.set()
+    with pytest.raises(StoppedError):
+        line.send({0: 0.5})
+
+
+class SweptTray(FirstOrderFans):
+    """Six fans whose device carries out the commands of a message in turn, up to the first that it refuses."""
+
+    def __init__(self, refuses: Callable[[int], str] = lambda _fan: "", swept_s: float = 20.0) -> None:
+        super().__init__([0.5] * 6)
+        self.refuses, self.swept_s = refuses, swept_s
+        self.stop = threading.Event()
+        self.is_gone = False
+
+    def connect(self) -> np.ndarray:
+        return self.command.copy()
+
+    def send(self, values: Mapping[int, float]) -> None:
+        if self.now_s > self.swept_s:
+            for fan, value in values.items():
+                if self.is_gone:
+                    raise NotReceivedError("no acquisition of tray tray1 received the command")
+                if why := self.refuses(fan):
+                    raise UserError(why)
+                super().send({fan: value})
+        else:
+            super().send(values)
+
+
+def swept_by_command(tray: SweptTray, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The error of the command; the bus is left out."""
+
+    class NoBus:
+        def __enter__(self) -> NoBus:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def alive(self, _key: str) -> set[str]:
+            return set()
+
+        def declare_alive(self, _key: str) -> None: ...
+
+    monkeypatch.setattr(sweep_module, "join_bus", lambda *_, **__: NoBus())
+    monkeypatch.setattr(sweep_module, "_BusLine", lambda *_: tray)
+    return error_of("sweep", "-c", DEMO / "demo.toml", "--fans", "0,1,2,3,4,5", "--rounds", "1")
+
+
+def test_one_fan_that_refuses_its_command_keeps_no_other_from_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    tray = SweptTray(lambda fan: "unit 1 refuses 97" if fan == 4 else "")
+    error = swept_by_command(tray, monkeypatch)
+    assert list(tray.command) == [0.4, 0.4, 0.4, 0.4, tray.command[4], 0.4]
+    assert tray.command[4] != 0.4
+    by_hand = "THESE FANS KEEP THE LAST COMMAND; send these by hand: fan 4 0.4 (unit 1 refuses 97); "
+    assert error == f"{by_hand}the sweep has ended: unit 1 refuses 97"
+
+
+def test_why_a_sweep_has_ended_is_said_also_where_all_fans_have_their_commands_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    refusals = iter(["unit 1 refuses 97"])
+    tray = SweptTray(lambda fan: next(refusals, "") if fan == 4 else "")
+    error = swept_by_command(tray, monkeypatch)
+    assert error.startswith("the sweep has ended: unit 1 refuses 97; the fans are left at these commands: fan 0 0.4, ")
+    assert list(tray.command) == [0.4] * 6
+
+
+def test_another_controller_is_named_also_where_the_device_refuses_the_commands_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tray = SweptTray(lambda fan: "unit 1 refuses 0.4" if fan > 3 else "", swept_s=0.0)
+    tray.forced = 0.5
+    error = swept_by_command(tray, monkeypatch)
+    assert "send these by hand: fan 4 0.4, fan 5 0.4 (unit 1 refuses 0.4); the sweep has ended: " in error
+    assert "fan 0 has command 0.5 and not 0.2: something else sets it" in error
+
+
+def test_without_acquisition_all_fans_are_named_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tray = SweptTray()
+    tray.is_gone = True
+    error = swept_by_command(tray, monkeypatch)
+    assert "fan 5 0.4 (no acquisition of tray tray1 received the command); the sweep has ended: no acq" in error

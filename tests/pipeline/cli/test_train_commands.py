@@ -16,7 +16,7 @@ from schemas.messages import Raw
 from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
 from schemas.topics import tray_key
 from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, counted_run, published_run
-from tests.support.fantwin_command import error_of, fantwin
+from tests.support.fantwin_command import error_of, fantwin, usage_error_of
 from twin.export.onnx_twin import OnnxTwin
 from twin.runs import Run
 
@@ -84,9 +84,17 @@ def test_a_supply_voltage_that_is_ignored_is_as_if_it_were_not_there(folder, tmp
     for options, needed in (((), ("supply_voltage_v",)), (("--ignore", "supply_voltage_v"), ())):
         done = fantwin("train", good, "--model", "physical", *options, "-o", twin)
         assert done.exit_code == 0, done.output
+        says = "allows for supply voltage (reference 12 V), and needs the column supply_voltage_v\n"
+        assert (says in done.stdout) == bool(needed)
         conditions = OnnxTwin(twin).card.conditions
         assert (conditions.needed if conditions else ()) == needed
-    assert "--ignore volts: known are supply_voltage_v" in error_of("identify", good, "--ignore", "volts")
+
+
+@pytest.mark.parametrize("name", ["volts", "current_a"])
+def test_a_column_that_no_twin_uses_cannot_be_ignored(folder: Path, tmp_path: Path, name: str):
+    for command, options in (("identify", ()), ("train", ("-o", tmp_path / "t.onnx"))):
+        error = usage_error_of(command, folder / "healthy.mcap", *options, "--ignore", name)
+        assert f"--ignore {name}: known are supply_voltage_v, temperature_c, the columns that a twin can use" in error
 
 
 def test_the_tacho_of_a_recording_counts_and_readings_that_speak_for_another_are_pointed_out(tmp_path):

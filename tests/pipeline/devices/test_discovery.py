@@ -41,6 +41,8 @@ def test_each_chip_with_fans_is_a_tray_that_reads_what_is_there(root: Path) -> N
     first = found[0]
     assert first.tray["source"]["device"] == "1-002f" and first.tray["source"]["fans"] == [1, 2]
     assert "fan3 at 0 rpm although commanded to turn, left out: not connected?" in first.missing
+    assert first.notes[:2] == ("fan 0 is fan1_input: 900 rpm", "fan 1 is fan2_input: 1200 rpm")
+    assert "# fan 0 is fan1_input: 900 rpm\n" in first.toml
     assert any(note.startswith("measures average over 0.05 s") for note in first.notes)
     assert found[2].missing[0].startswith("fan2 has no pwm2, so its command is not known")
     assert any("not known" in note for note in found[2].notes)
@@ -80,9 +82,22 @@ def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_
     assert isinstance(lacking.exception, UserError)
     assert "it lacks emc2305: paste the [[tray]] that is shown" in str(lacking.exception)
     assert file.read_text(encoding="utf-8") == text
-    file.write_text("no configuration [", encoding="utf-8")
-    unreadable = CliRunner().invoke(command_line.app, words)
-    assert "it lacks emc2305, nct6798, nct6798-2, thinkpad" in str(unreadable.exception)
+    file.write_text("", encoding="utf-8")
+    empty = CliRunner().invoke(command_line.app, words)
+    assert "it lacks emc2305, nct6798, nct6798-2, thinkpad" in str(empty.exception)
+
+
+@pytest.mark.parametrize("content", [b"no configuration [", b"\xff\xfe"])
+def test_a_file_that_is_no_configuration_is_not_changed(root: Path, tmp_path: Path, content: bytes) -> None:
+    command_line._register(["discover"] if not command_line.app.registered_commands else ["discover", "info"])
+    file = tmp_path / "fantwin.toml"
+    file.write_bytes(content)
+    error = CliRunner().invoke(command_line.app, ["discover", "--root", str(root), "--write", str(file)]).exception
+    assert isinstance(error, UserError)
+    assert str(error).startswith(f"{file}: exists, cannot be read as a configuration (")
+    assert str(error).endswith("), and was not changed: name a new file")
+    assert "\n" not in str(error)
+    assert file.read_bytes() == content
 
 
 def test_a_port_of_which_nothing_is_known_is_no_tray_and_what_is_not_written_is_said(

@@ -109,11 +109,11 @@ def test_a_unit_that_does_not_answer_is_a_failed_poll_and_a_server_that_ends_is_
         made.disconnect()
         made = device(port, timeout_s=0.1)
         slow.delay_s = 0.5
-        with pytest.raises(DeviceError, match="unit 3 does not answer within 0.1 s; check unit and wiring"):
+        with pytest.raises(DeviceError, match=r"^unit 3 does not answer within 0.1 s; check unit and wiring$"):
             made.read()
         slow.delay_s = 0.0
         made.disconnect()
-    with pytest.raises(DeviceError, match="cannot be opened or reached") as caught:
+    with pytest.raises(DeviceError, match=r"^cannot be opened or reached; waiting for it$") as caught:
         device(port)
     assert caught.value.is_lost
 
@@ -147,7 +147,7 @@ def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line(monk
     line = client.comm_params
     assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 1)
     assert made.check()[0].startswith("/dev/ttyUSB7: no such port")
-    with pytest.raises(DeviceError, match=r"^/dev/ttyUSB7: no such port, is it unplugged\?; waiting for it$"):
+    with pytest.raises(DeviceError, match=r"^no such port, is it unplugged\?; waiting for it$"):
         made.connect()
 
 
@@ -214,7 +214,7 @@ def test_a_serial_line_that_is_unplugged_is_one_clear_line(monkeypatch: pytest.M
         eventually(lambda: len(attempts) >= 4, "it has tried to open the port again, twice or more")
         source.stop()
     assert [type(event) for event in events if not isinstance(event, ReadingBatch)] == [LinkUp, LinkDown]
-    assert events[-1] == LinkDown(f"{line.host}: no such port, is it unplugged?; waiting for it")
+    assert events[-1] == LinkDown("no such port, is it unplugged?; waiting for it")
     items = [item for event in events if isinstance(event, ReadingBatch) for item in event.items]
     refused = {item.kind for item in items if isinstance(item, Rejected)}
     assert refused <= {"skipped_polls"}, "a busy machine skips polls; nothing else is refused"

@@ -75,11 +75,11 @@ def test_the_older_schema_gives_speeds_and_the_command_of_the_vendor() -> None:
 
 def test_what_does_not_fit_the_controller_is_one_line() -> None:
     with redfish_server(Controller(is_new=True)) as url:
-        with pytest.raises(DeviceError, match=r"no fan 'FAN9'; there are: FAN1, 1, FAN2, 2"):
+        with pytest.raises(DeviceError, match=r"^no fan 'FAN9'; there are: FAN1, 1, FAN2, 2"):
             connected(url, fans=["FAN9", "FAN1"]).read()
-        with pytest.raises(DeviceError, match="2 fans, this tray has 3"):
+        with pytest.raises(DeviceError, match="^2 fans, this tray has 3"):
             connected(url, 3).read()
-        with pytest.raises(DeviceError, match="no chassis 'Rack' with fans; there are: 1U"):
+        with pytest.raises(DeviceError, match="^no chassis 'Rack' with fans; there are: 1U"):
             connected(url, chassis="Rack")
 
 
@@ -88,14 +88,14 @@ def test_a_controller_that_fails_or_is_slow_is_a_failed_poll_and_one_that_is_gon
     with redfish_server(controller) as url:
         made = connected(url)
         controller.status = 503
-        with pytest.raises(DeviceError, match="refused with HTTP status 503") as caught:
+        with pytest.raises(DeviceError, match="^refused with HTTP status 503") as caught:
             made.read()
         assert not caught.value.is_lost
         controller.status = 200
         made.disconnect()
         made = connected(url, timeout_s=0.3)
         controller.delay_s = 1.0
-        with pytest.raises(DeviceError, match="does not answer within 0.3 s") as caught:
+        with pytest.raises(DeviceError, match="^does not answer within 0.3 s") as caught:
             made.read()
         controller.delay_s = 0.0
         made.disconnect()
@@ -131,11 +131,11 @@ def test_credentials_come_from_a_file_or_the_environment_over_a_verified_line_on
         made = connected(url, **settings)
         assert reading(made).speed == (4000.0, 4200.0)
         made.disconnect()
-        with pytest.raises(DeviceError, match="its certificate cannot be verified: name the authority by source.ca"):
+        with pytest.raises(DeviceError, match="^its certificate cannot be verified: name the authority by source.ca"):
             connected(url, folder=tmp_path, credentials="bmc.secret")
         monkeypatch.setenv(USER_VARIABLE, "operator")
         monkeypatch.setenv(PASSWORD_VARIABLE, f"{SECRET}-not")
-        with pytest.raises(DeviceError, match="user or password is refused") as caught:
+        with pytest.raises(DeviceError, match="^user or password is refused") as caught:
             connected(url, folder=tmp_path, ca="ca.pem")
         assert SECRET not in str(caught.value)
     with pytest.raises(DeviceError, match="would send the password in the clear"):

@@ -40,9 +40,22 @@ def test_what_a_device_counts_itself_has_a_line_of_its_own():
     counts = {"device_frames": 7, "device_glitches": 900, "device_bad_crc": 3, "device_lost_edges": 1}
     found = refused([health(samples=9, **counts), health(device_bad_crc=1, device_overruns=0)])
     assert found == {"acquisition/bench": {"device_bad_crc": 4, "device_lost_edges": 1}}
-    words = "4 frames with a wrong checksum, 1 tacho edges that came too fast"
+    words = "4 frames with a wrong checksum, 1 tacho edge that came too fast"
     assert refused_lines(found) == [f"acquisition/bench: counted by the device itself: {words}"]
     assert unusable_lines([health(device_bad_crc=4)], LAUNCHED) == []
+
+
+def test_one_of_a_kind_is_singular():
+    found = refused([health(refused_input=1, garbage=1, refused_too_large=1, device_watchdog_resets=1)])
+    refused_words = "1 piece of input that is no usable sample, 1 message that is too large (garbage 1)"
+    assert refused_lines(found) == [
+        f"acquisition/bench: refused: {refused_words}",
+        "acquisition/bench: counted by the device itself: 1 restart by its watchdog",
+    ]
+    (line,) = unusable_lines([health(refused_input=1, garbage=1)], LAUNCHED)
+    assert "1 was refused" in line
+    plural = refused_lines(refused([health(refused_too_large=2)]))
+    assert plural == ["acquisition/bench: refused: 2 messages that are too large"]
 
 
 def test_everything_that_a_device_counts_is_shown_but_what_is_no_loss():

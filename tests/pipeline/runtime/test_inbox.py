@@ -9,6 +9,7 @@ import pytest
 
 from pipeline.runtime.inbox import INBOX_SIZE, MOST_PATIENT, FromBus, FromSource, Inbox, Item, Liveness
 from schemas.topics import health_key, tray_key
+from tests.support.running_chain import eventually
 
 LONG_S = 20.0
 MOMENT_S = 0.1
@@ -67,12 +68,25 @@ def test_row_16_health_and_liveness_of_others_are_no_input(waiting: Item) -> Non
     inbox = Inbox(drops_oldest=True)
     inbox.put(FromBus(health_key("s", "scorer", "all"), b"", 1))
     inbox.put(Liveness("key", alive=True))
-    assert not inbox.has_input
+    assert not inbox.has_input("")
     inbox.put(waiting)
-    assert inbox.has_input
+    assert [inbox.has_input(tray) for tray in ("", "a", "b")] == [True, True, False]
     for _ in range(3):
         inbox.get(0)
-    assert not inbox.has_input
+    assert [inbox.has_input(tray) for tray in ("", "a", "b")] == [False, False, False]
+
+
+def test_row_16_while_an_item_cannot_be_put_input_of_any_tray_may_wait() -> None:
+    inbox = Inbox(drops_oldest=False)
+    for _ in range(INBOX_SIZE):
+        inbox.put(FromSource("a", None))
+    assert not inbox.has_input("b")
+    blocked = threading.Thread(target=inbox.put, args=(FromSource("a", None),))
+    blocked.start()
+    eventually(lambda: inbox.has_input("b"), "what waits behind it is not known")
+    inbox.get(0)
+    blocked.join(LONG_S)
+    assert not inbox.has_input("b")
 
 
 def test_row_16_what_was_dropped_is_no_input() -> None:
@@ -81,6 +95,6 @@ def test_row_16_what_was_dropped_is_no_input() -> None:
         inbox.put(item(number))
     assert inbox.dropped == 1
     for _ in range(INBOX_SIZE):
-        assert inbox.has_input
+        assert inbox.has_input("")
         inbox.get(0)
-    assert not inbox.has_input
+    assert not inbox.has_input("")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +15,8 @@ from pipeline.bus.session import Bus
 from pipeline.config.models import TrayConfig
 from pipeline.launch.loss_accounting import losses
 from pipeline.runtime.runner import TICK_S
+from pipeline.runtime.sessions import Sessions
+from pipeline.runtime.silences import Silences
 from pipeline.runtime.stage import BuiltStage, Context, Core
 from schemas.codec import encode, type_name
 from schemas.enums import StageStatus
@@ -151,22 +154,27 @@ def test_a_producer_that_publishes_one_message_and_leaves_causes_no_loss(config)
     assert losses([health, last]) == {"resampler": 0}
 
 
+def waits(health: Health, tray: str) -> bool:
+    """Whether input waits of which more grids of a tray may be made."""
+    return next(output.has_more for output in health.outputs if output.key == tray_key("s", tray, "grid"))
+
+
 def test_row_16_a_stage_that_was_held_up_says_that_its_input_is_not_all_processed(config, monkeypatch):
     monkeypatch.setattr("pipeline.runtime.runner.HEALTH_PERIOD_S", 0.0)
-    may_step, waits = threading.Semaphore(0), threading.Event()
+    may_step, is_held = threading.Semaphore(0), threading.Event()
 
     class HeldUp(Answers):
         def step(self, item):
-            waits.set()
+            is_held.set()
             assert may_step.acquire(timeout=20)
             return super().step(item)
 
     bench = Bench(toy(lambda _context: BuiltStage(HeldUp())), config)
     try:
-        assert not bench.next(Health).has_unprocessed
+        assert not waits(bench.next(Health), TRAY_A)
         for number in range(3):
             bench.feed(TRAY_A, number)
-        assert waits.wait(20)
+        assert is_held.wait(20)
         threading.Event().wait(2 * TICK_S)
         may_step.release()
         healths = [bench.next(Health)]
@@ -174,8 +182,56 @@ def test_row_16_a_stage_that_was_held_up_says_that_its_input_is_not_all_processe
             healths.append(bench.next(Health))
     finally:
         may_step.release(2)
-    assert healths[-1].has_unprocessed
-    assert not bench.end().has_unprocessed
+    last = bench.end()
+    assert waits(healths[-1], TRAY_A)
+    assert not waits(healths[-1], TRAY_B)
+    assert not waits(last, TRAY_A)
+
+
+class Endless:
+    """A source of which an item always waits: the core that processes one asks for the next."""
+
+    def __init__(self, *, is_silent: bool = False) -> None:
+        self.is_silent = is_silent
+
+    def start(self, deliver: Callable[[Any], None]) -> None:
+        self.deliver = deliver
+        if not self.is_silent:
+            deliver(None)
+
+    def stop(self) -> None:
+        self.deliver = lambda _item: None
+
+
+def test_row_16_a_tray_whose_source_is_silent_shows_it_although_input_of_other_trays_always_waits(config, monkeypatch):
+    monkeypatch.setattr("pipeline.runtime.runner.HEALTH_PERIOD_S", 0.0)
+    monkeypatch.setattr("pipeline.runtime.silences.BEGINS_NS", 0)
+    sources = {f"b{number}": Endless() for number in range(20)} | {"a": Endless(is_silent=True)}
+
+    class OfSource(Passer):
+        def __init__(self, tray: str) -> None:
+            super().__init__()
+            self.tray = tray
+
+        def step(self, item: Any) -> Sequence[Message]:
+            time.sleep(0.001)
+            sources[self.tray].deliver(None)
+            return []
+
+    def build(context: Context) -> BuiltStage:
+        name = context.tray.name
+        return BuiltStage(OfSource(name), source=sources[name])
+
+    config = replace(config, trays=tuple(TrayConfig(name=name, fans=1) for name in sources))
+    bench = Bench(toy(build, name="acquisition", reads=()), config)
+    silences = Silences({tray_key("s", name, "grid"): name for name in sources}, Sessions())
+    shown: set[str] = set()
+    for _ in range(5):
+        health = bench.next(Health)
+        silences.add_health(health, lambda _stream, _published: True)
+        shown |= {name for name in sources if silences.take(name)}
+    bench.end()
+    assert shown == {"a"}
 
 
 def test_health_accounts_for_inputs_outputs_counters_and_losses(config):

@@ -250,6 +250,22 @@ def test_row_16_what_a_stage_does_not_answer_for_long_is_lost_and_the_stream_goe
     assert len(slow.asked) == 1
 
 
+def test_row_16_a_stage_that_is_left_alone_because_it_did_not_answer_is_asked_later():
+    slow = SlowProducer()
+    sessions = Sessions()
+    sessions.update(Session("scorer", "all", 1, PRODUCER, "host", 1).key("site"), alive=True)
+
+    def ask(request: Request) -> Found | None:
+        return slow.ask(request) if request.not_before_s else Found()
+
+    tracker = SequenceTracker(ask, lambda: slow.now_s, sessions)
+    assert sequences(tracker.accept(packet(0))) == [0]
+    assert tracker.accept(packet(4)) == []
+    (later,) = slow.asked
+    assert sequences(tracker.answer(later, Found([packet(n) for n in (1, 2, 3)], published=5))) == [1, 2, 3, 4]
+    assert tracker.inputs()[0].missing == 0
+
+
 def test_row_16_a_stage_that_has_said_that_it_ends_does_not_return():
     slow, sessions = SlowProducer(), Sessions()
     token = Session("scorer", "all", 1, PRODUCER, "host", 1).key("site")

@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 
 from pipeline.runtime.killed_sessions import KilledSessions
-from pipeline.runtime.sessions import Session, this_host
-from pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, RESTART_S, Silences
+from pipeline.runtime.sessions import Session, Sessions, this_host
+from pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, MOST_HEARD, RESTART_S, Silences
 from schemas.enums import StageStatus
 from schemas.header import Header
 from schemas.health import Health, Output
@@ -27,9 +27,18 @@ class Consumer:
     def __init__(self) -> None:
         self.now_s = 1e6
         self.arrived = 0
-        self.silences = Silences({KEY: "a"}, lambda: self.now_s)
+        self.sessions = Sessions()
+        self.silences = Silences({KEY: "a"}, self.sessions, lambda: self.now_s)
 
-    def hear(self, published: int, status: StageStatus = OK, producer: str = "p", **fields: object) -> None:
+    def hear(
+        self,
+        published: int,
+        status: StageStatus = OK,
+        producer: str = "p",
+        *,
+        has_more: bool = False,
+        **fields: object,
+    ) -> None:
         health = Health(
             header=Header(producer, 0, ""),
             stage="acquisition",
@@ -37,9 +46,14 @@ class Consumer:
             status=status,
             t_ns=round(self.now_s * NS_PER_S),
             uptime_s=0.0,
-            outputs=(Output(key=KEY, published=published), Output(key="another", published=9)),
+            outputs=(
+                Output(key=KEY, published=published, has_more=has_more),
+                Output(key="another", published=9, has_more=True),
+            ),
         )
-        self.silences.add_health(replace(health, **fields), self._has_all_of)  # type: ignore[arg-type]
+        health = replace(health, **fields)  # type: ignore[arg-type]
+        self.sessions.add_health(health, {KEY})
+        self.silences.add_health(health, self._has_all_of)
 
     def _has_all_of(self, stream: tuple[str, str], published: int) -> bool:
         assert stream[0] == KEY
@@ -67,7 +81,7 @@ def test_row_16_a_silence_is_shown_once_by_each_health_that_says_that_all_has_ar
 
 def test_row_16_a_producer_that_has_not_processed_its_input_shows_nothing(consumer):
     consumer.arrived = 5
-    consumer.hear(5, has_unprocessed=True)
+    consumer.hear(5, has_more=True)
     assert not consumer.is_shown(), "it could not send for a while, and samples wait in it"
     consumer.hear(5)
     assert consumer.is_shown()
@@ -182,6 +196,78 @@ def test_row_11_a_killed_session_has_ended(consumer):
     consumer.arrived = 5
     assert consumer.is_shown()
     assert consumer.is_shown()
+
+
+FIRST, SECOND = (
+    Session("acquisition", "a", started, f"acquisition-a-0{started}", this_host(), started) for started in (1, 2)
+)
+
+
+@pytest.fixture
+def of_two(consumer: Consumer) -> Consumer:
+    """Two sessions have the tray. The one that started later is its owner; of its nine messages, four are kept."""
+    for session in (FIRST, SECOND):
+        consumer.sessions.update(session.key("s"), alive=True)
+    consumer.arrived = 5
+    consumer.hear(9, OK, SECOND.producer)
+    assert not consumer.is_shown()
+    return consumer
+
+
+def test_row_11_a_session_that_does_not_own_the_tray_shows_nothing(of_two):
+    for _ in range(2 * BEGINS_NS // NS_PER_S):
+        of_two.now_s += 1.0
+        of_two.hear(0, OK, FIRST.producer)
+        assert not of_two.is_shown()
+    of_two.hear(0, STOPPED, FIRST.producer)
+    assert not of_two.is_shown()
+    assert not of_two.is_shown(), "it was another session that ended"
+
+
+def test_row_11_a_session_that_has_become_the_owner_shows_a_silence(of_two):
+    of_two.sessions.update(SECOND.key("s"), alive=False)
+    of_two.hear(5, OK, FIRST.producer)
+    assert of_two.is_shown()
+
+
+@pytest.mark.parametrize("stage", ["acquisition", "another"])
+def test_row_11_a_producer_that_is_no_session_shows_nothing_where_a_session_publishes(of_two, stage):
+    of_two.hear(5, OK, "stranger", stage=stage)
+    assert not of_two.is_shown()
+
+
+def test_row_16_a_late_health_is_late_also_after_one_of_another_producer(consumer):
+    consumer.arrived = 5
+    consumer.hear(5)
+    assert consumer.is_shown()
+    sent_ns = round(consumer.now_s * NS_PER_S)
+    consumer.now_s += 30.0
+    consumer.hear(0, STARTING, "q")
+    consumer.hear(5, t_ns=sent_ns)
+    assert not consumer.is_shown()
+
+
+def test_a_session_has_begun_also_where_another_one_reports_by_turns(consumer):
+    shown: list[bool] = []
+    for _ in range(BEGINS_NS // NS_PER_S + 1):
+        consumer.hear(0)
+        shown.append(consumer.is_shown())
+        consumer.hear(3, OK, "q")
+        assert not consumer.is_shown()
+        consumer.now_s += 1.0
+    assert (shown[0], shown[-1]) == (False, True)
+
+
+def test_row_11_of_sessions_that_come_and_go_the_last_ones_are_remembered(consumer):
+    consumer.arrived = 5
+    sent_ns = round(consumer.now_s * NS_PER_S)
+    for number in range(MOST_HEARD + 1):
+        consumer.hear(5, OK, f"p{number}")
+    consumer.now_s += 30.0
+    for number, is_shown in ((MOST_HEARD, False), (0, True)):
+        consumer.is_shown()
+        consumer.hear(5, OK, f"p{number}", t_ns=sent_ns)
+        assert consumer.is_shown() == is_shown
 
 
 def token(process_id: int, host: str = this_host()) -> str:
