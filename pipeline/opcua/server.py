@@ -40,7 +40,7 @@ MOST_PENDING = 20_000
 """transitions that wait to become events; of more, the oldest are left out, and clients are asked to refresh"""
 LARGEST_BACKLOG_BYTES, LONGEST_BACKLOG_S = 16 << 20, 30.0
 """answers that wait because a client does not read them; with more, or after so long, it is cut off"""
-_LARGEST_REQUEST_BYTES = 4 << 20
+_LARGEST_REQUEST_BYTES = 16 << 20
 _CHUNK_BYTES = 65_535
 _AT_ONCE = 200
 """values that are published before others may do something"""
@@ -55,6 +55,18 @@ class Listening:
     certificate: Path
     key: Path
     is_open: bool
+
+
+class RequestLimits(TransportLimits):
+    """How large a request may be. The library takes what a client can receive for what it may send."""
+
+    def create_acknowledge_and_set_limits(self, msg: ua.Hello) -> ua.Acknowledge:
+        """The answer to a client's greeting."""
+        largest, chunks = self.max_message_size, self.max_chunk_count
+        answer = super().create_acknowledge_and_set_limits(msg)
+        self.max_message_size, self.max_chunk_count = largest, chunks
+        answer.MaxMessageSize, answer.MaxChunkCount = largest, chunks
+        return answer
 
 
 class OpcuaServer:
@@ -169,7 +181,7 @@ class OpcuaServer:
         host = listening.host.strip("[]")
         server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{listening.port}/fantwin")
         server.socket_address = (host, listening.port)
-        server.limits = TransportLimits(
+        server.limits = RequestLimits(
             _CHUNK_BYTES, _CHUNK_BYTES, _LARGEST_REQUEST_BYTES // _CHUNK_BYTES + 1, _LARGEST_REQUEST_BYTES
         )
         policies = [

@@ -89,7 +89,10 @@ def new_client(tmp_path: Path) -> Iterator[Callable[[], NodeOpcua]]:
         client.close()
 
 
-def test_it_browses_the_site_and_reads_values_with_their_quality_and_the_time_of_the_sample(opcua, new_client):
+def test_it_browses_the_site_and_reads_values_with_their_quality_and_the_time_of_the_sample(
+    opcua, new_client, monkeypatch
+):
+    monkeypatch.setattr("pipeline.presenting.site_model.SILENT_AFTER_S", 600.0)  # one score, and a slow host
     opcua.feed(score())
     client = new_client()
     assert client.connect(opcua.url, OPERATOR, PASSWORD)["mode"] == "SignAndEncrypt"

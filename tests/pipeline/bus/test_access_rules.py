@@ -108,7 +108,8 @@ def test_who_may_publish_what(site):
         for topic in OF_TRAYS
     }
     assert writers["raw"] == ["acquisition", "replay"]
-    assert writers["command"] == writers["request"] == ["dcim", "operator", "replay"]
+    assert writers["command"] == ["dcim", "operator", "replay"]
+    assert writers["request"] == ["dcim", "gateway", "opcua", "operator", "replay"]
 
 
 def test_who_may_read_what(site):
