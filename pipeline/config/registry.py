@@ -119,5 +119,6 @@ STAGES: dict[str, StageRow] = {
             reads=("score", "alarm", "twin", "health"),
             writes=("request",),
         ),
+        StageRow("notifier", "stages.notifier:STAGE", has_common_shards=False, reads=("alarm",), writes=()),
     )
 }
