@@ -10,6 +10,7 @@ import sqlite3
 import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -71,6 +72,7 @@ class Outbox:
         self._lock = threading.Lock()
         self.lost: Counter[str] = Counter()
         """messages lost since the start, by target"""
+        self._waiting = 0
         names = tuple(targets)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -190,9 +192,11 @@ class Outbox:
             )
 
     def count(self) -> int:
-        """How many messages wait."""
+        """How many messages wait; once the file is closed or cannot be read, how many did."""
         with self._lock:
-            return self._file.execute("SELECT COUNT(*) FROM message").fetchone()[0]
+            with suppress(sqlite3.Error):
+                self._waiting = self._file.execute("SELECT COUNT(*) FROM message").fetchone()[0]
+            return self._waiting
 
     def firing(self, target: str) -> set[FiringKey]:
         """The alerts that an Alertmanager was given and that have not been resolved there."""
@@ -208,6 +212,7 @@ class Outbox:
 
     def close(self) -> None:
         """Leave a complete file."""
+        self.count()
         with self._lock:
             self._file.close()
 
