@@ -31,7 +31,7 @@ EXPIRY_PERIOD_NS = 60 * NS_PER_S
 ALERTS_PERIOD_NS = NS_PER_S
 SAVED_AGAIN_AFTER_NS = NS_PER_S
 """a full disk is tried again"""
-STOPPED_WITHIN_S = 5.0
+STOPPED_WITHIN_S = 3.0
 """deliveries that are under way"""
 
 
@@ -116,7 +116,9 @@ class NotifierCore(Core):
 
     def problem(self) -> str:
         """Of the targets and the outbox."""
-        lost = [f"target {name}: messages were lost, too old or too many" for name in sorted(self._outbox.lost)]
+        lost = [
+            f"target {name}: messages were lost: too old, too many, or refused" for name in sorted(self._outbox.lost)
+        ]
         return "; ".join(filter(None, (self._saving, *(s.problem() for s in self._senders.values()), *lost)))
 
     def notes(self) -> Sequence[str]:

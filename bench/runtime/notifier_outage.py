@@ -52,87 +52,102 @@ url_file = "mail.url"
 """
 
 
+class Site:
+    """A scorer that publishes alarms, a mail server, and a notifier in a process."""
+
+    def __init__(self, folder: Path, bus: Bus, endpoint: str) -> None:
+        config = folder / "fantwin.toml"
+        config.write_text(CONFIGURATION.format(endpoint=endpoint, fans=FANS))
+        self.mail = MailServer()
+        self.mail.start()
+        secret(folder, "mail", self.mail.url)
+        self._folder = folder
+        self._words = ["run", "notifier", "-c", config]
+        key = tray_key("hall", "tray1", "alarm")
+        self._publisher = bus.publisher(key, BY_NAME["alarm"], type_name(Alarm), "scorer-all-1")
+        self.puts_s: list[float] = []
+        self.expected: list[str] = []
+        self.notifier = RunningCommand(self._words)
+
+    def publish(self, *fans: int) -> None:
+        for fan in fans:
+            payload = encode(alarm(fan=fan, sequence=self._publisher.published))
+            before_s = time.monotonic()
+            self._publisher.put(payload)
+            self.puts_s.append(time.monotonic() - before_s)
+        one, many = (
+            f"WARNING, fan {fans[0]} of tray1 (hall)",
+            f"{len(fans)} alarms in 1 tray (hall): {len(fans)} WARNING",
+        )
+        self.expected.append(one if len(fans) == 1 else many)
+
+    def outage(self, outage_s: float) -> None:
+        """The server is away; a power cut in the middle, and then a kill."""
+        self.mail.stop()
+        began_s, fan, is_cut, is_killed = time.monotonic(), 1, False, False
+        while (gone_s := time.monotonic() - began_s) < outage_s - EVERY_S:
+            self.publish(fan)
+            fan += 1
+            time.sleep(EVERY_S)
+            if not is_cut and gone_s > outage_s / 2:
+                is_cut = True
+                self.publish(*range(FANS - CUT_FANS, FANS))
+                time.sleep(EVERY_S)
+            if not is_killed and gone_s > KILLED_AT * outage_s:
+                is_killed = True
+                self.notifier.kill()
+                self.notifier = RunningCommand(self._words)
+        time.sleep(max(0.0, outage_s - (time.monotonic() - began_s)))
+        self.mail.start()
+
+    def is_done(self) -> bool:
+        return len(self.mail.mails) >= len(self.expected) and not waiting(self._folder)
+
+    def close(self) -> None:
+        self.notifier.end()
+        self.notifier.kill()
+        self.mail.stop()
+
+
 def main(
     outage_s: Annotated[float, typer.Option(min=60, help="How long the mail server is away.")] = 600.0,
     as_json: JsonOption = False,
 ) -> None:
-    with tempfile.TemporaryDirectory() as folder, socket.socket() as probe:
+    with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        probe.close()
-        measure(Path(folder), endpoint, outage_s, as_json)
-
-
-def measure(folder: Path, endpoint: str, outage_s: float, as_json: bool) -> None:
-    config = folder / "fantwin.toml"
-    config.write_text(CONFIGURATION.format(endpoint=endpoint, fans=FANS))
-    mail = MailServer()
-    mail.start()
-    secret(folder, "mail", mail.url)
-    words = ["run", "notifier", "-c", config]
-    puts_s: list[float] = []
-    expected: list[str] = []
-    with Bus(BusConfig(endpoint=endpoint)) as bus:
-        publisher = bus.publisher(
-            tray_key("hall", "tray1", "alarm"), BY_NAME["alarm"], type_name(Alarm), "scorer-all-1"
-        )
-
-        def publish(fan: int) -> None:
-            payload, before_s = encode(alarm(fan=fan, sequence=publisher.published)), time.monotonic()
-            publisher.put(payload)
-            puts_s.append(time.monotonic() - before_s)
-
-        def publish_one(fan: int) -> None:
-            publish(fan)
-            expected.append(f"WARNING, fan {fan} of tray1 (hall)")
-
-        notifier = RunningCommand(words)
+    with tempfile.TemporaryDirectory() as folder, Bus(BusConfig(endpoint=endpoint)) as bus:
+        site = Site(Path(folder), bus, endpoint)
         try:
-            publish_one(0)
-            eventually(lambda: mail.mails, "the first arrives")
-            mail.stop()
+            site.publish(0)
+            eventually(lambda: site.mail.mails, "the first arrives")
             progress(f"the mail server is away for {outage_s:.0f} s")
-            began_s, fan, is_cut, is_killed = time.monotonic(), 1, False, False
-            while (gone_s := time.monotonic() - began_s) < outage_s - EVERY_S:
-                publish_one(fan)
-                fan += 1
-                time.sleep(EVERY_S)
-                if not is_cut and gone_s > outage_s / 2:
-                    is_cut = True
-                    for each in range(CUT_FANS):
-                        publish(FANS - 1 - each)
-                    expected.append(f"{CUT_FANS} alarms in 1 tray (hall): {CUT_FANS} WARNING")
-                    time.sleep(EVERY_S)
-                if not is_killed and gone_s > KILLED_AT * outage_s:
-                    is_killed = True
-                    notifier.kill()
-                    notifier = RunningCommand(words)
-            time.sleep(max(0.0, outage_s - (time.monotonic() - began_s)))
-            mail.start()
+            site.outage(outage_s)
             back_s = time.time()
             progress("the mail server is back")
-            eventually(lambda: len(mail.mails) >= len(expected) and not waiting(folder), "all arrive", deadline_s=600)
-            notifier.end()
+            eventually(site.is_done, "all arrive", deadline_s=600)
         finally:
-            notifier.kill()
-            mail.stop()
-    cost = resource.getrusage(resource.RUSAGE_CHILDREN)
+            site.close()
+    show({"Mail server away": [row_of(site, outage_s, back_s)]}, ["from the return of the server"], as_json=as_json)
+
+
+def row_of(site: Site, outage_s: float, back_s: float) -> dict[str, float | str]:
+    cost, mail = resource.getrusage(resource.RUSAGE_CHILDREN), site.mail
     counts = Counter(mail.subjects())
     arrived_s = [each - back_s for each in mail.received_s[1:]]
-    row = {
+    return {
         "away, s": outage_s,
         "mails": len(mail.mails),
-        "missing": sum(subject not in counts for subject in expected),
+        "missing": sum(subject not in counts for subject in site.expected),
         "twice": sum(counts.values()) - len(counts),
         "marked": sum(MAY_BE_REPEATED in body for _, body in mail.mails),
-        "in order": "yes" if mail.subjects() == expected else "no",
+        "in order": "yes" if mail.subjects() == site.expected else "no",
         "first after, s": min(arrived_s),
         "last after, s": max(arrived_s),
-        "longest put, ms": 1000 * max(puts_s),
+        "longest put, ms": 1000 * max(site.puts_s),
         "CPU, s": cost.ru_utime + cost.ru_stime,
         "memory, MB": cost.ru_maxrss / 1024,
     }
-    show({"Mail server away": [row]}, ["times are from the return of the server"], as_json=as_json)
 
 
 def waiting(folder: Path) -> int:

@@ -158,14 +158,14 @@ class Outbox:
             self._lose("made_ns < ?", (now_ns - round(kept_s * NS_PER_S),))
             self._lose("number <= (SELECT number FROM message ORDER BY number DESC LIMIT 1 OFFSET ?)", (most_messages,))
 
-    def next_for(self, target: str) -> Waiting | None:
-        """The oldest message of a target; None: there is none."""
+    def next_for(self, target: str, after: int = 0) -> Waiting | None:
+        """The oldest message of a target, or the first one after another; None: there is none."""
         with self._lock:
             row = self._file.execute(
                 "SELECT number, made_ns, title, body, level, may_be_repeated,"
                 " coalesce((SELECT count FROM lost WHERE target = ?1), 0)"
-                " FROM message WHERE target = ?1 ORDER BY number LIMIT 1",
-                (target,),
+                " FROM message WHERE target = ?1 AND number > ?2 ORDER BY number LIMIT 1",
+                (target, after),
             ).fetchone()
         if row is None:
             return None
@@ -190,6 +190,11 @@ class Outbox:
                 "UPDATE message SET under_way = 0, may_be_repeated = may_be_repeated OR ? WHERE number = ?",
                 (is_uncertain, waiting.number),
             )
+
+    def refuse(self, target: str, waiting: Waiting) -> None:
+        """Its target takes others, but not this one: it is lost."""
+        with self._lock, self._transaction():
+            self._lose("target = ? AND number = ?", (target, waiting.number))
 
     def count(self) -> int:
         """How many messages wait; once the file is closed or cannot be read, how many did."""

@@ -16,15 +16,19 @@ FIRST_DELAY_S, LONGEST_DELAY_S = 1.0, 60.0
 HUNG_AFTER_S = 90.0
 """a delivery that takes longer is a problem to report"""
 IDLE_S = 1.0
+REFUSED_ATTEMPTS = 5
+"""a message that was refused so often is lost if the next one is taken"""
 MAY_BE_REPEATED = "(This may be a repetition: it is not known whether the delivery before this one arrived.)"
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a delivery failed. is_uncertain: it may have arrived all the same."""
+    """Why a delivery failed. is_uncertain: it may have arrived all the same. is_refusal: the target answers, and does
+    not want it."""
 
     reason: str
     is_uncertain: bool = False
+    is_refusal: bool = False
 
 
 Deliver = Callable[[Text], Failure | None]
@@ -54,6 +58,8 @@ class Sender:
         self._wake = threading.Event()
         self._failing = ""
         self._delivery_began_s: float | None = None
+        self._refused_number = self._refusals = 0
+        """of the message that was refused last, how often"""
         self.sent = self.attempts = 0
         self._thread = threading.Thread(target=self._run, name=f"sender of {target}", daemon=True)
 
@@ -100,17 +106,34 @@ class Sender:
             if waiting is None:
                 self._failing = ""
                 return 0.0
-            self._outbox.begin(waiting)
-            self.attempts += 1
-            self._delivery_began_s = time.monotonic()
-            failure = self._deliver(words_sent(waiting))
-            self._delivery_began_s = None
-            if failure is not None:
-                self._outbox.failed(waiting, is_uncertain=failure.is_uncertain)
+            failure = self._attempt(waiting)
+            if failure is not None and failure.is_refusal and self._is_refused_alone(waiting):
+                self._outbox.refuse(self._target, waiting)
+            elif failure is not None:
                 self._failing = f"target {self._target}: not delivered ({failure.reason}); tried again until it is"
                 return min(LONGEST_DELAY_S, max(FIRST_DELAY_S, 2 * delay_s))
-            self._outbox.delivered(self._target, waiting)
-            self.sent += 1
             self._failing, delay_s = "", 0.0
             self._stop.wait(self._pause_s)
         return delay_s
+
+    def _attempt(self, waiting: Waiting) -> Failure | None:
+        self._outbox.begin(waiting)
+        self.attempts += 1
+        self._delivery_began_s = time.monotonic()
+        failure = self._deliver(words_sent(waiting))
+        self._delivery_began_s = None
+        if failure is not None:
+            self._outbox.failed(waiting, is_uncertain=failure.is_uncertain)
+        else:
+            self._outbox.delivered(self._target, waiting)
+            self.sent += 1
+        return failure
+
+    def _is_refused_alone(self, waiting: Waiting) -> bool:
+        """Whether the target refuses this message again and again, and takes the next one, which it then has."""
+        self._refusals = self._refusals + 1 if waiting.number == self._refused_number else 1
+        self._refused_number = waiting.number
+        following = self._outbox.next_for(self._target, after=waiting.number)
+        if self._refusals < REFUSED_ATTEMPTS or following is None:
+            return False
+        return self._attempt(following) is None

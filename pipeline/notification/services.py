@@ -23,6 +23,8 @@ _KNOWN_REASONS = re.compile(
 )
 """in what apprise logs at level DEBUG, which may hold parts of the URL"""
 _OF_FAILURES = ("WARNING", "ERROR", "CRITICAL")
+_REFUSAL = re.compile(r"(?<!\d)5\d\d, b'|error=4(?!01|03|04|08|29)\d\d")
+"""the answer of a server that does not want this message; not those that it gives to any"""
 _UNCERTAIN = re.compile(r"timed out|closed|reset")
 
 
@@ -96,7 +98,7 @@ def _failure(said: list[tuple[str, str]]) -> Failure:
     known = [match for _, words in said for match in _KNOWN_REASONS.findall(words)]
     warnings = [words.strip() for level, words in said if level in _OF_FAILURES]
     reason = "; ".join(dict.fromkeys(each.lstrip("(") for each in known)) or (warnings[-1] if warnings else "refused")
-    return Failure(reason[:200], is_uncertain=bool(_UNCERTAIN.search(reason)))
+    return Failure(reason[:200], is_uncertain=bool(_UNCERTAIN.search(reason)), is_refusal=bool(_REFUSAL.search(reason)))
 
 
 def _asset() -> AppriseAsset:

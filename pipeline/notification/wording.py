@@ -184,8 +184,14 @@ def _how_many(fans: Sequence[tuple[FanAlarm, Happened]]) -> list[str]:
     parts = [f"{active[name]} {name}" for name in ("ALARM", "WARNING") if active.get(name)]
     if cleared := sum(not each.active for each in alarms):
         parts.append(f"{cleared} cleared")
-    for kind, words in ((Kind.AGAIN, "not acknowledged for long"), (Kind.ESCALATED, "acknowledged by nobody")):
-        if count := sum(kind in happened.kinds and alarm.active for alarm, happened in fans):
+    reasons = (
+        (Kind.WORSE, "worse"),
+        (Kind.AGAIN, "not acknowledged for long"),
+        (Kind.ESCALATED, "acknowledged by nobody"),
+        (Kind.NOT_CONFIRMED, "no longer confirmed by data"),
+    )
+    for kind, words in reasons:
+        if count := sum(a.active and kind in h.kinds and Kind.RAISED not in h.kinds for a, h in fans):
             parts.append(f"{count} {words}")
     return parts
 

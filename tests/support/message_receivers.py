@@ -40,6 +40,7 @@ class MailServer:
         """hangs_up: when it has taken a mail, before it says so"""
         self.answered: int | None = None
         """so many mails; the others it takes, and says nothing; None: all"""
+        self.refused_subjects: set[str] = set()
         self._controller: Controller | None = None
 
     @property
@@ -63,6 +64,8 @@ class MailServer:
             return "552 Too much mail"
         assert isinstance(envelope.content, bytes)
         mail = message_from_bytes(envelope.content, policy=default)
+        if mail["subject"] in self.refused_subjects:
+            return "554 No"
         body = mail.get_body(("plain",))
         assert body is not None
         self.mails.append((mail["subject"], body.get_content()))

@@ -164,6 +164,10 @@ def test_a_power_cut_is_one_message():
     assert "no power 300" in digest.body
     assert lines[-1] == "https://hall.example"
     assert len(digest.body) < 1000
+    for fan in range(200):
+        desk.hear(alarm(Transition.DATA_LOST, fan=fan, tray="tray0", severity=Severity.ALARM, stale=True))
+    (lost,) = desk.wait(100)
+    assert lost.title == "200 alarms in 1 tray (hall): 200 ALARM, 200 no longer confirmed by data"
 
 
 def test_while_more_fans_keep_coming_messages_become_rarer():
