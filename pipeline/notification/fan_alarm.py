@@ -11,6 +11,7 @@ from scoring.alarms.alarm_flags import is_presented, is_silenced
 
 FanName = tuple[str, int]
 """tray and fan"""
+MOST_FORMER = 8
 _WITH_DEVIATION = (Transition.RAISED, Transition.SEVERITY)
 _NAMES_WHO_ACKNOWLEDGED = (Transition.ACKNOWLEDGED, Transition.REPUBLISHED)
 
@@ -45,6 +46,8 @@ class FanAlarm:
     deviation: str
     """how far the fan is from its twin, as the last message of this occurrence that said so has it; may be empty"""
     causes: tuple[NamedCause, ...]
+    former_producers: tuple[str, ...] = ()
+    """the last ones before `producer`: what comes from them now is old"""
 
     @property
     def name(self) -> FanName:
@@ -64,17 +67,24 @@ class FanAlarm:
     def from_json(cls, text: str) -> Self:
         """What `to_json` wrote."""
         values = json.loads(text)
-        return cls(**{**values, "causes": tuple(NamedCause(**each) for each in values["causes"])})
+        causes = tuple(NamedCause(**each) for each in values["causes"])
+        return cls(**{**values, "causes": causes, "former_producers": tuple(values["former_producers"])})
 
 
 def after(before: FanAlarm | None, message: Alarm, now_ns: int) -> FanAlarm | None:
-    """The alarm of a fan after a message; None: the message was processed before, or a later one of its producer was.
+    """The alarm of a fan after a message; None: the message was processed before, or a later one was.
 
     now_ns: time of the host.
     """
     header = message.header
-    if before and before.producer == header.producer and header.sequence <= before.sequence:
+    former = before.former_producers if before else ()
+    if before and before.producer == header.producer:
+        if header.sequence <= before.sequence:
+            return None
+    elif header.producer in former:
         return None
+    elif before:
+        former = (*former, before.producer)[-MOST_FORMER:]
     of_same = before if before and before.onset_t_ns == message.onset_t_ns else None
     presented = is_presented(message)
     first_heard_ns = of_same.first_heard_ns if of_same else 0
@@ -100,6 +110,7 @@ def after(before: FanAlarm | None, message: Alarm, now_ns: int) -> FanAlarm | No
         stale=message.stale,
         deviation=deviation,
         causes=tuple(NamedCause(each.cause, each.probability, each.evidence) for each in message.causes),
+        former_producers=former,
     )
 
 

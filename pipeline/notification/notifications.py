@@ -19,7 +19,8 @@ from schemas.units import NS_PER_S
 
 FIRST_LOOK_NS = 10 * NS_PER_S
 """a notifier that has never run hears what happened before: in this time it only learns what the alarms are now"""
-TIMES_PERIOD_NS = NS_PER_S
+TIMES_PERIOD_NS = 5 * NS_PER_S
+"""so often it is looked whether time alone brings a message: for 5,000 active alarms that takes 50 ms"""
 
 
 class Basket(StrEnum):
