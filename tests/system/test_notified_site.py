@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
-from schemas.codec import encode, type_name
-from schemas.messages import Alarm
-from schemas.topics import BY_NAME, tray_key
+from schemas.codec import decode, encode, type_name
+from schemas.messages import Alarm, Health
+from schemas.topics import BY_NAME, health_key, tray_key
 from stages.notifier import OUTBOX
 from tests.support.message_receivers import MailServer
 from tests.support.notified_alarms import alarm, cleared, secret
@@ -63,6 +63,11 @@ def test_a_notifier_that_is_killed_during_an_outage_sends_all_once_and_in_order(
             tray_key("hall", "tray1", "alarm"), BY_NAME["alarm"], type_name(Alarm), "scorer-all-1"
         )
 
+        reported: list[Health] = []
+        bus.subscribe(
+            health_key("hall", "notifier", "all"), lambda _key, payload: reported.append(decode(Health, payload))
+        )
+
         def publish(fan: int, make: Callable[..., Alarm] = alarm) -> None:
             publisher.put(encode(make(fan=fan, sequence=publisher.published)))
 
@@ -84,6 +89,8 @@ def test_a_notifier_that_is_killed_during_an_outage_sends_all_once_and_in_order(
             mail.start()
             eventually(lambda: waiting(tmp_path) == 0, "all is delivered")
             assert notifier.end() == 0, notifier.lines
+            assert any("target mail: not delivered" in health.problem for health in reported), "the outage was said"
+            assert not any(health.waiting_for for health in reported), "alarms are rare: nobody waits for them"
         finally:
             notifier.kill()
     raised = [f"WARNING, fan {fan} of tray1 (hall)" for fan in (0, 1, 2, 3)]
