@@ -46,7 +46,7 @@ class Announced:
 
     Attributes:
         is_open: it has not heard that the alarm is over.
-        last_ns: when it last heard of it, by the clock of the host.
+        last_ns: when it last heard of it, by the clock of the host; not that data do not confirm it.
         repeats: how many times it was sent again.
         is_stale_said: it has heard that data do not confirm the alarm.
         was_silenced: an operator has silenced the alarm since.
@@ -129,7 +129,9 @@ def _continue(
     if not alarm.acknowledged and not events and (announced.was_silenced or is_due):
         now = replace(now, repeats=announced.repeats + 1)
         add(Kind.AGAIN, now.repeats)
-    return events, replace(now, last_ns=now_ns) if events else now
+    # of fans that were raised together, those that data do not confirm stay together with the others
+    is_reminded = any(event.kind != Kind.NOT_CONFIRMED for event in events)
+    return events, replace(now, last_ns=now_ns) if is_reminded else now
 
 
 def _has_passed(seconds: float, since_ns: int, now_ns: int) -> bool:
