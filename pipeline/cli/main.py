@@ -34,6 +34,7 @@ COMMANDS = {
     "router": "watch.router",
     "certs": "watch.certs",
     "users": "watch.users",
+    "notify": "watch.notify",
     "replay": "recordings.replay",
     "info": "recordings.info",
     "recover": "recordings.recover",

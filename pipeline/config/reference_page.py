@@ -85,6 +85,7 @@ def page() -> str:
             f"## `[{name}]`\n",
             f"{stage.about[0].upper()}{stage.about[1:]}.{start}\n",
             _table(stage.config, but=()),
+            *_tables_within(stage.config),
         ]
     return re.sub(r"\n{3,}", "\n\n", "\n".join(parts))
 
@@ -100,7 +101,7 @@ def _sources() -> Iterator[str]:
 
 
 def _tables_within(model: type[BaseModel]) -> Iterator[str]:
-    """The keys of the tables that are values of keys of a source, each kind of table once."""
+    """The keys of the tables that are values of keys of a source or a stage, each kind of table once."""
     waiting, shown = [model], set[type[BaseModel]]()
     while waiting:
         for key, field in waiting.pop(0).model_fields.items():

@@ -127,5 +127,6 @@ STAGES: dict[str, StageRow] = {
             reads=("score", "alarm", "twin"),
             writes=("request",),
         ),
+        StageRow("notifier", "stages.notifier:STAGE", has_common_shards=False, reads=("alarm",), writes=()),
     )
 }

@@ -120,7 +120,8 @@ class Runner:
             main_keys={
                 tray_key(config.site, tray, topic)
                 for topic in main
-                if topic in stage.reads_as_configured(config)
+                # what is published seldom is not waited for
+                if topic in stage.reads_as_configured(config) and not BY_NAME[topic].is_rare
                 for tray in shard.trays
             },
             trays=() if shard.is_whole else shard.trays,

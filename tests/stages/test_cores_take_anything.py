@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.config.models import TrayConfig
+from pipeline.notification.config import NotifierConfig
+from pipeline.notification.notifications import Notifications, Saved
+from pipeline.notification.outbox import Outbox
+from pipeline.notification.wording import Place
 from pipeline.runtime.stage import Core
 from pipeline.runtime.twin_file import TwinFile
 from pipeline.viewing.fleet import Fan
@@ -23,6 +28,7 @@ from schemas.header import Header
 from schemas.health import Health
 from schemas.messages import Alarm, Grid, Message, ModelCard, Prediction, Raw, Request, Score, ScorerSnapshot
 from schemas.topics import TOPICS
+from stages.notifier import NotifierCore
 from stages.resampler import ResamplerConfig, ResamplerCore
 from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from stages.viewer import STAGE, ViewerCore
@@ -144,3 +150,18 @@ def test_the_viewer_survives_any_message(session: list[Message], tray: str, is_f
     trays, plots = [TrayConfig(name="tray1", fans=FANS)], FleetPlots([Fan("tray1", 0)], 1)
     fleet = FleetView("site", trays, PlotPlaces(plots, 0), 2_000_000_000) if is_fleet else None
     survives(ViewerCore(trays, FakeSink(), fleet), session, tray, STAGE.undecoded)
+
+
+@NO_SLOW_CHECK
+@given(session=sessions(Alarm))
+def test_the_notifier_survives_any_alarm(session: list[Message]) -> None:
+    target = {"name": "hook", "url_env": "FANTWIN_TEST_URL", "quiet_hours": {"begin": "00:00", "end": "12:00"}}
+    config = NotifierConfig.model_validate({"target": [target], "gather_s": 0})
+    with tempfile.TemporaryDirectory() as folder:
+        outbox = Outbox(Path(folder) / "outbox", ["hook"])
+        notifications = Notifications(config, Place("hall"), Saved(is_first=False), outbox.was_sent)
+        core = NotifierCore(config, (TrayConfig(name="tray1", fans=FANS),), notifications, outbox, {})
+        survives(core, session)
+        left = Outbox(Path(folder) / "outbox", ["hook"])
+        left.load()
+        left.close()

@@ -1,0 +1,58 @@
+"""`fantwin notify`: a test message to the targets of the notifier."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from pipeline.config.loading import load_config
+from pipeline.errors import UsageError, UserError
+from pipeline.notification.config import NotifierConfig
+from pipeline.notification.targets import send_test
+from pipeline.notification.wording import Place
+
+
+def notify(
+    targets: Annotated[list[str] | None, typer.Argument(metavar="[TARGET]...", help="Without any: all.")] = None,
+    config: ConfigOption = DEFAULT_CONFIG,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Send a test message to the targets of the notifier, and say which have taken it.
+
+    The notifier need not run.
+
+    Example: fantwin notify on_call
+    """
+    settings = load_config(config, overrides or (), stages=("notifier",))
+    section = settings.sections["notifier"]
+    assert isinstance(section, NotifierConfig)
+    known = {target.name: target for target in section.target}
+    if not known:
+        raise UserError(f"{config}: no targets: add a table [[notifier.target]] with a name and url_file")
+    if unknown := [name for name in targets or () if name not in known]:
+        raise UsageError(f"{config}: no target {', '.join(unknown)}: there is {', '.join(known)}")
+
+    def resolve(path: Path) -> Path:
+        return path if path.is_absolute() else settings.folder / path
+
+    place = Place(settings.site, section.page, section.zone)
+    failed: list[str] = []
+    for name in targets or known:
+        try:
+            failure = send_test(known[name], resolve, place)
+            reason = failure.reason if failure else ""
+        except UserError as error:
+            reason = str(error)
+        if reason:
+            failed.append(name)
+        if json_output:
+            typer.echo(json.dumps({"target": name, "delivered": not reason, "reason": reason}))
+        else:
+            typer.echo(f"{name}: {f'not delivered: {reason}' if reason else 'delivered'}")
+    if failed:
+        raise UserError(f"no test message for {', '.join(failed)}")

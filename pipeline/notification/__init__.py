@@ -1,0 +1,1 @@
+"""Messages about alarms to people elsewhere: mail, chat, webhooks, Alertmanager."""

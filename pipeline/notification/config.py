@@ -1,0 +1,141 @@
+"""Section `[notifier]`."""
+
+from __future__ import annotations
+
+from datetime import time
+from pathlib import Path
+from typing import Literal, Self
+from urllib.parse import urlsplit
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+from pydantic import Field, field_validator, model_validator
+
+from pipeline.config.models import Name, Section
+from pipeline.runtime.stage import StageConfig
+
+_TIME = r"^([01]\d|2[0-3]):[0-5]\d$"
+
+
+class QuietHours(Section):
+    """A time of each day in which messages are held; at its end one message says what was held."""
+
+    begin: str = Field(pattern=_TIME, description='time of day, such as "22:00"')
+    end: str = Field(pattern=_TIME, description='time of day, such as "06:30"; if it is earlier, of the next day')
+    sent_from: Literal["alarm", "none"] = Field(
+        default="alarm",
+        description="messages about alarms at least as severe are sent all the same; none: all are held",
+    )
+
+    @property
+    def times(self) -> tuple[time, time]:
+        """Its begin and its end."""
+        return time.fromisoformat(self.begin), time.fromisoformat(self.end)
+
+    @model_validator(mode="after")
+    def _has_a_length(self) -> Self:
+        if self.begin == self.end:
+            raise ValueError(f"begin and end are both {self.begin}")
+        return self
+
+
+class TargetConfig(Section):
+    """Who gets messages, and which."""
+
+    name: Name = Field(description="letters, digits, `_` and `-`; names of targets differ")
+    kind: Literal["apprise", "alertmanager"] = Field(
+        default="apprise",
+        description="apprise: mail, chat, webhook, whatever its URLs name; alertmanager: that of Prometheus",
+    )
+    url_file: Path | None = Field(
+        default=None, description="file with the URL in its first line; only its owner may be able to read it"
+    )
+    url_env: str = Field(default="", description="variable of the environment that holds the URL, instead of a file")
+    url: str = Field(default="", description="of an Alertmanager without a password: its address")
+    severity: Literal["warning", "alarm"] = Field(default="warning", description="the least severity it hears of")
+    trays: tuple[Name, ...] = Field(default=(), description="the trays it hears of; without it, all")
+    repeat_s: float = Field(
+        default=3600.0,
+        ge=0,
+        description="after so long, an alarm that is active and not acknowledged is sent again; 0: never",
+    )
+    escalation_after_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="it hears only of alarms that nobody has acknowledged for so long; without it, of all at once",
+    )
+    quiet_hours: QuietHours | None = Field(default=None, description="hours in which messages are held")
+    pause_s: float | None = Field(
+        default=None, ge=0, description="least time between two messages; without it, what the service asks for"
+    )
+
+    @property
+    def least_severity(self) -> int:
+        """As a number of schemas.messages.Severity."""
+        return 2 if self.severity == "alarm" else 1
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        given = [name for name in ("url_file", "url_env", "url") if getattr(self, name)]
+        if len(given) != 1:
+            raise ValueError(f"target {self.name}: give one of url_file and url_env: a URL holds secrets")
+        if self.kind == "apprise":
+            if self.url:
+                raise ValueError(f"target {self.name}: a URL holds secrets: write it into a file, and give url_file")
+            return self
+        if self.url and (urlsplit(self.url).password or urlsplit(self.url).scheme not in ("http", "https")):
+            raise ValueError(f"target {self.name}: url: http:// or https://, without a password (that: url_file)")
+        if self.escalation_after_s or self.quiet_hours or self.pause_s or "repeat_s" in self.model_fields_set:
+            raise ValueError(
+                f"target {self.name}: an Alertmanager repeats, escalates and holds by itself: take out repeat_s, "
+                "escalation_after_s, quiet_hours and pause_s"
+            )
+        return self
+
+
+class NotifierConfig(StageConfig):
+    """Who gets messages about alarms, and how many alarms make one message."""
+
+    target: tuple[TargetConfig, ...] = Field(default=(), description="one table `[[notifier.target]]` for each")
+    page: str = Field(
+        default="", pattern=r"^(https?://\S+)?$", description="address of the operators' page, for a link in messages"
+    )
+    timezone: str = Field(
+        default="", description='of quiet hours and times in messages, such as "Europe/Berlin"; "": that of the host'
+    )
+    gather_s: float = Field(
+        default=5.0, ge=0, description="a message waits for so long for others that could go with it"
+    )
+    digest_above: int = Field(default=3, ge=1, description="more fans than this at a time are one message")
+    digest_within_s: float = Field(
+        default=30.0,
+        gt=0,
+        description="while more fans keep coming, the message waits for so long; the next one twice as long, and so on",
+    )
+    most_messages: int = Field(
+        default=10_000, ge=1, description="messages that wait for their targets; beyond, the oldest are lost"
+    )
+    kept_s: float = Field(default=3 * 86_400.0, gt=0, description="a message that has waited for so long is lost")
+
+    @field_validator("timezone")
+    @classmethod
+    def _is_known(cls, value: str) -> str:
+        try:
+            if value:
+                ZoneInfo(value)
+        except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+            raise ValueError(f"unknown time zone {value!r}; such as Europe/Berlin") from error
+        return value
+
+    @field_validator("target")
+    @classmethod
+    def _names_differ(cls, value: tuple[TargetConfig, ...]) -> tuple[TargetConfig, ...]:
+        names = [target.name for target in value]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two targets are called {name!r}")
+        return value
+
+    @property
+    def zone(self) -> ZoneInfo | None:
+        """None: that of the host."""
+        return ZoneInfo(self.timezone) if self.timezone else None

@@ -1,0 +1,187 @@
+"""Notifier: sends messages about alarms to people elsewhere (docs/how-to/notify.md).
+
+Reads `alarm` and writes nothing. One core serves all trays. What is to be sent is decided here and saved in an outbox
+of the run folder; a thread for each target delivers it.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from pipeline.config.models import TrayConfig
+from pipeline.notification.alertmanager import AlertSender
+from pipeline.notification.config import NotifierConfig
+from pipeline.notification.notifications import Changes, Notifications
+from pipeline.notification.outbox import Outbox
+from pipeline.notification.sending import Sender
+from pipeline.notification.targets import problems_of, sender_of
+from pipeline.notification.wording import Place
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from schemas.messages import Alarm, Message
+from schemas.topics import ALL_TRAYS
+from schemas.units import NS_PER_S
+
+OUTBOX = Path("notifier.sqlite")
+EXPIRY_PERIOD_NS = 60 * NS_PER_S
+"""so often, messages that have waited too long are looked for"""
+ALERTS_PERIOD_NS = NS_PER_S
+SAVED_AGAIN_AFTER_NS = NS_PER_S
+"""a full disk is tried again"""
+STOPPED_WITHIN_S = 3.0
+"""deliveries that are under way"""
+
+
+class NotifierCore(Core):
+    """Decides and saves; the senders deliver."""
+
+    def __init__(
+        self,
+        config: NotifierConfig,
+        trays: Sequence[TrayConfig],
+        notifications: Notifications,
+        outbox: Outbox,
+        senders: Mapping[str, Sender | AlertSender],
+    ) -> None:
+        """senders: by target; they are started here."""
+        self._config = config
+        self._fans = {tray.name: tray.fans for tray in trays}
+        self._notifications = notifications
+        self._outbox = outbox
+        self._senders = senders
+        self._counts: Counter[str] = Counter()
+        self._now_ns = 0
+        self._saved_ns = self._alerts_ns = self._failed_ns = 0
+        self._saving = ""
+        for sender in senders.values():
+            sender.start()
+
+    def step(self, item: Message) -> Sequence[Message]:
+        """Decide what a transition of an alarm brings."""
+        if not isinstance(item, Alarm):
+            return ()
+        if not 0 <= item.fan < self._fans.get(item.header.tray, 0):
+            self._counts["unknown_fan"] += 1
+            return ()
+        self._notifications.add(item, self._now_ns or time.time_ns())
+        return ()
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        """Decide what the time brings, and save it."""
+        self._now_ns = now_ns
+        self._notifications.tick(now_ns)
+        if self._notifications.is_looking:
+            return ()
+        is_expiry_due = abs(now_ns - self._saved_ns) >= EXPIRY_PERIOD_NS
+        may_save = not self._saving or abs(now_ns - self._failed_ns) >= SAVED_AGAIN_AFTER_NS
+        if may_save and (self._notifications.changes or is_expiry_due):
+            self._save(now_ns)
+        if abs(now_ns - self._alerts_ns) >= ALERTS_PERIOD_NS:
+            self._alerts_ns = now_ns
+            for target in self._config.target:
+                sender = self._senders[target.name]
+                if isinstance(sender, AlertSender):
+                    sender.want(self._notifications.firing(target))
+        return ()
+
+    def close(self) -> Sequence[Message]:
+        """Save, end the deliveries, and leave a complete file. What waits is sent after the next start."""
+        if self._notifications.changes and not self._notifications.is_looking:
+            self._save(self._now_ns)
+        self.abort()
+        return ()
+
+    def abort(self) -> None:
+        """The same after a crash, without saving."""
+        until_s = time.monotonic() + STOPPED_WITHIN_S
+        for sender in self._senders.values():
+            sender.stop(0.0)
+        for sender in self._senders.values():
+            sender.stop(max(0.0, until_s - time.monotonic()))
+        self._outbox.close()
+
+    def counters(self) -> Mapping[str, int]:
+        """Messages sent, waiting and lost, and attempts."""
+        lost = sum(self._outbox.lost.values())
+        return {
+            "messages_sent": sum(sender.sent for sender in self._senders.values()),
+            "attempts": sum(sender.attempts for sender in self._senders.values()),
+            "messages_waiting": self._outbox.count(),
+            **({"lost_messages": lost} if lost else {}),
+            **self._counts,
+        }
+
+    def problem(self) -> str:
+        """Of the targets and the outbox."""
+        lost = [
+            f"target {name}: messages were lost: too old, too many, or refused" for name in sorted(self._outbox.lost)
+        ]
+        return "; ".join(filter(None, (self._saving, *(s.problem() for s in self._senders.values()), *lost)))
+
+    def notes(self) -> Sequence[str]:
+        """How many fans wait for the end of quiet hours, or for others that go into the same message."""
+        return [
+            f"target {target}: {count} {'fan' if count == 1 else 'fans'} wait for the next message ({basket})"
+            for (target, basket), count in self._notifications.waiting().items()
+        ]
+
+    def _save(self, now_ns: int) -> None:
+        """What cannot be saved stays, and is tried again."""
+        changes = self._notifications.changes
+        try:
+            self._outbox.save(
+                self._notifications.saved,
+                changes,
+                most_messages=self._config.most_messages,
+                kept_s=self._config.kept_s,
+                now_ns=now_ns,
+            )
+        except sqlite3.Error as error:
+            self._failed_ns = now_ns
+            self._saving = f"messages cannot be saved, and are not sent before they are: {error}"
+            return
+        self._saving, self._saved_ns = "", now_ns
+        self._notifications.changes = Changes()
+        for outgoing in changes.outgoing:
+            sender = self._senders[outgoing.target]
+            if isinstance(sender, Sender):
+                sender.wake()
+
+
+def build(context: Context) -> BuiltStage:
+    """Read the secrets of the targets, open the outbox, and start to send what it has.
+
+    Raises:
+        StageError: the extra is not installed, a secret cannot be read, or the outbox cannot be read or written.
+    """
+    config: NotifierConfig = context.config
+    if problems := check(context):
+        raise StageError("; ".join(problems))
+    place = Place(context.site, config.page, config.zone)
+    outbox = Outbox(context.own_file(OUTBOX), [target.name for target in config.target])
+    notifications = Notifications(config, place, outbox.load(), outbox.was_sent)
+    senders = {target.name: sender_of(target, context.resolve, outbox, place) for target in config.target}
+    return BuiltStage(NotifierCore(config, context.trays, notifications, outbox, senders))
+
+
+def check(context: Context) -> list[str]:
+    """Report a missing extra, a URL that apprise cannot use, and files of secrets that cannot be read."""
+    config: NotifierConfig = context.config
+    # a shard does not know the trays of the others
+    trays = tuple(tray.name for tray in context.trays) if context.instance == ALL_TRAYS else None
+    return problems_of(config, trays, context.resolve)
+
+
+STAGE = Stage(
+    name="notifier",
+    about="sends mails, chat messages and alerts about alarms",
+    reads=("alarm",),
+    writes=(),
+    config=NotifierConfig,
+    build=build,
+    core_per_tray=False,
+    check=check,
+)

@@ -1,0 +1,366 @@
+"""The notifier against real servers on loopback: mail, webhook, Alertmanager; outages, kills and restarts."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.notification import sending
+from pipeline.notification.config import NotifierConfig
+from pipeline.notification.sending import MAY_BE_REPEATED
+from pipeline.runtime.stage import StageError
+from schemas.messages import Alarm, Severity, Transition
+from schemas.units import NS_PER_S
+from stages.notifier import OUTBOX, STOPPED_WITHIN_S, NotifierCore
+from tests.support.message_receivers import ALERTMANAGER, HttpReceiver, MailServer, RunningAlertmanager, free_port
+from tests.support.notified_alarms import START_NS, alarm, cleared, notifier_core, secret
+from tests.support.running_chain import eventually
+
+
+class Notifier:
+    """A notifier whose clock the test moves; its senders run in real time."""
+
+    def __init__(self, folder: Path, targets: list[dict[str, Any]], fans: int = 8, **settings: Any) -> None:
+        self.config = NotifierConfig.model_validate({"target": targets, "timezone": "UTC", **settings})
+        self._folder, self._fans = folder, fans
+        self.now_ns = START_NS
+        self.core: NotifierCore
+        self.start()
+
+    def start(self) -> None:
+        self.core = notifier_core(self._folder, self.config, {"tray1": self._fans})
+        self.wait(11)
+
+    def hear(self, *messages: Alarm) -> None:
+        for message in messages:
+            self.core.step(message)
+        self.wait(6)
+
+    def wait(self, seconds: int) -> None:
+        for _ in range(seconds):
+            self.now_ns += NS_PER_S
+            self.core.tick(self.now_ns)
+
+
+@pytest.fixture
+def mail() -> Iterator[MailServer]:
+    server = MailServer()
+    server.start()
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def started() -> Iterator[Callable[..., Notifier]]:
+    running: list[Notifier] = []
+
+    def start(*words: Any, **settings: Any) -> Notifier:
+        running.append(Notifier(*words, **settings))
+        return running[-1]
+
+    yield start
+    for each in running:
+        each.core.abort()
+
+
+@pytest.fixture(autouse=True)
+def short_delays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sending, "FIRST_DELAY_S", 0.05)
+    monkeypatch.setattr(sending, "LONGEST_DELAY_S", 0.2)
+
+
+def mail_target(folder: Path, mail: MailServer, **more: Any) -> dict[str, Any]:
+    return {"name": "mail", "url_file": secret(folder, "mail", mail.url), "pause_s": 0, "repeat_s": 0, **more}
+
+
+def test_a_mail_and_a_webhook_say_the_same(tmp_path, mail, started):
+    receiver = HttpReceiver()
+    hook = {"name": "hook", "url_file": secret(tmp_path, "hook", f"json://127.0.0.1:{receiver.port}/alarms")}
+    notifier = started(tmp_path, [mail_target(tmp_path, mail), hook])
+    notifier.hear(alarm(severity=Severity.ALARM))
+    eventually(lambda: mail.mails and receiver.received, "both have arrived")
+    (subject, body), (posted,) = mail.mails[0], receiver.received
+    assert subject == posted["title"] == "ALARM, fan 2 of tray1 (hall)"
+    assert posted["type"] == "failure"
+    assert body.split() == posted["message"].split()
+    assert "Cause: more drag (airflow blocked, filter clogged), 80 %" in posted["message"]
+    receiver.stop()
+
+
+def test_a_mail_server_that_was_down_gets_all_once_and_in_order(tmp_path, mail, started):
+    mail.stop()
+    notifier = started(tmp_path, [mail_target(tmp_path, mail)])
+    expected = []
+    for fan in range(8):
+        notifier.hear(alarm(fan=fan))
+        expected.append(f"WARNING, fan {fan} of tray1 (hall)")
+    problem = eventually(notifier.core.problem, "the outage is said")
+    assert problem.startswith("target mail: not delivered (") and "refused" in problem
+    assert notifier.core.counters()["messages_waiting"] == 8
+    assert notifier.core.problem() == problem, "the same words, so that it is reported once"
+    mail.start()
+    eventually(lambda: len(mail.mails) >= 8, "all have arrived")
+    assert mail.subjects() == expected
+    assert eventually(lambda: not notifier.core.problem(), "it is over")
+    eventually(lambda: notifier.core.counters()["messages_waiting"] == 0, "none is left")
+    assert MAY_BE_REPEATED not in str(mail.mails)
+
+
+def test_one_target_that_is_away_holds_up_no_other(tmp_path, mail, started):
+    away = {"name": "away", "url_file": secret(tmp_path, "away", f"json://127.0.0.1:{free_port()}/")}
+    notifier = started(tmp_path, [away, mail_target(tmp_path, mail)])
+    notifier.hear(alarm())
+    eventually(lambda: mail.mails, "the mail arrives")
+    assert "target away" in eventually(notifier.core.problem, "the other is reported")
+
+
+def test_a_target_that_hangs_holds_up_neither_the_core_nor_its_end(tmp_path, mail, started):
+    with socket.create_server(("127.0.0.1", 0)) as hanging:
+        url = f"mailto://127.0.0.1:{hanging.getsockname()[1]}/?from=f@hall.example&to=a@hall.example"
+        hangs = {"name": "hangs", "url_file": secret(tmp_path, "hangs", url)}
+        notifier = started(tmp_path, [hangs, mail_target(tmp_path, mail)])
+        notifier.hear(alarm())
+        eventually(lambda: mail.mails, "the other target has it")
+        began_s = time.monotonic()
+        notifier.hear(alarm(fan=3))
+        assert time.monotonic() - began_s < 1
+        notifier.core.close()
+        assert time.monotonic() - began_s < STOPPED_WITHIN_S + 1
+    file = sqlite3.connect(tmp_path / OUTBOX)
+    left = file.execute("SELECT under_way FROM message WHERE target = 'hangs' ORDER BY number").fetchall()
+    file.close()
+    assert left == [(1,), (0,)], "it is sent again after a restart"
+
+
+def test_500_fans_at_once_are_one_mail(tmp_path, mail, started):
+    notifier = started(tmp_path, [mail_target(tmp_path, mail)], fans=500)
+    notifier.hear(*(alarm(fan=fan) for fan in range(500)))
+    notifier.wait(60)
+    eventually(lambda: mail.mails and notifier.core.counters()["messages_waiting"] == 0, "it arrives")
+    assert mail.subjects() == ["500 alarms in 1 tray (hall): 500 WARNING"]
+
+
+def test_after_a_restart_nothing_is_sent_twice_and_what_waited_is_sent(tmp_path, mail, started):
+    notifier = started(tmp_path, [mail_target(tmp_path, mail)])
+    notifier.hear(alarm(fan=1, sequence=1))
+    eventually(lambda: mail.mails, "the first arrives")
+    mail.stop()
+    notifier.hear(alarm(fan=2, sequence=2))
+    notifier.core.close()
+    notifier.start()
+    notifier.hear(alarm(fan=1, sequence=1), alarm(fan=2, sequence=2), alarm(fan=3, sequence=3))
+    mail.start()
+    eventually(lambda: len(mail.mails) >= 3, "all have arrived")
+    assert mail.subjects() == [f"WARNING, fan {fan} of tray1 (hall)" for fan in (1, 2, 3)]
+
+
+KILLED_NOTIFIER = """
+import sys, time, json
+from pathlib import Path
+from pipeline.notification.config import NotifierConfig
+from tests.support.notified_alarms import notifier_core, alarm, START_NS
+folder = Path(sys.argv[1])
+config = NotifierConfig.model_validate(json.loads(sys.argv[2]))
+core = notifier_core(folder, config)
+now_ns = START_NS
+for second in range(1000):
+    now_ns += 10**9
+    if second >= 11 and second % 6 == 5 and second < 60:
+        fan = second // 6 - 1
+        core.step(alarm(fan=fan, sequence=second))
+    core.tick(now_ns)
+    if second >= 11:
+        time.sleep(0.02)
+print("done", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_kill_in_the_middle_of_a_delivery_forgets_nothing_and_marks_what_may_be_repeated(tmp_path, mail, started):
+    mail.answered = 2
+    target = mail_target(tmp_path, mail)
+    config = {"target": [{**target, "url_file": str(target["url_file"])}], "digest_above": 20}
+    root = Path(__file__).parents[2]
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED_NOTIFIER, str(tmp_path), json.dumps(config)],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )
+    try:
+        eventually(lambda: len(mail.mails) >= 3, "some have arrived")
+    finally:
+        process.kill()
+        process.wait()
+    file = sqlite3.connect(tmp_path / OUTBOX)
+    before = [title for (title,) in file.execute("SELECT title FROM message ORDER BY number")]
+    under_way = [title for (title,) in file.execute("SELECT title FROM message WHERE under_way")]
+    file.close()
+    assert len(under_way) == 1, "it was killed while the server took a mail"
+    mail.answered = None
+    arrived = mail.subjects()
+    notifier = started(tmp_path, [target], digest_above=20)
+    notifier.hear(*(alarm(fan=second // 6 - 1, sequence=second) for second in range(17, 54, 6)))
+    eventually(lambda: notifier.core.counters()["messages_waiting"] == 0, "all have arrived")
+    subjects = mail.subjects()
+    assert {f"WARNING, fan {fan} of tray1 (hall)" for fan in range(1, 8)} <= set(subjects)
+    assert subjects[len(arrived) :][: len(before)] == before, "in order"
+    repeated = [subject for subject, body in mail.mails if MAY_BE_REPEATED in body]
+    assert repeated == under_way
+    assert all(subjects.count(subject) == 1 for subject in set(subjects) - set(under_way))
+
+
+def test_what_is_too_old_or_too_much_is_lost_counted_and_said(tmp_path, mail, started):
+    mail.stop()
+    notifier = started(tmp_path, [mail_target(tmp_path, mail)], most_messages=3, kept_s=600)
+    for fan in range(5):
+        notifier.hear(alarm(fan=fan))
+    eventually(lambda: notifier.core.counters().get("lost_messages", 0) >= 1, "the oldest are lost")
+    assert "messages were lost" in notifier.core.problem()
+    notifier.wait(700)
+    assert notifier.core.counters()["messages_waiting"] <= 1, "all but one that may be under way are too old"
+    notifier.hear(alarm(fan=6))
+    lost = notifier.core.counters()["lost_messages"]
+    mail.start()
+    eventually(lambda: "WARNING, fan 6 of tray1 (hall)" in mail.subjects(), "the newest arrives")
+    said = [int(number) for _, body in mail.mails for number in re.findall(r"are lost: (\d+)", body)]
+    assert sum(said) == lost, "each is said once"
+
+
+def test_a_mail_whose_answer_does_not_come_is_sent_again_and_says_so(tmp_path, mail, started):
+    mail.hangs_up = True
+    notifier = started(tmp_path, [mail_target(tmp_path, mail)])
+    notifier.hear(alarm())
+    assert "Connection unexpectedly closed" in eventually(notifier.core.problem, "the server does not answer")
+    mail.hangs_up = False
+    eventually(lambda: notifier.core.counters()["messages_waiting"] == 0, "it is taken")
+    assert MAY_BE_REPEATED not in mail.mails[0][1]
+    assert all(MAY_BE_REPEATED in body for _, body in mail.mails[1:])
+
+
+def test_a_mail_that_the_server_refuses_is_sent_again_and_is_no_repetition(tmp_path, mail, started):
+    mail.refuses = True
+    notifier = started(tmp_path, [mail_target(tmp_path, mail)])
+    notifier.hear(alarm())
+    assert "552" in eventually(notifier.core.problem, "the server refuses it")
+    mail.refuses = False
+    eventually(lambda: mail.mails, "it is taken")
+    assert MAY_BE_REPEATED not in mail.mails[0][1]
+
+
+def test_a_mail_that_alone_is_refused_does_not_hold_up_the_next_ones(tmp_path, mail, started):
+    mail.refused_subjects.add("WARNING, fan 1 of tray1 (hall)")
+    notifier = started(tmp_path, [mail_target(tmp_path, mail)])
+    for fan in (0, 1, 2, 3):
+        notifier.hear(alarm(fan=fan))
+    eventually(lambda: notifier.core.counters()["messages_waiting"] == 0, "the others arrive")
+    assert mail.subjects() == [f"WARNING, fan {fan} of tray1 (hall)" for fan in (0, 2, 3)]
+    assert notifier.core.counters()["lost_messages"] == 1
+    assert "lost: 1" in mail.mails[2][1]
+
+
+def test_a_full_disk_is_said_and_nothing_is_forgotten(tmp_path, mail, started, monkeypatch):
+    notifier = started(tmp_path, [mail_target(tmp_path, mail)])
+
+    def full(*_: object, **__: object) -> None:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("pipeline.notification.outbox.Outbox.save", full)
+        notifier.hear(alarm())
+        assert "disk is full" in notifier.core.problem()
+    notifier.wait(5)
+    eventually(lambda: mail.mails and not notifier.core.problem(), "it is sent once the disk has room")
+
+
+@pytest.mark.skipif(ALERTMANAGER is None, reason="needs Debian's prometheus-alertmanager")
+def test_an_alertmanager_has_what_is_presented_and_no_more(tmp_path, started, monkeypatch):
+    monkeypatch.setattr("pipeline.notification.alertmanager.RESEND_S", 0.5)
+    manager = RunningAlertmanager(tmp_path)
+    try:
+        eventually(lambda: manager.alerts() is not None, "it answers")
+        target = {"name": "prometheus", "kind": "alertmanager", "url": manager.url}
+        notifier = started(tmp_path, [target], page="https://hall.example/")
+
+        def has(*expected: tuple[str, str]) -> bool:
+            alerts = manager.alerts() or []
+            return sorted((a["labels"]["fan"], a["labels"]["severity"]) for a in alerts) == sorted(expected)
+
+        notifier.hear(alarm(fan=1), alarm(fan=2), alarm(fan=3))
+        eventually(lambda: has(("1", "warning"), ("2", "warning"), ("3", "warning")), "it has all")
+        (found,) = [a for a in manager.alerts() or [] if a["labels"]["fan"] == "1"]
+        assert found["labels"] == {
+            "alertname": "FantwinFanAlarm",
+            "site": "hall",
+            "tray": "tray1",
+            "fan": "1",
+            "severity": "warning",
+        }
+        assert found["startsAt"] == "2026-09-21T14:13:20.000Z"
+        assert found["endsAt"] > found["updatedAt"]
+        assert "Cause: more drag" in found["annotations"]["description"]
+        assert found["generatorURL"] == "https://hall.example/#/fan/tray1/1"
+        eventually(
+            lambda: [a for a in manager.alerts() or [] if a["updatedAt"] > found["updatedAt"]], "it is sent again"
+        )
+        notifier.hear(cleared(1), alarm(Transition.SEVERITY, fan=2, severity=Severity.ALARM))
+        notifier.hear(alarm(Transition.SHELVED, fan=3, shelved_until_t_ns=1))
+        eventually(lambda: has(("2", "alarm")), "one is over, one worse, one shelved")
+        notifier.core.close()
+        notifier.start()
+        notifier.wait(5)
+        assert has(("2", "alarm"))
+        notifier.hear(cleared(2, severity=Severity.ALARM))
+        eventually(has, "none is left")
+    finally:
+        manager.stop()
+
+
+def test_an_alertmanager_that_comes_late_gets_all(tmp_path, started, monkeypatch):
+    monkeypatch.setattr("pipeline.notification.alertmanager.LONGEST_DELAY_S", 0.2)
+    receiver = HttpReceiver()
+    receiver.status = 503
+    url = f"http://ann:secret@127.0.0.1:{receiver.port}"
+    target = {"name": "prometheus", "kind": "alertmanager", "url_file": secret(tmp_path, "alerts", url)}
+    notifier = started(tmp_path, [target])
+    notifier.hear(*(alarm(fan=fan) for fan in range(4)))
+    problem = eventually(notifier.core.problem, "the outage is said")
+    assert "it answers 503" in problem and "secret" not in problem
+    receiver.status = 200
+    eventually(lambda: receiver.received, "it gets them")
+    assert [each["labels"]["fan"] for each in receiver.received[0]] == ["0", "1", "2", "3"]
+    receiver.stop()
+
+
+def test_secrets_that_others_read_and_urls_that_cannot_be_are_refused_without_showing_them(tmp_path, mail):
+    def start(**target: Any) -> NotifierCore:
+        return notifier_core(tmp_path, NotifierConfig.model_validate({"target": [{"name": "a", **target}]}))
+
+    readable = secret(tmp_path, "readable", mail.url)
+    readable.chmod(0o644)
+    several = secret(tmp_path, "several", mail.url + ",bob@hall.example")
+    unknown = secret(tmp_path, "unknown", "nothing://token123@host")
+    for words, expected in (
+        ({"url_file": readable}, "others may read it"),
+        ({"url_file": tmp_path / "none"}, "cannot be read"),
+        ({"url_env": "FANTWIN_TEST_UNSET"}, "set it for the process of the notifier"),
+        ({"url_file": several}, "has 2 recipients"),
+        ({"url_file": unknown}, "apprise cannot use this URL (nothing://...)"),
+        ({"url_file": readable, "trays": ["nowhere"]}, "there is no tray nowhere"),
+    ):
+        with pytest.raises(StageError) as refused:
+            start(**words)
+        assert expected in str(refused.value)
+        assert "token123" not in str(refused.value)
+    with pytest.raises(StageError, match="no targets"):
+        notifier_core(tmp_path, NotifierConfig())
