@@ -1,4 +1,4 @@
-"""A secret that a source needs, such as a password: from a file that only its owner reads, or from the environment."""
+"""A secret that a stage needs, such as a password: from a file that only its owner reads, or from the environment."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def read_secret(path: Path) -> str:
     return secret
 
 
-def secret_of_environment(name: str) -> str:
-    """A variable of the environment.
+def secret_of_environment(name: str, stage: str = "acquisition") -> str:
+    """A variable of the environment. stage: the one that needs it.
 
     Raises:
         UserError: it is not set.
     """
     secret = os.environ.get(name, "")
     if not secret:
-        raise UserError(f"the environment has no {name}: set it for the process of acquisition")
+        raise UserError(f"the environment has no {name}: set it for the process of {stage}")
     return secret
