@@ -119,5 +119,13 @@ STAGES: dict[str, StageRow] = {
             reads=("score", "alarm", "twin", "health"),
             writes=("request",),
         ),
+        StageRow(
+            "mqtt",
+            "stages.mqtt:STAGE",
+            has_common_shards=False,
+            may_drop=True,
+            reads=("score", "alarm", "health"),
+            writes=("request",),
+        ),
     )
 }
