@@ -134,7 +134,7 @@ class MqttCore(Core):
         return set()
 
     def notes(self) -> Sequence[str]:
-        """Fans that Home Assistant is not told of."""
+        """Fans that are left out of Home Assistant."""
         left_out = self._home_assistant.left_out if self._devices else 0
         if not left_out:
             return ()

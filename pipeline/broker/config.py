@@ -15,7 +15,7 @@ TopicPrefix = Annotated[str, Field(pattern=r"^[^+#$/\x00-\x1f][^+#\x00-\x1f]*[^+
 
 
 class MqttConfig(StageConfig, BrokerSettings, frozen=True):  # pyright: ignore[reportGeneralTypeIssues]  both are frozen
-    """The broker, how often states are published, what may be asked, and what Home Assistant is told."""
+    """The broker, how often states are published, what may be asked, and what Home Assistant shows."""
 
     prefix: TopicPrefix = Field(default="fantwin", description="first part of all topics: PREFIX/SITE/TRAY/FAN/state")
     period_s: float = Field(
@@ -40,16 +40,16 @@ class MqttConfig(StageConfig, BrokerSettings, frozen=True):  # pyright: ignore[r
         "sent a message",
     )
     home_assistant: Literal["off", "publish", "remove"] = Field(
-        default="off", description="publish: tell Home Assistant of the fans; remove: take back what it was told"
+        default="off", description="publish: fans become devices of Home Assistant; remove: these devices are removed"
     )
     home_assistant_prefix: TopicPrefix = Field(
         default="homeassistant", description="discovery prefix of Home Assistant"
     )
     home_assistant_trays: tuple[Name, ...] = Field(
-        default=(), description="trays whose fans Home Assistant is told of; empty: all"
+        default=(), description="trays whose fans become devices; empty: all"
     )
     home_assistant_fans: int = Field(
-        default=64, ge=0, le=10_000, description="most fans that Home Assistant is told of, 5 entities each"
+        default=64, ge=0, le=10_000, description="most fans that become devices, with 5 entities each"
     )
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""What Home Assistant is told of the site: MQTT discovery by device, one for each fan and one for the site.
+"""The site in Home Assistant: MQTT discovery by device, one for each fan and one for the site.
 
 https://www.home-assistant.io/integrations/mqtt/#device-discovery-payload, as of Home Assistant 2024.11 to 2026.11. A
 device is one retained message on PREFIX/device/NODE/OBJECT/config; an empty one removes it with its entities.

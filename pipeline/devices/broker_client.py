@@ -32,7 +32,7 @@ def require_paho(what: str) -> None:
 
 
 def refusal(reason: object) -> str:
-    """What people are told of a broker that lets nobody in under this name."""
+    """The line about a broker that does not let this client in."""
     return f"the broker refuses this client: {reason}; check username and password"
 
 

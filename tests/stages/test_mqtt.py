@@ -274,7 +274,7 @@ def test_by_default_no_request_is_heard(tmp_path, broker, listener):
         stage.close()
 
 
-def test_home_assistant_loses_the_fans_that_are_gone_and_all_when_told(tmp_path, broker, listener):
+def test_home_assistant_loses_the_fans_that_are_gone_and_all_on_request(tmp_path, broker, listener):
     def devices() -> set[str]:
         found = [
             topic for topic, text in retained_by(broker.port).items() if text and topic.startswith("homeassistant/")

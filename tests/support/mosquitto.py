@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -57,20 +56,22 @@ class Mosquitto:
 
 
 class Listener:
-    """A client that hears everything. set_up: what its client needs before it connects."""
+    """A client that hears everything."""
 
-    def __init__(self, port: int, set_up: Callable[[paho.Client], None] = lambda _client: None) -> None:
+    def __init__(self, port: int) -> None:
         self.heard: list[tuple[str, str, bool]] = []
         """topic, text and whether the broker had kept it"""
         self._subscribed = threading.Event()
         client = self.client = paho.Client(CallbackAPIVersion.VERSION2)
-        set_up(client)
-        client.on_connect = lambda *_rest: client.subscribe("#", 1)
+        client.on_connect = self._on_connect
         client.on_subscribe = lambda *_rest: self._subscribed.set()
         client.on_message = self._on_message
         client.connect("127.0.0.1", port)
         client.loop_start()
         assert self._subscribed.wait(20)
+
+    def _on_connect(self, client: paho.Client, *_rest: Any) -> None:
+        client.subscribe("#", 1)
 
     def _on_message(self, _client: Any, _data: Any, message: paho.MQTTMessage) -> None:
         self.heard.append((message.topic, message.payload.decode(), message.retain))

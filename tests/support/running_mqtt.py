@@ -21,7 +21,7 @@ PRODUCER = "mqtt-all-0123"
 ROOT = f"fantwin/{SITE}"
 TICK_S = 0.02
 SECONDS_A_TICK = 1
-"""of the time that the core is told"""
+"""of the time that the core is given"""
 
 
 class RunningMqtt:
@@ -35,13 +35,12 @@ class RunningMqtt:
         fans: int = FANS,
         **settings: Any,
     ) -> None:
-        config = MqttConfig(**{"host": "127.0.0.1", "port": port} | settings)
+        config = MqttConfig.model_validate({"host": "127.0.0.1", "port": port} | settings)
         trays = (TrayConfig(name=TRAY, fans=fans, speed_unit="rpm"),)
         built = build(Context(SITE, trays, config, folder, folder, 0, producer=PRODUCER))
         assert isinstance(built.core, MqttCore)
         self.core = built.core
         self.sent: list[Request] = []
-        self.longest_tick_s = 0.0
         self._answer = answer
         self._lock = threading.Lock()
         self._ended = threading.Event()
@@ -65,7 +64,7 @@ class RunningMqtt:
             return dict(self.core.counters())
 
     def kill(self) -> None:
-        """Nothing is sent any more, as if the process had died: the broker is not told."""
+        """Nothing is sent any more, as if the process had died: the connection stays."""
         self._ended.set()
         self._thread.join()
 

@@ -37,9 +37,9 @@ KEYS = {
 REQUIRED = {"binary_sensor": "state_topic", "sensor": "state_topic", "button": "command_topic"}
 
 
-def told(topics: Topics | None = None, **settings: Any) -> dict[str, dict[str, Any]]:
+def devices_of(topics: Topics | None = None, **settings: Any) -> dict[str, dict[str, Any]]:
     """The devices by the last part of their topics."""
-    config = MqttConfig(**{"host": "broker", "home_assistant": "publish"} | settings)
+    config = MqttConfig.model_validate({"host": "broker", "home_assistant": "publish"} | settings)
     messages = HomeAssistant(config, topics or Topics("fantwin", "hall"), TRAYS).messages()
     found: dict[str, dict[str, Any]] = {}
     for topic, text in messages.items():
@@ -51,7 +51,7 @@ def told(topics: Topics | None = None, **settings: Any) -> dict[str, dict[str, A
 
 @pytest.mark.parametrize("settings", [{}, {"accept": ("acknowledge",), "operator_name": "desk"}])
 def test_payloads_have_the_documented_keys_and_all_that_are_required(settings):
-    devices = told(**settings)
+    devices = devices_of(**settings)
     assert devices.keys() == {"site", "tray1-0", "tray1-1", "tray-2-0", "tray-2-1", "tray-2-2"}
     identifiers, unique_ids = list[str](), list[str]()
     for device in devices.values():
@@ -74,7 +74,7 @@ def test_payloads_have_the_documented_keys_and_all_that_are_required(settings):
 
 
 def test_entities_have_names_units_and_an_availability_that_people_and_home_assistant_understand():
-    fan = told()["tray-2-1"]
+    fan = devices_of()["tray-2-1"]
     assert fan["device"]["name"] == "tray-2 fan 1"
     names = {key: entity["name"] for key, entity in fan["components"].items()}
     assert names == {
@@ -91,28 +91,28 @@ def test_entities_have_names_units_and_an_availability_that_people_and_home_assi
     for entity in fan["components"].values():
         assert entity["availability_topic"] == "fantwin/hall/status"
         assert (entity["payload_available"], entity["payload_not_available"]) == ("online", "offline")
-    running = told()["site"]["components"]["running"]
+    running = devices_of()["site"]["components"]["running"]
     assert running["device_class"] == "connectivity"
     assert "availability_topic" not in running, "it says itself that the stage is gone"
 
 
 def test_only_chosen_trays_and_no_more_fans_than_allowed():
-    assert told(home_assistant_trays=("tray-2",)).keys() == {"site", "tray-2-0", "tray-2-1", "tray-2-2"}
-    assert told(home_assistant_fans=1).keys() == {"site", "tray1-0"}
+    assert devices_of(home_assistant_trays=("tray-2",)).keys() == {"site", "tray-2-0", "tray-2-1", "tray-2-2"}
+    assert devices_of(home_assistant_fans=1).keys() == {"site", "tray1-0"}
     config = MqttConfig(host="broker", home_assistant="publish", home_assistant_fans=1)
     assert HomeAssistant(config, Topics("fantwin", "hall"), TRAYS).left_out == 4
 
 
 def test_a_button_acknowledges_where_that_is_accepted():
-    button = told(accept=("acknowledge",), operator_name="desk")["tray1-0"]["components"]["acknowledge"]
+    button = devices_of(accept=("acknowledge",), operator_name="desk")["tray1-0"]["components"]["acknowledge"]
     assert button["command_topic"] == "fantwin/hall/tray1/0/request"
     assert json.loads(button["payload_press"])["action"] == "acknowledge"
-    assert "acknowledge" not in told(accept=("confirm",), operator_name="desk")["tray1-0"]["components"]
+    assert "acknowledge" not in devices_of(accept=("confirm",), operator_name="desk")["tray1-0"]["components"]
 
 
 def test_prefixes_and_shards_have_devices_of_their_own():
     def identifier(topics: Topics) -> str:
-        return told(topics)["site"]["device"]["identifiers"][0]
+        return devices_of(topics)["site"]["device"]["identifiers"][0]
 
     assert identifier(Topics("plant/a", "hall")) == "plant_a_hall-site"
     assert identifier(Topics("fantwin", "hall", "2-of-4")) == "fantwin_hall_2-of-4-site"
