@@ -8,12 +8,13 @@ import time
 from types import TracebackType
 from typing import Any, Self
 
-from fantwin_client.errors import NotReceivedError, SendError
-from fantwin_client.tray import Tray
+from fantwin_client.errors import NotAllowedError, NotReceivedError, SendError
+from fantwin_client.tray import READING, Tray
 from pipeline.bus.errors import BusError
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from pipeline.config.roles import SOURCE
+from schemas.topics import tray_key
 from schemas.units import SpeedUnit
 
 _LOG = logging.getLogger(__name__)
@@ -60,6 +61,7 @@ class Client:
         behind. timeout_s: how long to wait for its acquisition.
 
         Raises:
+            NotAllowedError: the certificate may not publish samples of this tray.
             NoAcquisitionError: no acquisition of this tray is at work, or its source is not `push`.
             ClientError: there is no such unit.
             ValueError: it was taken up before.
@@ -67,6 +69,8 @@ class Client:
         if name in self._trays:
             raise ValueError(f"tray {name} was taken up before")
         self._bus.wait_for_others(threading.Event())
+        if problem := self._bus.why_not_published(self._site, tray_key(self._site, name, READING)):
+            raise NotAllowedError(f"tray {name}: {problem}; use one of role {SOURCE!r}, or '{SOURCE}.{name}'")
         tray = Tray(self._bus, self._site, name, speed_unit, kept_samples, timeout_s)
         self._trays[name] = tray
         return tray

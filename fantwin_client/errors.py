@@ -11,6 +11,10 @@ class NoAcquisitionError(ClientError):
     """No acquisition of the tray is at work, or the source of its tray is another one."""
 
 
+class NotAllowedError(ClientError):
+    """The certificate may not publish samples of the tray."""
+
+
 class FanCountError(ClientError):
     """Values of another number of fans than the tray has. None of the samples was taken."""
 

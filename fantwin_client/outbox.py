@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.topics import CATCH_UP_MESSAGES, most_samples
+from schemas.topics import CATCH_UP_MESSAGES
 
 MOST_SAMPLES, MOST_FAN_SAMPLES = 1024, 1024 * 32
 """of one message; what waits is joined up to this"""
@@ -47,6 +47,11 @@ class Block:
     def goes_on_with(self, other: Block) -> bool:
         """Whether both can be in one message."""
         return self.line == other.line and self.others.keys() == other.others.keys()
+
+
+def most_samples_joined(fans: int) -> int:
+    """The most samples of a message of so many fans; fewer than the bus accepts (`schemas.topics.most_samples`)."""
+    return max(1, min(MOST_SAMPLES, MOST_FAN_SAMPLES // fans))
 
 
 def join_blocks(blocks: Sequence[Block]) -> Block:
@@ -92,7 +97,7 @@ class Outbox:
     def add(self, block: Block) -> None:
         """Add a block behind the others, in pieces that fit into a message."""
         samples, fans = block.command.shape
-        most = max(1, min(MOST_SAMPLES, MOST_FAN_SAMPLES // fans, most_samples(fans)))
+        most = most_samples_joined(fans)
         self._blocks += [block.rows(first, first + most) for first in range(0, samples, most)]
         self.waiting += samples
 
@@ -101,7 +106,7 @@ class Outbox:
         There must be some."""
         first = self._blocks.popleft()
         taken, samples, fans = [first], len(first.t_ns), first.command.shape[1]
-        most = max(1, min(MOST_SAMPLES, MOST_FAN_SAMPLES // fans))
+        most = most_samples_joined(fans)
         while self._blocks and first.goes_on_with(self._blocks[0]) and samples + len(self._blocks[0].t_ns) <= most:
             taken.append(self._blocks.popleft())
             samples += len(taken[-1].t_ns)

@@ -17,36 +17,29 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fantwin_client.errors import (
-    ClientError,
-    CommandError,
-    FanCountError,
-    NoAcquisitionError,
-    NotKeptError,
-    NotReceivedError,
-    SamplesLostError,
-    SendError,
-    TimeOrderError,
-)
+from fantwin_client import errors
 from fantwin_client.losses import WITHOUT_SPEED, CountsOfAcquisition, Losses
 from fantwin_client.outbox import Block, Outbox
 from fantwin_client.times import Time, times_ns
 from pipeline.bus.session import Bus
+from pipeline.devices.sample_source import limits_of_float32
 from pipeline.runtime.tray_acquisition import TrayAcquisition
 from schemas.codec import encode, type_name
-from schemas.messages import AcceptedSamples, Header, Health, PushedSamples
+from schemas.header import Header
+from schemas.health import AcceptedSamples, Health
+from schemas.messages import PushedSamples
 from schemas.topics import BY_NAME, tray_key
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
 
 Values: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | NDArray[Any]
+READING = "reading"
+"""the topic of pushed samples"""
 WATCH_S = 0.5
 """how often the thread looks by itself whether acquisition is there"""
 ASK_AGAIN_S = 2.0
 """after this long without a confirmation a message without samples shows acquisition what it may have missed"""
 ROOM_S = 5.0
 """how long `publish` waits for room while acquisition works"""
-FLOAT32_TOLERANCE = 1e-6
-"""commands that come from 32-bit numbers may be beyond the limits by this part"""
 _LOG = logging.getLogger(__name__)
 
 
@@ -58,7 +51,7 @@ class Tray:
     ) -> None:
         """See `Client.tray`."""
         if speed_unit not in RAD_S_PER_UNIT:
-            raise ClientError(f"speed_unit {speed_unit!r} is not known; known: {', '.join(RAD_S_PER_UNIT)}")
+            raise errors.ClientError(f"speed_unit {speed_unit!r} is not known; known: {', '.join(RAD_S_PER_UNIT)}")
         self.name = name
         self._site = site
         self._rad_s_per_unit = RAD_S_PER_UNIT[speed_unit]
@@ -76,11 +69,11 @@ class Tray:
         self._reported = Losses(0, 0, 0, 0)
         """the losses of the last check"""
         self._producer = f"client-{name}-{secrets.token_hex(4)}"
-        self._key = tray_key(site, name, "reading")
+        self._key = tray_key(site, name, READING)
         self._acquisition = TrayAcquisition(bus, site, name, self._on_change)
         first, self._accepts = self._first_health(timeout_s)
         self._counts = CountsOfAcquisition(first)
-        self._publisher = bus.publisher(self._key, BY_NAME["reading"], type_name(PushedSamples), self._producer)
+        self._publisher = bus.publisher(self._key, BY_NAME[READING], type_name(PushedSamples), self._producer)
         self._thread = threading.Thread(target=self._send_all, name=f"send {name}", daemon=True)
         self._thread.start()
 
@@ -169,7 +162,7 @@ class Tray:
         self._reported = losses
         if (losses.not_kept, losses.refused, losses.lost) != (before.not_kept, before.refused, before.lost):
             problem = self._problem_of_acquisition()
-            raise SamplesLostError(f"tray {self.name}: {losses}{f'; {problem}' if problem else ''}")
+            raise errors.SamplesLostError(f"tray {self.name}: {losses}{f'; {problem}' if problem else ''}")
         return losses
 
     def wait_received(self, timeout_s: float) -> None:
@@ -183,7 +176,7 @@ class Tray:
             is_received = self._changed.wait_for(lambda: not self._outbox.samples or self._failure, timeout_s)
             self._check_thread()
             if not is_received:
-                raise NotReceivedError(
+                raise errors.NotReceivedError(
                     f"tray {self.name}: acquisition has not received {self._outbox.samples} of {self._published} "
                     f"samples: {self._why_waiting()}"
                 )
@@ -205,7 +198,7 @@ class Tray:
             if left_s <= 0:
                 what = "says nothing" if self._acquisition.at_work() else "is at work"
                 who = "the acquisition" if self._acquisition.at_work() else "no acquisition"
-                raise NoAcquisitionError(
+                raise errors.NoAcquisitionError(
                     f"{who} of tray {self.name} of site {self._site} {what}: is `fantwin up` running there, with such "
                     "a tray?"
                 )
@@ -213,7 +206,7 @@ class Tray:
                 self._changed.wait(min(left_s, WATCH_S))
         accepts = self._accepted(health)
         if accepts is None:
-            raise NoAcquisitionError(
+            raise errors.NoAcquisitionError(
                 f'tray {self.name} takes no pushed samples: write source = {{ kind = "push" }} in its [[tray]]'
             )
         return health, accepts
@@ -231,7 +224,7 @@ class Tray:
         if array.shape == () and (samples, fans) == (1, 1):
             return array.reshape(1, 1)
         if array.shape != (samples, fans):
-            raise FanCountError(
+            raise errors.FanCountError(
                 f"tray {self.name}: {what} has shape {array.shape}; {samples} samples of {fans} fans have shape "
                 f"{(samples, fans)}"
             )
@@ -239,11 +232,11 @@ class Tray:
 
     def _check_commands(self, commands: NDArray[np.float64]) -> None:
         low, high = self._accepts.command_min, self._accepts.command_max
-        tolerance = FLOAT32_TOLERANCE * max(abs(low), abs(high))
-        wrong = ~((commands >= low - tolerance) & (commands <= high + tolerance))  # NaN is in no range
+        least, most = limits_of_float32(low, high)
+        wrong = ~((commands >= least) & (commands <= most))  # NaN is in no range
         if wrong.any():
             row, fan = np.argwhere(wrong)[0]
-            raise CommandError(
+            raise errors.CommandError(
                 f"tray {self.name}: command {commands[row, fan]:g} of fan {fan}, sample {row}: a command must be known "
                 f"and within command_min = {low:g} to command_max = {high:g}"
             )
@@ -251,7 +244,7 @@ class Tray:
     def _check_thread(self) -> None:
         if self._failure is not None:
             what = f"{type(self._failure).__name__}: {self._failure}"
-            raise SendError(
+            raise errors.SendError(
                 f"tray {self.name}: nothing is sent any more: {what}; open the client again"
             ) from self._failure
 
@@ -260,7 +253,7 @@ class Tray:
         steps = np.diff(times, prepend=before)
         if np.any(steps <= 0):
             row = int(np.argmax(steps <= 0))
-            raise TimeOrderError(
+            raise errors.TimeOrderError(
                 f"tray {self.name}: the time of sample {row} is {-int(steps[row]) / NS_PER_S:g} s before the last one, "
                 "or the same: times must increase; after the clock was set, call restart_time()"
             )
@@ -276,7 +269,7 @@ class Tray:
             if self._changed.wait_for(has_room, WATCH_S):
                 return
         self._not_kept += samples
-        raise NotKeptError(
+        raise errors.NotKeptError(
             f"tray {self.name}: {self._outbox.samples} samples wait for acquisition, and {self._kept_samples} are kept "
             f"at most: {self._why_waiting()}; {samples} samples were not taken"
         )

@@ -2,6 +2,7 @@
 
 Field names, order and units are those of `fan.proto`, and a test compares the two. Codec and export take enums, shapes
 and types from the declarations below, so that a new field needs an entry here and in `fan.proto`, and nothing else.
+What all messages begin with is in `header.py`, the health of a stage in `health.py`, enumerations are in `enums.py`.
 """
 
 from __future__ import annotations
@@ -11,164 +12,16 @@ from typing import TypeAlias, get_args
 
 import numpy as np
 
-from schemas.fields import Array, OpenEnum, column, derived, time_column
+from schemas.enums import Action, FanState, InvalidReason, Severity, Statistic, TachoKind, Transition
+from schemas.fields import Array, column, derived, time_column
+from schemas.header import Header
+from schemas.health import Health
 from schemas.tacho import Tacho
 
 LARGEST_PERIOD_NS = 86_400_000_000_000  # a day
 FURTHEST_T_NS = (1 << 62) - LARGEST_PERIOD_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
 RECEIVE_TIMES = (1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
 GRID_TIMES = (1 - (1 << 62), (1 << 62) - 1)  # the grid may go a little beyond what was received
-
-
-class InvalidReason(OpenEnum):
-    """Why a sample is not scored."""
-
-    NONE = 0
-    STALE = 1
-    GAP = 2
-    WARMING_UP = 3
-    OUT_OF_RANGE = 4
-    SATURATED = 5
-    NO_SPEED = 6
-    NO_TWIN = 7
-    CLOCK_RESTARTED = 8
-    STOPPED = 9
-    STARTING = 10
-    CONDITIONS_UNKNOWN = 11
-
-
-class FanState(OpenEnum):
-    """The state of a fan at one sample, as the scorer sees it."""
-
-    UNKNOWN = 0
-    NORMAL = 1
-    SUSPECT = 2
-    ALARM = 3
-    RETURNING = 4
-    COMMISSIONING = 5
-    STOPPED = 6
-    STARTING = 7
-
-
-class Statistic(OpenEnum):
-    """The statistics that are compared with limits; the values number them across messages and snapshots."""
-
-    NONE = 0
-    SPEED_SMOOTHED = 1
-    SPEED_DRIFT = 2
-    SPEED_VARIANCE_GROWTH = 3
-    BALANCE_SMOOTHED = 4
-    BALANCE_DRIFT = 5
-    BALANCE_VARIANCE_GROWTH = 6
-    SENSOR = 7
-    STANDSTILL = 8
-
-
-class Transition(OpenEnum):
-    """What happened to an alarm, in the terms of OPC UA Part 9."""
-
-    NONE = 0
-    RAISED = 1
-    SEVERITY = 2
-    DIAGNOSED = 3
-    CLEARED = 4
-    ACKNOWLEDGED = 5
-    CONFIRMED = 6
-    RESET = 7
-    SHELVED = 8
-    UNSHELVED = 9
-    SUPPRESSED = 10
-    UNSUPPRESSED = 11
-    OUT_OF_SERVICE = 12
-    IN_SERVICE = 13
-    COMMISSIONING = 14
-    REPUBLISHED = 15
-    REFUSED = 16
-    DATA_LOST = 17
-    DATA_RESTORED = 18
-
-
-class Action(OpenEnum):
-    """What an operator can request."""
-
-    NONE = 0
-    ACKNOWLEDGE = 1
-    CONFIRM = 2
-    RESET = 3
-    SHELVE = 4
-    UNSHELVE = 5
-    SUPPRESS = 6
-    UNSUPPRESS = 7
-    OUT_OF_SERVICE = 8
-    IN_SERVICE = 9
-    COMMISSION = 10
-
-
-class Severity(OpenEnum):
-    """Severity of an alarm."""
-
-    NONE = 0
-    WARNING = 1
-    ALARM = 2
-
-
-class StageStatus(OpenEnum):
-    """Status that a stage reports of itself."""
-
-    STARTING = 0
-    OK = 1
-    DEGRADED = 2
-    STOPPED = 3
-
-
-class TachoKind(OpenEnum):
-    """How a speed is measured, as schemas.tacho explains."""
-
-    INSTANTANEOUS = 0
-    COUNT = 1
-    PERIOD = 2
-    AVERAGE = 3
-
-
-@dataclass(frozen=True, slots=True)
-class InputPosition:
-    """How far a stage had read its main input for one tray when it made a message.
-
-    Attributes:
-        topic, producer, sequence: the input message consumed last.
-        consumed_count: all input messages consumed so far, that one included.
-        contiguous_from: no sequence number is missing from this one up to `sequence`.
-        from_timer: the message was made later, by a timer or at the end of the stage, not on consuming the input.
-    """
-
-    topic: str
-    producer: str
-    sequence: int
-    consumed_count: int
-    contiguous_from: int
-    from_timer: bool = False
-
-    @classmethod
-    def after(cls, before: InputPosition | None, topic: str, header: Header) -> InputPosition:
-        """The position after one more message, the one with this header."""
-        follows = before is not None and (before.producer, before.sequence + 1) == (header.producer, header.sequence)
-        return cls(
-            topic=topic,
-            producer=header.producer,
-            sequence=header.sequence,
-            consumed_count=before.consumed_count + 1 if before else 1,
-            contiguous_from=before.contiguous_from if before and follows else header.sequence,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Header:
-    """Producer and sequence number of a message, its tray, and the input it was made from."""
-
-    producer: str = ""
-    sequence: int = 0
-    tray: str = ""
-    input_position: InputPosition | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -472,102 +325,6 @@ class Clock:
     header: Header = Header()
     t_ns: int
     rate: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Counter:
-    """One counter of a stage; it only grows within a session."""
-
-    name: str
-    value: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class Input:
-    """One input of a stage: messages on one key from one producer.
-
-    Attributes:
-        missing: gaps in the sequence, never filled.
-        missing_at_start: those of them before the first message that was received.
-        refused: those of the received ones that were ignored, because another process owns the stage of their producer.
-        unsaved: the last of the received ones, so many, that are lost if the stage is killed now.
-    """
-
-    key: str
-    producer: str
-    received: int
-    missing: int
-    duplicated: int
-    next_sequence: int
-    missing_at_start: int = 0
-    refused: int = 0
-    unsaved: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Output:
-    """One output of a stage; `published` is also the next sequence number."""
-
-    key: str
-    published: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class AwaitedInput:
-    """An input that a stage waits for, and since when, host time."""
-
-    key: str
-    since_t_ns: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class Note:
-    """What a stage works with and has done for a tray, one line; an empty tray: for all."""
-
-    tray: str
-    text: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class AcceptedSamples:
-    """What an acquisition accepts of the clients that push samples of a tray; commands in the tray's unit."""
-
-    tray: str
-    fans: int
-    command_min: float
-    command_max: float
-    speed_max_rad_s: float
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Health:
-    """Status of a process of a stage, and what it has received, sent and lost.
-
-    Attributes:
-        trays: those that it has, separated by commas; empty: all of the site. Earlier versions do not say it: there, a
-            stage with a process for each tray has the one that its instance names.
-    """
-
-    header: Header = Header()
-    stage: str
-    instance: str
-    status: StageStatus
-    t_ns: int
-    uptime_s: float
-    problem: str = ""
-    inputs: tuple[Input, ...] = ()
-    outputs: tuple[Output, ...] = ()
-    counters: tuple[Counter, ...] = ()
-    latency_p50_ms: float = 0.0
-    latency_p99_ms: float = 0.0
-    lost: int = 0
-    process_id: int = 0
-    waiting_for: tuple[AwaitedInput, ...] = ()
-    newest_input_t_ns: int = 0
-    newest_output_t_ns: int = 0
-    notes: tuple[Note, ...] = ()
-    trays: str = ""
-    accepts: tuple[AcceptedSamples, ...] = ()
 
 
 Message: TypeAlias = (

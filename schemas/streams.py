@@ -14,7 +14,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from schemas.messages import Health, Input, InputPosition
+from schemas.header import InputPosition
+from schemas.health import Health, Input
 
 LOSS_PREFIX = "lost_"
 """start of the names of counters that count losses"""

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from schemas.fields import columns, time_column
+from schemas.health import Health
 from schemas.messages import (
     Alarm,
     Clock,
     Command,
     Consumed,
     Grid,
-    Health,
     Message,
     ModelCard,
     NewTwin,

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.messages import Array, Statistic
+from schemas.enums import Statistic
+from schemas.messages import Array
 from schemas.units import NS_PER_S
 from scoring.detectors.detector import DetectorInput, DetectorRow, Signal
 from scoring.residual_samples import JoinedResidual, ResidualSamples, ScoredResidual

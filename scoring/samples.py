@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.messages import Array, InvalidReason, Prediction
+from schemas.enums import InvalidReason
+from schemas.messages import Array, Prediction
 from scoring.detectors.detector import Signal
 from scoring.unseen_error import UnseenError
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.auxiliary import auxiliary_columns
-from schemas.messages import Array, FanState, InvalidReason, Prediction, Score
+from schemas.enums import FanState, InvalidReason
+from schemas.messages import Array, Prediction, Score
 from scoring.scored_block import ScoredBlock
 
 BAND_SIGMAS = 2.0

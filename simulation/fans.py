@@ -15,6 +15,7 @@ from simulation.plant import HEALTHY, Array, FanParameters, advance, at_rest, tr
 from simulation.surroundings import BACK_EMF_SHARE, RESISTANCE_OHM
 
 FanKind = Literal["dc", "4-pin"]
+FOUR_PIN_SUPPLY_V = 12.0
 
 
 class Fans(Protocol):
@@ -50,7 +51,7 @@ def simulated_fans(kind: FanKind, fans: int, fans_seed: int, fan_variation: floa
     """
     if kind == "dc":
         return DcFans(tray_of_fans(fans, fans_seed, fan_variation))
-    return _FourPinTray(four_pin_tray(fans, fans_seed, fan_variation), np.random.default_rng(seed), fans)
+    return FourPinTray(four_pin_tray(fans, fans_seed, fan_variation), np.random.default_rng(seed), fans)
 
 
 class DcFans:
@@ -99,6 +100,15 @@ class DcFans:
         )
 
 
-class _FourPinTray(FourPinFans):
+class FourPinTray(FourPinFans):
+    """Fans with a PWM input of their own, on one supply."""
+
+    @property
+    def supply_v(self) -> Array:
+        """(fans,) voltage of their supply now; that of a fan without power is 0."""
+        supply_v = np.full(len(self.speed_rad_s), FOUR_PIN_SUPPLY_V * self.supply_factor)
+        return np.where(self.damage.is_unpowered, 0.0, supply_v)
+
     def set_faults(self, faults: Sequence[Fault], t_s: float) -> None:
+        """See Fans."""
         self.damage = four_pin_damage(faults, len(self.speed_rad_s), t_s)

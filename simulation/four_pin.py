@@ -3,7 +3,8 @@
 Each fan follows a wanted speed with a first-order lag, slower downwards than upwards (it coasts). The wanted speed is a
 concave curve of the duty above `duty_min`, a plateau below it, and nothing below `duty_stop`; after standstill the fan
 is driven harder for `kick_s`. The supply of a tray gives way with the load of all its fans; the air of the room changes
-slowly; the speed wanders a little.
+slowly; the speed wanders a little. `supply_factor` is of what is measured of the supply beside that: a fan that holds
+its speed makes up for it, until it does not suffice.
 
 What Intel's "4-Wire Pulse Width Modulation (PWM) Controlled Fans Specification", revision 1.3 (2005), says is marked
 with its section below; it leaves dynamics to the vendor. All other defaults are those of a typical 120 mm fan.
@@ -63,6 +64,8 @@ class FourPinParameters:
     """amplitude of the slow change of the speed with the air of the room, relative"""
     air_period_s: float | Array = 3600.0
     """period of that"""
+    reserve: float | Array = 0.1
+    """at the full speed, the supply may be lower by this share until it does not suffice"""
 
 
 VARYING_PARAMETERS = ("speed_max_rad_s", "speed_min_rad_s", "bend", "up_s", "down_s")
@@ -139,6 +142,10 @@ class FourPinFans:
         self._kick_left_s = np.zeros(fans)
         self._t_s = 0.0
         self.damage = NO_DAMAGE
+        self.supply_factor = 1.0
+        """of the supply voltage now"""
+        self.supply_held = 1.0
+        """share of its change for which a fan makes up: 1 if it controls its speed, 0 if that follows the supply"""
         self.speed_rad_s = np.zeros(fans)
 
     def advance(self, duty: Array, duration_s: float) -> None:
@@ -151,6 +158,7 @@ class FourPinFans:
         left_s = np.where(is_on, np.where(starts, p.kick_s, self._kick_left_s), 0.0)
         wanted = np.where(left_s > 1e-9, p.kick_speed_rad_s, wanted_speed_rad_s(duty, p))
         wanted = np.where(is_on, wanted * self._surroundings(duration_s) * damage.speed_factor, 0.0)
+        wanted = np.minimum(wanted * self.supply_factor ** (1.0 - self.supply_held), self._fastest_rad_s())
         rises = wanted > self.speed_rad_s
         lag_s = np.where(rises, p.up_s * np.asarray(damage.up_factor), p.down_s * np.asarray(damage.down_factor))
         speed = wanted + (self.speed_rad_s - wanted) * np.exp(-duration_s / lag_s)
@@ -169,6 +177,11 @@ class FourPinFans:
         self._wander = kept * self._wander + p.wander * np.sqrt(1.0 - kept * kept) * drawn
         air = p.air * np.sin(2.0 * np.pi * self._t_s / np.asarray(p.air_period_s) + self._phase)
         return (1.0 - p.sag / self._per_supply * np.repeat(load, self._per_supply)) * (1.0 + air) * (1.0 + self._wander)
+
+    def _fastest_rad_s(self) -> Array:
+        """(fans,) the speed for which the supply suffices: in proportion to its voltage."""
+        p = self.parameters
+        return p.speed_max_rad_s * (1.0 + np.asarray(p.reserve)) * self.supply_factor
 
     def _blocked(self, speed_rad_s: Array, duration_s: float) -> Array:
         is_blocked = np.asarray(self.damage.is_blocked)

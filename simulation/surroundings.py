@@ -1,7 +1,8 @@
 """What surrounds simulated fans and changes with time: the supply of the tray and the air; and what is measured of it.
 
 The supply wanders around its nominal voltage, as one that others load (a first-order process), and the temperature of
-the air swings around its mean. Air that is warmer than 20 degrees Celsius is thinner, and drags less.
+the air swings around its mean. Air that is warmer than 20 degrees Celsius is thinner, and drags less; a 4-pin fan
+controls its speed, and air does not change that.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ class Surroundings:
     """standard deviation of the supply voltage, relative"""
     supply_wander_s: float = 20.0
     """correlation time of that"""
+    supply_held: float = 1.0
+    """share of it for which 4-pin fans make up: 1 where they control their speed, 0 where that follows the supply"""
     temperature_c: float = REFERENCE_C
     """mean of the air"""
     temperature_swing_c: float = 0.0

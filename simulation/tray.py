@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from simulation.errors import SimulationError
 from simulation.excitation import excitation
-from simulation.fans import DcFans, FanKind, simulated_fans
+from simulation.fans import DcFans, FanKind, FourPinTray, simulated_fans
 from simulation.faults import Fault, check_schedule, tacho_faults
 from simulation.plant import DeviceClock
 from simulation.surroundings import Surroundings, SurroundingsNow
@@ -186,10 +186,14 @@ class SimulatedTray:
         """Supply and air act from now on as they do at t_s; returns what is measured of them."""
         if self.settings.surroundings == Surroundings():
             return {}
-        assert isinstance(self._plant, DcFans), "checked"
-        self._surroundings.advance(t_s)
-        self._plant.surround(self._surroundings.supply_factor, self._surroundings.drag_factor)
-        return self._surroundings.measure(self._plant.supply_v, self._plant.current_a)
+        plant, now = self._plant, self._surroundings
+        now.advance(t_s)
+        if isinstance(plant, FourPinTray):
+            plant.supply_factor, plant.supply_held = now.supply_factor, self.settings.surroundings.supply_held
+            return now.measure(plant.supply_v, np.full(self.fans, np.nan))
+        assert isinstance(plant, DcFans), "there are no others"
+        plant.surround(now.supply_factor, now.drag_factor)
+        return now.measure(plant.supply_v, plant.current_a)
 
     def _measure(self, t_s: float) -> Array:
         """(fans,) tacho readings. Faults do not change which random numbers are drawn."""
@@ -234,6 +238,7 @@ def _check(settings: TraySettings) -> None:
         ("missing edges", settings.tacho.missing_edges, 0.0, 1.0),
         ("double edges", settings.tacho.double_edges, 0.0, 1.0),
         ("supply wander", settings.surroundings.supply_wander, 0.0, 0.3),
+        ("supply held", settings.surroundings.supply_held, 0.0, 1.0),
         ("air temperature", settings.surroundings.temperature_c, -50.0, 100.0),
         ("air swing", settings.surroundings.temperature_swing_c, 0.0, 50.0),
         ("missing readings", settings.tacho.missing_readings, 0.0, 1.0),
@@ -242,6 +247,6 @@ def _check(settings: TraySettings) -> None:
         if not smallest <= value <= largest:
             upto = f"to {largest:g}" if math.isfinite(largest) else "on"
             raise SimulationError(f"{name} = {value:g}; give one from {smallest:g} {upto}")
-    if settings.fan != "dc" and settings.surroundings != Surroundings():
-        raise SimulationError(f"{settings.fan} fans have no supply and no air of their own: choose dc fans for them")
+    if settings.fan != "dc" and "current_a" in settings.surroundings.measured:
+        raise SimulationError(f"the current of {settings.fan} fans is not simulated: choose dc fans for it")
     check_schedule(settings.faults, settings.fans, settings.duration_s, settings.fan)

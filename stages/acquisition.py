@@ -14,20 +14,17 @@ repeated samples, convert units, make messages of samples.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeAlias
 
-import numpy as np
 from pydantic import Field
 
 from pipeline.config.models import TrayConfig
-from pipeline.devices.device_clock import UINT32
 from pipeline.devices.device_sequence import DeviceSequence
 from pipeline.devices.host_clock import HOST_CLOCK, HostClock
 from pipeline.devices.input_quality import InputQuality
+from pipeline.devices.plausibility import Plausibility
 from pipeline.devices.push_source import PushSource
 from pipeline.devices.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
 from pipeline.devices.sample_source import (
@@ -35,16 +32,17 @@ from pipeline.devices.sample_source import (
     Reading,
     ReadingBatch,
     ReadingLimits,
-    Rejected,
     SampleSource,
     SourceContext,
-    within,
 )
 from pipeline.devices.source_kinds import build_source
 from pipeline.errors import UserError
+from pipeline.runtime.device_commands import DeviceCommands
+from pipeline.runtime.raw_messages import ReceivedReading, raw_message
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
-from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
-from schemas.messages import AcceptedSamples, Array, Command, PushedSamples, Raw, StatedTacho
+from schemas.auxiliary import AUXILIARY
+from schemas.health import AcceptedSamples
+from schemas.messages import Command, PushedSamples, Raw, StatedTacho
 from schemas.tacho import Tacho
 from schemas.topics import most_samples
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
@@ -63,57 +61,9 @@ class AcquisitionConfig(StageConfig):
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Received:
-    """A reading that will be published, and its time of receipt."""
-
-    reading: Reading
-    t_ns: int
-
-    @property
-    def columns(self) -> tuple[bool, ...]:
-        """Which of the columns that may be missing it has: the samples of one message must agree."""
-        reading = self.reading
-        return (
-            reading.clock_us is not None,
-            reading.sequence is not None,
-            bool(reading.supply_voltage_v),
-            bool(reading.current_a),
-            bool(reading.temperature_c),
-        )
-
-
 def limits_of(tray: TrayConfig) -> ReadingLimits:
     """Which readings of a tray are accepted."""
     return ReadingLimits(tray.fans, tray.command_min, tray.command_max, tray.speed_max)
-
-
-def raw_message(block: Sequence[_Received], tray: TrayConfig, tachos: tuple[StatedTacho, ...] = ()) -> Raw:
-    """One message of samples that agree in their columns. tachos: what their source states to measure."""
-    readings = [received.reading for received in block]
-    auxiliary: dict[str, Any] = {
-        column.name: _float32([getattr(r, column.name) for r in readings]) for column in AUXILIARY
-    }
-    return Raw(
-        fans=tray.fans,
-        host_receive_t_ns=np.array([received.t_ns for received in block], np.int64),
-        device_clock_us=_uint32(r.clock_us for r in readings),
-        device_sequence=_uint32(r.sequence for r in readings),
-        command=np.array([r.command for r in readings], np.float64),
-        speed_rad_s=np.array([r.speed for r in readings], np.float64) * RAD_S_PER_UNIT[tray.speed_unit],
-        tachos=tachos,
-        **auxiliary,
-    )
-
-
-def _uint32(values: Iterable[int | None]) -> Array:
-    """A column of numbers that wrap at 2^32; empty if the samples have none."""
-    return np.array([value % UINT32 for value in values if value is not None], np.uint32)
-
-
-def _float32(rows: list[tuple[float, ...]]) -> Array:
-    """A column, (samples, fans); empty if the samples have none."""
-    return np.array(rows if rows[0] else (), np.float32)
 
 
 Item: TypeAlias = BlockEvent | Command | PushedSamples
@@ -134,7 +84,6 @@ class AcquisitionCore(Core):
         """source: takes commands. blocks: its readings. host_clock: gives the times of receipt and of ticks; its steps
         are reported."""
         self._tray = tray
-        self._limits = limits_of(tray)
         self._host_clock = host_clock
         self._seen_step = host_clock.last_step
         self._config = config
@@ -148,17 +97,17 @@ class AcquisitionCore(Core):
         self._stated_tachos = tuple(map(StatedTacho.of, tray.stated_tachos))
         self._tachos: tuple[Tacho, ...] = ()
         """as the device itself says"""
+        self._commands = DeviceCommands(tray, source)
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
         self._quality = InputQuality(started_t_ns, config.silence_s)
-        self._auxiliary: list[AuxiliaryColumn] = []
-        """those that the source has given"""
+        self._plausibility = Plausibility(limits_of(tray), tray.speed_unit, self._counts, self._quality, self._sequence)
 
     def step(self, item: Item) -> list[Raw]:
         """Handle input from the source, a change of its connection, or a command to send."""
         if isinstance(item, Command):
-            self._send(item)
+            self._commands.send(item, self._down_reason)
             return []
         if isinstance(item, PushedSamples):
             return self._take_pushed(item)
@@ -203,12 +152,22 @@ class AcquisitionCore(Core):
         """Input by kind; docs/reference/wire-protocol.md explains each counter."""
         steps = {"host_clock_steps": self._host_clock.steps} if self._host_clock.steps else {}
         lost_refused = self._counts["lost_refused"] + self._sequence.refused
-        return {**self._counts, **({"lost_refused": lost_refused} if lost_refused else {}), **steps}
+        return {
+            **self._counts,
+            **self._commands.counts,
+            **({"lost_refused": lost_refused} if lost_refused else {}),
+            **steps,
+        }
 
     def notes(self) -> list[str]:
-        """What the source measures beside command and speed."""
-        also = ", ".join(column.title for column in AUXILIARY if column in self._auxiliary)
-        return [f"the source measures {also}, too"] if also else []
+        """What the source measures beside command and speed, and which input and commands were refused."""
+        also = ", ".join(column.title for column in AUXILIARY if column in self._plausibility.auxiliary)
+        found = [f"the source measures {also}, too"] if also else []
+        found += [
+            f"refused input: {kind} {self._counts[kind]}, the first of them: {detail}"
+            for kind, detail in self._plausibility.first_refused.items()
+        ]
+        return [*found, *filter(None, [self._commands.note()])]
 
     def samples_in(self, item: Item) -> int:
         """The readings in a block."""
@@ -263,7 +222,7 @@ class AcquisitionCore(Core):
     def _receive(self, block: ReadingBlock) -> list[Raw]:
         """A message of the samples of the block; several if these are many or differ in their columns."""
         messages: list[Raw] = []
-        samples: list[_Received] = []
+        samples: list[ReceivedReading] = []
         for batch in block.batches:
             if batch.tachos != self._tachos:
                 messages += self._message(samples)
@@ -276,7 +235,7 @@ class AcquisitionCore(Core):
                 samples.append(received)
         return [*messages, *self._message(samples)]
 
-    def _message(self, samples: Sequence[_Received]) -> list[Raw]:
+    def _message(self, samples: Sequence[ReceivedReading]) -> list[Raw]:
         return [raw_message(samples, self._tray, self._stated_tachos)] if samples else []
 
     def _follow_device(self, tachos: tuple[Tacho, ...]) -> None:
@@ -285,102 +244,19 @@ class AcquisitionCore(Core):
         stated = tachos[:1] if len(set(tachos)) == 1 else tachos
         self._stated_tachos = tuple(map(StatedTacho.of, stated or self._tray.stated_tachos))
 
-    def _samples(self, batch: ReadingBatch) -> Iterator[_Received]:
+    def _samples(self, batch: ReadingBatch) -> Iterator[ReceivedReading]:
         """The samples that are new and plausible; all others are counted."""
         if batch.byte_count:
             self._counts["bytes"] += batch.byte_count
+        for name, count in batch.device_counts.items():
+            self._counts[f"device_{name}"] += count
         self._quality.add_input(batch.received_t_ns)
         self._now_ns = max(self._now_ns, batch.received_t_ns)
         for item in batch.items:
-            reading = self._plausible(item)
+            reading = self._plausibility.plausible(item)
             if reading is not None and self._sequence.is_new(reading, self._counts):
-                if self._auxiliary or reading.supply_voltage_v or reading.current_a or reading.temperature_c:
-                    reading = self._with_plausible_columns(reading)
                 self._counts["samples"] += 1
-                yield _Received(reading, batch.received_t_ns)
-
-    def _plausible(self, item: Reading | Rejected) -> Reading | None:
-        """The reading, without implausible speeds; None, and counted, if it cannot be used."""
-        if isinstance(item, Reading) and self._is_ordinary(item):
-            self._counts["no_speed"] += 0  # shown from the first reading on
-            self._quality.add_valid()
-            return item
-        rejected = item if isinstance(item, Rejected) else self._limits.why_refused(item)
-        if rejected is None:
-            assert isinstance(item, Reading)
-            return self._with_plausible_speeds(item)
-        self._counts[rejected.kind] += 1
-        self._sequence.refused += rejected.is_sample
-        if not rejected.harmless:
-            self._counts["refused_input"] += 1
-            self._quality.add_fault(rejected)
-        return None
-
-    def _is_ordinary(self, reading: Reading) -> bool:
-        """Whether all values are there and plausible, as in nearly all readings; a sum shows any not finite."""
-        command, speed, tray = reading.command, reading.speed, self._tray
-        return (
-            len(command) == len(speed) == tray.fans
-            and math.isfinite(sum(command) + sum(speed))
-            and tray.command_min <= min(command)
-            and max(command) <= tray.command_max
-            and -tray.speed_max <= min(speed)
-            and max(speed) <= tray.speed_max
-        )
-
-    def _with_plausible_speeds(self, reading: Reading) -> Reading:
-        speed_max = self._tray.speed_max
-        self._counts["no_speed"] += sum(map(math.isnan, reading.speed))
-        absurd = [speed for speed in reading.speed if abs(speed) > speed_max]
-        if not absurd:
-            self._quality.add_valid()
-            return reading
-        self._counts["absurd_speed"] += len(absurd)
-        speeds = tuple(math.nan if abs(v) > speed_max else v for v in reading.speed)
-        if all(map(math.isnan, speeds)):
-            self._counts["absurd_samples"] += 1
-            detail = f"speed {absurd[0]:g} is beyond speed_max = {speed_max:g} {self._tray.speed_unit}"
-            self._quality.add_fault(Rejected("absurd_speed", detail, setting="speed_max and speed_unit"))
-        else:
-            self._quality.add_valid()
-        return replace(reading, speed=speeds)
-
-    def _with_plausible_columns(self, reading: Reading) -> Reading:
-        """The reading with NaN where a value beside command and speed cannot be true, or the source has left it out.
-
-        A source that gives a column in some samples only, such as a temperature once a second, has it in all.
-        """
-        unknown = (math.nan,) * self._tray.fans
-        changed: dict[str, tuple[float, ...]] = {}
-        for column in AUXILIARY:
-            values: tuple[float, ...] = getattr(reading, column.name)
-            if not values:
-                if column in self._auxiliary:
-                    changed[column.name] = unknown
-                continue
-            if column not in self._auxiliary:
-                self._auxiliary.append(column)
-            absurd = sum(not (column.is_plausible(value) or math.isnan(value)) for value in values)
-            if len(values) != self._tray.fans:
-                absurd, values = len(values), unknown
-            if absurd:
-                self._counts[f"absurd_{column.name.rpartition('_')[0]}"] += absurd
-                changed[column.name] = tuple(value if column.is_plausible(value) else math.nan for value in values)
-        return replace(reading, **changed) if changed else reading
-
-    def _send(self, wanted: Command) -> None:
-        """Send a command to the device; one that this tray cannot carry out is refused as a whole."""
-        tray = self._tray
-        command = tuple(map(float, wanted.command))
-        set_point = tuple(float(value) / RAD_S_PER_UNIT[tray.speed_unit] for value in wanted.set_point_rad_s)
-        if (
-            any(len(values) not in (0, tray.fans) for values in (command, set_point))
-            or not all(math.isnan(c) or within(c, tray.command_min, tray.command_max) for c in command)
-            or not all(math.isnan(s) or within(s, -tray.speed_max, tray.speed_max) for s in set_point)
-        ):
-            self._counts["refused_commands"] += 1
-        elif not all(map(math.isnan, command + set_point)):
-            self._counts["sent_commands" if self._source.send(command, set_point) else "lost_commands"] += 1
+                yield ReceivedReading(self._plausibility.with_plausible_columns(reading), batch.received_t_ns)
 
 
 def build_tray_source(context: Context) -> SampleSource:

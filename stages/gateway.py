@@ -25,7 +25,8 @@ from pipeline.presenting.site_model import SiteModel
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from pipeline.viewing.fleet import Fan
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Health, Message, ModelCard
+from schemas.health import Health
+from schemas.messages import Alarm, Message, ModelCard
 from schemas.units import NS_PER_S
 
 NEEDED = ("starlette", "uvicorn", "prometheus_client", "argon2")

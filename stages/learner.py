@@ -29,7 +29,8 @@ from pipeline.learning.versions import TwinVersions, Version, VersionList, learn
 from pipeline.recordings.dates import format_utc
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
-from schemas.messages import Action, Message, NewTwin, Raw, Request, Score
+from schemas.enums import Action
+from schemas.messages import Message, NewTwin, Raw, Request, Score
 from schemas.units import NS_PER_S
 
 LOOK_NS = NS_PER_S
@@ -283,7 +284,7 @@ class LearnerCore(Core):
     def _waits_for(self) -> str:
         minutes = self._history.seconds / 60.0
         missing = self._operation.missing()
-        lacks = f"; not moved enough yet: {'; '.join(missing)}; `fantwin sweep` moves the fans" if missing else ""
+        lacks = f"; not moved enough yet: {'; '.join(missing)}; {self._operation.how_to_move}" if missing else ""
         needed = f"{self._config.first_minutes:g} needed"
         return f"no twin yet, nothing is judged; {minutes:.0f} min recorded ({needed}){lacks}"
 

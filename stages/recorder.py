@@ -29,7 +29,8 @@ from pipeline.recordings.recorder_config import FLUSH_S, RecorderConfig, flush_i
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from schemas.envelope import Envelope
-from schemas.messages import Health, Message
+from schemas.health import Health
+from schemas.messages import Message
 from schemas.streams import StreamId
 from schemas.topics import TOPICS, tray_key
 from schemas.units import NS_PER_S

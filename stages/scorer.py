@@ -32,17 +32,9 @@ from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, S
 from pipeline.runtime.tray_scorer import DATA_LOST_AFTER_NS, TrayScorer
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.blocks import select
+from schemas.enums import Transition
 from schemas.fan_numbers import fans_in_words
-from schemas.messages import (
-    Alarm,
-    Message,
-    ModelCard,
-    Prediction,
-    Request,
-    Score,
-    ScorerSnapshot,
-    Transition,
-)
+from schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
 from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_text import AlarmText

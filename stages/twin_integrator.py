@@ -143,7 +143,7 @@ class TwinIntegratorCore(Core):
         missing, name = self.tray.missing_columns, self._twin.card.name
         if not missing:
             return ""
-        return f"twin {name} needs {missing}, which the source does not send: send it, or train a twin without it"
+        return f"twin {name} needs {missing}, which the source does not send: send it, or train a twin with --ignore"
 
     def _only_new(self, grid: Grid) -> Grid:
         """The block without the samples that are not newer than those before them."""

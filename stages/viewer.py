@@ -37,7 +37,8 @@ from pipeline.viewing.trace import MEASURED_COLUMNS, Trace, state_changes, state
 from pipeline.viewing.view_sink import ViewSink
 from schemas.codec import CodecError, decode_columns
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Health, Message, ModelCard, Score
+from schemas.health import Health
+from schemas.messages import Alarm, Message, ModelCard, Score
 from schemas.units import NS_PER_S
 
 NO_RERUN = f"the viewer needs the extra `view`: take viewer out of launcher.stages, or {how_to_install('view')}"

@@ -28,6 +28,7 @@ from twin.fitting.drive_fit import find_drive
 from twin.fitting.identification import identify
 from twin.fitting.model_fits import FitRequest, Trainer
 from twin.fitting.model_uncertainty import model_uncertainty
+from twin.fitting.reference_choice import behind_a_drive, identify_at_reference
 from twin.fitting.standstill import find_standstill
 from twin.fitting.training import MOST_NETWORKS, Physics
 from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
@@ -36,7 +37,7 @@ from twin.models.network_ode import NetworkOde
 from twin.models.physics import PARAMETER_NAMES
 from twin.networks import ForEachNetwork, one_after_another
 from twin.progress import Progress, unreported, within
-from twin.reference import at_reference, reference_of
+from twin.reference import at_reference
 from twin.runs import Array, Run, common_fans, common_tacho
 
 
@@ -82,16 +83,16 @@ def train_twin(
         runs, validation_runs = _as_if_instantaneous(runs), _as_if_instantaneous(validation_runs)
     tacho = common_tacho([*runs, *validation_runs])
     started_s = time.monotonic()
-    conditions = reference_of([*runs, *validation_runs])
+    found = identify_at_reference(runs, validation_runs, progress=progress)
+    conditions, identification, notes = found.conditions, found.identification, found.notes
     recorded, validation_recorded = at_reference(runs, None), at_reference(validation_runs, None)
     runs, validation_runs = at_reference(runs, conditions), at_reference(validation_runs, conditions)
-    identification = identify(runs, progress=progress)
     standstill = find_standstill([*recorded, *validation_recorded])
     drive = None
     if model_kind.knows_drives:
         drive = find_drive(recorded, validation_recorded, identification, standstill, progress)
     if drive is not None:  # a fan that controls its own speed makes up for its supply, in a way that is not known
-        conditions, runs, validation_runs = None, recorded, validation_recorded
+        conditions, runs, validation_runs, notes = None, recorded, validation_recorded, behind_a_drive(found)
     acting, validation_acting = runs, validation_runs
     if drive is not None:
         acting, validation_acting = drive.driven(runs), drive.driven(validation_runs)
@@ -114,7 +115,7 @@ def train_twin(
     )
     model, parameters = fitted.model, fitted.parameters
     duration_s = time.monotonic() - started_s
-    identification = replace(identification, warnings=(*identification.warnings, *fitted.warnings))
+    identification = replace(identification, warnings=(*notes, *identification.warnings, *fitted.warnings))
     uncertainty = None
     if isinstance(model, NetworkOde) and model.has_physics:
         progress("uncertainty", 0, 0, np.nan)

@@ -32,14 +32,18 @@ def at_reference(runs: Sequence[Run], reference: ReferenceConditions | None) -> 
 
     Raises TwinError when a run does not have a quantity that is needed.
     """
-    return [_converted(run, reference) if reference else _without_auxiliary(run) for run in runs]
+    return [_converted(run, reference) if reference and reference.needed else _without_auxiliary(run) for run in runs]
 
 
 def _without_auxiliary(run: Run) -> Run:
     return replace(run, auxiliary={}) if run.auxiliary else run
 
 
-def _ratios(run: Run, reference: ReferenceConditions) -> tuple[Array, Array, NDArray[np.bool_]]:
+def ratios_of(run: Run, reference: ReferenceConditions) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """The ratios of torque and density over a run, and whether all that is needed is known; (n, fans) each.
+
+    Raises TwinError when the run does not have a quantity that is needed.
+    """
     for name in reference.needed:
         if name not in run.auxiliary:
             raise TwinError(f"run {run.name!r} has no {name}, which the twin needs: give recordings that have it")
@@ -49,7 +53,7 @@ def _ratios(run: Run, reference: ReferenceConditions) -> tuple[Array, Array, NDA
 
 
 def _converted(run: Run, reference: ReferenceConditions) -> Run:
-    torque, density, known = _ratios(run, reference)
+    torque, density, known = ratios_of(run, reference)
     speed_rad_s = np.where(known, run.speed_rad_s * density, np.nan)
     return replace(run, command=run.command * torque * density, speed_rad_s=speed_rad_s, auxiliary={})
 
@@ -59,7 +63,7 @@ def _median(runs: Sequence[Run], name: str) -> float | None:
     if not runs or any(name not in run.auxiliary for run in runs):
         return None
     probe = ReferenceConditions(**{name: 1.0})
-    if any(_ratios(run, probe)[2].mean(axis=0).min() < LEAST_KNOWN for run in runs):
+    if any(ratios_of(run, probe)[2].mean(axis=0).min() < LEAST_KNOWN for run in runs):
         return None
     values = np.concatenate([run.auxiliary[name].ravel() for run in runs])
     return float(f"{np.nanmedian(values):.6g}")

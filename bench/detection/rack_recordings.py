@@ -11,7 +11,7 @@ from bench.detection.plant import START_NS
 from bench.detection.racks import DAY_S, TACHOS, Racks, fault_schedule, racks, reports, run_of
 from pipeline.recordings.reading import TACHO_KEY
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header
+from schemas.header import Header
 from schemas.tacho import tachos_to_json
 from schemas.topics import tray_key
 from simulation.faults import Fault

@@ -23,7 +23,8 @@ from bench.detection.rack_recordings import RackData
 from pipeline.cli.twins.calibrate import calibrate
 from pipeline.cli.twins.train import train
 from pipeline.replay.offline.replay_input import open_replay_input
-from schemas.messages import Alarm, InvalidReason, Message, Prediction, Score
+from schemas.enums import InvalidReason
+from schemas.messages import Alarm, Message, Prediction, Score
 
 CANNOT_TELL = "cannot_tell"
 DECLARED_PER_DAY = 1.0

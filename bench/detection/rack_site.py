@@ -31,7 +31,9 @@ from pipeline.learning.versions import TwinVersions, Version, learning_folder
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.runtime.stage import Core, load_stage
 from schemas.blocks import select
-from schemas.messages import Action, Alarm, Header, Raw, Request, Score
+from schemas.enums import Action
+from schemas.header import Header
+from schemas.messages import Alarm, Raw, Request, Score
 from schemas.units import NS_PER_S
 from stages.learner import LearnerCore
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.messages import Array, InvalidReason, Prediction
+from schemas.enums import InvalidReason
+from schemas.messages import Array, Prediction
 
 
 def speed_sigmas(block: Prediction) -> Array:

@@ -26,13 +26,16 @@ from pipeline.config.loading import parse_config
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.building import build_parts
 from pipeline.runtime.stage import Context, Core, load_stage
-from schemas.messages import Alarm, Grid, Header, Prediction, Raw, Transition
+from schemas.enums import Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Grid, Prediction, Raw
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 from simulation.faults import Fault
 from simulation.surroundings import Measured, Surroundings
 from simulation.tacho import NoisyTacho, TachoSettings
-from simulation.tray import SimulatedTray, TraySettings
+from simulation.tray import TraySettings
+from simulation.tray_run import run_of
 from twin.build import evaluate, train_twin
 from twin.runs import Run
 
@@ -86,16 +89,7 @@ def simulated(seed: int, wander: float, seconds: float, faults: Sequence[Fault] 
         faults=tuple(faults),
         surroundings=Surroundings(supply_wander=wander, temperature_swing_c=8.0, measured=MEASURED),
     )
-    tray, samples = SimulatedTray(settings), []
-    while tray.due_s() is not None:
-        samples.append(tray.take())
-    return Run(
-        f"seed {seed}",
-        np.array([sample.t_s for sample in samples]),
-        np.stack([sample.command for sample in samples]),
-        np.stack([sample.speed_rad_s for sample in samples]),
-        auxiliary={name: np.stack([sample.auxiliary[name] for sample in samples]) for name in MEASURED},
-    )
+    return run_of(settings)
 
 
 def _with(names: Sequence[str], run: Run) -> Run:

@@ -12,7 +12,8 @@ import matplotlib as mpl
 import numpy as np
 
 from pipeline.recordings.reading import read_recording
-from schemas.messages import Alarm, Prediction, Raw, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Prediction, Raw
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 from tests.support.fan_board import FANS
 from tests.support.pin_trace import read_pin_trace

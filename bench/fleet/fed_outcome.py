@@ -21,8 +21,10 @@ from pipeline.replay.offline.plan import undisturbed_plan
 from pipeline.replay.offline.raw_blocks import RawBlocks
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from schemas.codec import decode
+from schemas.enums import Transition
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Header, Message, Raw, Score, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Message, Raw, Score
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 

@@ -18,7 +18,10 @@ import numpy as np
 from pipeline.bus.publisher import Publisher
 from pipeline.bus.session import Bus
 from schemas.codec import decode, encode, type_name
-from schemas.messages import Header, Health, Output, Raw, Score, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
+from schemas.messages import Raw, Score
 from schemas.topics import ALL_TRAYS, BY_NAME, CATCH_UP_MESSAGES, health_key, tray_key
 from schemas.units import NS_PER_S
 from simulation.faults import Fault

@@ -14,9 +14,11 @@ import numpy as np
 from bench.detection.plant import START_NS
 from pipeline.config.models import TrayConfig
 from pipeline.viewing.fleet import Fan
+from schemas.enums import FanState, Severity, Statistic, Transition
 from schemas.envelope import Envelope
 from schemas.fields import columns
-from schemas.messages import Alarm, Array, FanState, Header, InputPosition, Score, Severity, Statistic, Transition
+from schemas.header import Header, InputPosition
+from schemas.messages import Alarm, Array, Score
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.messages import Array, Header, Raw
+from schemas.header import Header
+from schemas.messages import Array, Raw
 from schemas.units import NS_PER_S
 from simulation.published_fan import NOISE_RAD_S, RATE_HZ, rough_fans
 

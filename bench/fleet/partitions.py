@@ -35,7 +35,8 @@ from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.recordings.order import in_order
 from pipeline.replay.offline.replay_input import open_replay_input
 from schemas.codec import decode
-from schemas.messages import Raw, Score, StageStatus
+from schemas.enums import StageStatus
+from schemas.messages import Raw, Score
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 

@@ -29,7 +29,8 @@ from pipeline.config.loading import parse_config
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.stage import Core, load_stage
 from schemas.codec import decode, encode
-from schemas.messages import Alarm, Grid, Header, Prediction, Raw, Score
+from schemas.header import Header
+from schemas.messages import Alarm, Grid, Prediction, Raw, Score
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 from simulation.published_fan import RATE_HZ, rough_run

@@ -32,8 +32,10 @@ from pipeline.config.loading import parse_config
 from pipeline.config.models import BusConfig, Config
 from pipeline.runtime.runner import Runner
 from schemas.codec import encode, type_name
+from schemas.enums import StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Health, Score, StageStatus
+from schemas.health import Health
+from schemas.messages import Alarm, Score
 from schemas.topics import BY_NAME, tray_key
 from schemas.units import NS_PER_S
 from stages.viewer import STAGE

@@ -32,8 +32,9 @@ from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.runtime.inbox import Inbox, Newest
 from pipeline.runtime.newest_messages import NewestMessages
 from schemas.codec import decode, encode, type_name
+from schemas.enums import Transition
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Raw, Score, Transition
+from schemas.messages import Alarm, Raw, Score
 from schemas.topics import BY_NAME, tray_key
 from schemas.units import NS_PER_S
 from simulation.published_fan import RATE_HZ

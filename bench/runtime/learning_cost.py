@@ -30,7 +30,8 @@ from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.learning.healthy_history import HealthyHistory
 from pipeline.learning.versions import TwinVersions, learning_folder
 from pipeline.selftest.scratch_site import FANTWIN
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.units import NS_PER_S
 from simulation.published_fan import RATE_HZ, ROUGH_RANGE, published_fan, random_stairs
 

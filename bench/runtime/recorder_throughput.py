@@ -23,7 +23,8 @@ from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.writing import CHUNK_BYTES
 from schemas.codec import encode, proto_type
 from schemas.envelope import Envelope
-from schemas.messages import Grid, Header, Message, Prediction, Raw, Score, newest_t_ns
+from schemas.header import Header
+from schemas.messages import Grid, Message, Prediction, Raw, Score, newest_t_ns
 from schemas.topics import topic_of, tray_key
 from stages.recorder import Recorder, RecorderConfig
 

@@ -156,6 +156,9 @@ static void answer(const char *line)
 static void in_lock_step(void)
 {
     char line[LINE_BYTES];
+    if (isatty(STDIN_FILENO))
+        fputs("simulator: ready, in lock-step: give lines such as run 0.5 (seconds); --link PATH runs in real time\n",
+              stderr);
     while (!is_stopped && fgets(line, sizeof line, stdin)) {
         line[strcspn(line, "\n")] = 0;
         answer(line);
@@ -228,6 +231,8 @@ static void take_lines(void)
 static void in_real_time(void)
 {
     open_terminal();
+    fprintf(stderr, "simulator: ready: the serial line of the board is %s; settings and faults on standard input\n",
+            link_path);
     double began_s = now_s();
     bool was_behind = false;
     while (!is_stopped) {

@@ -1,4 +1,4 @@
-/* What went wrong since the start. Each wraps at 65536. */
+/* What went wrong since the start, sent once a second in this order. Each wraps at 65536. */
 #ifndef COUNTERS_H
 #define COUNTERS_H
 
@@ -18,6 +18,8 @@ typedef struct {
     uint16_t host_silences;
     uint16_t watchdog_resets; /* 1 if the last start was one */
 } counters_t;
+
+#define COUNTERS (sizeof(counters_t) / sizeof(uint16_t))
 
 extern volatile counters_t counters;
 

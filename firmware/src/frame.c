@@ -15,6 +15,18 @@ static uint8_t append(uint8_t *to, uint8_t at, const void *bytes, uint8_t length
     return at + length;
 }
 
+/* The payload with its CRC, which has room behind it. A delimiter on both sides: noise on an idle line then ends before
+ * the frame and cannot spoil it. */
+static uint8_t enclose(uint8_t *payload, uint8_t length, uint8_t *line)
+{
+    uint32_t crc = crc32(payload, length);
+    length = append(payload, length, &crc, 4);
+    line[0] = 0;
+    uint8_t line_length = 1 + cobs_encode(payload, length, line + 1);
+    line[line_length++] = 0;
+    return line_length;
+}
+
 uint8_t sample_encode(const sample_t *sample, uint8_t line[SAMPLE_LINE_BYTES])
 {
     uint8_t payload[SAMPLE_LINE_BYTES];
@@ -32,13 +44,16 @@ uint8_t sample_encode(const sample_t *sample, uint8_t line[SAMPLE_LINE_BYTES])
         if (SUPPLY)
             at = append(payload, at, &sample->supply_v, 4);
     }
-    uint32_t crc = crc32(payload, at);
-    at = append(payload, at, &crc, 4);
-    /* A delimiter on both sides: noise on an idle line then ends before the frame and cannot spoil it. */
-    line[0] = 0;
-    uint8_t length = 1 + cobs_encode(payload, at, line + 1);
-    line[length++] = 0;
-    return length;
+    return enclose(payload, at, line);
+}
+
+uint8_t counters_encode(uint32_t uptime_s, const uint16_t counts[COUNTERS], uint8_t line[COUNTERS_LINE_BYTES])
+{
+    uint8_t payload[COUNTERS_LINE_BYTES] = {FRAME_VERSION, TYPE_COUNTERS};
+    uint8_t at = append(payload, 2, &uptime_s, 4);
+    payload[at++] = COUNTERS;
+    at = append(payload, at, counts, 2 * COUNTERS);
+    return enclose(payload, at, line);
 }
 
 static received_t decode(uint8_t *piece, uint8_t piece_length, float values[FANS])

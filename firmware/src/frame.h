@@ -5,10 +5,11 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "counters.h"
 #include "settings.h"
 
 #define FRAME_VERSION 1
-enum { TYPE_SAMPLE = 1, TYPE_COMMAND = 2, TYPE_SET_POINT = 3, TYPE_SAMPLE_WITH_COLUMNS = 4 };
+enum { TYPE_SAMPLE = 1, TYPE_COMMAND = 2, TYPE_SET_POINT = 3, TYPE_SAMPLE_WITH_COLUMNS = 4, TYPE_COUNTERS = 5 };
 enum { COLUMN_SUPPLY = 1 };
 
 typedef struct {
@@ -23,6 +24,12 @@ typedef struct {
 
 /* Write a sample as it goes onto the line; returns its length. */
 uint8_t sample_encode(const sample_t *sample, uint8_t line[SAMPLE_LINE_BYTES]);
+
+/* Version, type, uptime, number of counters, counters, CRC; a code byte and two delimiters. */
+#define COUNTERS_LINE_BYTES (7 + 2 * COUNTERS + 4 + 3)
+
+/* Write the counters as they go onto the line; returns their length. */
+uint8_t counters_encode(uint32_t uptime_s, const uint16_t counts[COUNTERS], uint8_t line[COUNTERS_LINE_BYTES]);
 
 typedef enum {
     RECEIVED_NOTHING, /* the frame is not complete */

@@ -4,6 +4,7 @@
 #include <avr/sleep.h>
 #include <avr/wdt.h>
 #include <math.h>
+#include <util/atomic.h>
 
 #include "adc.h"
 #include "counters.h"
@@ -145,6 +146,25 @@ static float measured_rpm(uint8_t fan, uint16_t pulses, float period_rpm)
     return counted_rpm[fan];
 }
 
+/* Once a second: what the board has counted. If the line has no room, the next sample tries again. */
+static void send_counters(void)
+{
+    static uint8_t samples_before = RATE_HZ - 1;
+    if (samples_before < RATE_HZ - 1) {
+        samples_before++;
+        return;
+    }
+    uint16_t counts[COUNTERS];
+    for (uint8_t i = 0; i < COUNTERS; i++)
+        ATOMIC_BLOCK(ATOMIC_RESTORESTATE) /* one by one, so that no edge waits for all of them */
+        {
+            counts[i] = ((const volatile uint16_t *)&counters)[i];
+        }
+    uint8_t line[COUNTERS_LINE_BYTES];
+    if (uart_send(line, counters_encode(sequence / RATE_HZ, counts, line)))
+        samples_before = 0;
+}
+
 static void sample(void)
 {
     sample_t sample = {.sequence = sequence, .supply_v = adc_supply_v()};
@@ -169,6 +189,7 @@ static void sample(void)
     uint8_t line[SAMPLE_LINE_BYTES];
     if (!uart_send(line, sample_encode(&sample, line)))
         count(&counters.unsent_samples);
+    send_counters();
 }
 
 int main(void)

@@ -64,8 +64,8 @@
 #if PULSES < 1 || PULSES > 8
 #error "PULSES: 1 to 8 a revolution"
 #endif
-/* A frame of FANS fans (see frame.h) must leave within a sample: 10 bits a byte. */
-#if (18 + 4 * FANS * (SUPPLY ? 3 : 2) + 1) * 10 * RATE_HZ > BAUD
+/* Samples of FANS fans must leave at their rate, and once a second the counters (see frame.h): 10 bits a byte. */
+#if ((18 + 4 * FANS * (SUPPLY ? 3 : 2) + 1) * RATE_HZ + 38) * 10 > BAUD
 #error "BAUD is too low for that many fans at RATE_HZ"
 #endif
 

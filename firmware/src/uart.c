@@ -7,7 +7,7 @@
 #include "counters.h"
 #include "settings.h"
 
-#define OUT_SIZE 128 /* more than the longest frame */
+#define OUT_SIZE 128 /* more than a sample and the counters */
 #define IN_SIZE 64   /* what comes in 5 ms at 115200 baud */
 #define DIVISOR ((F_CPU + 4 * BAUD) / (8 * BAUD))
 

@@ -16,7 +16,8 @@ from pipeline.broker.topics import ALL_FANS, ANSWER, REQUEST, Topics
 from pipeline.config.models import TrayConfig
 from pipeline.presenting.request_desk import ANSWERED_WITHIN_S, RequestDesk
 from pipeline.presenting.request_form import LONGEST_COMMENT, RequestForm
-from schemas.messages import Alarm, Request, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Request
 
 LARGEST_REQUEST_BYTES = 4096
 

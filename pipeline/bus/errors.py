@@ -11,6 +11,10 @@ class BusError(UserError):
     """The bus cannot be used: one line that says what, where and what to do."""
 
 
+class NoAnswerError(BusError):
+    """Who is on the bus is not known."""
+
+
 def reason(error: zenoh.ZError) -> str:
     """Zenoh's message, without the place in its sources."""
     text = str(error)

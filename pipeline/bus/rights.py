@@ -17,6 +17,7 @@ import zenoh
 
 from pipeline.bus.access_rules import Rights, SiteRoles
 from pipeline.bus.link import LEASE_MS
+from pipeline.config.roles import OPERATOR
 from schemas.topics import key_in_words, rights_key
 
 PERIOD_S = 2.0
@@ -84,7 +85,7 @@ class OwnRights:
         if self._own is None:
             return f"its certificate says {role!r}, which is no role of site {self._site.site!r}; all is refused"
         if refused := self._refused(self._own):
-            return f"its certificate says {role!r}, which may not {refused}; give it that of its own role"
+            return f"its certificate says {role!r}, which may not {refused}; give it that of {self._fitting_role()}"
         is_connected = self._is_connected()
         with self._lock:
             granted, asked_s = self._granted, self._asked_s
@@ -116,8 +117,16 @@ class OwnRights:
                 self._routers, self._asked_s = routers, None
         return bool(routers)
 
+    def _fitting_role(self) -> str:
+        """The role for all that this session declares, for people: an operator's, or that of its stage."""
+        rights = self._site.rights(OPERATOR)
+        is_operator = rights is not None and all(rights.allow(*claim) for claim in tuple(self._claims))
+        return f"role {OPERATOR!r}" if is_operator else "its own role"
+
     def _refused(self, rights: Rights) -> str:
-        found = [(message, key) for message, key in tuple(self._claims) if not rights.allow(message, key)]
+        refused = [(message, key) for message, key in tuple(self._claims) if not rights.allow(message, key)]
+        # who may not publish may not answer for what it has published either: that needs no words
+        found = [claim for claim in refused if claim[0] != "declare_queryable"] or refused
         words = list(dict.fromkeys(f"{_WORDS.get(message, message)} {key_in_words(key)}" for message, key in found))
         more = f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else ""
         return ", ".join(words[:_SHOWN]) + more

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 
 from pipeline.bus.access_rules import SiteRoles, access_control
+from pipeline.bus.dead_links import given_up_soon
 from pipeline.bus.errors import BusError, reason
 from pipeline.bus.link import LEASE_MS, RETRY
 from pipeline.bus.rights import answer_rights
@@ -64,7 +65,8 @@ def open_router(
         raise BusError(f"the router cannot listen on {endpoint!r}: {reason(error)}; is one running already?") from error
     try:
         answering = answer_rights(session, site) if site else None
-        yield
+        with given_up_soon():
+            yield
         if answering is not None:
             answering.undeclare()
     finally:

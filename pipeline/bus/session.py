@@ -33,7 +33,7 @@ from pipeline.bus.endpoint import (
     require_tls_with_security,
     somebody_listens,
 )
-from pipeline.bus.errors import BusError, reason
+from pipeline.bus.errors import BusError, NoAnswerError, reason
 from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept, kept_key
 from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
 from pipeline.bus.publisher import KeptBytes, Publisher
@@ -43,7 +43,7 @@ from pipeline.bus.settings import Settings
 from pipeline.bus.spool import Spool
 from pipeline.config.models import BusConfig, Config
 from pipeline.config.roles import READERS
-from schemas.topics import Topic, largest_bytes
+from schemas.topics import Topic, key_in_words, largest_bytes
 
 if TYPE_CHECKING:
     from pipeline.bus.certificates import Credentials
@@ -55,6 +55,10 @@ SAID_AFTER_S = 3.0
 MEETING_LIMIT_S = 10.0
 """by then a process that listens at the endpoint has answered, however busy the machine"""
 _MEETING_POLL_S = 0.01
+RIGHTS_ASKED = 2
+"""times that a router is asked before no answer is one: a busy host may be late"""
+_ALIVE_TIMEOUTS = 2
+"""so many times recovery_timeout_s it is asked who is there"""
 
 
 class Bus:
@@ -168,9 +172,28 @@ class Bus:
                 return
 
     def alive(self, key_expression: str) -> set[str]:
-        """The keys of the tokens that exist now."""
-        replies = self._session.liveliness().get(key_expression, timeout=self._config.recovery_timeout_s)
-        return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+        """The keys of the tokens that exist now. Asks again if there is no complete answer.
+
+        Raises:
+            NoAnswerError: nobody has answered: who is there is not known.
+        """
+        timeout_s = self._config.recovery_timeout_s
+        until_s = time.monotonic() + _ALIVE_TIMEOUTS * timeout_s
+        while True:
+            replies = list(self._session.liveliness().get(key_expression, timeout=timeout_s))
+            found = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+            if all(reply.ok is not None for reply in replies) and self._has_its_router():
+                return found
+            if time.monotonic() > until_s:
+                raise NoAnswerError(
+                    f"bus.endpoint = {self._config.endpoint!r}: who is on the bus is not known, nobody has answered "
+                    f"within {_ALIVE_TIMEOUTS * timeout_s:g} s: see that the router runs and is not overloaded"
+                )
+            time.sleep(_ROUTER_RETRY_S)
+
+    def _has_its_router(self) -> bool:
+        """Whether a client is connected; without its router it sees no token. Peers need no router."""
+        return self._config.mode == "peer" or bool(self._session.info.routers_zid())
 
     def request_missed(
         self,
@@ -216,6 +239,19 @@ class Bus:
         assert self.credentials
         role = self.credentials.role
         return granted_rights(self._session, site.site, role) == site.rights(role)
+
+    def why_not_published(self, site: str, key: str) -> str:
+        """Why the router lets nothing through that this session publishes on a key of a site, and what to do; empty if
+        it does, or without `bus.security`. For a program that knows no roles; it waits for the answer."""
+        if self.credentials is None:
+            return ""
+        role = self.credentials.role
+        asked = (granted_rights(self._session, site, role) for _ in range(RIGHTS_ASKED))
+        granted = next(filter(None, asked), None)
+        whose = f"{self.credentials.certificate} is a certificate of role {role!r}"
+        if granted is None:
+            return f"{whose}, which the router at {self._config.endpoint} refuses: no such role in site {site!r}"
+        return "" if granted.allow("put", key) else f"{whose}, which may not publish {key_in_words(key)}"
 
     def security_problem(self) -> str:
         """What is refused, or which certificate expires soon; empty if there is nothing, or without `bus.security`.

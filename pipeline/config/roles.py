@@ -59,6 +59,11 @@ def roles_of(config: Config) -> dict[str, Role]:
     return {role.name: role for role in (*_roles_of_stages(config), *_roles_of_others(config))}
 
 
+def roles_of_stages() -> dict[str, Role]:
+    """The roles of all stages, for all trays, and that of a replay, by name: without a configuration."""
+    return {role.name: role for role in (*(_of_stage(stage, stage, (), ()) for stage in STAGES), _of_replay())}
+
+
 def role_names(stage: str, shard: Shard) -> tuple[str, ...]:
     """The roles that a process of a stage may have, the one with the fewest rights first."""
     limited = f"{stage}.{shard.name}"
@@ -114,6 +119,11 @@ def _roles_of_others(config: Config) -> Iterator[Role]:
     for tray in (None, *(tray.name for tray in config.trays)):
         name, of = (f"{SOURCE}.{tray}", f" of {tray}") if tray else (SOURCE, "")
         yield Role(name, f"a program that has readings{of}", trays=(tray,) if tray else (), writes=pushed)
-    replayed = tuple(topic.name for topic in TOPICS if not topic.is_of_session)
-    yield Role(REPLAY, "a replay of a recording onto the bus", stage=REPLAY, writes=replayed, reads=everything)
+    yield _of_replay()
     yield Role(ROUTER, "a router: passes on what its clients may do", is_router=True)
+
+
+def _of_replay() -> Role:
+    replayed = tuple(topic.name for topic in TOPICS if not topic.is_of_session)
+    everything = tuple(topic.name for topic in TOPICS)
+    return Role(REPLAY, "a replay of a recording onto the bus", stage=REPLAY, writes=replayed, reads=everything)

@@ -16,6 +16,8 @@ from pipeline.devices.hwmon_tree import ChipFolder, chip_folders, device_words
 
 HIGHEST_RPM = 20_000
 MOST_IN_TRAY = 64
+_UNKNOWN = "n/a"
+"""what pyserial says of a port of which the system knows nothing"""
 
 
 @dataclass(frozen=True)
@@ -67,10 +69,11 @@ def discover_hwmon(root: Path = ROOT, *, writable: bool = False) -> Iterator[Fou
 
 
 def discover_serial() -> Iterator[Found]:
-    """The serial ports that have a device behind them."""
+    """The serial ports that have a device behind them. The system may list more: then nothing is known of them."""
     from serial.tools import list_ports  # noqa: PLC0415  slow to import, and needed here only
 
-    ports = sorted(list_ports.comports())
+    listed = sorted(list_ports.comports())
+    ports = [port for port in listed if (port.description, port.hwid) != (_UNKNOWN, _UNKNOWN)]
     for number, port in enumerate(ports):
         readable = os.access(port.device, os.R_OK | os.W_OK)
         missing = () if readable else ("this user may not open it: join its group (often dialout)",)
@@ -82,7 +85,10 @@ def discover_serial() -> Iterator[Found]:
         }
         note = "fans, protocol and unit are a guess: `fantwin doctor` listens and says what does not fit"
         yield Found("serial", f"{port.device}: {port.description}", keys, (note,), missing)
-    if not ports:
+    if unknown := [port.device for port in listed if port not in ports]:
+        lacks = "no device is known there, left out; if one is connected, name its port in a [[tray]] yourself"
+        yield Found("serial", ", ".join(unknown), {}, missing=(lacks,))
+    if not listed:
         yield Found("serial", "serial ports", {}, missing=("none is there: connect the device",))
 
 

@@ -33,6 +33,11 @@ class HttpConfig(SourceConfig, frozen=True):
         """Whether only this host can reach it."""
         return is_of_this_host_only(self.host)
 
+    @property
+    def why_no_commands(self) -> str:
+        """Nothing sends them to the client."""
+        return "whatever posts its samples moves the fans"
+
     @model_validator(mode="after")
     def _is_protected(self) -> Self:
         if not self.is_local and self.token_file is None:

@@ -101,9 +101,9 @@ class HttpSource:
         for thread in self._threads:
             thread.join(STOP_LIMIT_S)
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
-        """False: whoever sends the samples moves the fans."""
-        return False
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        """Nothing is sent."""
+        return self._config.why_no_commands
 
     def check(self) -> list[str]:
         """Whether the port is free."""

@@ -50,6 +50,11 @@ class HwmonConfig(PolledConfig, frozen=True):
     )
     root: Path = Field(default=ROOT, description="folder of the chips")
 
+    @property
+    def why_no_commands(self) -> str:
+        """They are written only where the configuration says so."""
+        return "" if self.writable else "its source does not have writable = true"
+
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
         """What the driver of the chip gives, where it is known."""
         del fans

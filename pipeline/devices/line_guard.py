@@ -90,6 +90,11 @@ class LineGuard:
         self._refuse(held)
         return []
 
+    @property
+    def is_holding(self) -> bool:
+        """Whether it is undecided whether samples belong to the line."""
+        return bool(self._held)
+
     def problem(self) -> str:
         """What happened in the last minute of the line, in one line."""
         return self._report if self._newest_t_ns < self._report_until_t_ns else ""

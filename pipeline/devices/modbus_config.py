@@ -84,6 +84,11 @@ class ModbusConfig(PolledConfig, frozen=True):
         """Those whose registers are named."""
         return len(self.fan)
 
+    @property
+    def why_no_commands(self) -> str:
+        """They need a register."""
+        return "" if any(fan.write for fan in self.fan) else "no fan of its source has a register `write`"
+
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
         """The mean over average_s, in the steps of the register of each fan."""
         if self.average_s is None or fans != len(self.fan):

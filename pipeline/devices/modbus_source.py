@@ -12,6 +12,7 @@ import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.devices.modbus_config import ModbusConfig, ModbusFan, Register
@@ -92,7 +93,7 @@ class ModbusDevice:
         """Open the connection."""
         self._client = client = self._made_client()
         if not client.connect():
-            raise DeviceError(f"{self.name}: cannot be opened or reached; waiting for it", is_lost=True)
+            raise self._lost("cannot be opened or reached")
 
     def read(self) -> Reading:
         """Commands, speeds and what else has registers."""
@@ -181,13 +182,19 @@ class ModbusDevice:
         try:
             return request()
         except ConnectionException as error:
-            raise DeviceError(f"{self.name}: the connection is gone; waiting for it", is_lost=True) from error
+            raise self._lost("the connection is gone") from error
         except ModbusException as error:
             raise DeviceError(
                 f"{self.name}: unit {unit} does not answer within {self._config.timeout_s:g} s; check unit and wiring"
             ) from error
         except OSError as error:
-            raise DeviceError(f"{self.name}: {error.strerror or error}; waiting for it", is_lost=True) from error
+            raise self._lost(error.strerror or str(error)) from error
+
+    def _lost(self, what: str) -> DeviceError:
+        """The same for a port that is unplugged, whether it was in use or is to be opened again."""
+        if self._port and not Path(self._port).exists():
+            what = "no such port, is it unplugged?"
+        return DeviceError(f"{self.name}: {what}; waiting for it", is_lost=True)
 
     def _connected(self) -> ModbusBaseSyncClient:
         if self._client is None:

@@ -51,6 +51,11 @@ class MqttConfig(SourceConfig, BrokerSettings, frozen=True):
         """The topic of a fan of the tray, counted from 0."""
         return topic.replace(FAN, str(self.first_fan + fan))
 
+    @property
+    def why_no_commands(self) -> str:
+        """They need a topic."""
+        return "" if self.send_topic else "its source names no send_topic"
+
     @model_validator(mode="after")
     def _topics_fit(self) -> Self:
         if bool(self.topic) == bool(self.speed_topic or self.command_topic):

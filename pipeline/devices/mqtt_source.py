@@ -91,23 +91,27 @@ class MqttSource:
         self._client.disconnect()
         self._client.loop_stop()
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
         """Publish a command, if the configuration has a topic for it and the broker is there. Set-points only go as
         JSON."""
         topic = self._config.send_topic
-        if not topic or not self._is_up:
-            return False
+        if not topic:
+            return self._config.why_no_commands
+        if not self._is_up:
+            return f"{self.name} is not connected"
         if FAN not in topic:
             given = {"command": command, "set_point": set_point}
             values = {name: [None if math.isnan(x) else x for x in each] for name, each in given.items() if each}
-            return self._publish(topic, json.dumps(values))
-        if not all(map(math.isnan, set_point)):
-            return False
-        return all(
-            self._publish(self._config.of_fan(topic, fan), f"{value:.9g}")
-            for fan, value in enumerate(command)
-            if not math.isnan(value)
-        )
+            is_sent = self._publish(topic, json.dumps(values))
+        elif not all(map(math.isnan, set_point)):
+            return f"a send_topic with {FAN} in it takes commands, no set-points"
+        else:
+            is_sent = all(
+                self._publish(self._config.of_fan(topic, fan), f"{value:.9g}")
+                for fan, value in enumerate(command)
+                if not math.isnan(value)
+            )
+        return "" if is_sent else f"{self.name} did not take it"
 
     def check(self) -> list[str]:
         """Whether the broker answers and accepts this client."""
@@ -193,7 +197,7 @@ class MqttSource:
         try:
             found = parse_samples(payload)
         except JsonSamplesError as error:
-            return [_refused(received_t_ns, payload, Rejected("malformed", str(error), is_sample=True))]
+            return [_refused(received_t_ns, payload, Rejected("malformed", f"{topic}: {error}", is_sample=True))]
         return batches_of(found, received_t_ns, self._receipts, len(payload))
 
     def _items_of_value(self, topic: str, payload: bytes, is_retained: bool) -> list[Reading | Rejected]:

@@ -99,7 +99,8 @@ class _Write:
     def __init__(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
         self.command, self.set_point = command, set_point
         self.is_done = threading.Event()
-        self.has_failed = False
+        self.failure = ""
+        """why it could not be written"""
         self.is_awaited = True
         """its sender still waits for the outcome"""
 
@@ -142,21 +143,23 @@ class PollingSource:
         if self._thread:
             self._thread.join(STOP_LIMIT_S)
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
-        """Pass a command to the thread; False if the device takes none, is not connected, or has refused it.
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        """Pass a command to the thread. Returns why the device did not take it.
 
         A write that fails after WRITE_WAIT_S is counted as `failed_writes`.
         """
         write = _Write(command, set_point)
         with self._wake:
-            if not self.device.is_writable or not self._is_connected or self._stopping:
-                return False
+            if not self.device.is_writable:
+                return f"{self.name} takes no commands"
+            if not self._is_connected or self._stopping:
+                return f"{self.name} is not connected"
             self._writes.append(write)
             self._wake.notify_all()
         write.is_done.wait(WRITE_WAIT_S)
         with self._wake:
             write.is_awaited = False
-            return not write.has_failed
+            return write.failure
 
     def check(self) -> list[str]:
         """What would keep the device from being read."""
@@ -258,7 +261,7 @@ class PollingSource:
 
     def _finish(self, write: _Write, failure: str) -> None:
         with self._wake:
-            write.has_failed = bool(failure)
+            write.failure = failure
             write.is_done.set()
             is_known = write.is_awaited
         if failure and not is_known:

@@ -13,3 +13,8 @@ class PushConfig(SourceConfig, frozen=True):
     takes_pushed: ClassVar[bool] = True
 
     kind: Literal["push"] = "push"
+
+    @property
+    def why_no_commands(self) -> str:
+        """Nothing sends them to the program."""
+        return "the program that pushes its samples moves the fans"

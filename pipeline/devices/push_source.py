@@ -36,6 +36,7 @@ class PushSource:
     settings_to_check = ""
 
     def __init__(self, config: PushConfig, context: SourceContext) -> None:
+        self._config = config
         self._rad_s_per_unit = RAD_S_PER_UNIT[context.speed_unit]
         self._client = ""
         self._heard_t_ns = 0
@@ -53,9 +54,9 @@ class PushSource:
     def stop(self) -> None:
         """Nothing is kept here."""
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
-        """False: whoever pushes samples moves the fans itself, and hears commands on the bus if it wants to."""
-        return False
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        """Nothing is sent: whoever pushes samples may hear commands on the bus."""
+        return self._config.why_no_commands
 
     def check(self) -> list[str]:
         """Nothing: that nobody sends is seen while it runs."""

@@ -63,6 +63,11 @@ class RedfishConfig(PolledConfig, frozen=True):
             raise ValueError("a configuration is recorded: put user and password into the file of `credentials`")
         return value
 
+    @property
+    def why_no_commands(self) -> str:
+        """fantwin never writes to a controller."""
+        return "fans behind Redfish are only read"
+
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
         """The mean over average_s."""
         del fans

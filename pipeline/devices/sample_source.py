@@ -9,8 +9,8 @@ pipeline/devices/source_kinds.py.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Protocol, TypeAlias
 
@@ -38,6 +38,11 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         """The most fans of a tray with this source."""
         return MOST_FANS
 
+    @property
+    def why_no_commands(self) -> str:
+        """Why commands of `fantwin command` and `sweep` cannot reach the fans, in a few words; empty: they may."""
+        return ""
+
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
         """What readings of this source are of the speed, one for all fans or one for each; None if the kind of source
         does not determine it. `tacho` of the [[tray]] overrides it."""
@@ -53,10 +58,16 @@ def too_many_fans(kind: str, fans: int, most: int) -> str:
 FLOAT32_TOLERANCE = 1e-6
 
 
-def within(value: float, low: float, high: float) -> bool:
-    """Whether a float32 value lies in a range given in decimals: 0.1 as float32 is not beyond 0.1."""
+def limits_of_float32(low: float, high: float) -> tuple[float, float]:
+    """The limits of a range given in decimals for float32 values: 0.1 as float32 is not beyond 0.1."""
     tolerance = FLOAT32_TOLERANCE * max(abs(low), abs(high))
-    return low - tolerance <= value <= high + tolerance
+    return low - tolerance, high + tolerance
+
+
+def within(value: float, low: float, high: float) -> bool:
+    """Whether a float32 value lies in a range given in decimals."""
+    least, most = limits_of_float32(low, high)
+    return least <= value <= most
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +162,8 @@ class ReadingBatch:
     """bytes received, where the source counts them"""
     tachos: tuple[Tacho, ...] = ()
     """what the device itself says that it measures, one for all fans or one for each; empty where it does not say"""
+    device_counts: Mapping[str, int] = field(default_factory=dict)
+    """what the device itself has counted since it said so last, such as damaged frames"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,8 +202,9 @@ class SampleSource(Protocol):
         """Deliver what has already arrived, then end."""
         ...
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
-        """Send to the device; False if it was not sent. Never blocks for long, never raises.
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        """Send to the device. Returns why it was not sent, in a few words; empty: it was. Never blocks for long, never
+        raises.
 
         command: in the tray's command unit; set_point: in its speed unit. Each has one value per fan, where NaN leaves
         the fan as it is, or is empty.

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
+from pipeline.devices.device_counters import DeviceCounterSteps
 from pipeline.devices.sample_source import (
     LinkDown,
     LinkUp,
@@ -22,6 +24,7 @@ from pipeline.devices.serial_port import ReceivedBytes, SerialPort
 from pipeline.errors import UserError
 from schemas import wire
 
+_HARMLESS = (wire.FaultKind.RESYNC, wire.FaultKind.UNKNOWN_TYPE)
 _REFUSED_SAMPLES = (wire.FaultKind.WRONG_FAN_COUNT, wire.FaultKind.BAD_COMMAND)
 
 
@@ -50,6 +53,7 @@ class SerialSource:
         self._config = config
         self._link = link or SerialPort(str(self._path), config.baud)
         self._decoder = wire.Decoder(config.protocol, context.fans)
+        self._device_counters = DeviceCounterSteps()
         self._fans = context.fans
 
     @property
@@ -74,20 +78,28 @@ class SerialSource:
         """The readings that these bytes complete. Pieces of the stream that are not frames are `Rejected`."""
         if not isinstance(item, ReceivedBytes):
             self._decoder.reset()
+            self._device_counters.connection_interrupted()
             return item
-        found = tuple(map(self._reading_of, self._decoder.feed(item.data)))
-        return ReadingBatch(item.received_t_ns, found, len(item.data))
+        readings: list[Reading | Rejected] = []
+        device_counts: Counter[str] = Counter()
+        for found in self._decoder.feed(item.data):
+            if isinstance(found, wire.DeviceCounters):
+                device_counts.update(self._device_counters.steps(found))
+            else:
+                readings.append(self._reading_of(found))
+        return ReadingBatch(item.received_t_ns, readings, len(item.data), device_counts=device_counts)
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
         """Write one frame for commands and one for set-points, where a value is given."""
         frames = ((command, wire.CommandFrame(command)), (set_point, wire.SetPointFrame(set_point)))
-        return self._link.write(
+        is_written = self._link.write(
             b"".join(
                 wire.encode(self._config.protocol, frame)
                 for values, frame in frames
                 if not all(map(math.isnan, values))
             )
         )
+        return "" if is_written else f"{self.name} is not connected, or accepted no bytes"
 
     def check(self) -> list[str]:
         """Whether the port exists and may be opened."""
@@ -108,11 +120,11 @@ class SerialSource:
                 found.current_a,
                 found.temperature_c,
             )
-        assert isinstance(found, wire.Fault), "the decoder of a host gives samples and faults only"
+        assert isinstance(found, wire.Fault), "commands and set-points are not for the decoder of a host"
         return Rejected(
             found.kind.value,
             found.detail,
-            harmless=found.kind is wire.FaultKind.RESYNC,
+            harmless=found.kind in _HARMLESS,
             is_sample=found.kind in _REFUSED_SAMPLES,
             setting=f"fans = {self._fans}" if found.kind is wire.FaultKind.WRONG_FAN_COUNT else "",
         )

@@ -9,12 +9,14 @@ from __future__ import annotations
 import array
 import errno
 import fcntl
+import math
 import os
 import select
 import termios
 import threading
 import time
 import tty
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +35,14 @@ _DRAINED_FOR_S = 0.1
 _POLL_S = 0.01
 _TAKEN_LIMIT_S = 0.5
 _READ_BYTES = 4096
+_COUNTER_OF_FAULT = {
+    wire.FaultKind.WRONG_CRC: "bad_crc",
+    wire.FaultKind.WRONG_VERSION: "wrong_kind",
+    wire.FaultKind.UNKNOWN_TYPE: "wrong_kind",
+    wire.FaultKind.WRONG_TYPE: "wrong_kind",
+    wire.FaultKind.WRONG_FAN_COUNT: "wrong_kind",
+}
+"""as a device counts a fault of its input; any other is a bad length"""
 
 
 class DeviceSample(Protocol):
@@ -229,19 +239,22 @@ def play(
     stop: threading.Event,
     on_start: Callable[[int], Any] = lambda _start_ns: None,
 ) -> PlaybackCounts:
-    """Send every sample at its time, by a schedule that does not drift, until the last one or until `stop` is set.
+    """Send every sample at its time, by a schedule that does not drift, until the last one or until `stop` is set; in
+    the binary form also once a second what the device has counted.
 
     rad_s_per_unit: unit of speed on the line. on_start: called with the epoch time of t_s = 0, ns. After a delay of the
     process, missed samples are sent as fast as possible; they keep their times.
     """
     played = PlaybackCounts()
     decoder = wire.Decoder(protocol, device.fans, end="device")
+    counters: Counter[str] = Counter()
+    counters_due_s = 0.0
     if stop.is_set():
         return played
     start_s, played.start_ns = time.monotonic(), time.time_ns()
     on_start(played.start_ns)
     while (due_s := device.due_s()) is not None:
-        _receive_until(start_s + due_s, device, line, decoder, rad_s_per_unit, stop, played)
+        _receive_until(start_s + due_s, device, line, decoder, rad_s_per_unit, stop, played, counters)
         if stop.is_set():
             break
         lateness_s = time.monotonic() - start_s - due_s
@@ -254,6 +267,9 @@ def play(
             played.samples_sent += 1
         else:
             played.samples_unsent += 1
+            counters["unsent_samples"] += 1
+        if protocol == "binary" and due_s >= counters_due_s and line.write(_counters_frame(due_s, counters)):
+            counters_due_s = math.floor(due_s) + 1.0
     played.bytes_unread = line.drain(DRAIN_LIMIT_S)
     return played
 
@@ -265,6 +281,11 @@ def _frame(sample: DeviceSample, rad_s_per_unit: float) -> wire.Sample:
     return wire.Sample(sample.clock_us, sample.sequence, command, tuple(speed.tolist()), **auxiliary)
 
 
+def _counters_frame(uptime_s: float, counters: Counter[str]) -> bytes:
+    counts = tuple(counters[name] % wire.UINT16 for name in wire.DEVICE_COUNTERS)
+    return wire.encode("binary", wire.DeviceCounters(int(uptime_s), counts))
+
+
 def _receive_until(
     deadline_s: float,
     device: Device,
@@ -273,20 +294,23 @@ def _receive_until(
     rad_s_per_unit: float,
     stop: threading.Event,
     played: PlaybackCounts,
+    counters: Counter[str],
 ) -> None:
     """Pass frames from the host to the device until deadline_s (monotonic); reads at least once."""
     while not stop.is_set():
         left_s = min(max(deadline_s - time.monotonic(), 0.0), 0.1)
         data = line.wait(left_s)
         for frame in decoder.feed(data):
+            counters["frames"] += isinstance(frame, wire.CommandFrame | wire.SetPointFrame)
             if isinstance(frame, wire.CommandFrame):
                 played.commands_received += 1
                 device.command(np.array(frame.command))
             elif isinstance(frame, wire.SetPointFrame):
                 played.set_points_received += 1
                 device.set_point(np.array(frame.set_point) * rad_s_per_unit)
-            else:
+            elif isinstance(frame, wire.Fault):
                 played.commands_refused += 1
+                counters[_COUNTER_OF_FAULT.get(frame.kind, "bad_length")] += frame.kind is not wire.FaultKind.RESYNC
         left_s = deadline_s - time.monotonic()
         if left_s <= 0.0:
             return

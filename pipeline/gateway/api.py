@@ -34,8 +34,8 @@ from pipeline.presenting.shown import (
 )
 from pipeline.presenting.site_model import SiteModel
 from pipeline.viewing.fleet import Fan
+from schemas.enums import Transition
 from schemas.messages import Request as OperatorRequest
-from schemas.messages import Transition
 from schemas.units import NS_PER_S
 
 MOST_LISTED = 500

@@ -16,7 +16,7 @@ from prometheus_client.registry import Collector
 
 from pipeline.launch.site_state import AT_WORK, StageState
 from pipeline.presenting.site_model import SiteModel
-from schemas.messages import Severity
+from schemas.enums import Severity
 from schemas.units import RAD_S_PER_UNIT
 from scoring.alarms.alarm_flags import is_presented
 

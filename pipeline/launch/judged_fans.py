@@ -16,8 +16,9 @@ from pipeline.launch.event_log import without_figures
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode
+from schemas.enums import FanState, InvalidReason
 from schemas.fan_numbers import fans_in_words
-from schemas.messages import Alarm, FanState, InvalidReason, Score
+from schemas.messages import Alarm, Score
 from schemas.topics import tray_key
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST, REASONS

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pipeline.launch.loss_accounting import Launched
 from pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
-from schemas.messages import Health
+from schemas.health import Health
 from schemas.topics import topic_of, tray_of
 
 _WATCHED_TOPICS = {"alarm", "score", "snapshot"}

@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.bus.session import Bus, join_bus
+from pipeline.bus.session import Bus, credentials_of, join_bus
 from pipeline.config.models import Config
 from pipeline.config.registry import LEARNER, RECORDER, STAGES
+from pipeline.config.roles import role_names, roles_of
 from pipeline.config.shards import own_file
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.errors import UserError
@@ -27,7 +28,7 @@ from pipeline.recordings.parts import part_files, part_path
 from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.stage import load_stage
 from pipeline.runtime.tray_twin import load_tray_twin, twin_path
-from schemas.messages import StageStatus
+from schemas.enums import StageStatus
 from schemas.topics import ALL_TRAYS, alive_key
 
 _POLL_S = 0.05
@@ -124,13 +125,15 @@ class Launcher:
             UserError: a stage cannot run as configured; the others have been stopped.
         """
         self._refuse_unusable_twins()
+        for slot in self._slots:  # before one of them has made a file
+            credentials_of(self._config.bus, role_names(slot.row.stage, slot.row.shard))
         reads = {name: load_stage(name).reads_as_configured(self._config) for name in self._config.stages}
         with join_bus(self._config, stop, say=self._say) as bus:
             self._refuse_second_launcher(bus, stop)
             if problem := bus.security_problem():
                 self._say(problem)
             before = set(self._parts())
-            self._watcher = SiteWatcher(bus, self._config.site)
+            self._watcher = SiteWatcher(bus, self._config.site, roles_of(self._config))
             try:
                 self._start_all(stop)
                 self._report = SiteReport(self._config.bus.endpoint, self._say, HOST_CLOCK.now_ns())
@@ -270,7 +273,8 @@ class Launcher:
                 continue
             if status == EXIT_CANNOT_START and not slot.was_ready:
                 slot.child.stop(0.1)
-                raise UserError(slot.child.last_line or f"{slot.row.label} cannot start as configured")
+                reason, slot.child = slot.child.last_line, None  # which ends with this error, and with no other line
+                raise UserError(reason or f"{slot.row.label} cannot start as configured")
             self._plan_restart(slot, status, now)
         self._kill_what_hangs(now)
 
@@ -298,6 +302,9 @@ class Launcher:
         if now - slot.child.started_s > _STABLE_S:
             slot.delay_s = self._config.launcher.restart_delay_s
         how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
+        if status == EXIT_CANNOT_START:
+            slot.child.stop(0.1)  # its last line may still be on its way
+            how = f"cannot start: {slot.child.last_line}"
         self._say(f"{slot.row.label}: {slot.hung or how}, restarting in {slot.delay_s:.1f} s")
         slot.hung = ""
         self._watchdog.ended(slot.row.label)

@@ -25,7 +25,8 @@ from typing import TypeAlias
 
 from pipeline.config.registry import STAGES
 from pipeline.runtime.stage import load_stage
-from schemas.messages import Health, StageStatus
+from schemas.enums import StageStatus
+from schemas.health import Health
 from schemas.streams import StreamId, StreamState, input_streams, output_streams
 from schemas.topics import ALL_TRAYS, HEALTH_CHUNK, current_name, stage_label
 

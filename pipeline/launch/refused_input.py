@@ -1,4 +1,5 @@
-"""What stages have refused, over all their sessions: messages of others, and input of devices that is no usable sample.
+"""What stages have refused, over all their sessions: messages of others, and input of devices that is no usable sample;
+and what devices themselves have refused or lost, where they count it.
 
 Refused input is shown apart from losses. A stage that has refused all that its device sent has failed.
 """
@@ -9,7 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 
 from pipeline.launch.loss_accounting import Launched, label
-from schemas.messages import Health
+from schemas.health import Health
 
 WORDS = {
     "refused_of_second": "messages from a second process of a stage",
@@ -20,23 +21,44 @@ WORDS = {
     "refused_numbers": "messages with impossible numbers",
     "refused_producers": "messages from unknown or too many producers",
     "refused_too_large": "messages that are too large",
-    "refused_commands": "commands out of range or of another number of fans",
+    "refused_commands": "commands that the tray does not take",
     "refused_other_time": "samples of another time",
-    "refused_input": "lines or frames that are no usable sample",
+    "refused_input": "pieces of input that are no usable sample",
     "absurd_speed": "speeds beyond speed_max",
+    "undecodable": "messages that cannot be read",
 }
 """by counter"""
-_LINE = "protocol, baud and the wiring"
+ON_THE_DEVICE = {
+    "device_bad_length": "frames of a wrong length",
+    "device_bad_crc": "frames with a wrong checksum",
+    "device_wrong_kind": "frames of another version, type or number of fans",
+    "device_bad_value": "commands out of range",
+    "device_line_errors": "bytes with framing errors",
+    "device_overruns": "bytes that came too fast",
+    "device_unsent_samples": "samples for which the line had no room",
+    "device_lost_edges": "tacho edges that came too fast",
+    "device_host_silences": "silences of the host",
+    "device_watchdog_resets": "restarts by its watchdog",
+}
+"""by counter: what is lost or wrong there"""
+_LINE = "protocol and baud of the [[tray]], and the wiring"
+_TIMES = "the times that its client gives"
 _SETTINGS = {
-    "absurd_command": "command_min and command_max",
-    "absurd_samples": "speed_max and speed_unit",
+    "absurd_age": _TIMES,
+    "absurd_command": "command_min and command_max of the [[tray]]",
+    "absurd_samples": "speed_max and speed_unit of the [[tray]]",
     "bad_command": "what the device sends as command",
     "bad_number": _LINE,
+    "failed_polls": "source of the [[tray]], and the device",
     "garbage": _LINE,
+    "malformed": "the form of what is sent (docs/reference/json-samples.md)",
     "oversized": _LINE,
+    "skipped_polls": "period_s in source of the [[tray]]",
+    "time_order": _TIMES,
     "truncated": _LINE,
+    "unknown_command": "where source of the [[tray]] finds the command",
     "wrong_crc": _LINE,
-    "wrong_fan_count": "fans",
+    "wrong_fan_count": "fans of the [[tray]]",
     "wrong_type": "whether the line returns what is sent",
     "wrong_version": "the device's version of the protocol",
 }
@@ -44,25 +66,29 @@ _SETTINGS = {
 
 
 def refused(healths: Iterable[Health]) -> dict[str, dict[str, int]]:
-    """How much each stage has refused, by its label and by counter; only what is not 0. `refused_input` is the sum of
-    the faults of a device's input, which are there, too.
+    """How much each stage and its device have refused or lost, by the label of the stage and by counter; only what is
+    not 0. `refused_input` is the sum of the faults of a device's input, which are there, too.
 
     healths: the last of every session.
     """
-    known = {*WORDS, *_SETTINGS}
+    known = {*WORDS, *_SETTINGS, *ON_THE_DEVICE}
     found = {name: {c: n for c, n in counts.items() if c in known and n} for name, counts in _sums(healths).items()}
     return {name: counts for name, counts in sorted(found.items()) if counts}
 
 
 def refused_lines(found: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """A line for each stage."""
+    """A line for each stage, and one for its device."""
     lines: list[str] = []
     for name, counts in found.items():
         kinds = ", ".join(
             f"{kind} {count}" for kind, count in counts.items() if kind in _SETTINGS and kind not in WORDS
         )
         words = [f"{count} {WORDS[counter]}" for counter, count in counts.items() if counter in WORDS]
-        lines.append(f"{name}: refused: {', '.join(words)}" + (f" ({kinds})" if kinds else ""))
+        if words:
+            lines.append(f"{name}: refused: {', '.join(words)}" + (f" ({kinds})" if kinds else ""))
+        there = [f"{count} {ON_THE_DEVICE[counter]}" for counter, count in counts.items() if counter in ON_THE_DEVICE]
+        if there:
+            lines.append(f"{name}: counted by the device itself: {', '.join(there)}")
     return lines
 
 
@@ -77,7 +103,7 @@ def unusable_lines(healths: Iterable[Health], launched: Collection[Launched]) ->
         kinds = Counter({kind: counts[kind] for kind in _SETTINGS if counts[kind]}).most_common()
         if pieces and counts["samples"] == counts["absurd_samples"]:
             why = ", ".join(f"{kind} {count}" for kind, count in kinds)
-            check = f"check {_SETTINGS[kinds[0][0]]} of the [[tray]]" if kinds else "check source of the [[tray]]"
+            check = f"check {_SETTINGS[kinds[0][0]]}" if kinds else "check source of the [[tray]]"
             lines.append(
                 f"{name}: no sample could be used, {pieces} were refused ({why or 'of unknown kind'}): {check}"
             )

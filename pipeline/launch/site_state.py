@@ -17,7 +17,8 @@ from pipeline.launch.processes import StageProcess
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.launch.watchdog import START_LIMIT_S
 from pipeline.runtime.clock import REPLAY
-from schemas.messages import Health, StageStatus
+from schemas.enums import StageStatus
+from schemas.health import Health
 from schemas.streams import input_streams, output_streams
 from schemas.topics import ALL_TRAYS, HEALTH_CHUNK, key_in_words
 from schemas.units import NS_PER_S

@@ -11,13 +11,16 @@ from itertools import chain
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import NAME_PATTERN
+from pipeline.config.roles import Role, roles_of_stages
 from pipeline.launch.known_sessions import KnownSessions
 from pipeline.launch.loss_accounting import Launched, label, losses
 from pipeline.launch.refused_input import refused, unusable_lines
 from pipeline.launch.watched_alarms import WatchedAlarms
+from pipeline.runtime.believed_outputs import BelievedOutputs
 from pipeline.runtime.sessions import Session
 from schemas.codec import CodecError, decode
-from schemas.messages import Alarm, Health
+from schemas.health import Health
+from schemas.messages import Alarm
 from schemas.topics import alive_key, health_key, sessions_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm
@@ -69,7 +72,10 @@ class SiteWatcher:
     Whoever is no session of the site is not shown and not counted: `pipeline.launch.known_sessions`.
     """
 
-    def __init__(self, bus: Bus, site: str) -> None:
+    def __init__(self, bus: Bus, site: str, roles: Mapping[str, Role] | None = None) -> None:
+        """roles: those of the site, with the trays to which they are limited; None: those of all stages, for all
+        trays."""
+        self._believed_outputs = BelievedOutputs(roles_of_stages() if roles is None else roles)
         self._bus = bus
         self._site = site
         self._lock = threading.Lock()
@@ -186,6 +192,7 @@ class SiteWatcher:
     def _on_health(self, key: str, payload: bytes) -> None:
         health = _decoded(Health, payload)
         if isinstance(health, Health) and key == health_key(self._site, health.stage, health.instance):
+            health = self._believed_outputs.of(health)
             with self._lock:
                 self._sessions.add_health(health)
                 before = self._healths.get(health.header.producer) or self._unknown.get(health.header.producer)

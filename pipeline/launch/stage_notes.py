@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from pipeline.launch.loss_accounting import label
-from schemas.messages import Health
+from schemas.health import Health
 
 
 def note_lines(healths: Iterable[Health]) -> list[str]:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.messages import Array, FanState, Score
+from schemas.enums import FanState
+from schemas.messages import Array, Score
 from schemas.units import NS_PER_S
 from scoring.samples import among
 

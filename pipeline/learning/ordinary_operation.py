@@ -33,6 +33,11 @@ class OrdinaryOperation:
         self._changed_from = np.full(tray.fans, np.nan)
         self._lowest, self._highest = np.full(tray.fans, np.inf), np.full(tray.fans, -np.inf)
         self._last_t_ns: int | None = None
+        takes_commands = not tray.source.why_no_commands
+        self.how_to_move = (
+            "`fantwin sweep` moves the fans" if takes_commands else "the fans' own controller must vary their commands"
+        )
+        """for people"""
 
     def take(self, raw: Raw) -> None:
         """Take samples, in the order in which they were received."""

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 
-from schemas.messages import Alarm, Header, Request
+from schemas.header import Header
+from schemas.messages import Alarm, Request
 
 ANSWERED_WITHIN_S = 10.0
 MOST_UNDER_WAY = 256

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from schemas.messages import Action
+from schemas.enums import Action
 
 LONGEST_SHELVING_S = 30 * 86400.0
 LONGEST_COMMENT = 500

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -16,6 +15,7 @@ from pipeline.presenting.fan_history import Curves
 from pipeline.presenting.site_model import SiteModel
 from pipeline.viewing.fleet import Fan, FanNow, class_names
 from schemas.messages import Alarm, Array, ModelCard
+from schemas.twin_card import CardError, TwinCard
 from schemas.units import RAD_S_PER_UNIT
 from scoring.alarms.alarm_flags import is_listed
 from scoring.alarms.current_alarms import CurrentAlarm, words_of
@@ -70,10 +70,14 @@ def fan_in_full(model: SiteModel, fan: Fan) -> dict[str, Any]:
 
 def twin_json(card: ModelCard, fan: int) -> dict[str, Any]:
     """The twin in force, and the parameters of one fan that it uses."""
-    text = json.loads(card.card_json or "{}")
-    names, used = text.get("parameter_names", []), text.get("used_parameters", [])
-    values = (text.get("parameters") or [[]] * (fan + 1))[fan]
-    shown = {name: value for name, value in zip(names, values, strict=False) if name in used}
+    try:
+        found = TwinCard.from_json(card.card_json)
+    except CardError:  # of a version that this one does not know
+        shown = {}
+    else:
+        values = found.parameters[fan if fan < found.fans else 0]
+        used = found.used_parameters or found.parameter_names
+        shown = {name: value for name, value in zip(found.parameter_names, values, strict=True) if name in used}
     return {"name": card.twin, "kind": card.kind, "sha256": card.sha256, "since_t_ns": card.t_ns, "parameters": shown}
 
 

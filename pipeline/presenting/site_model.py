@@ -23,8 +23,10 @@ from pipeline.presenting.fan_history import COLUMNS, Curves, FanHistory, values_
 from pipeline.viewing.fleet import Fan, FanNow, Fleet
 from pipeline.viewing.fleet_view import last_sample
 from schemas.codec import CodecError, decode_columns, encode
+from schemas.enums import StageStatus, Transition
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Array, Health, ModelCard, Score, StageStatus, Transition
+from schemas.health import Health
+from schemas.messages import Alarm, Array, ModelCard, Score
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST
 

@@ -28,7 +28,8 @@ from pipeline.recordings.sequence_ledger import (
     recovered_from_metadata,
 )
 from schemas.codec import CodecError, decode
-from schemas.messages import Health, Message, ModelCard
+from schemas.health import Health
+from schemas.messages import Message, ModelCard
 from schemas.streams import StreamId
 from schemas.topics import topic_of
 

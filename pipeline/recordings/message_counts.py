@@ -8,7 +8,8 @@ from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header
-from schemas.messages import Health, ModelCard
+from schemas.health import Health
+from schemas.messages import ModelCard
 from schemas.topics import Topic, topic_of
 
 _PRODUCER_AT = 2  # in a payload, after the header's key and one byte of length: the producer is its first field

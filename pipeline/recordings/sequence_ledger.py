@@ -9,7 +9,7 @@ import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 
-from schemas.messages import Health
+from schemas.health import Health
 from schemas.streams import StreamId, StreamState, output_streams
 from schemas.topics import topic_of
 

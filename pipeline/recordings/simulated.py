@@ -14,7 +14,8 @@ from rich.progress import Progress
 from pipeline.devices.simulated_device import Device, DeviceSample, PlaybackCounts
 from pipeline.recordings.reading import TACHO_KEY
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S

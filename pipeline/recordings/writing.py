@@ -29,7 +29,8 @@ from pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, act
 from pipeline.recordings.sequence_ledger import BEFORE_NAME, SequenceLedger, ledger_metadata
 from schemas.codec import proto_type, type_name
 from schemas.envelope import Envelope
-from schemas.messages import Health, Message, newest_t_ns
+from schemas.health import Health
+from schemas.messages import Message, newest_t_ns
 from schemas.topics import topic_of
 
 CHUNK_BYTES = 256 * 1024

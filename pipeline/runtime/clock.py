@@ -61,9 +61,9 @@ class StageClock:
         if not alive:
             self._clear()
 
-    def add_replay_health(self, producer: str, *, has_stopped: bool) -> None:
+    def add_replay_health(self, producer: str, *, has_ended: bool) -> None:
         """A replayer has published health: its session owns the site, unless another owner still renews its time."""
-        if has_stopped:
+        if has_ended:
             if producer == self._owner:
                 self._clear()
         elif not any(self._time_of(tray) for tray in self._times):

@@ -17,7 +17,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from schemas.fields import Array, time_column
-from schemas.messages import Consumed, InputPosition, Message
+from schemas.header import InputPosition
+from schemas.messages import Consumed, Message
 from schemas.streams import continues
 from schemas.topics import BY_NAME
 from schemas.units import NS_PER_S

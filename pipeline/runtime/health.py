@@ -9,7 +9,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from schemas.messages import AcceptedSamples, AwaitedInput, Counter, Health, Input, Note, Output, StageStatus
+from schemas.enums import StageStatus
+from schemas.health import AcceptedSamples, AwaitedInput, Counter, Health, Input, Note, Output
 from schemas.streams import stage_losses
 from schemas.units import NS_PER_S
 

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 from pipeline.bus.kept_messages import KeptQuery
 from pipeline.bus.recovery import Answer
 from pipeline.runtime.tracked_streams import Request
+from schemas.topics import HEALTH_CHUNK
 
 INBOX_SIZE = 4096
 INBOX_BYTES = 128 << 20
@@ -68,7 +69,7 @@ class Inbox:
 
     def __init__(self, drops_oldest: bool) -> None:
         self._items: deque[Item] = deque()
-        self._bytes = 0
+        self._bytes = self._inputs = 0
         self._changed = threading.Condition()
         self._drops_oldest = drops_oldest
         self._closed = False
@@ -103,6 +104,11 @@ class Inbox:
         """How many items wait now."""
         return len(self._items)
 
+    @property
+    def has_input(self) -> bool:
+        """Whether something waits of which a stage makes outputs: health of others and liveliness are none."""
+        return self._inputs > 0
+
     def close(self) -> None:
         """Release any thread blocked in `put`: the bus cannot close while one of its threads is blocked."""
         with self._changed:
@@ -117,6 +123,7 @@ class Inbox:
             return False
         self._items.append(item)
         self._bytes += _size(item)
+        self._inputs += _is_input(item)
         if is_urgent:
             self._changed.notify_all()
         return True
@@ -127,15 +134,23 @@ class Inbox:
             if isinstance(item, FromBus):
                 del self._items[place]
                 self._bytes -= _size(item)
+                self._inputs -= _is_input(item)
                 return True
         return False
 
     def _take_first(self) -> Item:
         item = self._items.popleft()
         self._bytes -= _size(item)
+        self._inputs -= _is_input(item)
         self._changed.notify_all()
         return item
 
 
 def _size(item: Item) -> int:
     return len(item.payload) if isinstance(item, FromBus) else 0
+
+
+def _is_input(item: Item) -> bool:
+    if isinstance(item, FromBus):
+        return item.key.split("/", 3)[2:3] != [HEALTH_CHUNK]
+    return isinstance(item, FromSource | Recovered)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.messages import Array, InvalidReason
+from schemas.enums import InvalidReason
+from schemas.messages import Array
 from scoring.alarms.unscored_monitor import REASONS
 
 SMALLEST_SHARE = 0.0005  # smaller ones are not named

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from pipeline.bus.errors import NoAnswerError
 from pipeline.bus.kept_messages import KeptQuery
 from pipeline.bus.session import Bus
 from pipeline.config.registry import STAGES
@@ -116,8 +117,12 @@ class KeptSnapshots:
         return is_there
 
     def _has_keeper(self, bus: Bus, tray: str) -> bool:
+        """False also where nobody answers: who cannot be asked does not help."""
         keepers = filter(keeps_snapshots, STAGES)
-        tokens = (token for stage in keepers for token in bus.alive(sessions_key(self._site, stage)))
+        try:
+            tokens = [token for stage in keepers for token in bus.alive(sessions_key(self._site, stage))]
+        except NoAnswerError:
+            return False
         return any(each is not None and each.has(tray) for each in map(Session.of_key, tokens))
 
 

@@ -18,7 +18,8 @@ from pipeline.runtime.stage import Core, StageError
 from pipeline.runtime.twin_file import TwinFile, learned_twin
 from schemas.auxiliary import auxiliary_columns
 from schemas.blocks import cut, select
-from schemas.messages import Array, Grid, InvalidReason, Message, NewTwin, Prediction
+from schemas.enums import InvalidReason
+from schemas.messages import Array, Grid, Message, NewTwin, Prediction
 
 BEGINNING = np.iinfo(np.int64).min
 MOST_COMING = 8

@@ -9,7 +9,9 @@ from pipeline.bus.session import Bus
 from pipeline.runtime.consumed import CONSUMED, ConsumedReports
 from pipeline.runtime.stage import Stage, StageError
 from schemas.codec import encode, type_name
-from schemas.messages import Consumed, Header, InputPosition, Message, Output
+from schemas.header import Header, InputPosition
+from schemas.health import Output
+from schemas.messages import Consumed, Message
 from schemas.topics import BY_NAME, TOPICS, tray_key
 
 _TOPIC_NAMES = {topic.message: topic.name for topic in TOPICS}

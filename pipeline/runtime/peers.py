@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from pipeline.runtime.inbox import Liveness
-from schemas.messages import Health, StageStatus
+from schemas.health import Health
 
 MOST_PEERS = 4096
 """so many sessions are remembered: those heard most recently"""
@@ -23,7 +23,7 @@ class _Reported:
     """What matters here of the last health of a session."""
 
     is_producer: bool
-    has_stopped: bool
+    has_ended: bool
 
 
 class Peers:
@@ -48,7 +48,7 @@ class Peers:
     def add_health(self, key: str, health: Health) -> None:
         """The session with the liveliness key `key` has published a health."""
         is_producer = any(output.key in self._read_keys for output in health.outputs)
-        _remember(self._reported, key, _Reported(is_producer, health.status == StageStatus.STOPPED))
+        _remember(self._reported, key, _Reported(is_producer, health.has_ended))
 
     def has_producer(self) -> bool:
         """Whether a stage that writes what this one reads is alive."""
@@ -58,7 +58,7 @@ class Peers:
         """Whether a session has just left whose last health, and so its last messages, may still be on the way."""
         now = time.monotonic()
         return any(
-            now - left_s < LAST_HEALTH_TIMEOUT_S and not self._reported[key].has_stopped
+            now - left_s < LAST_HEALTH_TIMEOUT_S and not self._reported[key].has_ended
             for key, left_s in self._left_s.items()
             if key in self._reported
         )

@@ -8,32 +8,37 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence, Set
-from dataclasses import replace
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.config.roles import roles_of
 from pipeline.config.shards import Shard
 from pipeline.devices.host_clock import HOST_CLOCK
+from pipeline.runtime.believed_outputs import BelievedOutputs
 from pipeline.runtime.clock import REPLAY, StageClock
 from pipeline.runtime.due_messages import DueMessages
 from pipeline.runtime.health import HealthBuilder
 from pipeline.runtime.inbox import FromBus, Inbox, Liveness, Newest, Recovered
+from pipeline.runtime.killed_sessions import KilledSessions
 from pipeline.runtime.newest_messages import NewestMessages
 from pipeline.runtime.peers import Peers
 from pipeline.runtime.recovery import Recovery
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from pipeline.runtime.sessions import Sessions
+from pipeline.runtime.sessions import Sessions, this_host
 from pipeline.runtime.silences import Silences
 from pipeline.runtime.stage import Stage
 from pipeline.runtime.subscriptions import Subscriptions
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
-from schemas.messages import Clock, Health, StageStatus
-from schemas.topics import ALL_TRAYS, alive_key, health_key, sessions_key, topic_of, tray_key, tray_of
+from schemas.health import Health
+from schemas.messages import Clock
+from schemas.topics import ALL_TRAYS, alive_key, health_key, key_in_words, sessions_key, topic_of, tray_key, tray_of
 
 MANY_TRAYS = 16
 """in a process that processes several trays in one pass: then it takes messages at its ticks, together"""
+
+MOST_UNREADABLE_KEYS = 16
+"""so many keys of messages that cannot be read are named"""
 
 
 class Receiver:
@@ -57,7 +62,7 @@ class Receiver:
         what is received changes them."""
         self._stage = stage
         self._site = config.site
-        self._roles = {name: role for name, role in roles_of(config).items() if role.stage}
+        self._believed_outputs = BelievedOutputs(roles_of(config))
         self._shard = shard
         self._trays = frozenset(shard.trays)
         self._is_patient = stage.is_patient or (stage.joint is not None and len(shard.trays) >= MANY_TRAYS)
@@ -69,6 +74,8 @@ class Receiver:
         self._health = health
         self._due = due
         self.counts: Counter[str] = Counter()
+        self._unreadable: Counter[str] = Counter()
+        """messages that cannot be read, by key; of the first MOST_UNREADABLE_KEYS"""
         """of messages that could not be taken"""
         self._recovery = Recovery(bus, inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
         self.tracker = SequenceTracker(self._recovery.ask, sessions=sessions)
@@ -81,6 +88,7 @@ class Receiver:
         self._silences = Silences(
             {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}
         )
+        self._killed = KilledSessions(this_host())
 
     def start(self, *, follows_clock: bool) -> None:
         """Subscribe to health, to who is there and, if it follows them, to the clocks of the trays."""
@@ -134,15 +142,16 @@ class Receiver:
         return self.peers.awaits_last_health() or self.tracker.is_waiting
 
     def ask_again(self) -> None:
-        """Send again the requests that were not answered, as they become due."""
+        """Send again the requests that were not answered, as they become due; see which sessions were killed."""
         self._recovery.send_due()
+        for producer in self._killed.take():
+            self._silences.end(producer)
 
     def is_complete(self, tray: str) -> bool:
         """Whether the producer of a tray's main input has shown, since this was last asked, that all that it has sent
         has been processed; a replay shows it by its clock."""
-        if self._due.has(tray):
-            return False
-        return self._silences.take(tray) or self._clock.is_of_replay(tray)
+        is_shown = self._silences.take(tray)
+        return not self._due.has(tray) and (is_shown or self._clock.is_of_replay(tray))
 
     def take(self, item: FromBus | Recovered | Newest | Liveness) -> None:
         """Take an item of the inbox."""
@@ -156,6 +165,7 @@ class Receiver:
             case Liveness():
                 self.peers.update(item)
                 self._sessions.update(item.key, item.alive)
+                self._killed.update(item.key, item.alive)
                 if item.key == alive_key(self._site, REPLAY, ALL_TRAYS):
                     self._clock.set_replay_alive(item.alive)
 
@@ -207,32 +217,19 @@ class Receiver:
         return not (is_ignored or self._sessions.is_stranger(envelope.key, producer))
 
     def _take_health(self, envelope: Envelope, health: Health) -> None:
-        allowed = [output for output in health.outputs if self._may_write(health, output.key)]
-        if len(allowed) < len(health.outputs):
+        said, health = health, self._believed_outputs.of(health)
+        if health is not said:
             self.counts["refused_outputs"] += 1
-            health = replace(health, outputs=tuple(allowed))
         if not self.tracker.believes(health):
             return
         self.peers.add_health(alive_key(self._site, health.stage, health.instance), health)
         if health.stage == REPLAY:
-            self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
+            self._clock.add_replay_health(health.header.producer, has_ended=health.has_ended)
         self._sessions.add_health(health, self._subscriptions.keys)
         self._due.add(self.tracker.reconcile(health, self.current_keys))
         self._silences.add_health(health, self.tracker.has_all_of)
         if "health" in self._stage.reads and self._concerns(envelope):
             self._due.add(self.tracker.accept(envelope))
-
-    def _may_write(self, health: Health, key: str) -> bool:
-        """Whether the process of a health may have published on a key. Of a stage that this version does not know all
-        is believed: no certificate is for such a stage."""
-        role = self._roles.get(f"{health.stage}.{health.instance}") or self._roles.get(health.stage)
-        if role is None:
-            return True
-        try:
-            topic = topic_of(key).name
-        except KeyError:
-            return False
-        return topic in role.writes and (not role.trays or tray_of(key) in role.trays)
 
     def _concerns(self, envelope: Envelope) -> bool:
         """Whether a message is of a tray of this process. Health is of all trays of its process: so each recorder has
@@ -248,12 +245,19 @@ class Receiver:
         decoded = (self._decode(key, payload, received_t_ns) for key, payload in messages)
         return [envelope for envelope in decoded if envelope]
 
+    def note(self) -> str:
+        """Where messages came that cannot be read, and how many; empty if there were none."""
+        where = ", ".join(f"{count} on {key_in_words(key)}" for key, count in self._unreadable.most_common())
+        return f"messages that cannot be read: {where}" if where else ""
+
     def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
         try:
             envelope = Envelope(key, topic_of(key).name, payload, received_t_ns)
             _ = envelope.header if self.is_undecoded(envelope) else envelope.message
         except (KeyError, CodecError):
             self.counts["undecodable"] += 1
+            if key in self._unreadable or len(self._unreadable) < MOST_UNREADABLE_KEYS:
+                self._unreadable[key] += 1
             return None
         if not self._is_of_its_key(envelope):
             self.counts["refused_of_other_key"] += 1

@@ -38,8 +38,10 @@ from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Core, Stage
 from pipeline.runtime.steps import Steps
 from schemas.codec import encode, type_name
+from schemas.enums import StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import Header, Health, Note, StageStatus
+from schemas.header import Header
+from schemas.health import Health, Note
 from schemas.streams import stage_losses
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
@@ -317,17 +319,17 @@ class Runner:
         def report() -> None:
             status = StageStatus.DEGRADED if self._ending.error else StageStatus.STOPPED
             try:
-                health = self._build_health(status)
+                health = self._build_health(status, is_last=True)
                 payload = encode(health)
             except Exception as error:  # noqa: BLE001  kept, and reported without what raised it
                 self._ending.fail(error, f"counting failed: {type(error).__name__}: {error}")
-                health = self._build_health(StageStatus.DEGRADED, with_counts=False)
+                health = self._build_health(StageStatus.DEGRADED, with_counts=False, is_last=True)
                 payload = encode(health)
             reported.append(health)
             self._health_publisher.put(payload)
 
         self._ending.run("reporting the last health", report, HEALTH_SENT)
-        return reported[0] if reported else self._build_health(StageStatus.DEGRADED, with_counts=False)
+        return reported[0] if reported else self._build_health(StageStatus.DEGRADED, with_counts=False, is_last=True)
 
     def _handle_what_waits(self) -> int:
         """Take what else is in the inbox now, so that messages of a tray are joined. Not so much that what the inbox
@@ -380,7 +382,7 @@ class Runner:
     def _lost(self) -> int:
         return stage_losses(self._tracker.inputs(), self._counters(), may_drop=self.stage.may_drop)
 
-    def _build_health(self, status: StageStatus, *, with_counts: bool = True) -> Health:
+    def _build_health(self, status: StageStatus, *, with_counts: bool = True, is_last: bool = False) -> Health:
         cores = [parts.core for parts in self._parts.values()] if with_counts else []
         health = self._health.build(
             status=status,
@@ -399,9 +401,16 @@ class Runner:
             notes=[*self._notes()] if with_counts else (),
             accepts=filter(None, (core.accepts() for core in cores)),
         )
-        return replace(health, header=Header(self.producer, self._health_publisher.published, ""))
+        return replace(
+            health,
+            header=Header(self.producer, self._health_publisher.published, ""),
+            is_last=is_last,
+            has_unprocessed=bool(self._due) or self._inbox.has_input,
+        )
 
     def _notes(self) -> Iterator[Note]:
+        if note := self._receiver.note():
+            yield Note(tray="", text=note)
         for name, parts in self._parts.items():
             yield from (Note(tray=name, text=note) for note in parts.core.notes())
         if self._bus.spool and (note := self._bus.spool.note()):

@@ -29,7 +29,8 @@ from pipeline.runtime.clock import is_of_replay
 from pipeline.runtime.decision_rules import DecisionRules
 from schemas.auxiliary import AUXILIARY, auxiliary_columns
 from schemas.blocks import cut, join
-from schemas.messages import Array, Grid, InvalidReason, Raw
+from schemas.enums import InvalidReason
+from schemas.messages import Array, Grid, Raw
 from schemas.side_by_side import present_columns
 from schemas.tacho import Tacho
 from schemas.topics import most_samples
@@ -104,6 +105,8 @@ class SampleGrid:
             return self._published()
         for message in self._guard.admit(item, is_of_ended=item.header.producer in self._ended_producers):
             self._add(message, is_new=message.header.producer == self._guard.producer)
+        if self._guard.is_holding:
+            self._silence_ns = self._shown_silence_ns = 0  # samples have come, which may be the next ones of the line
         return self._published()
 
     def tick(self, now_ns: int, *, is_complete: bool = True) -> list[Grid]:

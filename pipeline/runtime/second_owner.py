@@ -25,7 +25,7 @@ def refuse_second(bus: Bus, site: str, session: Session, stop: threading.Event) 
 
     Raises:
         StageError: one does.
-        BusError: a program that is not fantwin listens at the endpoint.
+        BusError: a program that is not fantwin listens at the endpoint, or nobody says who is there.
     """
     replay = alive_key(site, REPLAY, ALL_TRAYS) if STAGES[session.stage].scope == "tray" else ""
     bus.wait_for_others(stop)

@@ -16,7 +16,7 @@ from typing import TypeAlias
 from pipeline.runtime.sessions import Sessions
 from pipeline.runtime.tracked_streams import Request, Stream, TrackedStreams, Waiting
 from schemas.envelope import Envelope
-from schemas.messages import Health, Input
+from schemas.health import Health, Input
 from schemas.streams import MOST_PUBLISHED, StreamId, output_streams
 from schemas.topics import CATCH_UP_MESSAGES
 

@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterable, Iterator, Set
 from dataclasses import dataclass
 
 from pipeline.config.shards import Shard
-from schemas.messages import Health
+from schemas.health import Health
 from schemas.topics import ALL_TRAYS, SESSION_CHUNK, health_key, session_key, stage_label, topic_of
 
 MOST_SESSIONS = 4096
@@ -48,9 +48,8 @@ class Session:
     @classmethod
     def of_this_process(cls, stage: str, shard: Shard, started_t_ns: int, producer: str) -> Session:
         """The session of a stage that runs in this process."""
-        host = re.sub(r"[^A-Za-z0-9_.-]", "_", socket.gethostname()) or "unknown"
         trays = () if shard.is_whole else shard.trays
-        return cls(stage, shard.name, started_t_ns, producer, host, os.getpid(), trays)
+        return cls(stage, shard.name, started_t_ns, producer, this_host(), os.getpid(), trays)
 
     @classmethod
     def of_key(cls, key: str) -> Session | None:
@@ -108,6 +107,11 @@ class Session:
         except OSError:
             pass
         return True
+
+
+def this_host() -> str:
+    """The name of this host, as sessions show it."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", socket.gethostname()) or "unknown"
 
 
 class Sessions:

@@ -17,7 +17,8 @@ from pipeline.config.shards import own_file
 from pipeline.errors import UserError
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from schemas.envelope import Envelope
-from schemas.messages import AcceptedSamples, Message, ScorerSnapshot
+from schemas.health import AcceptedSamples
+from schemas.messages import Message, ScorerSnapshot
 from schemas.topics import ALL_TRAYS, BY_NAME, makes_samples_of_samples
 
 

@@ -9,7 +9,7 @@ from itertools import islice
 
 from pipeline.runtime.sessions import Sessions
 from schemas.envelope import Envelope
-from schemas.messages import Input
+from schemas.health import Input
 from schemas.streams import StreamId, StreamState
 from schemas.topics import HEALTH_CHUNK, health_key
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pipeline.bus.session import Bus
 from pipeline.runtime.sessions import Session, Sessions
 from schemas.codec import CodecError, decode
-from schemas.messages import Health
+from schemas.health import Health
 from schemas.topics import alive_key, health_key, sessions_key
 
 STAGE = "acquisition"

@@ -18,7 +18,8 @@ from pipeline.runtime.stage import StageConfig
 from pipeline.runtime.starting_fans import StartingFans
 from pipeline.runtime.twin_file import TwinFile
 from schemas.auxiliary import auxiliary_columns
-from schemas.messages import Array, Grid, InvalidReason, Prediction
+from schemas.enums import InvalidReason
+from schemas.messages import Array, Grid, Prediction
 from schemas.side_by_side import present_columns
 from schemas.standstill import Standstill
 from schemas.units import NS_PER_S

@@ -17,7 +17,8 @@ import numpy as np
 
 from pipeline.selftest.scratch_site import FANS, SITE, STAGES, TRAY, NotKept, ScratchSite
 from schemas.codec import encode, type_name
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.topics import BY_NAME, tray_key
 
 REPLACED_LIMIT_S = 60.0

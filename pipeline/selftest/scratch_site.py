@@ -21,7 +21,8 @@ from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.selftest.line_relay import LineRelay
 from pipeline.selftest.stepped_clock import VARIABLE, set_offset_ns
 from schemas.codec import decode
-from schemas.messages import Alarm, Score, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Score
 from schemas.topics import tray_key
 
 FANTWIN = (sys.executable, "-P", "-m", "pipeline")

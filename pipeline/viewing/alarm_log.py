@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from schemas.messages import Alarm, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.messages import Alarm
 from scoring.alarms.current_alarms import words_of
 
 

@@ -1,8 +1,8 @@
 """bands.png: the fans of a tray beside their healthy twins, from a recording.
 
 One panel per fan shows measured speed, prediction, the band of two standard deviations, samples outside it as red dots,
-and red zones above and below the band while an alarm was active. A lane below shows the states and, if known, the true
-fault.
+and red zones above and below the band while an alarm was active. Smaller ones below show supply voltage, current and
+temperature, if they were measured, and a lane the states and, if known, the true fault.
 """
 
 from __future__ import annotations
@@ -26,14 +26,18 @@ from pipeline.recordings.dates import format_utc, has_date
 from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.viewing.trace import Trace, state_changes, trace_of
+from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
 from schemas.messages import Array, Score
 from schemas.units import NS_PER_S, SpeedUnit
 
 MAX_PANELS = 12
-PANEL_HEIGHT_IN, LANE_HEIGHT_IN, WIDTH_IN = 2.3, 0.2, 12.0
+PANEL_HEIGHT_IN, BESIDE_HEIGHT_IN, LANE_HEIGHT_IN, WIDTH_IN = 2.3, 0.8, 0.2, 12.0
+LEAST_REACH = 0.02
+"""of the axis of what was measured beside, around its middle, a share of the largest value: noise looks small"""
 BETWEEN_IN, HEADER_IN, FOOT_IN = 0.5, 1.25, 0.6
 
 MEASURED, TWIN, BAND, ZONE, OUTSIDE, FAULT = "#454545", "#006e30", "#8fd9a8", "#f4a3a3", "#d62020", "#4a4a8a"
+BESIDE = "#3b5ba5"
 STATE_COLORS = {
     "normal": "#57b97a",
     "suspect": "#f2b400",
@@ -159,7 +163,9 @@ def _chosen_fans(trace: Trace, fans: Sequence[int] | None) -> list[int]:
 
 def _figure(trace: Trace, fans: Sequence[int], faults: Sequence[Fault]) -> Figure:
     lanes_in = LANE_HEIGHT_IN * (2 if faults else 1)
-    block_in = PANEL_HEIGHT_IN + lanes_in
+    beside = [each for each in AUXILIARY if _is_measured(trace, each, fans)]
+    heights_in = [PANEL_HEIGHT_IN, *[BESIDE_HEIGHT_IN] * len(beside), lanes_in]
+    block_in = sum(heights_in)
     height = HEADER_IN + FOOT_IN + len(fans) * (block_in + BETWEEN_IN) - BETWEEN_IN
     figure = Figure(figsize=(WIDTH_IN, height))
     FigureCanvasAgg(figure)
@@ -174,11 +180,13 @@ def _figure(trace: Trace, fans: Sequence[int], faults: Sequence[Fault]) -> Figur
         bottom=FOOT_IN / height,
     )
     for row, fan in enumerate(fans):
-        inner = outer[row].subgridspec(2, 1, height_ratios=[PANEL_HEIGHT_IN, lanes_in], hspace=0.06)
+        inner = outer[row].subgridspec(len(heights_in), 1, height_ratios=heights_in, hspace=0.12 if beside else 0.06)
         mine = [fault for fault in faults if fault.fan == fan]
         panel = figure.add_subplot(inner[0])
-        lanes = figure.add_subplot(inner[1], sharex=panel)
         _draw_panel(panel, trace, fan, mine)
+        for number, column in enumerate(beside, 1):
+            _draw_beside(figure.add_subplot(inner[number], sharex=panel), trace, fan, column)
+        lanes = figure.add_subplot(inner[len(beside) + 1], sharex=panel)
         _draw_lanes(lanes, trace, fan, mine, with_truth=bool(faults))
         if row == len(fans) - 1:
             start_ns = int(trace.t_ns[0])
@@ -187,6 +195,11 @@ def _figure(trace: Trace, fans: Sequence[int], faults: Sequence[Fault]) -> Figur
         else:
             lanes.tick_params(axis="x", length=0, labelbottom=False)
     return figure
+
+
+def _is_measured(trace: Trace, column: AuxiliaryColumn, fans: Sequence[int]) -> bool:
+    values = trace.auxiliary.get(column.name)
+    return values is not None and bool(np.isfinite(values[:, fans]).any())
 
 
 def _draw_header(figure: Figure, trace: Trace, fans: Sequence[int], *, with_truth: bool) -> None:
@@ -232,6 +245,22 @@ def _draw_panel(axes: Axes, trace: Trace, fan: int, faults: Sequence[Fault]) -> 
     axes.tick_params(axis="x", length=0, labelbottom=False)
     axes.set_ylabel(f"speed ({trace.speed_unit})")
     axes.set_title(_title(trace, fan, faults), loc="left", size=10.5)
+
+
+def _draw_beside(axes: Axes, trace: Trace, fan: int, column: AuxiliaryColumn) -> None:
+    """Draw what was measured of the fan beside command and speed."""
+    gaps, values = _gaps(trace.t_ns), trace.auxiliary[column.name][:, fan]
+    t_s = _seconds(trace, trace.t_ns)
+    axes.plot(np.insert(t_s, gaps, t_s[gaps]), np.insert(values, gaps, np.nan), color=BESIDE, lw=0.7)
+    if np.isfinite(values).any():
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        reach = max(0.55 * (high - low), LEAST_REACH * max(abs(low), abs(high)))
+        axes.set_ylim((low + high) / 2 - reach, (low + high) / 2 + reach)
+    axes.locator_params(axis="y", nbins=3)
+    axes.ticklabel_format(axis="y", useOffset=False)
+    axes.grid(axis="y", color="#e6e6e6", lw=0.6, zorder=0)
+    axes.tick_params(axis="x", length=0, labelbottom=False)
+    axes.set_ylabel(f"{column.title.split()[0]}\n({column.unit})", size=8.5)
 
 
 def _draw_lanes(axes: Axes, trace: Trace, fan: int, faults: Sequence[Fault], *, with_truth: bool) -> None:

@@ -10,8 +10,9 @@ import numpy as np
 
 from pipeline.config.models import TrayConfig
 from pipeline.viewing.trace import state_codes, state_name
+from schemas.enums import FanState, Transition
 from schemas.fields import LARGEST_ENUM_VALUE
-from schemas.messages import Alarm, Array, FanState, Score, Transition
+from schemas.messages import Alarm, Array, Score
 from scoring.alarms.alarm_flags import is_silenced
 
 FLEET_COLUMNS = ("state", "invalid_reason", "score")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pipeline.config.models import TrayConfig
 from pipeline.viewing.fleet import FLEET_COLUMNS, Fan, Fleet
 from pipeline.viewing.plot_places import PlotPlaces
-from pipeline.viewing.trace import TRACE_COLUMNS
+from pipeline.viewing.trace import MEASURED_COLUMNS
 from pipeline.viewing.worst_page import worst_page
 from schemas.messages import Alarm, Array, Score
 from schemas.units import NS_PER_S
@@ -31,7 +31,7 @@ REPEAT_NS = 5 * NS_PER_S
 """what does not change is sent again for viewers that join late"""
 FANS_NAMED = 8
 """fans in alarm that are named on the map"""
-COLUMNS = tuple(dict.fromkeys((*FLEET_COLUMNS, *TRACE_COLUMNS)))
+COLUMNS = tuple(dict.fromkeys((*FLEET_COLUMNS, *MEASURED_COLUMNS)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class FleetView:
         return self._places.taken()
 
     def history(self, tray: str) -> Sequence[Score]:
-        """The samples of a tray that were added within the last window, one a score, with `TRACE_COLUMNS`."""
+        """The samples of a tray that were added within the last window, one a score, with `MEASURED_COLUMNS`."""
         kept = self._history[tray]
         return [score for score in kept if 0 <= int(kept[-1].t_ns[0] - score.t_ns[0]) < self._window_ns]
 

@@ -18,12 +18,14 @@ from pipeline.viewing.rerun_layout import (
     auxiliary_path,
     fan_path,
     log_fan_styles,
+    place_auxiliary,
     place_lane,
     place_root,
     speed_style,
     state_path,
 )
 from pipeline.viewing.trace import Trace
+from schemas.auxiliary import AUXILIARY
 from schemas.messages import Array
 from schemas.units import SpeedUnit
 
@@ -56,6 +58,8 @@ class RerunBands:
         times = np.array([t_ns])
         speed = fan_path(self._root(fan), fan.number, "speed")
         self._send_measurements(speed, times, np.full((1, 4), np.nan), np.zeros((1, 4)))
+        for column in AUXILIARY:
+            self._send_where(self._auxiliary_path(fan, column.name), times, np.array([np.nan]))
         self.change_states(fan.tray, fan.number, times, [FREE])
         del self._places[fan]
 
@@ -64,9 +68,8 @@ class RerunBands:
         for column in range(trace.fans):
             self._draw_fan(trace, column)
         for name, values in trace.auxiliary.items():
-            for fan, of_fan in zip(trace.fan_numbers, values.T, strict=True):
-                if not self._places and self._has_news(auxiliary_path(trace.tray, name, fan), of_fan):
-                    self._send(auxiliary_path(trace.tray, name, fan), trace.t_ns, rr.Scalars.columns(scalars=of_fan))
+            for number, of_fan in zip(trace.fan_numbers, values.T, strict=True):
+                self._send_where(self._auxiliary_path(Fan(trace.tray, number), name), trace.t_ns, of_fan)
 
     def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
         """Set the state of a fan's lane from each time on."""
@@ -77,6 +80,10 @@ class RerunBands:
     def _root(self, fan: Fan) -> str:
         place = self._places.get(fan)
         return fan.tray if place is None else place_root(place, fan.tray)
+
+    def _auxiliary_path(self, fan: Fan, column: str) -> str:
+        place = self._places.get(fan)
+        return auxiliary_path(fan.tray, column, fan.number) if place is None else place_auxiliary(place, column)
 
     def _draw_fan(self, trace: Trace, column: int) -> None:
         fan = Fan(trace.tray, trace.fan_numbers[column])

@@ -1,8 +1,9 @@
 """A fleet in Rerun: a map with a cell for every fan, the worst fans by name, alarm log, and a tab with a few plots.
 
-A cell is a point; its class says its colour and, under the mouse, its meaning. The layout never changes while a fleet
-is watched: a plot has a fixed place, and what the fans in it leave behind stays at its time. So nothing jumps under an
-operator's hands, and a file shows at each time what was shown then.
+A cell is a point; its class says its colour and, under the mouse, its meaning. The layout of a fleet that is watched
+changes only when supply voltage, current or temperature are measured for the first time: a plot has a fixed place, and
+what the fans in it leave behind stays at its time. So nothing jumps under an operator's hands, and a file shows at each
+time what was shown then.
 """
 
 from __future__ import annotations
@@ -30,10 +31,12 @@ from pipeline.viewing.rerun_layout import (
     UNKNOWN_COLOR,
     log_state_styles,
     log_view,
+    place_auxiliary,
     place_lane,
     rolling,
 )
 from pipeline.viewing.trace import state_names
+from schemas.auxiliary import AuxiliaryColumn
 from schemas.messages import Array
 
 MAP = "fleet/map"
@@ -180,16 +183,19 @@ def overview_tab(bounds: rrb.VisualBounds2D, window_s: float) -> rrb.Container:
     )
 
 
-def plots_tab(plots: FleetPlots, window_s: float) -> rrb.Container:
-    """The tab with the plots."""
+def plots_tab(plots: FleetPlots, window_s: float, auxiliary: Sequence[AuxiliaryColumn] = ()) -> rrb.Container:
+    """The tab with the plots. auxiliary: the columns beside command and speed that are drawn."""
     starts = range(1, plots.count + 1, FANS_ON_A_PAGE)
     pages = [
-        _plots_page(plots, range(start, min(start + FANS_ON_A_PAGE, plots.count + 1)), window_s) for start in starts
+        _plots_page(plots, range(start, min(start + FANS_ON_A_PAGE, plots.count + 1)), window_s, auxiliary)
+        for start in starts
     ]
     return rrb.Tabs(*pages, active_tab=0, name="plots") if len(pages) > 1 else pages[0]
 
 
-def _plots_page(plots: FleetPlots, places: Sequence[int], window_s: float) -> rrb.Container:
+def _plots_page(
+    plots: FleetPlots, places: Sequence[int], window_s: float, auxiliary: Sequence[AuxiliaryColumn]
+) -> rrb.Container:
     lanes = rrb.StateTimelineView(
         origin=f"/{SHOWN}/state",
         contents=[f"/{place_lane(place)}" for place in places],
@@ -205,9 +211,19 @@ def _plots_page(plots: FleetPlots, places: Sequence[int], window_s: float) -> rr
         )
         for place in places
     ]
+    beside = [
+        rrb.TimeSeriesView(
+            origin=f"/{SHOWN}/{column.name}",
+            contents=[f"/{place_auxiliary(place, column.name)}" for place in places],
+            name=f"{column.title} of the fan in each plot ({column.unit})",
+            axis_x=rolling(window_s, MARGIN_FOR_LEGEND),
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+        )
+        for column in auxiliary
+    ]
     return rrb.Horizontal(
         rrb.Grid(*views, grid_columns=COLUMNS if len(views) > 1 else 1),
-        rrb.Vertical(lanes, log_view(FLEET_LOG, "alarm log")),
+        rrb.Vertical(lanes, *beside, log_view(FLEET_LOG, "alarm log")),
         column_shares=[7, 3],
         name="plots" if len(places) == plots.count else f"plots from {places[0]} on",
     )

@@ -112,6 +112,11 @@ def place_lane(place: int) -> str:
     return f"{SHOWN}/state/plot_{place}"
 
 
+def place_auxiliary(place: int, column: str) -> str:
+    """In a fleet, the entity of what is measured beside command and speed of the fan in plot number `place`."""
+    return f"{SHOWN}/{column}/plot_{place}"
+
+
 def speed_style(unit: SpeedUnit, width: float, name: str = "") -> rr.Measurements:
     """Style of the series of a fan's `speed`: measured, twin with band, and the lowest and highest ends of the band,
     which are not seen: an axis fits the lines, not the bands around them.

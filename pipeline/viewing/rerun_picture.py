@@ -30,6 +30,7 @@ from pipeline.errors import UserError
 from pipeline.viewing.rerun_fleet import CELLS, MAP, bounds_of, overview_tab
 from pipeline.viewing.rerun_layout import TIMELINE, TrayLayout, blueprint, place_in, tray_tab
 from pipeline.viewing.rerun_sink import APPLICATION, LOOPBACK, rerun_program
+from schemas.auxiliary import AUXILIARY
 from schemas.messages import Array
 from schemas.units import NS_PER_S, SpeedUnit
 
@@ -147,6 +148,7 @@ def _read(rrd: Path) -> _Rrd:
     trays: dict[str, TrayLayout] = {}
     on_map: list[Array] = []
     times: list[Array] = []
+    auxiliary: set[tuple[str, str]] = set()
     for chunk in chunks:
         path = chunk.entity_path.strip("/")
         if path.endswith("/speed"):
@@ -159,10 +161,16 @@ def _read(rrd: Path) -> _Rrd:
             on_map.append(np.array(chunk.to_record_batch().column("Points2D:positions")[0].as_py()))
         elif path == CELLS:
             times.append(_times_ns(chunk.to_record_batch()))
+        elif path.count("/") == 2:
+            tray, column, _ = path.split("/")
+            auxiliary.add((tray, column))
     if not times:
         raise PictureError(f"{rrd}: holds no speeds drawn by the viewer stage")
     all_times = np.concatenate(times)
     map_places = np.concatenate(on_map) if on_map else None
+    for name, layout in trays.items():
+        beside = [column for column in AUXILIARY if (name, column.name) in auxiliary]
+        trays[name] = replace(layout, auxiliary=beside)
     return _Rrd(chunks, trays, map_places, int(all_times.min()), int(all_times.max()))
 
 

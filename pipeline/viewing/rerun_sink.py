@@ -17,6 +17,7 @@ import numpy as np
 
 os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")  # otherwise every start warns of the missing footer
 import rerun as rr
+import rerun.blueprint as rrb
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import StageError
@@ -39,7 +40,7 @@ from pipeline.viewing.rerun_layout import (
 )
 from pipeline.viewing.trace import Trace
 from pipeline.viewing.view_file import ViewFile
-from schemas.auxiliary import AUXILIARY
+from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
 from schemas.messages import Array
 from schemas.units import SpeedUnit
 
@@ -116,10 +117,8 @@ class RerunSink:
         layouts = [] if fleet else [TrayLayout(tray.name, range(tray.fans), tray.speed_unit) for tray in trays]
         self._layouts = {layout.name: layout for layout in layouts}
         self._window_s = window_s
-        tabs = [tray_tab(layout, window_s) for layout in layouts]
-        if fleet and self._fleet:
-            tabs = [overview_tab(self._fleet.bounds, window_s)]
-            tabs += [plots_tab(fleet, window_s)] if fleet.count else []
+        self._plots = fleet
+        self._fleet_auxiliary: list[AuxiliaryColumn] = []
         self._late = False
         self._file = _open_view(file) if file is not None else None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
@@ -129,7 +128,7 @@ class RerunSink:
         if grpc_port is not None:
             server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=memory_limit)
             sinks.append(server)
-        self._recording.set_sinks(*sinks, default_blueprint=blueprint(tabs))
+        self._recording.set_sinks(*sinks, default_blueprint=blueprint(self._tabs()))
         if self._file is not None:
             self._file.release_pipe()
         self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
@@ -148,12 +147,21 @@ class RerunSink:
     def _lay_out(self, trace: Trace) -> None:
         """Give what a source measures beside command and speed its plots, when it comes for the first time."""
         layout = self._layouts.get(trace.tray)
-        if layout is None or trace.auxiliary.keys() <= {column.name for column in layout.auxiliary}:
+        drawn = layout.auxiliary if layout else self._fleet_auxiliary
+        if trace.auxiliary.keys() <= {column.name for column in drawn}:
             return
-        shown = [column for column in AUXILIARY if column in layout.auxiliary or column.name in trace.auxiliary]
-        self._layouts[trace.tray] = replace(layout, auxiliary=shown)
-        tabs = [tray_tab(each, self._window_s) for each in self._layouts.values()]
-        self._recording.send_blueprint(blueprint(tabs))
+        shown = [column for column in AUXILIARY if column in drawn or column.name in trace.auxiliary]
+        if layout:
+            self._layouts[trace.tray] = replace(layout, auxiliary=shown)
+        else:
+            self._fleet_auxiliary = shown
+        self._recording.send_blueprint(blueprint(self._tabs()))
+
+    def _tabs(self) -> list[rrb.Container]:
+        if not (self._plots and self._fleet):
+            return [tray_tab(each, self._window_s) for each in self._layouts.values()]
+        tabs = [overview_tab(self._fleet.bounds, self._window_s)]
+        return [*tabs, plots_tab(self._plots, self._window_s, self._fleet_auxiliary)] if self._plots.count else tabs
 
     def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
         """Set the state of a fan's lane from each time on."""

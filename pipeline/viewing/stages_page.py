@@ -12,7 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.messages import Health, ModelCard, StageStatus
+from schemas.enums import StageStatus
+from schemas.health import Health
+from schemas.messages import ModelCard
 from schemas.topics import key_in_words, stage_label
 
 CHANGES_SHOWN = 20

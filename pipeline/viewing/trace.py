@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from schemas.auxiliary import AUXILIARY
+from schemas.enums import FanState, InvalidReason
 from schemas.fields import LARGEST_ENUM_VALUE
-from schemas.messages import Array, FanState, InvalidReason, Score
+from schemas.messages import Array, Score
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
 IN_ALARM = (FanState.ALARM, FanState.RETURNING)

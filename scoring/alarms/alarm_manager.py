@@ -9,18 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from schemas.messages import (
-    Alarm,
-    Array,
-    Diagnosis,
-    FanState,
-    Header,
-    Request,
-    Score,
-    Severity,
-    Statistic,
-    Transition,
-)
+from schemas.enums import FanState, Severity, Statistic, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Array, Diagnosis, Request, Score
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed
 from scoring.alarms.alarm_text import AlarmText

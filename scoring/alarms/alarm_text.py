@@ -6,7 +6,8 @@ earlier versions differ. Only the line of a republished alarm, which says no mor
 
 from __future__ import annotations
 
-from schemas.messages import Alarm, Severity, Statistic, Transition
+from schemas.enums import Severity, Statistic, Transition
+from schemas.messages import Alarm
 from schemas.units import SpeedUnit
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.table import row_of

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from schemas.messages import Alarm, Diagnosis, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.messages import Alarm, Diagnosis
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_presented, is_retained, is_silenced
 from scoring.alarms.alarm_text import CONTINUES

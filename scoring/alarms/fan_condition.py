@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from schemas.messages import Action, FanState, Severity, Transition
+from schemas.enums import Action, FanState, Severity, Transition
 from scoring.alarms.return_rule import AlarmReturn, HoldingDetector, ReturnEvidence
 from scoring.former_snapshot_keys import FORMER_CONDITION_KEYS, current_keys
 

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from schemas.messages import Action, Array, FanState, Transition
+from schemas.enums import Action, FanState, Transition
+from schemas.messages import Array
 from scoring.alarms.fan_condition import (
     NORMAL,
     SUSPECT,

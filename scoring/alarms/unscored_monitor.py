@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from schemas.enums import InvalidReason
 from schemas.fan_numbers import fans_in_words
-from schemas.messages import Array, InvalidReason
+from schemas.messages import Array
 from schemas.units import NS_PER_S
 from scoring.samples import IDLE, among
 
@@ -28,14 +29,27 @@ JUDGED_AT_REST = (InvalidReason.STOPPED, InvalidReason.STARTING)
 """a fan without a score for one of these reasons is judged by whether it stands or turns as commanded"""
 
 
+RARE_WINDOWS = 2
+"""so many windows in which a fan was scored, but for less than half of the time, are a problem; the end of a long time
+without a score gives one"""
+
+
 class UnscoredMonitor:
-    """How long each fan has not been scored, in the time of its samples, and why."""
+    """How long each fan has not been scored, in the time of its samples, and why.
+
+    A fan that is scored for a sample now and then can raise no alarm either: its share is counted in windows.
+    """
 
     def __init__(self, fans: int, limit_ns: int) -> None:
         self._limit_ns = limit_ns
         self._unscored_ns = np.zeros(fans, np.int64)
         self._invalid_reason = np.zeros(fans, np.uint8)
         self._was_scored = np.zeros(fans, np.bool_)
+        self._window = _Window(fans)
+        self._rare_windows = np.zeros(fans, np.int64)
+        """windows in which it was scored rarely, since the last one in which it was scored for half of the time"""
+        self._latest_reason = np.zeros(fans, np.uint8)
+        """of the last sample that was not scored"""
 
     def update(self, period_ns: int, valid: Array, invalid_reason: Array) -> None:
         """Process a block; valid, invalid_reason: (n, fans)."""
@@ -45,6 +59,23 @@ class UnscoredMonitor:
         self._unscored_ns = np.where(scored, 0, self._unscored_ns) + rows_since * period_ns
         self._invalid_reason = invalid_reason[-1]
         self._was_scored |= scored
+        last = len(judged) - 1 - np.argmax(~judged[::-1], axis=0)
+        latest = np.take_along_axis(invalid_reason, last[np.newaxis], axis=0)[0]
+        self._latest_reason = np.where(judged.all(axis=0), self._latest_reason, latest)
+        self._count_shares(period_ns, judged)
+
+    def _count_shares(self, period_ns: int, judged: Array) -> None:
+        """Windows end at the same samples, whatever blocks these come in."""
+        while len(judged):
+            rows = min(len(judged), -(-(self._limit_ns - self._window.length_ns) // period_ns))
+            self._window.add(period_ns, judged[:rows])
+            judged = judged[rows:]
+            if self._window.length_ns >= self._limit_ns:
+                doubled_ns = 2 * self._window.scored_ns
+                is_rare = (doubled_ns > 0) & (doubled_ns < self._window.length_ns)
+                is_enough = doubled_ns >= self._window.length_ns
+                self._rare_windows = np.where(is_enough, 0, self._rare_windows + is_rare)
+                self._window = _Window(len(self._rare_windows))
 
     def problem(self) -> str:
         """Which fans are not scored, in one line; empty for none. Times double, so that the line rarely changes."""
@@ -55,9 +86,32 @@ class UnscoredMonitor:
         for reason in np.unique(self._invalid_reason[late]).tolist():
             fans = np.flatnonzero(late & (self._invalid_reason == reason))
             doublings = int(self._unscored_ns[fans].min() // self._limit_ns).bit_length() - 1
-            names = fans_in_words(fans.tolist())
-            subject = f"fan {names} is" if len(fans) == 1 else f"fans {names} are"
-            explanation = REASONS.get(InvalidReason(reason), InvalidReason(reason).words)
             at_least_s = self._limit_ns * 2**doublings / NS_PER_S
-            parts.append(f"{subject} not scored: {explanation}, for {at_least_s:g} s or more")
+            parts.append(f"{_subject(fans)} not scored: {_explanation(reason)}, for {at_least_s:g} s or more")
+        rarely = ~late & (self._rare_windows >= RARE_WINDOWS)
+        for reason in np.unique(self._latest_reason[rarely]).tolist():
+            fans = np.flatnonzero(rarely & (self._latest_reason == reason))
+            parts.append(f"{_subject(fans)} not scored most of the time: {_explanation(reason)}")
         return "; ".join(parts)
+
+
+class _Window:
+    """How long each fan was scored since the window began."""
+
+    def __init__(self, fans: int) -> None:
+        self.length_ns = 0
+        self.scored_ns = np.zeros(fans, np.int64)
+
+    def add(self, period_ns: int, judged: Array) -> None:
+        """judged: (n, fans)."""
+        self.length_ns += len(judged) * period_ns
+        self.scored_ns += np.count_nonzero(judged, axis=0) * period_ns
+
+
+def _subject(fans: Array) -> str:
+    names = fans_in_words(fans.tolist())
+    return f"fan {names} is" if len(fans) == 1 else f"fans {names} are"
+
+
+def _explanation(reason: int) -> str:
+    return REASONS.get(InvalidReason(reason), InvalidReason(reason).words)

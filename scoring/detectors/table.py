@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from schemas.messages import Statistic
+from schemas.enums import Statistic
 from scoring.detectors.detector import DetectorRow, LimitRule
 from scoring.detectors.drift import Drift
 from scoring.detectors.missing_readings import MissingReadings

@@ -20,7 +20,8 @@ from bench.detection.rack_scoring import Episode, Judged, episodes
 from bench.detection.rack_tables import AFTER_S, beside, found_faults
 from bench.detection.racks import events, run_of
 from pipeline.cli.twins.train import train
-from schemas.messages import Alarm, Array, Diagnosis, Severity
+from schemas.enums import Severity
+from schemas.messages import Alarm, Array, Diagnosis
 from schemas.tacho import Tacho
 
 COUNT = Tacho(kind="count", window_s=1.0)

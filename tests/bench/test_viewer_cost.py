@@ -9,8 +9,9 @@ import pytest
 from bench.detection.plant import START_NS
 from bench.fleet.fleet_scores import ALARM_S, DELAY_S, FleetScores
 from schemas.codec import decode
+from schemas.enums import FanState
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, FanState, Score
+from schemas.messages import Alarm, Score
 
 
 @pytest.mark.parametrize("block_s", [0.05, 1.0])

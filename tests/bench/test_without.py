@@ -16,7 +16,8 @@ from bench.detection import run
 from bench.detection.mechanisms import MECHANISMS, Mechanism
 from bench.detection.without import NOTHING, UnknownMechanismError, owner_of, without
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
-from schemas.messages import Alarm, Array, InvalidReason, Prediction, Score
+from schemas.enums import InvalidReason
+from schemas.messages import Alarm, Array, Prediction, Score
 from schemas.standstill import Standstill
 from schemas.tacho import Tacho
 from schemas.twin_card import DriveCard

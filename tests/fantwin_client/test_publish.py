@@ -32,6 +32,7 @@ from schemas.topics import BY_NAME
 from stages.acquisition import AcquisitionCore, limits_of
 from tests.support.running_acquisition import SITE, TRAY, Raws, acquisition, push_config, raws_of
 from tests.support.running_chain import eventually
+from tests.support.secured_site import SecuredSite, free_endpoint
 from tests.support.site_certificates import SiteCertificates
 
 RPM = 2 * np.pi / 60
@@ -178,7 +179,7 @@ def test_what_acquisition_refuses_is_counted_by_reason_and_raised_by_check(
         core, accepted = running.runner._parts[TRAY].core, tray._accepts
         assert isinstance(core, AcquisitionCore)
         core._tray = push_config(endpoint, tmp_path, fans=3).trays[0]
-        core._limits = limits_of(core._tray)
+        core._plausibility.limits = limits_of(core._tray)
         core.accepts = lambda: accepted
         tray.publish(T_S + 1, [0.5, 0.5], [1.0, 1.0])
         with pytest.raises(fantwin_client.SamplesLostError, match=r"1 refused \(wrong_fan_count\)"):
@@ -259,6 +260,30 @@ def test_a_date_in_summer_time_is_the_moment_it_names() -> None:
     assert times_ns([moment, moment + zone]).tolist() == [1782914400000000000, 1782921600000000000]
     assert times_ns(1.5).tolist() == [1_500_000_000]
     assert times_ns(1_790_000_000.123456) == pytest.approx(1_790_000_000_123_456_000, abs=300)
+
+
+@pytest.mark.parametrize(
+    ("role", "why"),
+    [
+        ("viewer", "is a certificate of role 'viewer', which may not publish reading of a"),
+        ("source.b", "is a certificate of role 'source.b', which may not publish reading of a"),
+        (
+            "stranger",
+            "is a certificate of role 'stranger', which the router at .* refuses: no such role in site 'site'",
+        ),
+    ],
+)
+def test_a_certificate_that_may_not_publish_is_named_with_its_role(tmp_path: Path, role: str, why: str) -> None:
+    site = SecuredSite(tmp_path, free_endpoint())
+    site.certificates.issue("stranger")
+    ca, (certificate, key) = tmp_path / "ca.pem", (tmp_path / f"{role}.{end}" for end in ("pem", "key"))
+    security = {"ca": ca, "certificate": certificate, "key": key}
+    with (
+        site.running(),
+        fantwin_client.connect(site.endpoint, "site", mode="client", security=security) as client,
+        pytest.raises(fantwin_client.NotAllowedError, match=f"tray a: .*{role}.pem {why}; use one of role 'source', "),
+    ):
+        client.tray("a")
 
 
 def test_with_certificates_a_source_publishes(endpoint: str, tmp_path: Path) -> None:

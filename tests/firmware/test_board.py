@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from schemas.units import RAD_S_PER_UNIT
-from schemas.wire import CommandFrame, Sample, SetPointFrame, encode
+from schemas.wire import DEVICE_COUNTERS, CommandFrame, DeviceCounters, Sample, SetPointFrame, encode
 from tests.support.fan_board import FANS, FanBoard
 from tests.support.firmware_build import firmware_file, simulator_file
 
@@ -56,6 +56,7 @@ def test_it_starts_at_full_speed_and_samples_at_an_even_pace(board: FanBoard) ->
     assert all(math.isnan(speed) for speed in samples[0].speed)
     assert [fan.duty for fan in board.truth().fans] == [1.0] * FANS
     assert board.truth().counters == dict.fromkeys(board.truth().counters, 0)
+    assert board.counters == [DeviceCounters(second, (0,) * len(DEVICE_COUNTERS)) for second in (0, 1)]
 
 
 def test_a_command_moves_the_pwm_and_the_sample_tells_since_when(board: FanBoard) -> None:
@@ -125,7 +126,10 @@ def test_noise_on_the_tachos_is_filtered_and_counted(board: FanBoard) -> None:
     samples = speeds(board.run(2.0))
     # A short pulse may hide an edge until it has passed: the edge is late by that, and no more.
     assert np.abs(60e6 / samples - 60e6 / 3000).max() < 200
-    assert board.truth().counters["glitches"] > 1000
+    counted = board.truth().counters["glitches"]
+    assert counted > 1000
+    sent = [counters.counts[DEVICE_COUNTERS.index("glitches")] for counters in board.counters]
+    assert 0.5 * counted < sent[-1] <= counted, "the last frame is up to a second old"
 
 
 def test_a_blocked_rotor_reads_zero_within_the_time_of_standing(board: FanBoard) -> None:
@@ -193,6 +197,8 @@ def test_what_is_no_frame_changes_nothing_and_is_counted(board: FanBoard) -> Non
     assert counted["bad_crc"] + counted["bad_length"] + counted["wrong_kind"] >= 20
     assert counted["frames"] == 2  # the first, and the one whose bytes all came with framing errors, but whole
     assert reported == pytest.approx((0.9,) * FANS, abs=STEP_OF_DUTY)
+    board.run(1.1)
+    assert board.counters[-1].counts == tuple(counted.values()), "the host is sent what the board has counted"
 
 
 @pytest.mark.parametrize(("supply_v", "chip_v"), [(12.0, 5.0), (10.5, 5.0), (13.2, 4.6)])
@@ -216,6 +222,7 @@ def test_the_watchdog_of_the_chip_restarts_it_at_full_speed(board: FanBoard) -> 
     assert board.truth().counters["watchdog_resets"] == 1
     assert (samples[0].sequence, samples[-1].command) == (0, (1.0,) * FANS)
     assert len(samples) >= 0.7 * RATE_HZ
+    assert board.counters[-1] == DeviceCounters(0, (0,) * (len(DEVICE_COUNTERS) - 1) + (1,))
     assert samples[-1].speed == pytest.approx(
         [fan.speed_rad_s / RAD_S_PER_UNIT["rpm"] for fan in board.truth().fans], rel=0.05
     )

@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from pipeline.recordings.reading import read_recording
-from schemas.messages import Alarm, Array, Raw, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Array, Raw
 from schemas.units import NS_PER_S
+from schemas.wire import CommandFrame, encode
 from tests.support.fan_board import FANS
 from tests.support.firmware_build import FIRMWARE, firmware_file, simulator_file
 from tests.support.make_board_twin import BOARD_TWIN
@@ -47,6 +49,13 @@ class SimulatedBoard:
         return self.process.communicate(timeout=DEADLINE_S)[1].decode()
 
 
+def test_the_simulator_says_that_it_is_ready_and_where_its_line_is(board: SimulatedBoard, tmp_path: Path) -> None:
+    assert board.process.stderr
+    expected = f"simulator: ready: the serial line of the board is {tmp_path / 'tray'}; settings and faults on "
+    assert board.process.stderr.readline().decode().startswith(expected)
+    assert (tmp_path / "tray").exists()
+
+
 @pytest.fixture
 def board(tmp_path: Path) -> Iterator[SimulatedBoard]:
     board = SimulatedBoard(tmp_path / "tray", tmp_path / "pins.vcd")
@@ -74,6 +83,7 @@ def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: C
         moved = fantwin(*chain.words("command"), "--fan", FAN, DUTY)
         assert moved.returncode == 0, moved.stderr
         scored = published(view_of(watcher, "scorer"))
+        board.order(f"send {spoilt_frame().hex()}")
         eventually(lambda: published(view_of(watcher, "scorer")) > scored + 250, "the baseline is complete")
         board.order(f"block {FAN}")
         eventually(watcher.alarms, "an alarm is raised")
@@ -86,6 +96,7 @@ def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: C
     alarms = [message for message in messages if isinstance(message, Alarm)]
 
     assert not any(outcome["lost"].values()), outcome
+    assert list(outcome["refused"].values()) == [{"device_bad_crc": 1}], "as the board has counted"
     clock_s = np.concatenate([raw.device_clock_us for raw in raws]) / 1e6
     check_that_the_pins_were_recorded(trace, clock_s, raws)
     raised = [alarm for alarm in alarms if alarm.transition == Transition.RAISED]
@@ -96,6 +107,13 @@ def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: C
     delay_s = np.interp(raised[0].t_ns / NS_PER_S, received_s, clock_s) - blocked_s
     assert 0.0 < delay_s < LONGEST_DELAY_S, pace
     print(f"blocked at {blocked_s:.3f} s of the trace, alarm {delay_s:.3f} s later; {pace}")
+
+
+def spoilt_frame() -> bytes:
+    """Commands as noise on the line leaves them."""
+    frame = bytearray(encode("binary", CommandFrame((0.5,) * FANS)))
+    frame[-3] ^= 3
+    return bytes(frame)
 
 
 def check_that_the_pins_were_recorded(trace: PinTrace, clock_s: Array, raws: list[Raw]) -> None:

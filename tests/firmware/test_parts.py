@@ -1,24 +1,26 @@
-"""The firmware's parts without hardware: they agree with schemas/wire.py, and measure what they should."""
+"""The firmware's parts without hardware: they agree with schemas/wire, and measure what they should."""
 
 from __future__ import annotations
 
 import ctypes
 import math
 import zlib
-from ctypes import byref, c_uint8
+from ctypes import byref, c_uint8, c_uint16
 
 import pytest
 from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.wire import CommandFrame, Decoder, Sample, SetPointFrame, encode
+from schemas.wire import DEVICE_COUNTERS, CommandFrame, Decoder, DeviceCounters, Sample, SetPointFrame, encode
 from tests.support.firmware_build import parts_library
 from tests.support.firmware_parts import (
     BAD_CRC,
     BAD_LENGTH,
     BAD_VALUE,
     COMMAND,
+    COUNTERS,
+    COUNTERS_LINE_BYTES,
     FANS,
     NOTHING,
     PULSES,
@@ -106,6 +108,16 @@ def test_the_host_reads_the_sample_that_was_written(
     assert (read.clock_us, read.sequence, read.command) == (clock, sequence, command)
     assert read.speed == pytest.approx(speed, abs=0, nan_ok=True)
     assert read.supply_voltage_v == pytest.approx((supply,) * FANS, abs=0, nan_ok=True)
+
+
+@given(
+    uptime_s=st.integers(0, UINT32 - 1), counts=st.lists(st.integers(0, 65535), min_size=COUNTERS, max_size=COUNTERS)
+)
+def test_the_host_reads_the_counters_that_were_written(parts: ctypes.CDLL, uptime_s: int, counts: list[int]) -> None:
+    line = (c_uint8 * COUNTERS_LINE_BYTES)()
+    length = parts.counters_encode(uptime_s, (c_uint16 * COUNTERS)(*counts), line)
+    assert Decoder("binary", FANS).feed(bytes(line[:length])) == [DeviceCounters(uptime_s, tuple(counts))]
+    assert len(DEVICE_COUNTERS) == COUNTERS
 
 
 def received(parts: ctypes.CDLL, data: bytes) -> list[tuple[int, tuple[float, ...]]]:

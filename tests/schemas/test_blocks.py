@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from schemas.blocks import can_join, cut, join, select
 from schemas.codec import decode, encode
 from schemas.fields import columns
-from schemas.messages import Command, Grid, Header, Message, Prediction, Raw, Score
+from schemas.header import Header
+from schemas.messages import Command, Grid, Message, Prediction, Raw, Score
 from tests.support.message_strategies import any_message, same
 
 OF_SAMPLES = (Raw, Grid, Prediction, Score)

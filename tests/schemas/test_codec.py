@@ -19,22 +19,9 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from schemas import fan_pb2, messages
 from schemas.codec import FORMER, CodecError, decode, encode, proto_type, type_name
 from schemas.fields import OpenEnum, columns, other_fields
-from schemas.messages import (
-    MESSAGE_TYPES,
-    Alarm,
-    Command,
-    Counter,
-    Diagnosis,
-    Grid,
-    Header,
-    Input,
-    InputPosition,
-    Message,
-    Output,
-    Prediction,
-    Raw,
-    Score,
-)
+from schemas.header import Header, InputPosition
+from schemas.health import Counter, Input, Output
+from schemas.messages import MESSAGE_TYPES, Alarm, Command, Diagnosis, Grid, Message, Prediction, Raw, Score
 from tests.support.message_strategies import any_message, same
 
 ENUMS: list[type[OpenEnum]] = OpenEnum.__subclasses__()

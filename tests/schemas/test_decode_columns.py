@@ -13,7 +13,8 @@ from schemas import fan_pb2
 from schemas.codec import CodecError, decode, decode_columns, encode
 from schemas.envelope import Envelope
 from schemas.fields import columns, other_fields
-from schemas.messages import Grid, Header, Message, Prediction, Raw, Score
+from schemas.header import Header
+from schemas.messages import Grid, Message, Prediction, Raw, Score
 from tests.support.message_strategies import any_message, same
 from tests.support.score_data import made_up_tray
 

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from schemas.codec import CodecError, encode
+from schemas.enums import TachoKind
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header, decode_together
-from schemas.messages import Header, InputPosition, Raw, StatedTacho, TachoKind
+from schemas.header import Header, InputPosition
+from schemas.messages import Raw, StatedTacho
 from tests.support.message_strategies import same
 
 KEY = "fantwin/plant/tray1/raw"

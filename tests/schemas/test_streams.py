@@ -5,7 +5,9 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.messages import Header, Health, Input, Output, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Input, Output
 from schemas.streams import StreamState, input_streams, output_streams, stage_losses
 
 

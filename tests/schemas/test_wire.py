@@ -17,9 +17,11 @@ from hypothesis import strategies as st
 
 from schemas.auxiliary import AUXILIARY
 from schemas.wire import (
+    DEVICE_COUNTERS,
     MAX_FRAME_BYTES,
     CommandFrame,
     Decoder,
+    DeviceCounters,
     Fault,
     FaultKind,
     Frame,
@@ -111,6 +113,34 @@ def test_byte_by_byte_gives_the_same_even_where_a_piece_is_too_long(protocol: Pr
     assert whole == [SAMPLE, Fault(FaultKind.OVERSIZED, "more than 5120 bytes without an end"), SAMPLE, SAMPLE]
 
 
+@given(uptime_s=UINT32, counts=st.lists(st.integers(0, 65535), max_size=len(DEVICE_COUNTERS)).map(tuple))
+def test_what_a_device_has_counted_comes_back_for_the_host_whatever_its_fans(
+    uptime_s: int, counts: tuple[int, ...]
+) -> None:
+    frame = DeviceCounters(uptime_s, counts)
+    assert joined("binary", fans=3).feed(encode("binary", frame)) == [frame]
+    assert faults(joined("binary", end="device").feed(encode("binary", frame))) == [FaultKind.WRONG_TYPE]
+
+
+def test_of_more_counters_than_are_known_the_known_ones_are_taken() -> None:
+    payload = struct.pack("<BBIB20H", 1, 5, 9, 20, *range(20))
+    assert joined("binary").feed(framed(payload)) == [DeviceCounters(9, tuple(range(len(DEVICE_COUNTERS))))]
+
+
+@pytest.mark.parametrize(
+    ("protocol", "frame"),
+    [
+        ("text", DeviceCounters(1, (0,))),
+        ("binary", DeviceCounters(1, (65536,))),
+        ("binary", DeviceCounters(1, (0,) * (len(DEVICE_COUNTERS) + 1))),
+        ("binary", DeviceCounters(2**32, (0,))),
+    ],
+)
+def test_counters_that_no_frame_can_carry_are_refused(protocol: Protocol, frame: DeviceCounters) -> None:
+    with pytest.raises(ValueError, match=r"device counters|does not fit 32 bits"):
+        encode(protocol, frame)
+
+
 @given(noise=st.binary(max_size=200).filter(lambda b: b"\0" not in b))
 def test_noise_before_a_binary_frame_never_costs_the_frame(noise: bytes) -> None:
     assert joined("binary").feed(noise + SAMPLE_BINARY)[-1] == SAMPLE
@@ -157,6 +187,7 @@ def test_after_a_reset_half_a_frame_is_forgotten(protocol: Protocol) -> None:
 
 SAMPLE_PAYLOAD = cobs.decode(SAMPLE_BINARY.strip(b"\0"))[:-4]
 WITH_COLUMN = cobs.decode(encode("binary", replace(SAMPLE, current_a=(1.5, 2.5))).strip(b"\0"))[:-4]
+COUNTERS_PAYLOAD = cobs.decode(encode("binary", DeviceCounters(5, (1, 2, 3))).strip(b"\0"))[:-4]
 NAN, INFINITY = struct.pack("<f", math.nan), struct.pack("<f", math.inf)
 BINARY_FAULTS = {
     "garbage": (b"\0\x05helo\0", FaultKind.TRUNCATED),
@@ -165,13 +196,15 @@ BINARY_FAULTS = {
     "a byte missing": (b"\0" + cobs.encode(cobs.decode(SAMPLE_BINARY.strip(b"\0"))[:-1]) + b"\0", FaultKind.TRUNCATED),
     "a bit flipped": (framed(SAMPLE_PAYLOAD)[:-3] + b"\x55" + framed(SAMPLE_PAYLOAD)[-2:], FaultKind.WRONG_CRC),
     "a newer version": (framed(b"\x02" + SAMPLE_PAYLOAD[1:]), FaultKind.WRONG_VERSION),
-    "an unknown type": (framed(b"\x01\x09" + SAMPLE_PAYLOAD[2:]), FaultKind.WRONG_TYPE),
+    "an unknown type": (framed(b"\x01\x09" + SAMPLE_PAYLOAD[2:]), FaultKind.UNKNOWN_TYPE),
     "a frame for the device": (encode("binary", CommandFrame((0.5, 0.5))), FaultKind.WRONG_TYPE),
     "three fans": (encode("binary", Sample(1, 1, (0.5,) * 3, (1.0,) * 3)), FaultKind.WRONG_FAN_COUNT),
     "fan count and length differ": (framed(SAMPLE_PAYLOAD[:10] + b"\x03" + SAMPLE_PAYLOAD[11:]), FaultKind.TRUNCATED),
     "a column and length differ": (framed(WITH_COLUMN[:11] + b"\x03" + WITH_COLUMN[12:]), FaultKind.TRUNCATED),
     "an unknown column": (framed(WITH_COLUMN[:11] + b"\x08" + WITH_COLUMN[12:]), FaultKind.WRONG_TYPE),
     "ends before its columns": (framed(WITH_COLUMN[:11]), FaultKind.TRUNCATED),
+    "ends before its counters": (framed(COUNTERS_PAYLOAD[:6]), FaultKind.TRUNCATED),
+    "a counter missing": (framed(COUNTERS_PAYLOAD[:-2]), FaultKind.TRUNCATED),
     "too long": (b"\0" + b"\x01" * (MAX_FRAME_BYTES + 1) + b"\0", FaultKind.OVERSIZED),
     "NaN command": (framed(SAMPLE_PAYLOAD[:11] + NAN + SAMPLE_PAYLOAD[15:]), FaultKind.BAD_COMMAND),
     "infinite command": (framed(SAMPLE_PAYLOAD[:11] + INFINITY + SAMPLE_PAYLOAD[15:]), FaultKind.BAD_COMMAND),
@@ -282,6 +315,9 @@ def test_the_worked_examples_of_the_document_are_true() -> None:
     sample = Sample(1_000_000, 42, (0.5,), (100.0,))
     assert encode("binary", sample).hex(" ") in document
     assert encode("binary", CommandFrame((0.75, math.nan))).hex(" ") in document
+    counters = DeviceCounters(60, (7, 0, 2, 0, 0, 0, 0, 0, 1, 0, 0, 0))
+    assert encode("binary", counters).hex(" ") in document
+    assert all(f"`device_{name}`" in document for name in DEVICE_COUNTERS)
     assert encode("text", sample) == b"S 1000000 42 0.5 100.0\n"
     assert encode("text", CommandFrame((math.nan, 0.5))) == b"C 1 0.5\n"
     assert "S 1000000 42 0.5 100.0" in document

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.messages import Statistic
+from schemas.enums import Statistic
 from schemas.tacho import Tacho
 from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.settings import BaselineSettings

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.messages import Alarm, FanState, InvalidReason, Prediction, Transition
+from schemas.enums import FanState, InvalidReason, Transition
+from schemas.messages import Alarm, Prediction
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import LIVELY, commissioned, core_of, feed, prediction_of, snapshot_of
 

@@ -86,6 +86,24 @@ def test_the_supply_gives_way_to_the_load_of_the_fans_that_share_it_and_the_spee
 
 
 @pytest.mark.parametrize(
+    ("duty", "held", "share"), [(0.6, 1.0, 1.0), (0.6, 0.0, 0.8), (1.0, 1.0, 0.88), (1.0, 0.0, 0.8)]
+)
+def test_a_fan_that_holds_its_speed_needs_no_more_supply_until_it_does_not_suffice(
+    duty: float, held: float, share: float
+) -> None:
+    """At 80 % of the supply, with a reserve of 10 %."""
+    steady = replace(four_pin_tray(1, 0, 0.0), sag=np.zeros(1), wander=np.zeros(1), air=np.zeros(1))
+    speeds = []
+    for supply_factor in (1.0, 0.8):
+        fans = FourPinFans(steady, np.random.default_rng(1), 1)
+        fans.supply_factor, fans.supply_held = supply_factor, held
+        for _ in range(200):
+            fans.advance(np.array([duty]), 0.1)
+        speeds.append(fans.speed_rad_s[0])
+    assert speeds[1] / speeds[0] == pytest.approx(share, rel=1e-3)
+
+
+@pytest.mark.parametrize(
     ("text", "lost"),
     [("blade:fan=0,start=5", 0.10), ("bearing:fan=0,start=5", 0.03), ("clog:fan=0,start=5", 0.06)],
 )

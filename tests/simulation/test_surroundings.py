@@ -66,6 +66,27 @@ def test_the_supply_wanders_as_much_as_it_is_set_to() -> None:
     assert volts.mean() == pytest.approx(12.0, rel=0.03)
 
 
-def test_fans_that_control_their_own_speed_have_no_surroundings() -> None:
+FOUR_PIN = replace(STILL, fan="4-pin", surroundings=Surroundings(measured=("supply_voltage_v", "temperature_c")))
+
+
+def test_without_surroundings_4_pin_fans_are_as_before() -> None:
+    plain, measured = samples(replace(FOUR_PIN, surroundings=Surroundings())), samples(FOUR_PIN)
+    for one, other in zip(plain, measured, strict=True):
+        np.testing.assert_array_equal(one.speed_rad_s, other.speed_rad_s)
+    np.testing.assert_allclose(measured[-1].auxiliary["supply_voltage_v"], 12.0, atol=0.2)
+
+
+def test_4_pin_fans_follow_a_supply_that_wanders_only_where_they_do_not_hold_their_speed() -> None:
+    wanders = Surroundings(supply_wander=0.05, supply_wander_s=1e4, measured=("supply_voltage_v",))
+    steady = last(replace(FOUR_PIN, surroundings=Surroundings())).speed_rad_s
+    held = last(replace(FOUR_PIN, surroundings=wanders))
+    follows = last(replace(FOUR_PIN, surroundings=replace(wanders, supply_held=0.0)))
+    share = follows.auxiliary["supply_voltage_v"] / 12.0
+    assert np.all(np.abs(share - 1.0) > 0.02)
+    np.testing.assert_allclose(held.speed_rad_s / steady, 1.0, atol=0.005)
+    np.testing.assert_allclose(follows.speed_rad_s / steady, share, atol=0.01)
+
+
+def test_the_current_of_4_pin_fans_is_not_simulated() -> None:
     with pytest.raises(SimulationError, match="choose dc fans"):
         SimulatedTray(TraySettings(fan="4-pin", surroundings=Surroundings(measured=ALL)))

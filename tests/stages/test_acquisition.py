@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import random
+import struct
+import zlib
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from cobs import cobs
 
 from pipeline.config.models import TrayConfig
 from pipeline.config.registry import STAGES
@@ -24,7 +27,17 @@ from schemas.codec import decode
 from schemas.codec import encode as encode_message
 from schemas.messages import Command, Raw
 from schemas.units import NS_PER_S
-from schemas.wire import CommandFrame, Decoder, Frame, Protocol, Sample, SetPointFrame, encode
+from schemas.wire import (
+    DEVICE_COUNTERS,
+    CommandFrame,
+    Decoder,
+    DeviceCounters,
+    Frame,
+    Protocol,
+    Sample,
+    SetPointFrame,
+    encode,
+)
 from stages.acquisition import STAGE, AcquisitionConfig, AcquisitionCore
 from tests.support.serial_core import FakeLink, SerialCore
 
@@ -81,6 +94,15 @@ def test_samples_that_arrive_together_share_the_time_at_which_they_arrived() -> 
     assert core.step(ReceivedBytes(data[:10], S)) == []
     messages = core.step(ReceivedBytes(data[10:], 2 * S))
     assert [raw.host_receive_t_ns.tolist() for raw in messages] == [[2 * S] * 3]
+
+
+def test_refused_input_is_named_by_kind_with_what_was_wrong_with_the_first() -> None:
+    core = make_core()
+    assert core.notes() == []
+    feed(core, [sample(0), sample(1, command=7.0), sample(2, command=8.0), sample(3)])
+    assert core.notes() == [
+        "refused input: absurd_command 2, the first of them: command 7 is outside command_min = 0 to command_max = 1"
+    ]
 
 
 def feed_times(core: SerialCore, times_ms: Iterable[int]) -> list[tuple[int, list[int]]]:
@@ -279,6 +301,73 @@ def test_faulty_frames_are_counted_by_kind_and_valid_ones_pass(protocol: Protoco
     assert counters["samples"] == 2
 
 
+def test_a_frame_of_a_later_protocol_is_skipped_and_is_no_fault() -> None:
+    core = make_core()
+    payload = b"\x01\x09later"
+    later = b"\0" + cobs.encode(payload + struct.pack("<I", zlib.crc32(payload))) + b"\0"
+    for number in range(100):
+        feed(core, [sample(number)])
+        core.step(ReceivedBytes(later * 3, S))
+    counters = core.counters()
+    assert counters["unknown_type"] == 300
+    assert counters["samples"] == 100
+    assert not {"refused_input", "lost_on_line", "lost_refused"} & {name for name, count in counters.items() if count}
+    assert core.problem() == ""
+
+
+def device_counts(core: SerialCore) -> dict[str, int]:
+    """What the device has counted itself, only what is not 0."""
+    names = {f"device_{name}" for name in DEVICE_COUNTERS}
+    return {name: count for name, count in core.counters().items() if name in names and count}
+
+
+def test_a_device_without_counters_has_none() -> None:
+    core = make_core()
+    feed_sequences(core, range(200))
+    assert not {f"device_{name}" for name in DEVICE_COUNTERS} & core.counters().keys()
+
+
+def test_what_the_device_counts_is_counted_since_the_line_was_opened() -> None:
+    core = make_core()
+    feed(core, [DeviceCounters(70, (9, 65_530, 4))])
+    assert device_counts(core) == {}
+    assert core.counters()["device_bad_crc"] == 0, "it is known to be none"
+    feed(core, [sample(1), DeviceCounters(71, (9, 65_533, 4)), sample(2), DeviceCounters(72, (10, 2, 4))])
+    assert device_counts(core) == {"device_frames": 1, "device_bad_length": 8}
+    assert core.counters()["samples"] == 2
+    assert core.problem() == ""
+
+
+def test_counters_of_one_read_are_added_up() -> None:
+    core = make_core()
+    frames = (DeviceCounters(uptime_s, (0, 0, uptime_s)) for uptime_s in range(5))
+    core.step(ReceivedBytes(b"".join(encode("binary", frame) for frame in frames) + encode("binary", sample(1)), S))
+    assert device_counts(core) == {"device_bad_crc": 4}
+
+
+def test_a_device_that_restarts_counts_from_0_again() -> None:
+    core = make_core()
+    feed(
+        core, [DeviceCounters(70, (9,) * 12), DeviceCounters(0, (0,) * 11 + (1,)), DeviceCounters(1, (0,) * 11 + (1,))]
+    )
+    assert device_counts(core) == {"device_watchdog_resets": 1}
+
+
+def test_what_the_device_counts_while_the_line_is_closed_is_not_counted_unless_it_restarts() -> None:
+    core = make_core()
+    feed(core, [DeviceCounters(70, (0, 0, 5))])
+    for frame, counted in (
+        (DeviceCounters(90, (0, 0, 3)), {}),
+        (DeviceCounters(1, (0, 0, 2)), {"device_bad_crc": 2}),
+    ):
+        core.step(LinkDown("gone"))
+        core.step(LinkUp())
+        feed(core, [frame])
+        assert device_counts(core) == counted
+    feed(core, [DeviceCounters(2, (0, 0, 3))])
+    assert device_counts(core) == {"device_bad_crc": 3}
+
+
 def command(*values: float, set_point: tuple[float, ...] = (), fans: int = 2) -> Command:
     return Command(fans=fans, t_ns=S, command=np.array(values), set_point_rad_s=np.array(set_point))
 
@@ -297,22 +386,27 @@ def test_commands_and_set_points_are_sent_in_the_unit_of_the_tray(protocol: Prot
 
 
 @pytest.mark.parametrize(
-    "refused",
+    ("refused", "reason"),
     [
-        command(1.5, 0.5),
-        command(-0.1, 0.5),
-        command(math.inf, 0.5),
-        command(0.5, 0.5, set_point=(2000.0, 0.0)),
-        command(0.5, fans=1),
-        command(0.5, 0.5, 0.5, fans=3),
+        (command(1.5, 0.5), "the command of fan 0 is 1.5, outside 0 to 1"),
+        (command(0.5, -0.1), "the command of fan 1 is -0.1, outside 0 to 1"),
+        (command(math.inf, 0.5), "the command of fan 0 is inf, outside 0 to 1"),
+        (command(0.5, 0.5, set_point=(2000.0, 0.0)), "the set-point, rad/s, of fan 0 is 2000, outside -1000 to 1000"),
+        (command(0.5, fans=1), "it is for 1 fans, the tray has 2"),
+        (command(0.5, 0.5, 0.5, fans=3), "it is for 3 fans, the tray has 2"),
     ],
 )
-def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_counted(refused: Command) -> None:
+def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_counted_with_the_reason(
+    refused: Command, reason: str
+) -> None:
     link = FakeLink()
     core = make_core(link, speed_max=1000)
     core.step(refused)
+    assert core.notes() == [f"1 command refused: {reason}"]
+    core.step(refused)
     assert link.written == b""
-    assert core.counters()["refused_commands"] == 1
+    assert core.counters()["refused_commands"] == 2
+    assert core.notes() == [f"2 commands refused, the last one: {reason}"]
 
 
 def test_a_command_that_was_not_written_is_counted_as_lost() -> None:
@@ -321,6 +415,7 @@ def test_a_command_that_was_not_written_is_counted_as_lost() -> None:
     core = make_core(link)
     core.step(command(0.5, 0.5))
     assert core.counters()["lost_commands"] == 1
+    assert core.notes()[0].startswith("1 command lost on the way to the device: ")
 
 
 def test_a_command_that_changes_nothing_is_not_sent() -> None:

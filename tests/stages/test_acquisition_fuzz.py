@@ -233,6 +233,6 @@ def test_the_streams_hold_untouched_frames_and_every_kind_of_outcome() -> None:
             kinds += outcomes_by_kind(protocol, stream)
             untouched += len(good)
         assert untouched > 3000
-        # A wrong version needs a true checksum: test_wire.py has it.
-        absent = {"wrong_version", "bad_number" if protocol == "binary" else "wrong_crc"}
+        # A wrong version and an unknown type need a true checksum: test_wire.py has them.
+        absent = {"wrong_version", "unknown_type", "bad_number" if protocol == "binary" else "wrong_crc"}
         assert set(kinds) == {"samples", *(kind.value for kind in FaultKind)} - absent

@@ -10,7 +10,8 @@ import pytest
 
 from pipeline.devices.push_source import SILENT_NS, PushSource
 from pipeline.runtime.stage import Context
-from schemas.messages import Header, PushedSamples, Raw
+from schemas.header import Header
+from schemas.messages import PushedSamples, Raw
 from schemas.units import NS_PER_S
 from stages.acquisition import STAGE, AcquisitionCore
 from tests.support.running_acquisition import push_config

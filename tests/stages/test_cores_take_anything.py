@@ -19,19 +19,9 @@ from pipeline.viewing.fleet_view import FleetView
 from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
 from schemas.codec import decode, encode
 from schemas.envelope import Envelope
-from schemas.messages import (
-    Alarm,
-    Grid,
-    Header,
-    Health,
-    Message,
-    ModelCard,
-    Prediction,
-    Raw,
-    Request,
-    Score,
-    ScorerSnapshot,
-)
+from schemas.header import Header
+from schemas.health import Health
+from schemas.messages import Alarm, Grid, Message, ModelCard, Prediction, Raw, Request, Score, ScorerSnapshot
 from schemas.topics import TOPICS
 from stages.resampler import ResamplerConfig, ResamplerCore
 from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore

@@ -13,18 +13,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.users import User, UserRole, hasher, write_users
-from schemas.messages import (
-    Action,
-    Alarm,
-    Diagnosis,
-    FanState,
-    Header,
-    InvalidReason,
-    Request,
-    Score,
-    Severity,
-    Transition,
-)
+from schemas.enums import Action, FanState, InvalidReason, Severity, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Diagnosis, Request, Score
 from schemas.units import RAD_S_PER_UNIT
 from tests.support.running_chain import eventually
 from tests.support.running_gateway import FANS, SITE, TRAY, Client, RunningGateway

@@ -15,7 +15,8 @@ from pipeline.runtime.building import build_parts
 from pipeline.runtime.joint_step import step_together
 from pipeline.runtime.stage import Context, Core, Joint, load_stage
 from schemas.codec import encode
-from schemas.messages import Alarm, Grid, Header, Message, Prediction, Raw
+from schemas.header import Header
+from schemas.messages import Alarm, Grid, Message, Prediction, Raw
 from schemas.units import NS_PER_S
 from simulation.faults import Fault
 from simulation.tray import SimulatedTray, TraySettings

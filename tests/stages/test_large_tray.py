@@ -33,7 +33,9 @@ from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
 from schemas import wire
 from schemas.codec import decode, encode
-from schemas.messages import Alarm, Grid, Header, Message, Prediction, Raw, Score, Transition
+from schemas.enums import Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Grid, Message, Prediction, Raw, Score
 from schemas.topics import BY_NAME, TOPICS, most_samples
 from schemas.units import NS_PER_S
 from tests.support.twin_files import small_hybrid, write_twin
@@ -88,8 +90,8 @@ class TableSource:
     def stop(self) -> None:
         pass
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
-        return False
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        return "not connected"
 
     def check(self) -> list[str]:
         return []

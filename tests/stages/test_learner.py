@@ -13,7 +13,8 @@ import pytest
 
 from pipeline.learning.learning_process import LearningProcess
 from pipeline.learning.versions import Check
-from schemas.messages import Action, FanState, Message, Request
+from schemas.enums import Action, FanState
+from schemas.messages import Message, Request
 from schemas.units import NS_PER_S
 from tests.pipeline.learning.test_versions import version
 from tests.support.one_learner import START_NS, Learner, raw

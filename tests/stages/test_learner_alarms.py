@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.learning.healthy_history import healthy_recordings
-from schemas.messages import Action, FanState, NewTwin, Request
+from schemas.enums import Action, FanState
+from schemas.messages import NewTwin, Request
 from schemas.units import NS_PER_S
 from stages.learner import LearnerConfig
 from tests.support.one_learner import START_NS, Learner, raw, restarted

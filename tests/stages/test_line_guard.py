@@ -11,7 +11,9 @@ import pytest
 
 from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import join
-from schemas.messages import Grid, Header, InvalidReason, Raw
+from schemas.enums import InvalidReason
+from schemas.header import Header
+from schemas.messages import Grid, Raw
 from schemas.units import NS_PER_S
 from stages.resampler import ResamplerConfig, ResamplerCore
 

@@ -18,7 +18,8 @@ from pipeline.broker.config import MqttConfig
 from pipeline.config.models import TrayConfig
 from pipeline.devices.mqtt_config import MqttConfig as SourceConfig
 from pipeline.runtime.stage import Context, StageError
-from schemas.messages import Action, Alarm, FanState, Request, Transition
+from schemas.enums import Action, FanState, Transition
+from schemas.messages import Alarm, Request
 from stages.mqtt import build, check
 from tests.stages.test_gateway import alarm, granted, score
 from tests.support.mosquitto import Listener, Mosquitto, needs_mosquitto, retained_by

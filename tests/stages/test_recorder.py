@@ -28,8 +28,11 @@ from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.stage import Context, StageError
 from schemas.codec import encode
+from schemas.enums import StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import Header, Health, Input, Message, ModelCard, Output, Raw, StageStatus
+from schemas.header import Header
+from schemas.health import Health, Input, Output
+from schemas.messages import Message, ModelCard, Raw
 from schemas.topics import TOPICS, health_key, topic_of, tray_key
 from stages.recorder import STAGE, Recorder, RecorderConfig
 from tests.support.message_strategies import any_message, same

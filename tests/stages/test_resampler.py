@@ -15,7 +15,9 @@ from pydantic import ValidationError
 
 from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import join
-from schemas.messages import Grid, Header, InvalidReason, Raw, StatedTacho, TachoKind
+from schemas.enums import InvalidReason, TachoKind
+from schemas.header import Header
+from schemas.messages import Grid, Raw, StatedTacho
 from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
 from stages.resampler import ResamplerConfig, ResamplerCore
@@ -523,6 +525,21 @@ def test_row_16_a_gap_is_published_once_acquisition_shows_that_it_has_sent_nothi
     assert not found.valid.any()
     assert found.t_ns[-1] == at(3.49), "up to the watermark before the time at which it is shown"
     assert silent_for(core, 2.0, is_complete=False, from_s=4.0) == []
+
+
+def test_row_16_samples_of_the_next_session_that_are_not_admitted_yet_are_no_silence():
+    """They are more than a second away from those before; all that was sent has arrived, and waits for more of them."""
+    core = ResamplerCore(1, FIXED)
+    core.step(replace(raw(at(*np.arange(0.0, 1.0, 0.01)), np.ones(100)), header=Header("acquisition-a-1", 0, "")))
+    assert silent_for(core, 2.0, is_complete=False) == []
+    grids: list[Grid] = []
+    for number in range(100):
+        times_s = 3.0 + 0.05 * number + np.arange(0.0, 0.05, 0.01)
+        grids += core.step(replace(raw(at(*times_s), np.ones(5)), header=Header("acquisition-a-2", number, "")))
+        grids += silent_for(core, 0.05, is_complete=True, from_s=times_s[-1])
+    assert "lost_too_late" not in core.counters()
+    found = joined(grids)
+    assert seconds_of(found.t_ns[found.valid.all(axis=1)])[0] == pytest.approx(3.0)
 
 
 def test_row_16_a_gap_is_published_when_the_link_has_been_in_doubt_for_too_long():

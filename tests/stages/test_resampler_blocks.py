@@ -13,7 +13,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from schemas.blocks import join
-from schemas.messages import Grid, Header, Raw
+from schemas.header import Header
+from schemas.messages import Grid, Raw
 from stages.resampler import ResamplerConfig, ResamplerCore
 from tests.stages.test_resampler import NAN, at, raw
 

@@ -19,19 +19,9 @@ from pipeline.runtime.decision_rules import DecisionRules
 from pipeline.runtime.healthy_twin import ScorerConfig, limits_in_force
 from pipeline.runtime.stage import Context, StageError
 from schemas.blocks import cut
+from schemas.enums import Action, FanState, InvalidReason, Severity, Statistic, Transition
 from schemas.fields import columns
-from schemas.messages import (
-    Action,
-    FanState,
-    InvalidReason,
-    Prediction,
-    Request,
-    Score,
-    ScorerSnapshot,
-    Severity,
-    Statistic,
-    Transition,
-)
+from schemas.messages import Prediction, Request, Score, ScorerSnapshot
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.tacho import TachoSettings
 from scoring.detectors.variance_growth import VarianceGrowthSettings

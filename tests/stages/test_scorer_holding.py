@@ -11,7 +11,8 @@ import pytest
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, FORMER_DEFAULTS, DecisionRules
 from schemas.blocks import join
-from schemas.messages import InvalidReason, Prediction, Raw, Statistic, Transition
+from schemas.enums import InvalidReason, Statistic, Transition
+from schemas.messages import Prediction, Raw
 from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
 from stages.resampler import ResamplerConfig, ResamplerCore

@@ -13,8 +13,10 @@ import pytest
 
 from pipeline.runtime.snapshot_store import SnapshotStore
 from schemas.blocks import cut
+from schemas.enums import Action, FanState, Transition
 from schemas.fields import columns
-from schemas.messages import Action, Alarm, FanState, Header, Prediction, Score, ScorerSnapshot, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Prediction, Score, ScorerSnapshot
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms

@@ -12,7 +12,8 @@ from pipeline.recordings.reading import read_metadata
 from pipeline.runtime.stage import Context
 from schemas.codec import encode
 from schemas.envelope import Envelope
-from schemas.messages import Header, ScorerSnapshot
+from schemas.header import Header
+from schemas.messages import ScorerSnapshot
 from schemas.topics import tray_key
 from stages import recorder, viewer
 from stages.recorder import RecorderConfig

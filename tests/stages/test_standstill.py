@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
 from schemas.blocks import cut
-from schemas.messages import Alarm, FanState, Grid, InvalidReason, Prediction, Score, Statistic, Transition
+from schemas.enums import FanState, InvalidReason, Statistic, Transition
+from schemas.messages import Alarm, Grid, Prediction, Score
 from schemas.reference_conditions import ReferenceConditions
 from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS

@@ -16,7 +16,9 @@ from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context
 from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import cut, join
-from schemas.messages import Grid, Header, InvalidReason, ModelCard, Prediction
+from schemas.enums import InvalidReason
+from schemas.header import Header
+from schemas.messages import Grid, ModelCard, Prediction
 from schemas.model_uncertainty import ModelUncertainty
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from scoring.samples import speed_residual_rad_s

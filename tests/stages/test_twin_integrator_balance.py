@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from schemas.blocks import cut
-from schemas.messages import Grid, InvalidReason
+from schemas.enums import InvalidReason
+from schemas.messages import Grid
 from schemas.twin_card import DriveCard
 from tests.stages.test_twin_integrator import (
     NAN,

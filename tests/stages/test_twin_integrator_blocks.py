@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 import pipeline
 from pipeline.runtime.twin_file import TwinFile
+from schemas.enums import InvalidReason
 from schemas.fields import columns
-from schemas.messages import Grid, InvalidReason, Prediction
+from schemas.messages import Grid, Prediction
 from stages.twin_integrator import TwinIntegratorCore
 from tests.stages.test_twin_integrator import (
     EPOCH_NS,

@@ -14,8 +14,9 @@ from pipeline.runtime.joint_tray_integrator import JointTrayIntegrator
 from pipeline.runtime.tray_integrator import TwinIntegratorConfig
 from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import cut, join
+from schemas.enums import InvalidReason
 from schemas.fields import columns
-from schemas.messages import Array, Grid, InvalidReason, Prediction
+from schemas.messages import Array, Grid, Prediction
 from schemas.reference_conditions import ReferenceConditions
 from schemas.units import NS_PER_S
 from stages.twin_integrator import TwinIntegratorCore

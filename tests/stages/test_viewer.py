@@ -23,20 +23,11 @@ from pipeline.viewing.fleet_view import Overview
 from pipeline.viewing.loopback import check_free
 from pipeline.viewing.trace import Trace
 from schemas.codec import encode
+from schemas.enums import FanState, InvalidReason, Severity, StageStatus, Transition
 from schemas.envelope import Envelope
-from schemas.messages import (
-    Alarm,
-    FanState,
-    Header,
-    Health,
-    InvalidReason,
-    Message,
-    ModelCard,
-    Score,
-    Severity,
-    StageStatus,
-    Transition,
-)
+from schemas.header import Header
+from schemas.health import Health
+from schemas.messages import Alarm, Message, ModelCard, Score
 from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 from stages.viewer import (

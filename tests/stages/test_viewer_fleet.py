@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -277,3 +278,23 @@ def test_a_fan_to_show_that_does_not_exist_is_a_one_line_error(tmp_path: Path, n
     with pytest.raises(StageError) as caught:
         build(wrong)
     assert str(caught.value) == problem and list(tmp_path.iterdir()) == []
+
+
+def test_what_is_measured_beside_of_a_fan_with_a_plot_is_drawn_and_ends_with_it(tmp_path: Path) -> None:
+    core = build(context(tmp_path, 3, 3, fleet_above=3, alarm_plot_hold_s=HOLD_S)).core
+    assert isinstance(core, ViewerCore)
+    measured = [
+        replace(message, supply_voltage_v=np.full(message.score.shape, 12.5, np.float32))
+        if isinstance(message, Score) and message.header.tray == "tray2"
+        else message
+        for message in messages_of()
+    ]
+    play(core, measured)
+    core.close()
+    rows = {path: of for path, of in rows_of(tmp_path / "view.rrd").items() if "supply_voltage_v" in path}
+    (path,) = rows
+    assert path == "/shown/supply_voltage_v/plot_1"
+    *shown, last = [row["Scalars:scalars"][0] for _, row in rows[path]]
+    assert set(shown) == {12.5} and np.isnan(last)
+    begin_s, end_s = ((rows[path][index][0] - START_NS) / 1e9 for index in (0, -1))
+    assert begin_s < 8.5 and end_s < 19.0

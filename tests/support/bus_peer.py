@@ -15,8 +15,10 @@ from pipeline.config.models import BusConfig
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.tracked_streams import Request
 from schemas.codec import decode, encode, type_name
+from schemas.enums import Severity
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Header, Severity
+from schemas.header import Header
+from schemas.messages import Alarm
 from schemas.topics import BY_NAME, tray_key
 
 KEY = tray_key("site", "tray", "alarm")

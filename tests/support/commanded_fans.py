@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.learning.healthy_history import HealthyHistory
-from schemas.messages import Array, Header, Raw
+from schemas.header import Header
+from schemas.messages import Array, Raw
 from schemas.units import NS_PER_S
 
 START_S = 1_800_000_000

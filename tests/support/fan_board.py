@@ -8,14 +8,9 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.wire import CommandFrame, Decoder, Fault, Sample, SetPointFrame, encode
+from schemas.wire import DEVICE_COUNTERS, CommandFrame, Decoder, DeviceCounters, Fault, Sample, SetPointFrame, encode
 
 FANS = 4
-COUNTERS = (
-    *("frames", "bad_length", "bad_crc", "wrong_kind", "bad_value", "line_errors", "overruns", "unsent_samples"),
-    *("lost_edges", "glitches", "host_silences", "watchdog_resets"),
-)
-"""those of firmware/src/counters.h, in order"""
 
 
 @dataclass(frozen=True)
@@ -55,6 +50,8 @@ class FanBoard:
         self._decoder = Decoder("binary", FANS)
         self.faults: list[Fault] = []
         self.samples: list[Sample] = []
+        self.counters: list[DeviceCounters] = []
+        """as the firmware has sent them"""
 
     def order(self, *words: object) -> str:
         """Send a line to the simulator; returns what it answers beside `ok` and the bytes of the firmware."""
@@ -89,13 +86,13 @@ class FanBoard:
     def truth(self) -> BoardTruth:
         """The board now."""
         found = json.loads(self.order("state"))
-        counters = struct.unpack(f"<{len(COUNTERS)}H", bytes.fromhex(found["counters"]))
+        counters = struct.unpack(f"<{len(DEVICE_COUNTERS)}H", bytes.fromhex(found["counters"]))
         return BoardTruth(
             found["t_s"],
             found["restarts"],
             found["supply_v"],
             tuple(FanTruth(**fan) for fan in found["fans"]),
-            dict(zip(COUNTERS, counters, strict=True)),
+            dict(zip(DEVICE_COUNTERS, counters, strict=True)),
         )
 
     def close(self) -> None:
@@ -108,6 +105,8 @@ class FanBoard:
         for found in self._decoder.feed(data):
             if isinstance(found, Sample):
                 self.samples.append(found)
+            elif isinstance(found, DeviceCounters):
+                self.counters.append(found)
             else:
                 assert isinstance(found, Fault)
                 self.faults.append(found)

@@ -9,6 +9,8 @@ from pathlib import Path
 FANS = 4
 PULSES = 2
 PWM_STEPS = 640
+COUNTERS = 12
+COUNTERS_LINE_BYTES = 7 + 2 * COUNTERS + 4 + 3
 SAMPLE_LINE_BYTES = 11 + 1 + 4 * FANS * 3 + 4 + 3
 NOTHING, COMMAND, SET_POINT, BAD_LENGTH, BAD_CRC, WRONG_KIND, BAD_VALUE = range(7)
 Values = c_float * FANS
@@ -69,6 +71,7 @@ def firmware_parts(library: Path) -> ctypes.CDLL:
         ("cobs_decode", c_int16, (octets, c_uint8)),
         ("crc32", c_uint32, (octets, c_uint8)),
         ("sample_encode", c_uint8, (POINTER(SampleStruct), octets)),
+        ("counters_encode", c_uint8, (c_uint32, POINTER(c_uint16), octets)),
         ("receiver_take", c_int, (POINTER(Receiver), c_uint8, POINTER(c_float))),
         ("tacho_start", None, (tacho, c_bool, c_uint32)),
         ("tacho_edge", None, (tacho, c_bool, c_uint32)),

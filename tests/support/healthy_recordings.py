@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.learning.healthy_history import HealthyHistory
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.units import NS_PER_S
 from tests.support.fan_data import published_run
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.signal import lfilter
 
-from schemas.messages import Array, Statistic, Transition
+from schemas.enums import Statistic, Transition
+from schemas.messages import Array
 from schemas.units import NS_PER_S
 from scoring.alarms.fan_condition import ConditionSettings
 from scoring.alarms.tray_conditions import TrayConditions

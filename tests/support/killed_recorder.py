@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.scan import scan
-from schemas.messages import StageStatus
+from schemas.enums import StageStatus
 from tests.support.recorder_feed import PRODUCER, SITE
 from tests.support.running_chain import DEADLINE_S, FANTWIN, eventually
 

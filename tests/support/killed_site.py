@@ -22,7 +22,9 @@ from pipeline.runtime.decision_rules import CURRENT_RULES
 from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import join
-from schemas.messages import Action, Consumed, Header, InputPosition, Message, NewTwin, Raw, Request
+from schemas.enums import Action
+from schemas.header import Header, InputPosition
+from schemas.messages import Consumed, Message, NewTwin, Raw, Request
 from schemas.topics import BY_NAME, TOPICS, tray_key
 from schemas.units import NS_PER_S
 from tests.support.twin_files import small_hybrid, write_twin

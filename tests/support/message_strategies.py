@@ -7,21 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 
 from schemas.fields import LARGEST_ENUM_VALUE, Column, OpenEnum, columns, other_fields
-from schemas.messages import (
-    FURTHEST_T_NS,
-    LARGEST_PERIOD_NS,
-    AcceptedSamples,
-    AwaitedInput,
-    Counter,
-    Diagnosis,
-    Header,
-    Input,
-    InputPosition,
-    Message,
-    Note,
-    Output,
-    StatedTacho,
-)
+from schemas.header import Header, InputPosition
+from schemas.health import AcceptedSamples, AwaitedInput, Counter, Input, Note, Output
+from schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Diagnosis, Message, StatedTacho
 
 TIME_NS = st.integers(1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
 PERIOD_NS = st.integers(1, LARGEST_PERIOD_NS)

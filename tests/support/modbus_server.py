@@ -1,17 +1,21 @@
-"""A drive behind Modbus TCP, in this process: pymodbus's own server in front of simulated fans."""
+"""A drive behind Modbus, in this process: pymodbus's own server in front of simulated fans, by TCP or serial line."""
 
 from __future__ import annotations
 
 import asyncio
+import os
+import select
 import struct
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+import tty
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
 
 import numpy as np
 from pymodbus.constants import ExcCodes
-from pymodbus.server import ModbusTcpServer
+from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from simulation.tray import SimulatedTray
@@ -59,36 +63,97 @@ class Drive:
         return None
 
 
-@contextmanager
-def modbus_server(drives: dict[int, Drive], port: int = 0) -> Iterator[int]:
-    """Serve the drives by their unit ids; gives the TCP port."""
-    devices = [
+def _devices(drives: dict[int, Drive]) -> list[SimDevice]:
+    return [
         SimDevice(unit, [SimData(0, count=300, values=0, datatype=DataType.REGISTERS)], action=drive.access)
         for unit, drive in drives.items()
     ]
-    loop, found = asyncio.new_event_loop(), list[int]()
-    ready = threading.Event()
-    servers: list[ModbusTcpServer] = []
 
-    async def serve() -> None:
-        server = ModbusTcpServer(devices, address=("127.0.0.1", port))
-        servers.append(server)
-        await server.serve_forever(background=True)
-        assert server.transport is not None
-        found.append(server.transport.sockets[0].getsockname()[1])  # type: ignore[attr-defined]
-        ready.set()
 
-    def run() -> None:
-        loop.run_until_complete(serve())
-        loop.run_forever()
-
-    thread = threading.Thread(target=run)
+@contextmanager
+def _serving(start: Callable[[], Awaitable[ModbusTcpServer | ModbusSerialServer]]) -> Iterator[Any]:
+    """Run a server in a thread; gives it when it listens."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
     thread.start()
-    assert ready.wait(10.0)
+
+    async def started() -> ModbusTcpServer | ModbusSerialServer:
+        server = await start()
+        await server.serve_forever(background=True)
+        return server
+
     try:
-        yield found[0]
+        server = asyncio.run_coroutine_threadsafe(started(), loop).result(10.0)
+        try:
+            yield server
+        finally:
+            asyncio.run_coroutine_threadsafe(server.shutdown(), loop).result(5.0)
     finally:
-        asyncio.run_coroutine_threadsafe(servers[0].shutdown(), loop).result(5.0)
         loop.call_soon_threadsafe(loop.stop)
         thread.join(5.0)
         loop.close()
+
+
+@contextmanager
+def modbus_server(drives: dict[int, Drive], port: int = 0) -> Iterator[int]:
+    """Serve the drives by their unit ids; gives the TCP port."""
+
+    async def start() -> ModbusTcpServer:
+        return ModbusTcpServer(_devices(drives), address=("127.0.0.1", port))
+
+    with _serving(start) as server:
+        yield server.transport.sockets[0].getsockname()[1]
+
+
+class SerialLine:
+    """Two serial ports, `device` and `host`, with a cable between them.
+
+    transferred: the bytes that went over it, to the device and to the host.
+    """
+
+    def __init__(self) -> None:
+        self._ends = [self._open(), self._open()]
+        self.device, self.host = (os.ttyname(port) for _, port in self._ends)
+        self.transferred = {"device": b"", "host": b""}
+        self._is_cut = False
+        self._thread = threading.Thread(target=self._carry)
+        self._thread.start()
+
+    @staticmethod
+    def _open() -> tuple[int, int]:
+        end, port = os.openpty()
+        tty.setraw(port)
+        return end, port
+
+    def _carry(self) -> None:
+        (device, _), (host, _) = self._ends
+        while not self._is_cut:
+            for end in select.select([device, host], [], [], 0.02)[0]:
+                to, other = ("device", device) if end == host else ("host", host)
+                data = os.read(end, 4096)
+                self.transferred[to] += data
+                os.write(other, data)
+
+    def unplug(self) -> None:
+        """Take the adapter of the host away: its port hangs up, as that of a USB adapter does."""
+        self._is_cut = True
+        self._thread.join()
+        for descriptor in (descriptor for end in self._ends for descriptor in end):
+            with suppress(OSError):
+                os.close(descriptor)
+
+
+@contextmanager
+def modbus_line(drives: dict[int, Drive]) -> Iterator[SerialLine]:
+    """Serve the drives by their unit ids at one end of a serial line, as Modbus RTU; gives the line. A pseudo-terminal
+    has no parity."""
+    line = SerialLine()
+
+    async def start() -> ModbusSerialServer:
+        return ModbusSerialServer(_devices(drives), port=line.device, baudrate=19200, parity="N")
+
+    try:
+        with _serving(start):
+            yield line
+    finally:
+        line.unplug()

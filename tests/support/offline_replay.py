@@ -12,7 +12,8 @@ from pipeline.replay.offline.comparison import Comparison
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import RescoredTray, rescore
 from pipeline.replay.offline.verify import TrayVerifier
-from schemas.messages import Alarm, Header, Score
+from schemas.header import Header
+from schemas.messages import Alarm, Score
 from tests.support.killed_site import Site
 
 

@@ -10,7 +10,8 @@ from pipeline.config.models import TrayConfig
 from pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.learning.versions import Check, TwinVersions
-from schemas.messages import FanState, Message, NewTwin, Raw, Score
+from schemas.enums import FanState
+from schemas.messages import Message, NewTwin, Raw, Score
 from schemas.units import NS_PER_S
 from stages.learner import LearnerConfig, LearnerCore
 from tests.pipeline.learning.test_versions import version

@@ -20,7 +20,10 @@ import numpy as np
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from schemas.codec import encode, type_name
-from schemas.messages import Grid, Header, Health, Message, Output, Prediction, Raw, Score, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
+from schemas.messages import Grid, Message, Prediction, Raw, Score
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 SITE, PRODUCER, STAGE = "kills", "feed-1", "feed"

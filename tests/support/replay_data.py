@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.topics import tray_key
 
 START_NS = 1_700_000_000_000_000_000

@@ -16,7 +16,8 @@ from pipeline.config.shards import chosen_shard
 from pipeline.runtime.runner import Runner
 from schemas.codec import decode
 from schemas.fields import Array
-from schemas.messages import Health, Raw
+from schemas.health import Health
+from schemas.messages import Raw
 from schemas.topics import tray_key
 from stages.acquisition import STAGE
 from tests.support.running_chain import eventually

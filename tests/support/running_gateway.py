@@ -15,7 +15,8 @@ from pipeline.config.models import TrayConfig
 from pipeline.gateway.config import GatewayConfig
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Header, Message, Request, Score
+from schemas.header import Header
+from schemas.messages import Alarm, Message, Request, Score
 from schemas.topics import tray_key
 from stages.gateway import GatewayCore, build
 

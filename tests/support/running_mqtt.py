@@ -12,7 +12,8 @@ from pipeline.broker.config import MqttConfig
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Header, Message, Request, Score
+from schemas.header import Header
+from schemas.messages import Alarm, Message, Request, Score
 from schemas.topics import tray_key
 from stages.mqtt import MqttCore, build
 

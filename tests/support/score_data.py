@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from schemas.enums import FanState, InvalidReason, Severity, Statistic, Transition
 from schemas.fields import columns as columns_of
-from schemas.messages import Alarm, FanState, Header, InvalidReason, Score, Severity, Statistic, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Score
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
 from pipeline.runtime.snapshot_store import SnapshotStore
-from schemas.messages import Action, Alarm, Header, InvalidReason, Prediction, Request, Score, ScorerSnapshot
+from schemas.enums import Action, InvalidReason
+from schemas.header import Header
+from schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot
 from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.units import SpeedUnit
 from scoring.diagnosis.regression_window import HealthyBalance

@@ -17,7 +17,10 @@ from pipeline.runtime.runner import Runner
 from pipeline.runtime.sessions import Session
 from pipeline.runtime.stage import load_stage
 from schemas.codec import encode, type_name
-from schemas.messages import Header, Health, Output, Raw, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
+from schemas.messages import Raw
 from schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.secured_site import SITE, SecuredSite

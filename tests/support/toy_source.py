@@ -43,9 +43,9 @@ class ToySource:
     def stop(self) -> None:
         pass
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
         self.sent.append((command, set_point))
-        return True
+        return ""
 
     def check(self) -> list[str]:
         return [] if self._config.speeds else ["toy: no speeds given"]

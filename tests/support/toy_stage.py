@@ -15,7 +15,10 @@ from pipeline.config.shards import chosen_shard
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from schemas.codec import decode, encode, type_name
-from schemas.messages import Grid, Header, Health, Message, Raw, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health
+from schemas.messages import Grid, Message, Raw
 from schemas.topics import BY_NAME, health_key, tray_key
 
 TRAY_A, TRAY_B = "a", "b"

@@ -9,7 +9,9 @@ import numpy as np
 
 from pipeline.recordings.reading import read_recording
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Alarm, Array, Header, Raw, Severity
+from schemas.enums import Severity
+from schemas.header import Header
+from schemas.messages import Alarm, Array, Raw
 from schemas.topics import tray_key
 from twin.runs import Run
 

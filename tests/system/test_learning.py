@@ -10,7 +10,8 @@ import pytest
 
 from pipeline.learning.versions import TwinVersions, learning_folder
 from pipeline.recordings.reading import read_recording
-from schemas.messages import InvalidReason, ModelCard, Score
+from schemas.enums import InvalidReason
+from schemas.messages import ModelCard, Score
 from tests.support.fantwin_command import fantwin
 from tests.support.healthy_recordings import FANS, add_recording
 from tests.support.running_chain import RunningCommand, eventually

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from pipeline.recordings.reading import read_recording
-from schemas.messages import InvalidReason, Message, ModelCard, Raw, Score
+from schemas.enums import InvalidReason
+from schemas.messages import Message, ModelCard, Raw, Score
 from tests.support.fantwin_command import fantwin
 from tests.support.running_chain import DEADLINE_S, RunningCommand
 

@@ -19,7 +19,8 @@ from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.reading import read_recording
-from schemas.messages import Alarm, Grid, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Grid
 from tests.support.running_chain import SITE, TRAY, Chain, RunningCommand, eventually, fantwin, published, view_of
 from tests.support.tcp_relay import TcpRelay
 

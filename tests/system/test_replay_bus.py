@@ -22,7 +22,10 @@ from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.reading import read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import decode
-from schemas.messages import Clock, Grid, Header, Health, Message, ModelCard, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health
+from schemas.messages import Clock, Grid, Message, ModelCard
 from schemas.topics import health_key, tray_key
 from tests.support.killed_site import Site as RecordedSite
 from tests.support.replay_data import START_NS, STEP_NS, write_raw

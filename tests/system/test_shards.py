@@ -22,7 +22,9 @@ from pipeline.config.models import BusConfig
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.reading import read_recording
 from schemas.codec import decode, encode, type_name
-from schemas.messages import Alarm, Header, Score, ScorerSnapshot, Transition
+from schemas.enums import Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Score, ScorerSnapshot
 from schemas.topics import BY_NAME, tray_key
 from tests.support.running_chain import RunningCommand, eventually, fantwin
 from tests.support.scored_blocks import EPOCH_NS, LIVELY, STEP_NS, prediction_of

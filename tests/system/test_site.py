@@ -12,13 +12,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.reading import read_recording
-from schemas.messages import Alarm, Request, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Request
+from tests.stages.test_viewer import rows_of
 from tests.support.offline_replay import without_topics
-from tests.support.running_chain import TRAY, Chain, eventually, fantwin, is_running, published, received, view_of
+from tests.support.running_chain import FANS, TRAY, Chain, eventually, fantwin, is_running, published, received, view_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
@@ -123,6 +126,21 @@ def check_recordings(chain: Chain) -> None:
     assert recorded_values(chain, "prediction", "t_ns") == recorded_values(chain, "score", "t_ns") == set(times)
 
 
+def check_supply(chain: Chain) -> None:
+    """The voltage that the tray measures is in each message on the way to the score, and in the view."""
+    for topic in ("raw", "grid", "prediction", "score"):
+        entries = [entry for path in chain.recordings() for entry in read_recording(path, topics=[topic])]
+        messages: list[Any] = [entry.message for entry in entries]
+        volts = np.concatenate([np.reshape(message.supply_voltage_v, (-1, FANS)) for message in messages])
+        assert len(volts) > 1_000, topic
+        assert np.nanmedian(volts, axis=0) == pytest.approx(12.0, abs=0.02), topic
+        assert np.isfinite(volts).mean() > 0.5, f"{topic}: unknown only in the pause of acquisition"
+    newest = max(chain.folder.glob("view*.rrd"), key=lambda path: path.stat().st_mtime_ns)
+    rows = rows_of(newest)
+    shown = [row["Scalars:scalars"][0] for _, row in rows[f"/{TRAY}/supply_voltage_v/fan_{FAULTY}"]]
+    assert np.nanmedian(shown) == pytest.approx(12.0, abs=0.02)
+
+
 def check_alarms(chain: Chain, onset_t_ns: int) -> None:
     """The alarm was raised once, and each request of the operators was answered under its name."""
     recorded = [entry.message for path in chain.recordings() for entry in read_recording(path, ("alarm", "request"))]
@@ -161,7 +179,8 @@ def check_replay(chain: Chain) -> None:
 
 
 def test_operators_are_answered_and_killed_stages_come_back_without_losing_state(chain):
-    chain.start_tray("--fault", f"inlet:fan={FAULTY},start=8,stop=600,size=2.5")
+    fault = ("--fault", f"inlet:fan={FAULTY},start=8,stop=600,size=2.5")
+    chain.start_tray(*fault, "--measure", "supply_voltage_v")
     up = chain.start_up()
     up.line_with("ALARM")
     before = operate(chain)
@@ -189,5 +208,6 @@ def test_operators_are_answered_and_killed_stages_come_back_without_losing_state
     check_account(chain, sent, up.output(), status)
     check_recordings(chain)
     check_alarms(chain, answer["onset_t_ns"])
+    check_supply(chain)
 
     check_replay(chain)

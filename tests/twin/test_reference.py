@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,15 @@ import pytest
 from schemas.reference_conditions import ReferenceConditions
 from simulation.surroundings import Surroundings
 from simulation.tacho import NoisyTacho, TachoSettings
-from simulation.tray import SimulatedTray, TraySettings
+from simulation.tray import TraySettings
+from simulation.tray_run import run_of
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.evaluation.resampling import resampled
+from twin.fitting.drive_fit import FoundDrive
+from twin.fitting.identification import identify
+from twin.fitting.reference_choice import identify_at_reference
+from twin.models.drive import Drive
 from twin.reference import at_reference, reference_of
 from twin.runs import Run
 
@@ -26,16 +32,7 @@ def simulated(seed: int, surroundings: Surroundings, seconds: float = 60.0) -> R
     settings = TraySettings(
         fans=1, rate_hz=50.0, duration_s=seconds, profile="prbs", seed=seed, tacho=tacho, surroundings=surroundings
     )
-    tray, samples = SimulatedTray(settings), []
-    while tray.due_s() is not None:
-        samples.append(tray.take())
-    return Run(
-        f"seed {seed}",
-        np.array([sample.t_s for sample in samples]),
-        np.stack([sample.command for sample in samples]),
-        np.stack([sample.speed_rad_s for sample in samples]),
-        auxiliary={name: np.stack([sample.auxiliary[name] for sample in samples]) for name in samples[0].auxiliary},
-    )
+    return run_of(settings)
 
 
 MEASURED = Surroundings(
@@ -86,6 +83,42 @@ def test_only_what_all_runs_know_nearly_throughout_is_used(runs: tuple[Run, Run]
     sparse[::50] = 20.0  # once a second
     found = reference_of([replace(other, auxiliary={"temperature_c": sparse})])
     assert found is not None and found.needed == ("temperature_c",)
+
+
+def test_a_column_that_the_fans_do_not_follow_is_left_out(runs: tuple[Run, Run]) -> None:
+    """As with a fan that makes up for its supply, or a bad sensor."""
+    volts = runs[0].auxiliary["supply_voltage_v"]
+    strange = replace(runs[0], auxiliary={**runs[0].auxiliary, "supply_voltage_v": volts[::-1].copy()})
+    left_out = identify_at_reference([strange])
+    assert left_out.conditions is not None
+    assert left_out.conditions.needed == ("temperature_c",)
+    (note,) = left_out.notes
+    assert note.startswith("supply voltage: not used, because the fans do not follow it")
+    by_air = identify(at_reference([strange], left_out.conditions))
+    np.testing.assert_array_equal(left_out.identification.parameters, by_air.parameters)
+
+
+def test_a_column_that_hardly_varies_is_kept_without_a_comparison(
+    runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Sequence[Run]] = []
+    monkeypatch.setattr("twin.fitting.reference_choice.identify", lambda runs, **_: made.append(runs) or identify(runs))
+    volts = 12.0 + 0.02 * np.random.default_rng(1).normal(size=runs[0].command.shape)
+    kept = identify_at_reference([replace(runs[0], auxiliary={"supply_voltage_v": volts})])
+    assert kept.conditions is not None
+    assert not kept.notes
+    assert len(made) == 1
+
+
+def test_a_twin_behind_a_drive_allows_for_nothing_and_says_so(
+    runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive = FoundDrive(Drive(0.01, 0.3, 1.0), np.array([[0.02, 0.0, 0.5]]))
+    monkeypatch.setattr("twin.build.find_drive", lambda *_: drive)
+    twin = train_twin([runs[0]], [], "physical", name="drive")
+    assert twin.card.conditions is None
+    said = "supply voltage and temperature: not used, because these fans control their own speed"
+    assert said in twin.identification.warnings
 
 
 def test_speeds_are_missing_where_the_conditions_are_not_known(runs: tuple[Run, Run]) -> None:

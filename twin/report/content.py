@@ -1,6 +1,6 @@
 """What a report says, in numbers: a twin run freely over recordings, fan by fan."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,7 +84,8 @@ class Summary:
 @dataclass(frozen=True, eq=False)
 class FanContent(FanSummary):
     """One fan with its samples. column: of the runs. Arrays (n,) are in rad/s or command units, over all pieces one
-    after the other; predicted_rad_s, error_rad_s: as of recording_sums.FreeRun."""
+    after the other; predicted_rad_s, error_rad_s: as of recording_sums.FreeRun. auxiliary: what else was measured,
+    (n,) by name, NaN where not."""
 
     column: int
     command: Array
@@ -92,6 +93,7 @@ class FanContent(FanSummary):
     measured_rad_s: Array
     predicted_rad_s: Array
     error_rad_s: Array
+    auxiliary: Mapping[str, Array]
 
     @property
     def raised_command(self) -> Array:
@@ -173,6 +175,7 @@ def report_content(
         np.concatenate([getattr(free_run, name) for free_run in free_runs])
         for name in ("predicted_rad_s", "error_rad_s")
     )
+    measured_beside = _auxiliary(evaluation_pieces(runs))
     fans = tuple(
         FanContent(
             **vars(fan),
@@ -182,11 +185,21 @@ def report_content(
             measured_rad_s=measured[:, column],
             predicted_rad_s=predicted[:, column],
             error_rad_s=error[:, column],
+            auxiliary={name: of[:, column] for name, of in measured_beside.items()},
         )
         for column, fan in enumerate(summary.fans)
     )
     fields: dict[str, Any] = vars(summary) | {"fans": fans}
     return Content(**fields, pieces=pieces, timeline=timeline(pieces))
+
+
+def _auxiliary(pieces: Sequence[Run]) -> dict[str, Array]:
+    """(n, fans) what was measured beside command and speed, by name; NaN in pieces without it."""
+    names = dict.fromkeys(name for piece in pieces for name in piece.auxiliary)
+    return {
+        name: np.concatenate([piece.auxiliary.get(name, np.full_like(piece.command, np.nan)) for piece in pieces])
+        for name in names
+    }
 
 
 def _parameters(twin: OnnxTwin, row: int) -> tuple[Parameter, ...]:

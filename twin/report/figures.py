@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
 from schemas.model_uncertainty import ModelUncertainty
 from twin.report.content import Content, FanContent
 from twin.report.steady_states import StaticCurve
@@ -35,6 +36,10 @@ STYLE: dict[Any, Any] = {
     "legend.handlelength": 1.4,
 }
 WIDE_IN, NARROW_IN, SMALL_IN = (11.5, 5.4), (4.2, 6.0), (4.0, 2.9)
+BESIDE_IN = 0.95
+"""height of the panel of what was measured beside command and speed"""
+LEAST_REACH = 0.02
+"""of its axis around the middle, a share of the largest value"""
 WIDE_COLUMNS, NARROW_COLUMNS = 500, 200
 MOST_TICKS = 5
 AROUND_PEAK_SAMPLES = 300
@@ -49,12 +54,19 @@ LINE = {"lw": 0.5, "color": MEASURED, "solid_joinstyle": "round"}
 
 
 def over_time(content: Content, fan: FanContent, *, narrow: bool) -> str:
-    """Measured speed on free run and band, the error in its band, and the command."""
-    with _figure(NARROW_IN if narrow else WIDE_IN) as figure:
-        speed, error, command = figure.subplots(3, 1, sharex=True, height_ratios=[2.4, 1.5, 0.8])
-        _draw_over_time(content, fan, (speed, error, command), NARROW_COLUMNS if narrow else WIDE_COLUMNS)
+    """Measured speed on free run and band, the error in its band, the command, and what was measured beside."""
+    width_in, height_in = NARROW_IN if narrow else WIDE_IN
+    beside = [column for column in AUXILIARY if np.isfinite(fan.auxiliary.get(column.name, np.nan)).any()]
+    with _figure((width_in, height_in + BESIDE_IN * len(beside))) as figure:
+        shares = [2.4, 1.5, 0.8] + [0.8] * len(beside)
+        panels: list[Axes] = figure.subplots(len(shares), 1, sharex=True, height_ratios=shares).tolist()
+        speed, error, command, *others = panels
+        columns = NARROW_COLUMNS if narrow else WIDE_COLUMNS
+        _draw_over_time(content, fan, (speed, error, command), columns)
+        for axes, column in zip(others, beside, strict=True):
+            _draw_beside(content, axes, column, fan.auxiliary[column.name], columns)
         line = content.timeline
-        for axes in (speed, error, command):
+        for axes in panels:
             for gap in line.gaps:
                 axes.axvspan(gap.start_s, gap.stop_s, color=GAP, lw=0, zorder=0.5)
             for start_s, _ in line.recordings[1:]:
@@ -62,7 +74,7 @@ def over_time(content: Content, fan: FanContent, *, narrow: bool) -> str:
         if len(line.recordings) > 1 and not narrow:
             for start_s, name in line.recordings:
                 speed.text(start_s, 1.01, f" {name}", transform=speed.get_xaxis_transform(), size=7.5, color="#555555")
-        command.set_xlabel("time in the recording (s)" if line.keeps_the_clock else "measured time (s)")
+        panels[-1].set_xlabel("time in the recording (s)" if line.keeps_the_clock else "measured time (s)")
         speed.legend(loc="lower left", bbox_to_anchor=(0, 1.04), ncols=2 if narrow else 4, borderaxespad=0.0)
         figure.align_ylabels()
         return _svg(
@@ -234,6 +246,18 @@ def _draw_over_time(content: Content, fan: FanContent, panels: tuple[Axes, Axes,
     unit = content.card.command_unit
     command.set_ylabel(f"command\n({unit})" if unit else "command")
     command.set_xlim(line.t_s[0], line.t_s[-1])
+
+
+def _draw_beside(content: Content, axes: Axes, column: AuxiliaryColumn, values: Array, columns: int) -> None:
+    """What was measured beside command and speed, on an axis on which noise looks small."""
+    line = content.timeline
+    kept = kept_samples(line.t_s, (values,), columns)
+    axes.plot(*broken_at(line.starts, kept, line.t_s, values), **{**LINE, "color": COMMAND})
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    reach = max(0.55 * (high - low), LEAST_REACH * max(abs(low), abs(high)))
+    axes.set_ylim((low + high) / 2.0 - reach, (low + high) / 2.0 + reach)
+    axes.ticklabel_format(axis="y", useOffset=False)
+    axes.set_ylabel(f"{column.title.replace(' ', chr(10))}\n({column.unit})")
 
 
 def _strokes(x: Array, low: Array, high: Array) -> tuple[Array, Array]:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,7 +30,8 @@ from pipeline.recordings.logs.formats import LogFormat, log_format, open_log
 from pipeline.recordings.logs.samples_of_log import read_samples
 from pipeline.recordings.reading import TACHO_KEY
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Array, Header, Raw
+from schemas.header import Header
+from schemas.messages import Array, Raw
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan, tachos_to_json
 from schemas.topics import RESERVED_TRAY_NAMES, tray_key
 from schemas.units import NS_PER_S
@@ -211,8 +213,10 @@ def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...]
     if tachos != INSTANTANEOUS:
         metadata[f"{TACHO_KEY}.{tray}"] = tachos_to_json(tachos)
     with RecordingWriter(output, metadata, t_ns=int(table.t_ns[0]), overwrite=True) as writer:
-        for sequence, first in enumerate(range(0, len(table.t_ns), SAMPLES_PER_MESSAGE)):
-            rows = slice(first, first + SAMPLES_PER_MESSAGE)
+        # a message has the time of its last sample; the first is of one sample: the recording begins with its first
+        starts = [0, *range(1, len(table.t_ns), SAMPLES_PER_MESSAGE), len(table.t_ns)]
+        for sequence, (first, end) in enumerate(pairwise(starts)):
+            rows = slice(first, end)
             auxiliary: dict[str, Any] = {name: values[rows] for name, values in table.auxiliary.items()}
             raw = Raw(
                 header=Header("import", sequence, tray),

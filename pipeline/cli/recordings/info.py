@@ -27,7 +27,7 @@ from pipeline.recordings.reading import left_out_of
 from pipeline.recordings.records import active_path
 from pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
 from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
-from schemas.messages import Health
+from schemas.health import Health
 from schemas.streams import StreamId
 from schemas.units import NS_PER_S
 

@@ -5,16 +5,12 @@ from __future__ import annotations
 
 import json
 import math
-import threading
 import time as clock
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from pydantic import ValidationError
 
 from pipeline.cli.options import (
     CurrentOption,
@@ -23,38 +19,28 @@ from pipeline.cli.options import (
     TemperatureOption,
     auxiliary_options,
 )
-from pipeline.cli.simulation.simulated_hwmon import RATE_HZ, InjectedFaults, tachos_of
-from pipeline.devices.hwmon_simulator import FAULT_FILE, HwmonTree, play_hwmon
+from pipeline.cli.simulation.serving import serve_hwmon, serve_line
+from pipeline.cli.simulation.simulated_hwmon import RATE_HZ, tachos_of
+from pipeline.cli.simulation.simulated_tray import made_tacho, made_tray, measured_columns
+from pipeline.cli.simulation.summary import count_text, save, save_start, summary_of_file, summary_of_tray
 from pipeline.devices.measured_table import read_table
-from pipeline.devices.simulated_device import PlaybackCounts, PseudoTerminal, play, wait_for_reader
+from pipeline.devices.simulated_device import PlaybackCounts
 from pipeline.devices.table_device import TableDevice
 from pipeline.errors import UsageError, UserError
 from pipeline.recordings.simulated import record
-from pipeline.runtime.signals import stop_on_signals
 from schemas import wire
-from schemas.auxiliary import AUXILIARY
-from schemas.tacho import INSTANTANEOUS, Tacho
-from schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from schemas.tacho import INSTANTANEOUS
+from schemas.units import SpeedUnit
 
 if TYPE_CHECKING:
     from simulation.tray import SimulatedTray
-
-Summary = dict[str, Any]
-
-_TACHO_OPTIONS = {
-    "kind": "--tacho",
-    "pulses": "--pulses",
-    "window_s": "--window",
-    "update_s": "--update",
-    "delay_s": "--tacho-delay",
-}
 
 _LINE = "Serial line"
 _HWMON = "Fans of a computer instead"
 _RECORDING = "Write a recording instead"
 _FILE = "Play a measured file instead of simulating"
 _TACHO = "Tacho"
-_SURROUNDINGS = "Supply and air, of dc fans"
+_SURROUNDINGS = "Supply and air"
 _IMPERFECTIONS = "Imperfections of real trays"
 
 
@@ -166,6 +152,13 @@ def simulate(
             help="Relative standard deviation of the supply voltage, for example 0.05.", rich_help_panel=_SURROUNDINGS
         ),
     ] = 0.0,
+    supply_held: Annotated[
+        float,
+        typer.Option(
+            help="Share of it for which 4-pin fans make up: 1 if they control their speed, 0 if it follows the supply.",
+            rich_help_panel=_SURROUNDINGS,
+        ),
+    ] = 1.0,
     air_temperature: Annotated[
         float, typer.Option(help="Mean temperature of the air, °C.", rich_help_panel=_SURROUNDINGS)
     ] = 20.0,
@@ -251,25 +244,26 @@ def simulate(
         auxiliary = auxiliary_options(supply_voltage, current, temperature)
         table = read_table(from_csv, time or None, command or [], speed or [], period=period, auxiliary=auxiliary)
         device = TableDevice(table, from_s, to_s)
-        summary_of = partial(_summary_of_file, from_csv, device)
+        summary_of = partial(summary_of_file, from_csv, device)
     else:
         if time or period or command or speed or supply_voltage or current or temperature:
             raise UsageError("--time, --period and columns describe a file: name it with --from-csv FILE")
         tachos = tuple(
-            _tacho(kind=tacho, pulses=pulses, window_s=one, update_s=update, delay_s=tacho_delay)
+            made_tacho(kind=tacho, pulses=pulses, window_s=one, update_s=update, delay_s=tacho_delay)
             for one in window or [0.0]
         )
         if hwmon and tacho == "instantaneous":
             tachos = tachos_of(chip)
-        device = tray = _tray(
+        device = tray = made_tray(
             faults=fault or [],
             tachos=tachos,
             noise_rad_s=noise,
             shares={"missing_edges": missing_edges, "double_edges": double_edges, "missing_readings": missing},
             clock={"drift_ppm": drift_ppm, "start_us": clock_start_us},
             surroundings={
-                "measured": _measured(measure or []),
+                "measured": measured_columns(measure or []),
                 "supply_wander": supply_wander,
+                "supply_held": supply_held,
                 "temperature_c": air_temperature,
                 "temperature_swing_c": air_swing,
             },
@@ -284,9 +278,9 @@ def simulate(
             lost=lost,
             jitter_us=jitter_us,
         )
-        summary_of = partial(_summary_of_tray, tray)
+        summary_of = partial(summary_of_tray, tray)
     if hwmon and tray:
-        played = _serve_hwmon(tray, hwmon, chip, err=json_output)
+        played = serve_hwmon(tray, hwmon, chip, err=json_output)
     elif recording:
         if duration is None or link or wait:
             raise UsageError("--recording needs --duration, and excludes --link and --wait-for-reader")
@@ -297,157 +291,10 @@ def simulate(
         epoch_ns = clock.time_ns() if epoch_ns is None else epoch_ns
         played = record(device, recording, epoch_ns, duration, speed_unit, tachos)
     else:
-        _save(truth, summary_of(PlaybackCounts(), complete=False))
-        played = _serve_line(
-            device, link, protocol, speed_unit, partial(_save_start, truth, summary_of), wait=wait, err=json_output
+        save(truth, summary_of(PlaybackCounts(), complete=False))
+        played = serve_line(
+            device, link, protocol, speed_unit, partial(save_start, truth, summary_of), wait=wait, err=json_output
         )
     summary = summary_of(played, complete=True)
-    _save(truth, summary)
-    typer.echo(json.dumps(summary) if json_output else _count_text(played))
-
-
-def _serve_line(
-    device: SimulatedTray | TableDevice,
-    link: Path | None,
-    protocol: wire.Protocol,
-    speed_unit: SpeedUnit,
-    on_start: Callable[[int], None],
-    *,
-    wait: bool,
-    err: bool,
-) -> PlaybackCounts:
-    """Play the device on a pseudo-terminal. wait: for a reader. err: say on stderr where it is."""
-    stop = threading.Event()
-    stop_on_signals(stop)
-    line = PseudoTerminal(link)
-    try:
-        fans_on = "1 fan on" if device.fans == 1 else f"{device.fans} fans on"
-        typer.echo(f"{fans_on} {link or line.port}: {protocol}, speeds in {speed_unit}", err=err)
-        if wait:
-            wait_for_reader(line, protocol, stop)
-        return play(device, line, protocol, RAD_S_PER_UNIT[speed_unit], stop, on_start)
-    finally:
-        line.close()
-
-
-def _serve_hwmon(tray: SimulatedTray, root: Path, chip: str, *, err: bool) -> PlaybackCounts:
-    """Run the tray behind a tree of files until Ctrl-C. err: say where on stderr."""
-    stop = threading.Event()
-    stop_on_signals(stop)
-    tree = HwmonTree(root, chip, tray.fans)
-    try:
-        typer.echo(
-            f"{tray.fans} fans of {chip} in {root}; faults: echo tacho-stuck:fan=0 > {root / FAULT_FILE}", err=err
-        )
-        return play_hwmon(tray, tree, stop, InjectedFaults(tray, root).follow)
-    finally:
-        tree.close()
-
-
-def _tacho(**settings: Any) -> Tacho:
-    """The tacho with these settings; see `schemas.tacho.Tacho`.
-
-    Raises:
-        UsageError: they do not fit one another, or one is out of range.
-    """
-    try:
-        return Tacho(**settings)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = f"{_TACHO_OPTIONS[str(first['loc'][0])]} {first['input']}: " if first["loc"] else ""
-        text = first["msg"].removeprefix("Value error, ")
-        for field in ("window_s", "update_s"):
-            text = text.replace(field, _TACHO_OPTIONS[field])
-        raise UsageError(where + text) from error
-
-
-def _tray(
-    *,
-    faults: list[str],
-    tachos: tuple[Tacho, ...],
-    noise_rad_s: float,
-    shares: Mapping[str, float],
-    clock: Mapping[str, Any],
-    surroundings: Mapping[str, Any],
-    **settings: Any,
-) -> SimulatedTray:
-    """The tray with these settings; see `simulation.tray.TraySettings`.
-
-    Raises:
-        UsageError: a setting is out of range, or a fault cannot be parsed.
-    """
-    from simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
-    from simulation.faults import parse_fault  # noqa: PLC0415
-    from simulation.plant import DeviceClock  # noqa: PLC0415
-    from simulation.surroundings import Surroundings  # noqa: PLC0415
-    from simulation.tacho import NoisyTacho, TachoSettings  # noqa: PLC0415
-    from simulation.tray import SimulatedTray, TraySettings  # noqa: PLC0415
-
-    measured = TachoSettings(tachos, NoisyTacho(noise_rad_s), **shares)
-    try:
-        schedule = tuple(map(parse_fault, faults))
-        around, device_clock = Surroundings(**surroundings), DeviceClock(**clock)
-        return SimulatedTray(
-            TraySettings(faults=schedule, tacho=measured, clock=device_clock, surroundings=around, **settings)
-        )
-    except SimulationError as error:
-        raise UsageError(str(error)) from error
-
-
-def _measured(names: list[str]) -> tuple[str, ...]:
-    known = [column.name for column in AUXILIARY]
-    for name in names:
-        if name not in known:
-            raise UsageError(f"--measure {name}: known are {', '.join(known)}")
-    return tuple(name for name in known if name in names)
-
-
-def _counts(played: PlaybackCounts) -> Summary:
-    counts = asdict(played)
-    del counts["start_ns"]
-    return counts
-
-
-def _summary_of_tray(tray: SimulatedTray, played: PlaybackCounts, *, complete: bool) -> Summary:
-    from simulation.truth import truth  # noqa: PLC0415
-
-    return truth(tray, played.start_ns, complete=complete, counts=_counts(played))
-
-
-def _summary_of_file(path: Path, table: TableDevice, played: PlaybackCounts, *, complete: bool) -> Summary:
-    return {
-        "complete": complete,
-        "start_ns": played.start_ns,
-        **_counts(played),
-        "faults": [],
-        "fans": table.fans,
-        "file": str(path),
-    }
-
-
-def _save(path: Path | None, summary: Summary) -> None:
-    from simulation.truth import write_truth  # noqa: PLC0415
-
-    if path is None:
-        return
-    try:
-        write_truth(path, summary)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}; name another file with --truth") from error
-
-
-def _save_start(path: Path | None, summary_of: Callable[..., Summary], start_ns: int) -> None:
-    _save(path, summary_of(PlaybackCounts(start_ns=start_ns), complete=False))
-
-
-def _count_text(played: PlaybackCounts) -> str:
-    parts = [f"{played.samples_sent} samples sent"]
-    if played.samples_dropped:
-        parts.append(f"{played.samples_dropped} lost as simulated")
-    if played.samples_unsent:
-        parts.append(f"{played.samples_unsent} not sent because no program read the port, or too slowly")
-    if played.bytes_unread:
-        parts.append(f"the last {played.bytes_unread} bytes were not read")
-    if played.samples_late:
-        parts.append(f"{played.samples_late} sent late, by up to {played.worst_lateness_s * 1e3:.0f} ms")
-    return "; ".join(parts)
+    save(truth, summary)
+    typer.echo(json.dumps(summary) if json_output else count_text(played))

@@ -17,12 +17,14 @@ from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
+    IgnoreOption,
     Part,
     RecordingsArgument,
     ToOption,
     TrainingData,
     TrayOption,
     WindowOption,
+    ignored_columns,
     read_training_data,
     show_hints,
     twin_errors,
@@ -30,6 +32,7 @@ from pipeline.cli.twins.training_data import (
 
 if TYPE_CHECKING:
     from twin.fitting.identification import Identification
+    from twin.fitting.reference_choice import AtReference
     from twin.runs import Array
 
 UNITS = {
@@ -47,6 +50,7 @@ def identify(
     tray: TrayOption = None,
     fans: FansOption = None,
     window_s: WindowOption = None,
+    ignore: IgnoreOption = None,
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
     skip_bad: SkipBadOption = False,
@@ -55,32 +59,35 @@ def identify(
     """Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.
 
     Each has a 95 % interval. w is in rad/s and the command in its own unit, and so are the parameters: only their
-    ratios are mechanical quantities. A warning on stderr names what the recordings do not determine, and why.
+    ratios are mechanical quantities. Where supply voltage or temperature are recorded, they are the parameters at
+    reference values of these. A warning on stderr names what the recordings do not determine, and why.
 
     Example: fantwin identify REC.mcap --json
     """
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible("nothing was identified"), twin_errors():
-        from twin.fitting.identification import identify as identify_fans  # noqa: PLC0415  loads twin only when it is needed
+        from twin.fitting.reference_choice import identify_at_reference  # noqa: PLC0415  loads twin only when it is needed
 
-        part = Part(tray, fans, from_s, to_s, tuple(window_s or ()))
+        part = Part(tray, fans, from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
         with pool:
             training_data = read_training_data(recordings, part, pool)
         if not json_output:
             show_hints(training_data.hints)
         with training_progress(training_data) as start:
-            found = identify_fans(training_data.runs, progress=start(""))
+            found = identify_at_reference(training_data.runs, progress=start(""))
     result = as_json(found, training_data)
     if json_output:
         typer.echo(json.dumps(result | pool.as_json()))
     else:
         Console().print(_table(result))
+        if result["allows_for"]:
+            typer.echo(f"allows for {result['allows_for']}")
         for warning in result["warnings"]:
             typer.secho(f"warning: {warning}", fg=typer.colors.YELLOW, err=True)
     pool.end()
 
 
-def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any]:
+def as_json(at_reference: AtReference, training_data: TrainingData) -> dict[str, Any]:
     """The result as JSON fields; None where a figure is undefined.
 
     Rows and columns of covariance and correlation are in the order of `parameters`; those of a lag that was not found
@@ -88,6 +95,7 @@ def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any
     """
     from twin.models.physics import PARAMETER_NAMES  # noqa: PLC0415
 
+    found, conditions = at_reference.identification, at_reference.conditions
     fans = [
         {
             "fan": training_data.fans[fan],
@@ -107,7 +115,8 @@ def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any
         "units": {name: UNITS[name] for name in PARAMETER_NAMES},
         "speed_unit": training_data.speed_unit,
         "iterations": found.iterations,
-        "warnings": training_data.with_fan_numbers([*found.warnings, *found.misfits]),
+        "warnings": training_data.with_fan_numbers([*at_reference.notes, *found.warnings, *found.misfits]),
+        "allows_for": conditions.in_words if conditions else "",
         "hints": list(training_data.hints),
     }
 

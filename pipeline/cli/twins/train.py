@@ -18,6 +18,7 @@ from pipeline.cli.twins.figures import figures_in, sentence, shown
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
+    IgnoreOption,
     Part,
     RecordingsArgument,
     ToOption,
@@ -29,6 +30,7 @@ from pipeline.cli.twins.training_data import (
     WindowOption,
     check_writable,
     data_cards,
+    ignored_columns,
     read_held_out,
     read_training_data,
     show_hints,
@@ -79,6 +81,7 @@ def train(
     tray: TrayOption = None,
     fans: FansOption = None,
     window_s: WindowOption = None,
+    ignore: IgnoreOption = None,
     name: Annotated[str | None, typer.Option(help="Name of the twin. Default: the name of the file.")] = None,
     seed: Annotated[int, typer.Option(help="The same seed and recordings give the same twin.")] = 0,
     trainer: Annotated[Trainer, typer.Option(help="adam is the published one.")] = "levenberg-marquardt",
@@ -125,7 +128,7 @@ def train(
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible(not_written), twin_errors():
         check_writable(output, ".onnx")
-        part = Part(tray, fans, from_s, to_s, tuple(window_s or ()))
+        part = Part(tray, fans, from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
         validation_part = replace(part, from_s=validate_from_s, to_s=validate_to_s)
         with pool:
             training_data = read_training_data(recordings, part, pool)

@@ -22,7 +22,8 @@ from pipeline.errors import UsageError, UserError
 from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.checksum import sha256_of
 from pipeline.recordings.remote import matching, recording_path
-from pipeline.recordings.runs import RecordedTray, read_runs
+from pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
+from schemas.auxiliary import AUXILIARY
 from schemas.tacho import Tacho
 
 if TYPE_CHECKING:
@@ -50,6 +51,14 @@ WindowOption: TypeAlias = Annotated[
         metavar="S",
         help="Seconds over which tachos count two pulses a revolution, in place of what the recordings say: one for "
         "all fans, or one for each. Repeatable.",
+    ),
+]
+IgnoreOption: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--ignore",
+        metavar="COLUMN",
+        help="Do not use this column, because it is bad: supply_voltage_v or temperature_c. Repeatable.",
     ),
 ]
 ValidateOption: TypeAlias = Annotated[
@@ -130,13 +139,15 @@ def _rounded(value: float) -> str:
 
 @dataclass(frozen=True)
 class Part:
-    """Which part of each recording is read; see the options. windows_s: of tachos, in place of the recordings' own."""
+    """Which part of each recording is read; see the options. windows_s: of tachos, in place of the recordings' own.
+    ignored: columns beside command and speed that are left out."""
 
     tray: str | None = None
     fans: str | None = None
     from_s: float = 0.0
     to_s: float = math.inf
     windows_s: tuple[float, ...] = ()
+    ignored: tuple[str, ...] = ()
 
 
 def read_training_data(recordings: Sequence[Path], part: Part, pool: RecordingsInParallel) -> TrainingData:
@@ -161,6 +172,7 @@ def report_damage(data: TrainingData) -> None:
 def read_recording_data(path: Path, part: Part) -> TrainingData:
     """The runs of one recording. Raises as `read_training_data`."""
     found = read_runs(path, part.tray, fan_numbers(part.fans), part.from_s, part.to_s)
+    found = replace(found, runs=tuple(_without(run, part.ignored) for run in found.runs))
     data = training_data_of(found, part.fans, part.windows_s)
     longest, tacho = max(
         ((run, run_data.tacho) for run, run_data in zip(found.runs, data.runs, strict=True)),
@@ -168,6 +180,23 @@ def read_recording_data(path: Path, part: Part) -> TrainingData:
     )
     hints = tacho_hints(longest.t_s, longest.speed_rad_s, tacho, data.fans)
     return replace(data, hints=tuple(hints), sha256={path: sha256_of(path)})
+
+
+def ignored_columns(names: Sequence[str] | None) -> tuple[str, ...]:
+    """The columns beside command and speed that are to be left out.
+
+    Raises:
+        UsageError: one is not known.
+    """
+    known = [column.name for column in AUXILIARY]
+    for name in names or ():
+        if name not in known:
+            raise UsageError(f"--ignore {name}: known are {', '.join(known)}")
+    return tuple(names or ())
+
+
+def _without(run: RecordedRun, ignored: Sequence[str]) -> RecordedRun:
+    return replace(run, auxiliary={name: of for name, of in run.auxiliary.items() if name not in ignored})
 
 
 def training_data_of(found: RecordedTray, fans: str | None = None, windows_s: Sequence[float] = ()) -> TrainingData:

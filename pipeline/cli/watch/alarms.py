@@ -23,7 +23,7 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.cli.watch.request import ask
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
-from pipeline.config.roles import OPERATOR
+from pipeline.config.roles import OPERATOR, roles_of
 from pipeline.errors import UsageError, UserError
 from pipeline.launch.judged_fans import JudgedChanges, JudgedFans, Unjudged, as_judged
 from pipeline.launch.processes import process_list
@@ -32,7 +32,8 @@ from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.launch.stage_notes import note_lines
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
-from schemas.messages import Action, Alarm, Diagnosis, Request, Severity, Transition, newest_t_ns
+from schemas.enums import Action, Severity, Transition
+from schemas.messages import Alarm, Diagnosis, Request, newest_t_ns
 from schemas.topics import alive_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
@@ -117,7 +118,7 @@ def alarms(
     )
     stop_on_signals(stop)
     with join_bus(settings, stop, listens=False, roles=(OPERATOR,)) as bus:
-        watcher = SiteWatcher(bus, settings.site)
+        watcher = SiteWatcher(bus, settings.site, roles_of(settings))
         wait_for_stages(bus, watcher, settings, stop, tray=name)
         fans = set(range(settings.tray(name).fans)) if number < 0 else {number}
         answers = ask(bus, settings.site, name, request, fans, timeout_s, stop, watcher)
@@ -128,7 +129,7 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
     key = tray_key(config.site, "*", "alarm")
     news: queue.Queue[Alarm] = queue.Queue()
     bus.subscribe(key, lambda its_key, payload: _decoded(config.site, its_key, payload, news.put))
-    watcher = SiteWatcher(bus, config.site)
+    watcher = SiteWatcher(bus, config.site, roles_of(config))
     judged = JudgedFans(bus, config.site, config.trays, watcher)
     wait_for_stages(bus, watcher, config, stop)
     known: list[Alarm] = []

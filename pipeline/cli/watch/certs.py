@@ -257,7 +257,7 @@ def _show(request: _Request, *, json_output: bool) -> None:
         for each in found:
             known = roles.get(each.role)
             about = "authority of the site" if each.is_authority else known.about if known else "no role of this site"
-            row = (each.role, f"{each.not_after:%Y-%m-%d}", str((each.not_after - now).days), about)
+            row = (each.role, f"{each.not_after:%Y-%m-%d}", str((each.not_after.date() - now.date()).days), about)
             table.add_row(*row, *([" ".join(each.hosts)] if request.roles else []))
         Console().print(table)
         for each in found:

@@ -10,7 +10,7 @@ import typer
 
 from pipeline.bus.session import join_bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of, share_note
+from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of, require_commandable, share_note
 from pipeline.config.loading import load_config
 from pipeline.config.roles import OPERATOR
 from pipeline.runtime.signals import stop_on_signals
@@ -38,6 +38,7 @@ def command(
     """
     settings = load_config(config, overrides or (), stages=())
     chosen = chosen_tray(settings, tray)
+    require_commandable(chosen, "")
     number, value = fan
     message = command_of(chosen, {number: value}, is_set_point=set_point)
     stop = threading.Event()

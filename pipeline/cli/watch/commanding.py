@@ -16,7 +16,9 @@ from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UsageError, UserError
 from pipeline.runtime.tray_acquisition import TrayAcquisition
 from schemas.codec import encode, type_name
-from schemas.messages import Command, Header, Health
+from schemas.header import Header
+from schemas.health import Health
+from schemas.messages import Command
 from schemas.topics import BY_NAME, tray_key
 from schemas.units import RAD_S_PER_UNIT
 
@@ -78,6 +80,16 @@ def share_note(tray: TrayConfig, command: float) -> str:
     return f"note: commands of tray {tray.name} go from {low:g} to {high:g}, and {command:g} was sent; {share}"
 
 
+def require_commandable(tray: TrayConfig, instead: str) -> None:
+    """Refuse a tray that takes no commands. instead: what to do, after a colon; may be empty.
+
+    Raises:
+        UserError: it takes none.
+    """
+    if reason := tray.source.why_no_commands:
+        raise UserError(f"tray {tray.name} takes no commands, {reason}{': ' * bool(instead)}{instead}")
+
+
 class CommandSender:
     """Sends commands to one tray."""
 
@@ -116,8 +128,9 @@ class CommandSender:
         after, before = self._wait(self._received), self._before
         is_same = before is not None and after.header.producer == before.header.producer
         if _not_sent(after) > (_not_sent(before) if before and is_same else 0):
-            reason = after.problem or "it was refused"
-            raise UserError(f"tray {self._tray}: acquisition could not send the command: {reason}")
+            known = before.notes if before and is_same else ()
+            reasons = "; ".join(note.text for note in after.notes if note.tray == self._tray and note not in known)
+            raise UserError(f"tray {self._tray}: {reasons or 'the command was not sent'}")
 
     def _received(self) -> Health | None:
         health, sent = self._acquisition.health(), self._publisher.published

@@ -19,6 +19,7 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.cli.progress import EXIT_INTERRUPTED
 from pipeline.cli.twins.training_data import check_writable, twin_errors
 from pipeline.cli.watch.child_commands import Commands, Stopped
+from pipeline.cli.watch.commanding import require_commandable
 from pipeline.cli.watch.commissioning import Commissioning, Plan, TrayWork
 from pipeline.cli.watch.doctor import running_sessions
 from pipeline.cli.watch.sweep import range_within
@@ -158,6 +159,7 @@ def _refuse_wrong_range(
     if tray.command_min == tray.command_max:
         raise UserError(f"{path}: command_min and command_max of tray {tray.name} are equal: no twin can be made")
     if sweep:
+        require_commandable(tray, "leave out --sweep, and let the fans' own controller vary their commands meanwhile")
         range_within(tray, low, high, safe)
     elif given := [name for name, value in (("--low", low), ("--high", high), ("--safe", safe)) if value is not None]:
         raise UsageError(f"{given[0]} needs --sweep, which moves the fans: add --sweep")

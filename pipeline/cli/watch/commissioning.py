@@ -187,10 +187,11 @@ class Commissioning:
     def _drop_unmoved(self, missing: dict[str, list[str]], waited_s: float) -> None:
         for work in self.left:
             if lacks := missing.get(work.name):
+                move = "let their own controller vary the commands" if work.tray.source.why_no_commands else "--sweep"
                 self._fail(
                     work,
-                    f"in {waited_s / 3600:.3g} h its fans have not moved enough ({'; '.join(lacks)}): move them with "
-                    "--sweep, or wait longer with --at-most-hours",
+                    f"in {waited_s / 3600:.3g} h its fans have not moved enough ({'; '.join(lacks)}): move them "
+                    f"({move}), or wait longer with --at-most-hours",
                 )
 
     def _learn(self, work: TrayWork) -> None:

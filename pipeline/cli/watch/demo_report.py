@@ -12,7 +12,8 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.recordings.reading import read_recording
-from schemas.messages import Alarm, Array, Grid, Raw, Score, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Array, Grid, Raw, Score
 from schemas.units import NS_PER_S
 
 SETTLING_NS = 5 * NS_PER_S  # an alarm is attributed to a fault until the fan has settled after its end

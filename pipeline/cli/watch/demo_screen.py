@@ -10,10 +10,12 @@ from rich.text import Text
 from pipeline.bus.session import Bus
 from pipeline.cli.watch.status import stage_table
 from pipeline.config.models import Config
+from pipeline.config.roles import roles_of
 from pipeline.launch.judged_fans import JudgedFans
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import decode
-from schemas.messages import FanState, InvalidReason, Score
+from schemas.enums import FanState, InvalidReason
+from schemas.messages import Score
 from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT
 
@@ -27,7 +29,7 @@ class DemoScreen:
     def __init__(self, config: Config, bus: Bus) -> None:
         self._config = config
         self._tray = config.trays[0]
-        self._watcher = SiteWatcher(bus, config.site)
+        self._watcher = SiteWatcher(bus, config.site, roles_of(config))
         self._judged = JudgedFans(bus, config.site, config.trays, self._watcher)
         self._score: Score | None = None
         bus.subscribe(tray_key(config.site, self._tray.name, "score"), self._on_score)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -31,7 +32,8 @@ def discover(
 ) -> None:
     """List the fans and serial ports of this computer, with a configuration to paste for each, and what is missing.
 
-    It writes nothing to a device. Exit code 1 if nothing can be watched.
+    It writes nothing to a device. --write leaves out serial ports, since what is connected there is a guess, and never
+    changes a file that is there. Exit code 1 if nothing can be watched.
 
     Example: fantwin discover --write fantwin.toml
     """
@@ -47,8 +49,8 @@ def discover(
         for each in found:
             _show(each)
     if write:
-        _write(write, [each for each in found if each.kind == "hwmon" and each.tray])
-        typer.echo(f"written: {write}; next: fantwin doctor -c {write}", err=json_output)
+        for line in _written(write, found):
+            typer.echo(line, err=json_output)
     if not any(each.tray for each in found):
         raise typer.Exit(1)
 
@@ -62,14 +64,47 @@ def _show(found: Found) -> None:
         console.print(f"{found.kind}: {found.title}: {line}", markup=False)
 
 
-def _write(path: Path, found: Iterable[Found]) -> None:
-    trays = [each.toml for each in found]
-    if not trays:
+def _written(path: Path, found: Sequence[Found]) -> list[str]:
+    """Write the hwmon chips into a new file; what was done, and what was left out. A file that is there is not touched.
+
+    Raises:
+        UserError: there is no chip to watch, the file cannot be written, or is there and lacks a chip.
+    """
+    chips = [each for each in found if each.kind == "hwmon" and each.tray]
+    if not chips:
         raise UserError(f"{path}: not written: no hwmon chip has a fan to watch")
     try:
         with path.open("x", encoding="utf-8") as file:
-            file.write("\n".join(['site = "site"\n', *trays]))
-    except FileExistsError as error:
-        raise UserError(f"{path}: exists; name a new file, or paste what is shown") from error
+            file.write("\n".join(['site = "site"\n', *(each.toml for each in chips)]))
+    except FileExistsError:
+        if lacking := [str(each.tray["name"]) for each in chips if _chip(each.tray) not in _chips_in(path)]:
+            raise UserError(
+                f"{path}: exists, and was left as it is; it lacks {', '.join(lacking)}: paste what is shown, or name a "
+                "new file"
+            ) from None
+        return [f"{path}: exists, has all hwmon chips with fans, and was left as it is"]
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}; name another file") from error
+    left_out = [f"left out: {each.title}: {_why_left_out(each)}" for each in found if each not in chips]
+    return [*left_out, f"written: {path}; next: fantwin doctor -c {path}"]
+
+
+def _why_left_out(found: Found) -> str:
+    if found.tray:
+        return "what is connected there is not known; paste its [[tray]] if it is to be watched"
+    return found.missing[0] if found.missing else "it cannot be watched"
+
+
+def _chip(tray: Mapping[str, Any]) -> tuple[str, ...]:
+    """Which chip a [[tray]] has: its name, its device where several have this name, and its root; empty if none."""
+    source = tray.get("source")
+    return tuple(str(source.get(key, "")) for key in ("chip", "device", "root")) if isinstance(source, Mapping) else ()
+
+
+def _chips_in(path: Path) -> set[tuple[str, ...]]:
+    """Those of the trays in a configuration; empty if it is none."""
+    try:
+        trays = tomllib.loads(path.read_text(encoding="utf-8")).get("tray", [])
+    except (OSError, ValueError):
+        return set()
+    return {_chip(tray) for tray in trays if isinstance(tray, Mapping)} if isinstance(trays, list) else set()

@@ -20,10 +20,10 @@ from rich.console import Console
 from pipeline.bus.access_rules import SiteRoles
 from pipeline.bus.certificates import of_role
 from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
-from pipeline.bus.errors import BusError
+from pipeline.bus.errors import BusError, NoAnswerError
 from pipeline.bus.session import credentials_of, join_bus
 from pipeline.cli.exposure import exposure_problem, is_exposed
-from pipeline.cli.options import JsonOption, SetOption
+from pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from pipeline.cli.watch.line_check import check_line
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, ConfigError
@@ -37,13 +37,17 @@ from pipeline.runtime.stage import Context, load_stage
 from schemas.topics import sessions_key
 
 _DEVELOPMENT_EXTRAS = {"dev", "bench"}  # used by tests and benches only
+_NOT_GRANTED = "the router does not grant it the rights of its role: restart it with this configuration"
 _MIN_FREE_BYTES = 1 << 30
 _LOOKS = 4
 """for the sessions of a site, GOSSIP_S apart"""
 
 
 def doctor(
-    config: Annotated[Path | None, typer.Option("-c", "--config", help="Also check this configuration.")] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option("-c", "--config", help=f"The configuration to check. Default: {DEFAULT_CONFIG}, if it is here."),
+    ] = None,
     overrides: SetOption = None,
     json_output: JsonOption = False,
     listen_s: Annotated[
@@ -54,7 +58,7 @@ def doctor(
         typer.Option("--tray", metavar="NAME", help="Check only the source and the line of this tray. Repeatable."),
     ] = None,
 ) -> None:
-    """Check the installation, and a configuration if one is given.
+    """Check the installation, and a configuration: fantwin.toml in this folder unless another is given.
 
     It listens to the line of each tray and names what does not fit: rate, commands, speeds, fans, unit, tachos.
 
@@ -83,8 +87,10 @@ def _findings(
     """(in order or not, one line) for each check. trays: those whose lines are checked; empty for all."""
     yield True, f"Python {sys.version.split()[0]}"
     yield from _check_packages()
-    if config is None:
+    if config is None and not DEFAULT_CONFIG.exists():
+        yield True, f"no {DEFAULT_CONFIG} in this folder, and none given with -c: only the installation was checked"
         return
+    config = config or DEFAULT_CONFIG
     try:
         settings = load_config(config, overrides or ())
         lines = {settings.tray(name).name for name in trays} or {tray.name for tray in settings.trays}
@@ -154,6 +160,8 @@ def _check_bus(settings: Config, running: list[Session]) -> Iterator[tuple[bool,
             running += running_sessions(settings)
             site = f"site {settings.site!r} runs there" if running else "fantwin answers there"
             yield True, f"bus.endpoint {endpoint}: {site}"
+        except NoAnswerError as error:
+            yield False, str(error)
         except BusError:
             yield False, foreign_program(endpoint, is_secure=config.security is not None)
 
@@ -173,23 +181,38 @@ def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:
     ]
     if not here:
         yield False, f"{security.certificate}: no certificate of any role here: `fantwin certs issue` makes them"
+    problems: list[tuple[str, str]] = []
     for role in here:
         try:
             credentials = credentials_of(settings.bus, (role,))
             assert credentials
             if warning := credentials.warning():
-                yield False, warning
+                problems.append((role, warning))
             elif credentials.role not in site.roles:
-                yield False, f"{credentials.certificate}: {credentials.role!r} is no role of this configuration"
+                problems.append(
+                    (role, f"{credentials.certificate}: {credentials.role!r} is no role of this configuration")
+                )
             elif answers:
                 with join_bus(settings, listens=False, roles=(role,)) as bus:
                     is_granted = bus.has_all_rights_of_its_role(site)
-                restart = "the router does not grant it the rights of its role: restart it with this configuration"
-                yield is_granted, f"certificate of {role}: {'the router grants its rights' if is_granted else restart}"
+                if is_granted:
+                    yield True, f"certificate of {role}: the router grants its rights"
+                else:
+                    problems.append((role, f"certificate of {role}: {_NOT_GRANTED}"))
             else:
                 yield True, f"certificate of {role}: until {credentials.own.not_after:%Y-%m-%d}"
         except BusError as error:
-            yield False, str(error)
+            problems.append((role, str(error)))
+    yield from ((False, line) for line in _of_roles_together(problems))
+
+
+def _of_roles_together(problems: Sequence[tuple[str, str]]) -> Iterator[str]:
+    """One line for roles whose lines differ in the name of the role only."""
+    alike: dict[str, dict[str, str]] = {}
+    for role, line in problems:
+        alike.setdefault(re.sub(rf"\b{re.escape(role)}\b", "ROLE", line), {})[role] = line
+    for line, by_role in alike.items():
+        yield f"{line} (ROLE: {', '.join(by_role)})" if len(by_role) > 1 else next(iter(by_role.values()))
 
 
 def running_sessions(settings: Config) -> list[Session]:
@@ -207,6 +230,8 @@ def _check_stages(
     config: Config, running: Sequence[Session], listen_s: float, lines: Collection[str]
 ) -> Iterator[tuple[bool, str]]:
     """lines: the trays whose devices are checked."""
+    found: dict[str, list[str]] = {}
+    """processes by problem"""
     for row in process_list(config):
         ours = Session.of_this_process(row.stage, row.shard, 0, "")
         session = next((s for s in running if s.stage == row.stage and s.shares_a_tray_with(ours)), None)
@@ -232,12 +257,14 @@ def _check_stages(
             for group in groups
         ]
         problems = [problem for context in contexts for problem in stage.check(context)]
-        yield from ((False, f"{row.label}: {problem}") for problem in problems)
+        for problem in dict.fromkeys(problems):
+            found.setdefault(problem, []).append(row.label)
         if not problems:
             yield True, f"{row.label}: {_runs_already(session, row.label) if session else 'can start'}"
         if row.stage == "acquisition" and listen_s and not problems:
             for context in contexts:
                 yield from check_line(context, config, listen_s, is_running=session is not None)
+    yield from ((False, f"{', '.join(labels)}: {problem}") for problem, labels in found.items())
 
 
 def _runs_already(session: Session, label: str) -> str:

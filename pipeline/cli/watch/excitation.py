@@ -114,6 +114,7 @@ class Excitation:
         """The longer one of each fan, of a step up and one down over the whole range."""
         found = np.full((2, len(self.fans)), np.nan)
         self._settle(self.low, "to the lowest command")
+        self._say_which_read_0()
         for row, (command, words) in enumerate(((self.high, "up"), (self.low, "down"))):
             found[row] = self._settle(command, f"{words}, to measure the time constants")
         slowest_s = np.where(np.isfinite(found), found, -np.inf).max(axis=0)
@@ -126,6 +127,13 @@ class Excitation:
                 f"no fan follows its command from {self.low:g} to {self.high:g}: do the fans have power and a tacho?"
             )
         return constants
+
+    def _say_which_read_0(self) -> None:
+        """At a lowest command at which fans are to turn."""
+        speeds = self.line.observed().speed_rad_s[:, self.fans]
+        for fan, speed_rad_s in zip(self.fans, speeds[-1] if len(speeds) else (), strict=False):
+            if speed_rad_s == 0.0 and self.low > 0.0:
+                self.progress(f"fan {fan} reads 0 at command {self.low:g}; if it stands, give a higher --low")
 
     def _settle(self, command: float, words: str) -> Array:
         """Send a command and wait until all speeds have settled. Returns the time constants, (fans,)."""

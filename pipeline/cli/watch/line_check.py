@@ -25,6 +25,7 @@ from schemas.codec import CodecError, decode
 from schemas.messages import Array, Raw
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
+from schemas.wire import DEVICE_COUNTERS
 
 FIRST_SAMPLE_S = 6.0
 """a microcontroller restarts when its port is opened, and sends its first sample after some seconds"""
@@ -94,7 +95,8 @@ def refusal(counters: Mapping[str, int]) -> str:
     return f"{refused} of the inputs cannot be used: {named}; see docs/reference/wire-protocol.md"
 
 
-_NOT_NAMED = {"bytes", "samples", "line_up", "line_down", "no_speed", "refused_input"}
+_OF_THE_DEVICE = {f"device_{name}" for name in DEVICE_COUNTERS}
+_NOT_NAMED = {"bytes", "samples", "line_up", "line_down", "no_speed", "refused_input", "unknown_type", *_OF_THE_DEVICE}
 _OF_A_SETTING = ("absurd_command", "absurd_speed")
 _DISTURBED_SHARE = 0.01
 """of the samples: so many lines may be cut or garbled"""

@@ -12,7 +12,8 @@ from pipeline.bus.session import Bus
 from pipeline.errors import UserError
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode, encode, type_name
-from schemas.messages import Alarm, Header, Request
+from schemas.header import Header
+from schemas.messages import Alarm, Request
 from schemas.topics import BY_NAME, tray_key
 
 _POLL_S = 0.05
@@ -50,7 +51,8 @@ def ask(
         if time.monotonic() > until_s or stop.is_set():
             missing = ", ".join(map(str, sorted(fans - set(answers))))
             raise UserError(
-                f"tray {tray}: no answer for fan {missing} within {timeout_s:g} s: does a scorer run for this tray?"
+                f"tray {tray}: no answer for fan {missing} within {timeout_s:g} s: nothing watches its alarms now, "
+                "for example because it has no twin yet: see `fantwin status`"
             )
         try:
             alarm = decode(Alarm, received.get(timeout=_POLL_S))

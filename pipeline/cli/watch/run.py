@@ -24,7 +24,7 @@ from pipeline.runtime.notifier import starting
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.signals import set_when_stdin_closes, stop_on_signals
 from pipeline.runtime.stage import load_stage
-from schemas.messages import Health
+from schemas.health import Health
 from schemas.streams import LOSS_PREFIX
 from schemas.topics import stage_label
 

@@ -21,7 +21,7 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
-from pipeline.config.roles import READERS, role_names
+from pipeline.config.roles import READERS, role_names, roles_of
 from pipeline.config.shards import chosen_shard
 from pipeline.errors import UsageError, UserError
 from pipeline.launch.judged_fans import JudgedFans, Unjudged, as_judged
@@ -31,7 +31,7 @@ from pipeline.launch.site_state import AT_WORK, StageState, Word, site_states
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.launch.stage_notes import note_lines, notes_as_json
 from pipeline.runtime.signals import stop_on_signals
-from schemas.messages import Severity
+from schemas.enums import Severity
 from schemas.streams import LOSS_PREFIX
 from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S
@@ -84,7 +84,7 @@ def status(
         raise UsageError("--trays and --shard need --stage: which process?")
     with join_bus(settings, listens=False) as bus:
         of_bus = _bus_lines(bus)
-        watcher = SiteWatcher(bus, settings.site)
+        watcher = SiteWatcher(bus, settings.site, roles_of(settings))
         judged = JudgedFans(bus, settings.site, settings.trays, watcher)
         if once or json_output or not sys.stdout.isatty():
             _listen(watcher, settings, judged, stop)
@@ -116,7 +116,7 @@ def _process(config: Config, stage: str, trays: str | None, shard: str | None) -
 def _probe(config: Config, process: StageProcess, stop: threading.Event, *, json_output: bool) -> None:
     """Say whether one process is at work: as soon as it is known, or when it has not been heard for long enough."""
     with join_bus(config, listens=False, roles=(*READERS, *role_names(process.stage, process.shard))) as bus:
-        watcher = SiteWatcher(bus, config.site)
+        watcher = SiteWatcher(bus, config.site, roles_of(config))
         until_s = time.monotonic() + _LISTEN_MAX_S
         while True:
             watcher.ask_for_health(process.stage, process.instance)

@@ -15,7 +15,13 @@ import typer
 
 from pipeline.bus.session import Bus, join_bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of, require_within_limits
+from pipeline.cli.watch.commanding import (
+    CommandSender,
+    chosen_tray,
+    command_of,
+    require_commandable,
+    require_within_limits,
+)
 from pipeline.cli.watch.excitation import Excitation, Observed, StoppedError
 from pipeline.config.loading import load_config
 from pipeline.config.models import TrayConfig
@@ -28,13 +34,18 @@ from schemas.topics import sweep_key, tray_key
 from schemas.units import NS_PER_S
 
 _FIRST_SAMPLE_S = 5.0
+LEAST_SHARE = 0.2
+"""of the range: 4-pin fans turn there, though some no slower than at 30 %"""
 
 
 def sweep(
     config: ConfigOption = DEFAULT_CONFIG,
     tray: Annotated[str | None, typer.Option(help="The tray; required if there are several.")] = None,
     fans: Annotated[str, typer.Option(metavar="all|N,N,...", help="The fans that are moved.")] = "all",
-    low: Annotated[float | None, typer.Option(help="Lowest command; without it command_min of the tray.")] = None,
+    low: Annotated[
+        float | None,
+        typer.Option(help="Lowest command; without it a fifth of the tray's range, where healthy fans keep turning."),
+    ] = None,
     high: Annotated[float | None, typer.Option(help="Highest command; without it command_max of the tray.")] = None,
     safe: Annotated[
         float | None,
@@ -55,6 +66,7 @@ def sweep(
     """
     settings = load_config(config, overrides or (), stages=())
     chosen = chosen_tray(settings, tray)
+    require_commandable(chosen, "run `fantwin up` while the fans' own controller varies their commands; it is recorded")
     numbers = _fans(fans, chosen)
     lowest, highest = range_within(chosen, low, high, safe)
     stop = threading.Event()
@@ -76,6 +88,8 @@ def sweep(
         at_end = {fan: float(before[fan]) if safe is None else safe for fan in numbers}
         left_at = ", ".join(f"fan {fan} {value:g}" for fan, value in at_end.items())
         progress(_range_in_words(chosen, lowest, highest))
+        if low is None and lowest > chosen.command_min:
+            progress(f"without --low no fan is to stop; --low {chosen.command_min:g} moves them over the whole range")
         progress(f"at the end and after Ctrl-C the fans get these commands: {left_at}")
         is_stopped, constants_s = False, dict[int, float]()
         try:
@@ -102,18 +116,28 @@ def sweep(
 
 
 def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: float | None) -> tuple[float, float]:
-    """The commands of a sweep, lowest and highest: the limits of the tray where none is given.
+    """The commands of a sweep, lowest and highest.
+
+    Without --low no fan is to stop, which may be cooling something: the lowest is a fifth of the range of the tray. A
+    tray that turns its fans both ways has no such command, and is swept from its lowest. Without --high it is
+    command_max.
 
     Raises:
         UsageError: one of them, or the safe command, is outside those limits.
     """
-    lowest, highest = tray.command_min if low is None else low, tray.command_max if high is None else high
+    lowest, highest = lowest_turning(tray) if low is None else low, tray.command_max if high is None else high
     if not tray.command_min <= lowest < highest <= tray.command_max:
         limits = f"{tray.command_min:g} to {tray.command_max:g}"
         raise UsageError(f"--low {lowest:g} --high {highest:g}: name a range within {limits} of tray {tray.name}")
     if safe is not None:
         require_within_limits(tray, safe, "--safe")
     return lowest, highest
+
+
+def lowest_turning(tray: TrayConfig) -> float:
+    """The command of a tray at which healthy fans keep turning, as far as can be said without asking them."""
+    both_ways = tray.command_min < 0.0
+    return tray.command_min if both_ways else tray.command_min + LEAST_SHARE * (tray.command_max - tray.command_min)
 
 
 def _range_in_words(tray: TrayConfig, lowest: float, highest: float) -> str:

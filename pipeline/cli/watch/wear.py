@@ -20,6 +20,7 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.cli.progress import working
 from pipeline.cli.watch.alarms import wait_for_stages
 from pipeline.config.loading import load_config
+from pipeline.config.roles import roles_of
 from pipeline.errors import UserError
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.dates import format_local, has_date
@@ -63,7 +64,7 @@ def wear(
         stop = threading.Event()
         stop_on_signals(stop)
         with join_bus(settings, stop, listens=False) as bus:
-            watcher = SiteWatcher(bus, settings.site)
+            watcher = SiteWatcher(bus, settings.site, roles_of(settings))
             wait_for_stages(bus, watcher, settings, stop, what="wear")
             answers = bus.recover(tray_key(settings.site, "*", "snapshot"))
             snapshots = [

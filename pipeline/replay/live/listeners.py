@@ -16,7 +16,7 @@ from pipeline.replay.stage_chain import replay_starts
 from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.sessions import Sessions
 from pipeline.runtime.stage import Stage, load_stage
-from schemas.messages import Health
+from schemas.health import Health
 from schemas.streams import StreamId, input_streams, output_streams
 from schemas.topics import ALL_TRAYS, BY_NAME, alive_key, sessions_key, stage_label
 

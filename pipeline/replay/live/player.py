@@ -10,8 +10,9 @@ from typing import Protocol
 
 from pipeline.replay.live.keyboard import Key
 from pipeline.replay.live.pace import Pace, faster, slower
+from schemas.enums import StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import NewTwin, Raw, StageStatus
+from schemas.messages import NewTwin, Raw
 from schemas.topics import BY_NAME, TOPICS
 
 BEAT_S = 0.05

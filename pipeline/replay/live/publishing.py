@@ -18,7 +18,7 @@ from pipeline.replay.live.player import Player, Progress, RealTime, Stopped
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from pipeline.replay.live.sender import Sender
 from pipeline.replay.resolve_config import trays_of
-from schemas.messages import StageStatus
+from schemas.enums import StageStatus
 from schemas.topics import BY_NAME
 from schemas.units import NS_PER_S
 

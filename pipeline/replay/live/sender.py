@@ -14,8 +14,11 @@ from pipeline.errors import UserError
 from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.health import HealthBuilder
 from schemas.codec import encode, type_name
+from schemas.enums import StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import Clock, Header, Message, Output, StageStatus
+from schemas.header import Header
+from schemas.health import Output
+from schemas.messages import Clock, Message
 from schemas.topics import ALL_TRAYS, BY_NAME, alive_key, health_key, tray_key, tray_of
 
 

@@ -22,7 +22,8 @@ from pipeline.replay.offline.sample_stream import SampleStream
 from pipeline.replay.stage_chain import StageChain
 from pipeline.runtime.stage import Context, Core, Stage
 from schemas.blocks import cut
-from schemas.messages import Header, Message, NewTwin, Prediction, Request, ScorerSnapshot
+from schemas.header import Header
+from schemas.messages import Message, NewTwin, Prediction, Request, ScorerSnapshot
 from schemas.messages import newest_t_ns as message_t_ns
 from schemas.topics import BY_NAME
 

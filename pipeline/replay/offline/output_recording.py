@@ -15,7 +15,8 @@ from pipeline.recordings.records import active_path
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.offline.replay_input import ReplayInput
 from schemas.blocks import cut
-from schemas.messages import Grid, Header, Message, Prediction, Raw, Request, Score, newest_t_ns
+from schemas.header import Header
+from schemas.messages import Grid, Message, Prediction, Raw, Request, Score, newest_t_ns
 from schemas.topics import TOPICS, tray_key
 
 MESSAGE_SAMPLES = 100

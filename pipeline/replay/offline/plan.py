@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from pipeline.replay.stage_chain import StageChain
-from schemas.messages import InputPosition, ModelCard, Request, ScorerSnapshot
+from schemas.header import InputPosition
+from schemas.messages import ModelCard, Request, ScorerSnapshot
 
 BEGINNING = -(2**63)
 RAW_MISSING = "{raw_missing}"

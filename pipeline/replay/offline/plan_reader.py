@@ -14,18 +14,8 @@ from pipeline.replay.stage_chain import StageChain
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header
-from schemas.messages import (
-    Alarm,
-    Consumed,
-    Grid,
-    InputPosition,
-    Message,
-    ModelCard,
-    Prediction,
-    Request,
-    Score,
-    ScorerSnapshot,
-)
+from schemas.header import InputPosition
+from schemas.messages import Alarm, Consumed, Grid, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
 from schemas.streams import continues
 
 _NEVER_REACHED = "raw messages never reached {}, and the recording does not say which"

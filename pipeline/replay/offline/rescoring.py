@@ -18,7 +18,9 @@ from pipeline.replay.offline.plan import RAW_MISSING, TrayPlan, undisturbed_plan
 from pipeline.replay.offline.replay_input import ReplayInput
 from pipeline.replay.offline.verify import TrayVerifier
 from schemas.codec import CodecError
-from schemas.messages import Alarm, Header, InvalidReason, Message, Score, ScorerSnapshot
+from schemas.enums import InvalidReason
+from schemas.header import Header
+from schemas.messages import Alarm, Message, Score, ScorerSnapshot
 from schemas.streams import LOSS_PREFIX
 from schemas.units import NS_PER_S
 

@@ -18,10 +18,11 @@ from pipeline.replay.offline.compare_snapshots import SnapshotVerifier
 from pipeline.replay.offline.comparison import CAUSE_TOLERANCE, Comparison
 from pipeline.replay.offline.plan import Limit, Session
 from schemas.blocks import cut
+from schemas.enums import Transition
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header, decode_together
 from schemas.fields import columns
-from schemas.messages import Alarm, Array, Score, ScorerSnapshot, Transition
+from schemas.messages import Alarm, Array, Score, ScorerSnapshot
 
 SCORE, SNAPSHOT = "score", "snapshot"
 _BLOCK_MESSAGES = 512

@@ -27,7 +27,10 @@ from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.recordings.reading import read_recording
 from pipeline.runtime.sessions import Session
 from schemas.codec import decode, encode
-from schemas.messages import Grid, Header, Health, Output, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
+from schemas.messages import Grid
 from schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.flooding_client import NOISE
 from tests.support.running_chain import RunningCommand, eventually

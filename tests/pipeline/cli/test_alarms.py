@@ -22,18 +22,9 @@ from pipeline.runtime.healthy_twin import ScorerConfig
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Core, Stage
 from schemas.codec import decode, encode, type_name
-from schemas.messages import (
-    Action,
-    Alarm,
-    Diagnosis,
-    Header,
-    InvalidReason,
-    Message,
-    Request,
-    Severity,
-    StageStatus,
-    Transition,
-)
+from schemas.enums import Action, InvalidReason, Severity, StageStatus, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Diagnosis, Message, Request
 from schemas.topics import BY_NAME, tray_key
 from scoring.alarms.current_alarms import CurrentAlarm, clock
 from scoring.alarms.fan_condition import AlarmState, ConditionSettings
@@ -342,7 +333,10 @@ def test_row_10_an_answer_of_a_stranger_is_none(site):
 def test_a_scorer_that_does_not_answer_is_reported_after_the_timeout(site):
     site.core.deaf = True
     error = site.refused("ack", TRAY, 3, "--timeout", 0.5)
-    assert error == f"tray {TRAY}: no answer for fan 3 within 0.5 s: does a scorer run for this tray?"
+    assert error == (
+        f"tray {TRAY}: no answer for fan 3 within 0.5 s: nothing watches its alarms now, for example because it has no "
+        "twin yet: see `fantwin status`"
+    )
 
 
 @pytest.mark.parametrize("words", [(), ("ack", TRAY, 3)], ids=["list", "ack"])

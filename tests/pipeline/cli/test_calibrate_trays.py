@@ -11,7 +11,8 @@ import pytest
 
 from pipeline.recordings.reading import read_recording
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.topics import tray_key
 from tests.support.fantwin_command import error_of, fantwin
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import stat
-from datetime import timedelta
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -78,6 +78,9 @@ def test_from_nothing_to_certificates_that_every_process_can_use(path):
     result = certs(path, "show")
     assert result.exit_code == 0
     assert all(role in result.stdout for role in roles)
+    line = next(line for line in result.stdout.splitlines() if line.split()[:1] == ["operator"])
+    until, days = line.split()[1:3]
+    assert date.fromisoformat(until) - datetime.now(UTC).date() == timedelta(days=int(days)) == timedelta(days=397)
 
 
 def test_nothing_is_replaced_without_being_asked(path):

@@ -13,7 +13,8 @@ from pipeline.cli.twins.next_version import make_next_version
 from pipeline.cli.twins.version_data import spread_parts
 from pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
 from pipeline.learning.versions import Check, TwinVersions
-from schemas.messages import Array, Header, Raw
+from schemas.header import Header
+from schemas.messages import Array, Raw
 from schemas.units import NS_PER_S
 from tests.pipeline.learning.test_versions import version
 from tests.support.commanded_fans import GAIN, RATE_HZ, START_S, moving

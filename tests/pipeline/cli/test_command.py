@@ -19,7 +19,9 @@ from pipeline.cli.watch.commanding import CommandSender, command_of, share_note
 from pipeline.config.models import BusConfig, TrayConfig
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode, type_name
-from schemas.messages import Header, Health, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health
 from schemas.topics import BY_NAME, alive_key, health_key
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO, Chain, RunningCommand, eventually, fantwin
@@ -43,7 +45,7 @@ def test_a_command_that_the_line_did_not_take_is_one_line_that_says_why(chain, a
     done = fantwin(*chain.words("command"), "--fan", 3, 0.5)  # there is no tray
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
-    assert "acquisition could not send the command" in done.stderr
+    assert "tray tray1: 1 command lost on the way to the device: " in done.stderr
     assert str(chain.port) in done.stderr
 
 

@@ -95,7 +95,7 @@ def test_a_command_that_flickers_between_two_ranges_does_not_change_and_gaps_do_
         ("", "", ("-o", "kept.onnx"), "kept.onnx: exists already: name another with -o"),
         ("", "", ("-o", "twin.bin"), "name a file that ends in .onnx with -o"),
         ("", "", ("--low", "0.2"), "--low needs --sweep, which moves the fans: add --sweep"),
-        ("", "", ("--sweep", "--high", "7"), "--low 0 --high 7: name a range within 0 to 1 of tray tray1"),
+        ("", "", ("--sweep", "--high", "7"), "--low 0.2 --high 7: name a range within 0 to 1 of tray tray1"),
         ("command_max = 0", "", (), "command_min and command_max of tray tray1 are equal"),
     ],
 )

@@ -24,7 +24,8 @@ from pipeline.cli.watch.child_commands import Commands, Stopped
 from pipeline.config.models import TrayConfig
 from pipeline.errors import UserError
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 from tests.support.fantwin_command import fantwin

@@ -16,8 +16,10 @@ from pipeline.cli.watch.demo import _print_report
 from pipeline.cli.watch.demo_report import SETTLING_NS, summarise
 from pipeline.errors import UserError
 from pipeline.recordings.writing import RecordingWriter
+from schemas.enums import Severity, Transition
 from schemas.fields import columns
-from schemas.messages import Alarm, Grid, Header, Message, Raw, Score, Severity, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Grid, Message, Raw, Score
 from schemas.topics import tray_key
 
 START_NS = 1_700_000_000_000_000_000

@@ -17,7 +17,7 @@ import typer
 
 from pipeline.bus.session import Bus
 from pipeline.cli.watch import doctor as module
-from pipeline.cli.watch.doctor import doctor
+from pipeline.cli.watch.doctor import _of_roles_together, doctor
 from pipeline.config.models import BusConfig
 from pipeline.config.shards import Shard
 from pipeline.runtime.sessions import Session
@@ -44,9 +44,11 @@ def examine(capsys: pytest.CaptureFixture[str], config: Path | None = None, *set
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_an_installation_in_order_is_fine(capsys):
+def test_an_installation_in_order_is_fine(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     code, found = examine(capsys)
     assert code == 0
+    assert "no fantwin.toml in this folder, and none given with -c: only the installation was checked" in found["good"]
     assert found["ok"] and found["problems"] == []
     assert any(line.startswith("eclipse-zenoh 1.") for line in found["good"])
 
@@ -192,3 +194,32 @@ def test_the_text_marks_problems_apart_from_passed_checks(capsys):
     out = capsys.readouterr().out
     assert "FIX  acquisition/tray1: /dev/none" in out
     assert "ok   scorer: can start" in out
+
+
+def test_without_c_the_configuration_of_this_folder_is_checked_as_by_other_commands(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fantwin.toml").write_text('[[tray]]\nname = "tray1"\nfanz = 1\n')
+    code, found = examine(capsys)
+    assert code == 1
+    assert "fanz" in found["problems"][0]
+
+
+def test_what_several_processes_have_wrong_is_one_line(capsys, tmp_path, endpoint):
+    file = tmp_path / "fantwin.toml"
+    trays = "".join(f'[[tray]]\nname = "{name}"\nfans = 1\nport = "/dev/none"\n' for name in "abc")
+    file.write_text(f'[bus]\nendpoint = "{endpoint}"\n[launcher]\nstages = ["acquisition", "recorder"]\n{trays}')
+    found = examine(capsys, file)[1]["problems"]
+    assert len([line for line in found if "/dev/none" in line]) == 1
+    assert found[-1].startswith("acquisition/a, acquisition/b, acquisition/c: ")
+
+
+def test_certificates_that_have_the_same_wrong_are_one_line():
+    lines = [
+        ("scorer", "/certs/scorer.pem: expired: `fantwin certs renew scorer`"),
+        ("recorder", "/certs/recorder.pem: expired: `fantwin certs renew recorder`"),
+        ("viewer", "/certs/viewer.pem: others can read it"),
+    ]
+    assert list(_of_roles_together(lines)) == [
+        "/certs/ROLE.pem: expired: `fantwin certs renew ROLE` (ROLE: scorer, recorder)",
+        "/certs/viewer.pem: others can read it",
+    ]

@@ -17,7 +17,9 @@ from pipeline.recordings import read_arrays
 from pipeline.recordings.tables import PIECE_ROWS, open_table, table_columns
 from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import proto_type
-from schemas.messages import MESSAGE_TYPES, FanState, Health, ModelCard, Raw, Statistic
+from schemas.enums import FanState, Statistic
+from schemas.health import Health
+from schemas.messages import MESSAGE_TYPES, ModelCard, Raw
 from tests.pipeline.recordings.test_arrays import GOLDEN, alarm, raw, write
 from tests.support.failing_writers import disk_of
 from tests.support.fantwin_command import error_of, fantwin

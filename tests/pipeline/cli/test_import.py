@@ -50,6 +50,8 @@ def test_the_recording_holds_the_numbers_of_the_table(tmp_path):
     np.testing.assert_allclose(t_ns / 1e9, values[:, 0], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(command, values[:, [1, 1]])
     np.testing.assert_allclose(speed_rad_s / (2 * np.pi / 60), values[:, 2:], rtol=1e-14)
+    (shown,) = json.loads(fantwin("info", recording, "--json").stdout)["files"]
+    assert shown["duration_s"] == pytest.approx(values[-1, 0] - values[0, 0], abs=1e-6), "from the first to the last"
 
 
 def test_columns_beside_command_and_speed_go_into_the_recording_and_out_into_tables(tmp_path):
@@ -125,7 +127,7 @@ def test_the_recording_has_unit_source_and_tray_in_its_metadata(tmp_path):
     entries = list(read_recording(tmp_path / "r.mcap"))
     assert {entry.key for entry in entries} == {"fantwin/imported/bench-2/raw"}
     assert {entry.message.header.tray for entry in entries} == {"bench-2"}
-    assert [entry.message.header.sequence for entry in entries] == list(range(13))
+    assert [entry.message.header.sequence for entry in entries] == list(range(14))
 
 
 def test_the_tachos_are_in_the_recording_and_in_the_configuration_made_for_it(tmp_path):
@@ -180,7 +182,7 @@ def test_an_existing_recording_is_replaced_only_when_forced(tmp_path):
     assert error_of(*arguments) == f"{recording}: exists; name another file with -o, or replace it with --force"
     assert recording.read_bytes() == b"precious"
     assert fantwin(*arguments, "--force").exit_code == 0
-    assert len(list(read_recording(recording))) == 13
+    assert len(list(read_recording(recording))) == 14
 
 
 def test_a_table_that_cannot_be_read_leaves_no_recording(tmp_path):

@@ -14,7 +14,10 @@ from pipeline.recordings import contents
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Counter, Header, Health, Input, ModelCard, Note, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Counter, Health, Input, Note
+from schemas.messages import ModelCard
 from schemas.topics import health_key, tray_key
 from tests.pipeline.recordings.test_parts import part, parts_in
 from tests.support.fantwin_command import error_of, fantwin

@@ -12,7 +12,9 @@ from pipeline.recordings.contents import TRUNCATED, contents_of
 from pipeline.recordings.records import RecordReader
 from pipeline.recordings.repair import repair_in_place
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Health, Output, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
 from schemas.topics import health_key
 from tests.pipeline.recordings.test_repair import chunk_ends, read_by_others, small
 from tests.support.fantwin_command import error_of, fantwin

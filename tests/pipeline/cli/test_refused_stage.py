@@ -40,6 +40,18 @@ def test_a_stage_with_a_certificate_of_another_role_ends_with_1_and_one_line(sit
     assert done.stderr.count("\n") == 1
 
 
+def test_whoever_may_not_command_is_told_the_role_that_may_in_words_of_the_documentation(site):
+    other = site.certificates.folder / "viewer"
+    words = [f"bus.security.{name}='{other}.{end}'" for name, end in (("certificate", "pem"), ("key", "key"))]
+    source = "tray.0.source={kind = 'serial', port = '/dev/none'}"
+    with site.running():
+        given = ("--tray", "a", "--fan", "0", "0.5", "--set", source, *(w for word in words for w in ("--set", word)))
+        done = called("command", "-c", site.config.path, *given)
+    assert str(done.exception) == (
+        "its certificate says 'viewer', which may not publish command of a; give it that of role 'operator'"
+    )
+
+
 @pytest.mark.real_time
 def test_a_stage_that_is_refused_while_it_runs_says_so_and_ends_with_1(site):
     stage = None

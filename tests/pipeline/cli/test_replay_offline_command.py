@@ -16,7 +16,8 @@ from typer.testing import Result
 from pipeline.cli.recordings.replay_offline import _table
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Alarm, InvalidReason, Raw
+from schemas.enums import InvalidReason
+from schemas.messages import Alarm, Raw
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import short_name
 from tests.support.fantwin_command import error_of, fantwin

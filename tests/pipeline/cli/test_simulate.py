@@ -63,6 +63,7 @@ class Reader:
         self.decoder = wire.Decoder(protocol, fans)
         self.samples: list[wire.Sample] = []
         self.faults: list[wire.Fault] = []
+        self.counters: list[wire.DeviceCounters] = []
 
     def read_some(self) -> bool:
         """Whether the device still exists."""
@@ -75,6 +76,8 @@ class Reader:
         for frame in self.decoder.feed(data):
             if isinstance(frame, wire.Sample):
                 self.samples.append(frame)
+            elif isinstance(frame, wire.DeviceCounters):
+                self.counters.append(frame)
             else:
                 assert isinstance(frame, wire.Fault)
                 self.faults.append(frame)
@@ -188,6 +191,9 @@ def test_commands_and_set_points_show_in_the_samples(tmp_path: Path) -> None:
         reader.read_until(1)
         reader.send(wire.CommandFrame((0.25, KEEP)))
         reader.send(wire.SetPointFrame((KEEP, 3000.0)))
+        spoilt = bytearray(wire.encode("binary", wire.CommandFrame((0.75, KEEP))))
+        spoilt[-3] ^= 3
+        reader.serial.write(spoilt)
         reader.read_until(300)
         process.send_signal(signal.SIGINT)
         reader.read_all()
@@ -195,7 +201,10 @@ def test_commands_and_set_points_show_in_the_samples(tmp_path: Path) -> None:
     assert reader.samples[299].command[0] == 0.25
     assert reader.samples[299].speed[1] == pytest.approx(3000.0, rel=0.05)
     truth = truth_of(tmp_path)
-    assert (truth["commands_received"], truth["set_points_received"], truth["commands_refused"]) == (1, 1, 0)
+    assert (truth["commands_received"], truth["set_points_received"], truth["commands_refused"]) == (1, 1, 1)
+    assert [counters.uptime_s for counters in reader.counters[:3]] == [0, 1, 2]
+    counts = dict(zip(wire.DEVICE_COUNTERS, reader.counters[2].counts, strict=True))
+    assert {name: count for name, count in counts.items() if count} == {"frames": 2, "bad_crc": 1}
 
 
 class Burst:

@@ -27,19 +27,10 @@ from pipeline.launch.judged_fans import JudgedFans
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from schemas.codec import encode, type_name
-from schemas.messages import (
-    Alarm,
-    Counter,
-    Diagnosis,
-    Header,
-    Health,
-    Input,
-    InvalidReason,
-    Output,
-    Severity,
-    StageStatus,
-    Transition,
-)
+from schemas.enums import InvalidReason, Severity, StageStatus, Transition
+from schemas.header import Header
+from schemas.health import Counter, Health, Input, Output
+from schemas.messages import Alarm, Diagnosis
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import clock

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,12 @@ from pipeline.cli.watch.excitation import (
     has_settled,
     time_constants,
 )
+from pipeline.cli.watch.sweep import range_within
+from pipeline.config.loading import load_config
+from pipeline.config.models import TrayConfig
+from pipeline.devices.serial_config import SerialConfig
 from pipeline.errors import UserError
+from pipeline.learning.ordinary_operation import OrdinaryOperation
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO
 
@@ -145,3 +151,65 @@ def test_where_something_else_sets_the_command_it_says_so() -> None:
 )
 def test_what_the_tray_cannot_do_is_refused_in_one_line(words: str, expected: str) -> None:
     assert expected in error_of("sweep", "-c", DEMO / "demo.toml", *words.split())
+
+
+UNCOMMANDED = [
+    ('kind = "push"', "the program that pushes its samples moves the fans"),
+    ('kind = "http"', "whatever posts its samples moves the fans"),
+    ('kind = "mqtt", host = "broker", topic = "t"', "its source names no send_topic"),
+    ('kind = "hwmon", chip = "nct6798"', "its source does not have writable = true"),
+    ('kind = "redfish", url = "https://bmc"', "fans behind Redfish are only read"),
+]
+
+
+def configured(folder: Path, source: str) -> Path:
+    path = folder / "fantwin.toml"
+    path.write_text(f'[[tray]]\nname = "tray1"\nfans = 1\nspeed_unit = "rpm"\nsource = {{ {source} }}\n')
+    return path
+
+
+@pytest.mark.parametrize(("source", "reason"), UNCOMMANDED)
+def test_a_tray_that_takes_no_commands_is_not_swept_and_one_line_says_what_to_do_instead(
+    tmp_path: Path, source: str, reason: str
+) -> None:
+    path = configured(tmp_path, source)
+    for words, instead in (
+        (("sweep",), "run `fantwin up` while the fans' own controller varies their commands; it is recorded"),
+        (("commission", "--sweep"), "leave out --sweep, and let the fans' own controller vary their commands"),
+        (("command", "--fan", "0", "0.5"), ""),
+    ):
+        error = error_of(words[0], "-c", path, *words[1:])
+        assert f"tray tray1 takes no commands, {reason}" in error
+        assert instead in error
+
+
+@pytest.mark.parametrize(
+    ("source", "hint"),
+    [
+        ('kind = "push"', "the fans' own controller must vary their commands"),
+        ('kind = "mqtt", host = "broker", topic = "t", send_topic = "c"', "`fantwin sweep` moves the fans"),
+    ],
+)
+def test_a_sweep_is_advised_only_where_it_can_be_done(tmp_path: Path, source: str, hint: str) -> None:
+    (tray,) = load_config(configured(tmp_path, source), stages=()).trays
+    assert OrdinaryOperation(tray).how_to_move == hint
+
+
+@pytest.mark.parametrize(("low", "high", "expected"), [(0, 255, (51, 255)), (20, 70, (30, 70)), (-1, 1, (-1, 1))])
+def test_without_low_no_fan_is_to_stop(low: float, high: float, expected: tuple[float, float]) -> None:
+    source = SerialConfig(port="line")
+    tray = TrayConfig(name="tray1", fans=1, source=source, command_min=low, command_max=high)
+    assert range_within(tray, None, None, None) == pytest.approx(expected)
+    assert range_within(tray, low, None, None) == (low, high)
+
+
+def test_a_fan_that_reads_0_at_the_lowest_command_is_named_at_once() -> None:
+    class StandsBelow(FirstOrderFans):
+        def observed(self) -> Observed:
+            seen = super().observed()
+            return seen._replace(speed_rad_s=np.where(seen.command < 0.3, 0.0, seen.speed_rad_s))
+
+    _, said = swept(StandsBelow([0.5]))
+    assert said[1] == "fan 0 reads 0 at command 0.2; if it stands, give a higher --low"
+    _, said = swept(StandsBelow([0.5]), low=0.0)
+    assert not [line for line in said if "reads 0" in line], "it is meant to stand"

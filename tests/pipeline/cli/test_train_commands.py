@@ -4,13 +4,15 @@ import builtins
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.cli.twins.training_data import TrainingData
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
 from schemas.topics import tray_key
 from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, counted_run, published_run
@@ -25,12 +27,14 @@ def record(path: Path, run: Run, unit: str = "rad/s", tray: str = "tray1") -> Pa
     metadata = {"speed_unit": unit, f"tacho.{tray}": tachos_to_json(run.tacho)}
     with RecordingWriter(path, metadata, overwrite=True) as writer:
         t_ns = np.rint(run.t_s * 1e9).astype(np.int64)
+        auxiliary: dict[str, Any] = {name: of.astype(np.float32) for name, of in run.auxiliary.items()}
         raw = Raw(
             header=Header("test", 0, tray),
             fans=run.fans,
             host_receive_t_ns=t_ns,
             command=run.command,
             speed_rad_s=run.speed_rad_s,
+            **auxiliary,
         )
         writer.add_message(tray_key("test", tray, "raw"), raw, int(t_ns[-1]))
     return path
@@ -62,6 +66,27 @@ def test_identify_finds_the_published_fan(folder):
         assert low < fan[name] < high
         assert fan[name] == pytest.approx(published, rel=0.15)
     assert result["speed_unit"] == "rad/s"
+
+
+def test_a_supply_voltage_that_is_ignored_is_as_if_it_were_not_there(folder, tmp_path):
+    run = published_run(1)
+    volts = np.full_like(run.command, 12.0)
+    volts[len(volts) // 2 :] = 6.0
+    bad = record(tmp_path / "bad.mcap", replace(run, auxiliary={"supply_voltage_v": volts}))
+    found = json.loads(fantwin("identify", bad, "--json").stdout)
+    assert any(line.startswith("supply voltage: not used") for line in found["warnings"])
+    plain = json.loads(fantwin("identify", folder / "healthy.mcap", "--json").stdout)
+    ignored = json.loads(fantwin("identify", bad, "--ignore", "supply_voltage_v", "--json").stdout)
+    assert ignored == plain
+    good = record(tmp_path / "good.mcap", replace(run, auxiliary={"supply_voltage_v": np.full_like(volts, 12.0)}))
+    assert "allows for supply voltage (reference 12 V)" in fantwin("identify", good).stdout
+    twin = tmp_path / "t.onnx"
+    for options, needed in (((), ("supply_voltage_v",)), (("--ignore", "supply_voltage_v"), ())):
+        done = fantwin("train", good, "--model", "physical", *options, "-o", twin)
+        assert done.exit_code == 0, done.output
+        conditions = OnnxTwin(twin).card.conditions
+        assert (conditions.needed if conditions else ()) == needed
+    assert "--ignore volts: known are supply_voltage_v" in error_of("identify", good, "--ignore", "volts")
 
 
 def test_the_tacho_of_a_recording_counts_and_readings_that_speak_for_another_are_pointed_out(tmp_path):
@@ -104,7 +129,7 @@ def test_ctrl_c_during_training_leaves_no_twin(folder, tmp_path, monkeypatch):
     def interrupted(*_arguments, **_options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("twin.build.identify", interrupted)
+    monkeypatch.setattr("twin.fitting.reference_choice.identify", interrupted)
     result = fantwin("train", folder / "healthy.mcap", "--model", "physical", "-o", tmp_path / "twin.onnx")
     assert (result.exit_code, list(tmp_path.iterdir())) == (130, [])
     assert result.stderr.splitlines()[-1].startswith("interrupted: no twin was written")

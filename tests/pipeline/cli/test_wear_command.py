@@ -18,7 +18,8 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.healthy_twin import ScorerConfig
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Core, Stage
-from schemas.messages import Header, Message, ScorerSnapshot
+from schemas.header import Header
+from schemas.messages import Message, ScorerSnapshot
 from schemas.topics import tray_key
 from scoring.former_snapshot_keys import FORMER_PARAMETER_KEYS
 from tests.scoring.wear.test_wear_monitor import (

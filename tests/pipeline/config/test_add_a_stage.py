@@ -21,7 +21,10 @@ from pipeline.launch.processes import process_list
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, load_stage
 from schemas.codec import decode, encode, type_name
-from schemas.messages import Alarm, Header, Health, Message, Severity, StageStatus
+from schemas.enums import Severity, StageStatus
+from schemas.header import Header
+from schemas.health import Health
+from schemas.messages import Alarm, Message
 from schemas.topics import BY_NAME, health_key, tray_key
 
 # --- the new file: stages/alarm_log.py ---

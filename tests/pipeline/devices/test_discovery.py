@@ -7,11 +7,13 @@ import os
 from pathlib import Path
 
 import pytest
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner
 
 from pipeline.cli import main as command_line
 from pipeline.config.loading import load_config, parse_config
-from pipeline.devices.discovery import discover_hwmon
+from pipeline.devices.discovery import discover_hwmon, discover_serial
 from pipeline.devices.hwmon_config import HwmonConfig
 from pipeline.devices.sample_source import SourceContext
 from pipeline.devices.source_kinds import build_source
@@ -68,5 +70,32 @@ def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_
     config = load_config(file)
     assert [tray.source.kind for tray in config.trays] == ["hwmon"] * 3
     assert all(isinstance(tray.source, HwmonConfig) and tray.source.writable for tray in config.trays)
+    assert "left out: acpitz" not in result.stderr, "it has no fans"
+    text = file.read_text(encoding="utf-8")
     again = CliRunner().invoke(command_line.app, words)
-    assert isinstance(again.exception, UserError) and "exists; name a new file" in str(again.exception)
+    assert again.exit_code == 0
+    assert f"{file}: exists, has all hwmon chips with fans, and was left as it is" in again.stderr
+    add_chip(root, 9, "emc2305", "i2c-3/3-0020", {"fan1_input": 3000, "pwm1": 128})
+    lacking = CliRunner().invoke(command_line.app, words)
+    assert isinstance(lacking.exception, UserError)
+    assert "it lacks emc2305: paste what is shown" in str(lacking.exception)
+    assert file.read_text(encoding="utf-8") == text
+    file.write_text("no configuration [", encoding="utf-8")
+    unreadable = CliRunner().invoke(command_line.app, words)
+    assert "it lacks emc2305, nct6798, nct6798-2, thinkpad" in str(unreadable.exception)
+
+
+def test_a_port_of_which_nothing_is_known_is_no_tray_and_what_is_not_written_is_said(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ports = [ListPortInfo("/dev/ttyS0"), ListPortInfo("/dev/ttyUSB0")]
+    ports[1].description, ports[1].hwid = "FT232R USB UART", "USB VID:PID=0403:6001"
+    monkeypatch.setattr(list_ports, "comports", lambda: ports)
+    known, unknown = discover_serial()
+    assert known.tray["source"]["port"] == "/dev/ttyUSB0"
+    assert not unknown.tray and unknown.title == "/dev/ttyS0" and "left out" in unknown.missing[0]
+    command_line._register(["discover"] if not command_line.app.registered_commands else ["discover", "info"])
+    words = ["discover", "--root", str(root), "--write", str(tmp_path / "fantwin.toml")]
+    lines = CliRunner().invoke(command_line.app, words).stdout.splitlines()
+    assert [line for line in lines if line.startswith("left out: /dev/ttyUSB0: FT232R USB UART: what is connected")]
+    assert [line for line in lines if line.startswith("left out: /dev/ttyS0: no device is known there")]

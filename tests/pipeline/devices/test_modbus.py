@@ -28,6 +28,8 @@ from tests.support.modbus_server import (
     VOLTAGE,
     WANTED,
     Drive,
+    SerialLine,
+    modbus_line,
     modbus_server,
 )
 
@@ -144,8 +146,71 @@ def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line(monk
     line = client.comm_params
     assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 1)
     assert made.check()[0].startswith("/dev/ttyUSB7: no such port")
-    with pytest.raises(DeviceError, match="/dev/ttyUSB7: cannot be opened"):
+    with pytest.raises(DeviceError, match=r"^/dev/ttyUSB7: no such port, is it unplugged\?; waiting for it$"):
         made.connect()
+
+
+def over_serial(line: SerialLine, **settings: Any) -> tuple[ModbusConfig, SourceContext]:
+    values = {"port": line.host, "parity": "N", "timeout_s": 5.0, "fan": (FAN,), **settings}
+    return ModbusConfig.model_validate(values), SourceContext(1, "rpm", Path())
+
+
+def test_frames_of_modbus_rtu_go_over_a_serial_line_both_ways() -> None:
+    with modbus_line({3: drive()}) as line:
+        made = ModbusDevice(*over_serial(line))
+        made.connect()
+        first = made.read()
+        assert (first.current_a, first.supply_voltage_v) == ((1.5,), pytest.approx((540.25,)))
+        made.write((0.9,), ())
+        time.sleep(0.8)
+        second = made.read()
+        assert second.command == (0.9,) and second.speed[0] > first.speed[0] + 500.0
+        with pytest.raises(DeviceError, match=r"unit 3 refuses 1.5 for register 100 \(exception 3\)"):
+            made.write((1.5,), ())
+        made.disconnect()
+    # unit, function, address, count or value, CRC: seven registers from 10 on, and 900 to register 100
+    read, write = bytes.fromhex("0303000a000725e8"), bytes.fromhex("031000640001020384b787")
+    assert line.transferred["device"].startswith(read + write + read)
+    assert (
+        line.transferred["host"].startswith(bytes.fromhex("03030e")) and len(line.transferred["host"]) == 2 * 19 + 8 + 5
+    )
+
+
+def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_one_works() -> None:
+    slow = drive()
+    with modbus_line({3: slow}) as line:
+        made = ModbusDevice(*over_serial(line))
+        made.connect()
+        made.read()  # the first one waits for the simulation
+        made.disconnect()
+        made = ModbusDevice(*over_serial(line, timeout_s=0.2))
+        made.connect()
+        slow.delay_s = 0.4
+        with pytest.raises(DeviceError, match=r"unit 3 does not answer within 0.2 s; check unit and wiring") as caught:
+            made.read()
+        assert not caught.value.is_lost
+        slow.delay_s = 0.0
+        time.sleep(0.4)
+        assert made.read().supply_voltage_v == pytest.approx((540.25,))
+        made.disconnect()
+
+
+def test_a_serial_line_that_is_unplugged_is_one_clear_line() -> None:
+    events: list[SourceEvent] = []
+    with modbus_line({3: drive()}) as line:
+        source = ModbusSource(*over_serial(line, period_s=0.02))
+        source.start(events.append)
+        until_s = time.monotonic() + 15.0
+        while sum(isinstance(event, ReadingBatch) for event in events) < 5:
+            assert time.monotonic() < until_s, events
+            time.sleep(0.01)
+        line.unplug()
+        time.sleep(1.0)  # it has tried to open the port again, twice or more
+        source.stop()
+    assert [type(event) for event in events if not isinstance(event, ReadingBatch)] == [LinkUp, LinkDown]
+    assert events[-1] == LinkDown(f"{line.host}: no such port, is it unplugged?; waiting for it")
+    refused = [item for event in events if isinstance(event, ReadingBatch) for item in event.items]
+    assert all(isinstance(item, Reading) for item in refused)
 
 
 def test_the_registers_say_what_is_measured_where_the_averaging_time_is_known() -> None:

@@ -152,14 +152,14 @@ def test_polls_that_are_late_are_left_out_and_counted_as_lost() -> None:
 def test_commands_are_written_between_polls_and_the_sender_sees_a_refusal() -> None:
     device = Device()
     source = PollingSource(device, 10.0)
-    assert not source.send((0.3,), ()), "not connected"
+    assert "not connected" in source.send((0.3,), ())
     up = threading.Event()
     source.start(lambda event: up.set() if isinstance(event, ReadingBatch) else None)
     assert up.wait(5.0)
-    assert source.send((0.3,), ())
-    assert not source.send((math.inf,), ())
+    assert source.send((0.3,), ()) == ""
+    assert source.send((math.inf,), ()) == "not allowed"
     device.is_writable = False
-    assert not source.send((0.4,), ())
+    assert "takes no commands" in source.send((0.4,), ())
     source.stop()
     assert device.written == [(0.3,)]
 

@@ -28,8 +28,8 @@ class FakeSource:
     def stop(self) -> None:
         self.deliver(batch(999))
 
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
-        return False
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        return "not connected"
 
     def check(self) -> list[str]:
         return []

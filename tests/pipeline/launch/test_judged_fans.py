@@ -13,7 +13,10 @@ from pipeline.launch.judged_fans import JUDGED_WITHIN_S, RETURNING, JudgedChange
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import encode
-from schemas.messages import Alarm, FanState, Header, InvalidReason, Output, Severity
+from schemas.enums import FanState, InvalidReason, Severity
+from schemas.header import Header
+from schemas.health import Output
+from schemas.messages import Alarm
 from schemas.topics import tray_key
 from scoring.alarms.current_alarms import CurrentAlarm
 from tests.pipeline.launch.test_site_watcher import SCORER, STRANGER, StubBus, health

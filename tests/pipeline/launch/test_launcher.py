@@ -10,7 +10,9 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -23,10 +25,13 @@ from pipeline.launch.launcher import Launcher, Outcome, _Slot
 from pipeline.launch.notices import Notices
 from pipeline.launch.processes import Child, StageProcess, process_list
 from pipeline.launch.site_watcher import SiteWatcher
-from schemas.messages import Header, Health, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health
 from schemas.topics import alive_key
 from tests.pipeline.launch.test_site_watcher import StubBus
 from tests.support.running_chain import DEMO, SITE, Chain, fantwin
+from tests.support.site_certificates import SiteCertificates
 
 HEALTH = Health(
     header=Header("recorder-all-1", 0, ""),
@@ -76,6 +81,37 @@ def no_bus(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 def test_a_twin_that_cannot_be_used_is_refused_before_anything_starts(no_bus, settings, fault):
     with pytest.raises(UserError, match=re.escape(fault)):
         Launcher(load_config(DEMO / "demo.toml", settings), (), no_bus).run(threading.Event())
+
+
+def test_a_certificate_that_cannot_be_used_is_refused_before_anything_starts(tmp_path, endpoint, no_bus):
+    certificates = SiteCertificates(tmp_path)
+    certificates.issue("acquisition", "resampler", "recorder")
+    certificates.issue("resampler", lifetime=timedelta(seconds=-1))
+    security = "".join(f'{name} = "{path}"\n' for name, path in certificates.security.model_dump().items() if path)
+    file = tmp_path / "fantwin.toml"
+    stages = ["acquisition", "resampler", "recorder"]
+    bus = f'[bus]\nmode = "client"\nendpoint = "{endpoint.replace("tcp/", "tls/")}"\n[bus.security]\n{security}'
+    file.write_text(f'{bus}[launcher]\nstages = {stages}\n[[tray]]\nname = "a"\nfans = 2\nport = "/dev/none"\n')
+    with pytest.raises(UserError, match=r"resampler\.pem: expired on "):
+        Launcher(load_config(file), (), no_bus).run(threading.Event())
+    certificates.issue("resampler")
+    with pytest.raises(ConnectionError):
+        Launcher(load_config(file), (), no_bus).run(threading.Event())
+
+
+def test_why_a_stage_cannot_start_again_is_in_the_line_that_says_so():
+    class Ended:
+        started_s, last_line, notices = 0.0, "scorer.pem: expired", SimpleNamespace(close=lambda: None)
+
+        def stop(self, _timeout_s: float) -> None:
+            pass
+
+    said: list[str] = []
+    launcher = Launcher(load_config(DEMO / "demo.toml"), (), said.append)
+    slot = next(slot for slot in launcher._slots if slot.row.label == "scorer")
+    slot.child, slot.delay_s = cast("Any", Ended()), 1.0
+    launcher._plan_restart(slot, 78, 5.0)
+    assert said == ["scorer: cannot start: scorer.pem: expired, restarting in 1.0 s"]
 
 
 def test_a_site_that_only_records_needs_no_twin(no_bus):

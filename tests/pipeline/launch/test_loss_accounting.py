@@ -7,7 +7,9 @@ import sys
 from dataclasses import replace
 
 from pipeline.launch.loss_accounting import losses
-from schemas.messages import Counter, Header, Health, Input, Output, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Counter, Health, Input, Output
 
 KEY = "fantwin/s/t/raw"
 OK, STOPPED = StageStatus.OK, StageStatus.STOPPED

@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 
 from pipeline.launch.launcher import Outcome
-from pipeline.launch.refused_input import refused, refused_lines, unusable_lines
-from schemas.messages import Counter, Health, StageStatus
-from schemas.wire import FaultKind
+from pipeline.launch.refused_input import ON_THE_DEVICE, refused, refused_lines, unusable_lines
+from schemas.enums import StageStatus
+from schemas.health import Counter, Health
+from schemas.wire import DEVICE_COUNTERS, FaultKind
 
+HARMLESS = {FaultKind.RESYNC, FaultKind.UNKNOWN_TYPE}
 LAUNCHED = {("acquisition/bench", 7)}
 
 
@@ -30,8 +32,22 @@ def test_row_07_what_sessions_have_refused_is_added_up():
 def test_noise_on_a_line_is_listed_with_its_kinds():
     found = refused([health(samples=9, garbage=3, truncated=1, resync=1, refused_input=4)])
     assert found == {"acquisition/bench": {"garbage": 3, "truncated": 1, "refused_input": 4}}
-    words = "4 lines or frames that are no usable sample (garbage 3, truncated 1)"
+    words = "4 pieces of input that are no usable sample (garbage 3, truncated 1)"
     assert refused_lines(found) == [f"acquisition/bench: refused: {words}"]
+
+
+def test_what_a_device_counts_itself_has_a_line_of_its_own():
+    counts = {"device_frames": 7, "device_glitches": 900, "device_bad_crc": 3, "device_lost_edges": 1}
+    found = refused([health(samples=9, **counts), health(device_bad_crc=1, device_overruns=0)])
+    assert found == {"acquisition/bench": {"device_bad_crc": 4, "device_lost_edges": 1}}
+    words = "4 frames with a wrong checksum, 1 tacho edges that came too fast"
+    assert refused_lines(found) == [f"acquisition/bench: counted by the device itself: {words}"]
+    assert unusable_lines([health(device_bad_crc=4)], LAUNCHED) == []
+
+
+def test_everything_that_a_device_counts_is_shown_but_what_is_no_loss():
+    shown = {name.removeprefix("device_") for name in ON_THE_DEVICE}
+    assert shown == set(DEVICE_COUNTERS) - {"frames", "glitches"}
 
 
 def test_a_device_of_which_all_was_refused_is_named_with_the_count_and_the_setting():
@@ -65,10 +81,23 @@ def test_sessions_that_others_have_started_do_not_count():
     assert unusable_lines([health("acquisition/bench", 8, garbage=30, refused_input=30)], LAUNCHED) == []
 
 
-@pytest.mark.parametrize("kind", [kind for kind in FaultKind if kind is not FaultKind.RESYNC])
+@pytest.mark.parametrize("kind", sorted(set(FaultKind) - HARMLESS, key=str))
 def test_every_fault_of_the_line_has_a_setting_to_look_at(kind: FaultKind):
     (line,) = unusable_lines([health(refused_input=1, **{kind.value: 1})], LAUNCHED)
     assert "source of the [[tray]]" not in line
+
+
+def test_faults_of_other_sources_are_named_with_what_to_look_at():
+    sessions = [health(malformed=3, refused_input=3)]
+    words = "acquisition/bench: refused: 3 pieces of input that are no usable sample (malformed 3)"
+    assert refused_lines(refused(sessions)) == [words]
+    (line,) = unusable_lines(sessions, LAUNCHED)
+    assert line.endswith("(malformed 3): check the form of what is sent (docs/reference/json-samples.md)")
+
+
+def test_messages_of_the_bus_that_cannot_be_read_are_listed():
+    found = refused([health("scorer/all", undecodable=2)])
+    assert refused_lines(found) == ["scorer: refused: 2 messages that cannot be read"]
 
 
 def test_a_device_of_which_all_was_refused_is_a_failure_of_the_site():

@@ -9,7 +9,7 @@ import pytest
 from pipeline.launch.site_report import RunningProcess, SiteReport
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import StageView
-from schemas.messages import Note
+from schemas.health import Note
 from schemas.units import NS_PER_S
 from tests.pipeline.launch.test_site_state import CONSUMER, view
 

@@ -10,7 +10,9 @@ from pipeline.config.shards import Shard
 from pipeline.launch.processes import StageProcess
 from pipeline.launch.site_state import StageState, Word, stage_states
 from pipeline.launch.site_watcher import StageView
-from schemas.messages import AwaitedInput, Header, Health, Input, Output, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import AwaitedInput, Health, Input, Output
 from schemas.units import NS_PER_S
 
 GRID = "fantwin/s/tray1/grid"

@@ -8,11 +8,15 @@ from typing import Any
 
 import pytest
 
+from pipeline.config.roles import roles_of_stages
 from pipeline.launch.site_watcher import MOST_UNKNOWN_SESSIONS, MOST_WATCHED_SESSIONS, SiteWatcher
 from pipeline.launch.watched_alarms import MOST_WATCHED_FANS, WATCHED_BYTES
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode
-from schemas.messages import Alarm, Diagnosis, Header, Health, Output, Severity, StageStatus, Transition
+from schemas.enums import Severity, StageStatus, Transition
+from schemas.header import Header
+from schemas.health import Health, Output
+from schemas.messages import Alarm, Diagnosis
 from schemas.topics import alive_key, health_key, sessions_key, tray_key
 from scoring.alarms import current_alarms
 from tests.support.bus_peer import alarm
@@ -90,6 +94,27 @@ def test_row_11_an_alarm_of_a_stranger_is_not_shown_while_the_scorer_is_alive(bu
     assert fans(watcher) == []
     bus.raise_alarm(of(SCORER.producer, fan=3))
     assert fans(watcher) == [3]
+
+
+@pytest.mark.parametrize(
+    ("stage", "claimed"),
+    [("viewer", KEY), ("acquisition", KEY), ("resampler", tray_key("s", "other", "grid"))],
+    ids=["of a stage that writes nothing", "of another stage", "of another tray"],
+)
+def test_row_17_a_health_is_not_believed_about_what_its_stage_may_not_write(bus, stage, claimed):
+    """Otherwise whoever may show a session of a viewer makes the alarms of the scorer those of a stranger."""
+    limited = {"resampler.all": replace(roles_of_stages()["resampler"], trays=("tray",))}
+    watcher = SiteWatcher(bus, "s", roles_of_stages() | limited)
+    thief = session(stage, 7)
+    bus.show(thief)
+    own = tuple(Output(key=tray_key("s", "tray", topic), published=5) for topic in roles_of_stages()[stage].writes)
+    bus.say(health(thief, outputs=(*own, Output(key=claimed, published=4000))))
+    (view,) = watcher.stages()
+    assert view.health.outputs == own
+    assert watcher.losses() == {stage: 0}
+    assert not watcher._sessions.is_stranger(claimed, STRANGER)
+    bus.raise_alarm(of(STRANGER))
+    assert fans(watcher) == [0], "no session publishes there"
 
 
 def test_row_11_an_alarm_of_a_stranger_that_came_before_the_scorer_was_heard_is_not_shown_after_it(bus):

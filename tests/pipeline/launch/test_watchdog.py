@@ -11,7 +11,7 @@ from pipeline.launch.notices import Notices
 from pipeline.launch.site_watcher import StageView
 from pipeline.launch.watchdog import START_LIMIT_S, Watchdog
 from pipeline.runtime.notifier import Notifier, starting
-from schemas.messages import StageStatus
+from schemas.enums import StageStatus
 from tests.support.running_chain import Chain, eventually, view_of
 
 LIMIT_S = 10.0

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.learning.fan_alarms import LONGEST_UNKNOWN_NS, FanAlarms
-from schemas.messages import FanState, Score
+from schemas.enums import FanState
+from schemas.messages import Score
 from schemas.units import NS_PER_S
 
 N, S, A, R = FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING

@@ -19,7 +19,8 @@ from pipeline.learning.healthy_history import (
 from pipeline.learning.history_recordings import OPEN_NAME
 from pipeline.recordings.disk import AtomicAppendFile
 from pipeline.recordings.reading import read_metadata
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.units import NS_PER_S
 
 START_S = 1_800_000_000

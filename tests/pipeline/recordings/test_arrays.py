@@ -17,24 +17,10 @@ from pipeline.recordings.arrays import Arrays, Block, block_columns, read_topics
 from pipeline.recordings.order import Seen
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import (
-    MESSAGE_TYPES,
-    Alarm,
-    Array,
-    Command,
-    Counter,
-    Grid,
-    Header,
-    Health,
-    InvalidReason,
-    Message,
-    ModelCard,
-    Raw,
-    Severity,
-    StageStatus,
-    Statistic,
-    Transition,
-)
+from schemas.enums import InvalidReason, Severity, StageStatus, Statistic, Transition
+from schemas.header import Header
+from schemas.health import Counter, Health
+from schemas.messages import MESSAGE_TYPES, Alarm, Array, Command, Grid, Message, ModelCard, Raw
 from schemas.topics import health_key, tray_key
 from tests.support.score_data import made_up_tray
 

@@ -12,7 +12,8 @@ from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.runs import read_runs
 from pipeline.recordings.writing import RecordingWriter
 from schemas import envelope
-from schemas.messages import Array, Header, Raw
+from schemas.header import Header
+from schemas.messages import Array, Raw
 from schemas.topics import tray_key
 
 START_NS = 1_800_000_000_000_000_000

@@ -10,7 +10,8 @@ import pytest
 
 from pipeline.recordings.length import longest_s
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Raw
+from schemas.header import Header
+from schemas.messages import Raw
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 

@@ -19,7 +19,8 @@ from mcap.stream_reader import StreamReader
 
 from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Alarm, Command, Header, Message, Raw, Score
+from schemas.header import Header
+from schemas.messages import Alarm, Command, Message, Raw, Score
 from tests.pipeline.recordings.test_arrays import alarm, key_of, raw
 from tests.support.score_data import made_up_tray
 

@@ -15,7 +15,8 @@ from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.records import RecordReader
 from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import decode
-from schemas.messages import Header, ModelCard
+from schemas.header import Header
+from schemas.messages import ModelCard
 from schemas.topics import tray_key
 from tests.support.replay_data import START_NS, STEP_NS, raw_of
 

@@ -9,7 +9,9 @@ import pytest
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.runs import read_runs
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Raw, StatedTacho, TachoKind
+from schemas.enums import TachoKind
+from schemas.header import Header
+from schemas.messages import Raw, StatedTacho
 from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.topics import tray_key
 

@@ -13,7 +13,8 @@ from pipeline.recordings.contents import contents_of
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.envelope import Envelope
-from schemas.messages import Command, Header, Message, Raw
+from schemas.header import Header
+from schemas.messages import Command, Message, Raw
 from schemas.topics import tray_key
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, raw, sequences, write
 

@@ -27,7 +27,9 @@ from pipeline.recordings.repair import recover, repair_in_place
 from pipeline.recordings.scan import scan
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Header, Health, Output, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
 from schemas.topics import health_key
 from tests.support.failing_writers import disk_of
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write

@@ -15,7 +15,9 @@ from pipeline.recordings.run_recordings import recorded_files, run_metadata
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from pipeline.replay.offline.replay_input import open_replay_input
-from schemas.messages import Counter, Header, Health, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Counter, Health
 from schemas.topics import health_key, tray_key
 from tests.support.fantwin_command import fantwin
 from tests.support.killed_site import CONFIGURATION, SITE, TRAY, Site

@@ -15,7 +15,9 @@ from pipeline.recordings.sequence_ledger import (
     next_sequences,
     sum_by_key,
 )
-from schemas.messages import Header, Health, Output, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
 
 KEY, TWIN_KEY = "fantwin/plant/tray1/raw", "fantwin/plant/tray1/twin"
 

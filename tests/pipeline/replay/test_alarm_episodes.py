@@ -6,7 +6,9 @@ import json
 from typing import Any
 
 from pipeline.replay.offline.alarm_episodes import Episode, compare_episodes, episodes
-from schemas.messages import Alarm, Diagnosis, Header, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Diagnosis
 
 DRAG, GAIN = Diagnosis(cause="drag_up", probability=0.6), Diagnosis(cause="gain_down", probability=0.9)
 

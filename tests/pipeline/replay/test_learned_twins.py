@@ -11,7 +11,8 @@ import pytest
 
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import rescore
-from schemas.messages import Action, FanState, InvalidReason, ModelCard, Score, Transition
+from schemas.enums import Action, FanState, InvalidReason, Transition
+from schemas.messages import ModelCard, Score
 from tests.support.killed_site import CALIBRATION, FANS, Site
 from tests.support.offline_replay import made_equal, recorded, verified
 from tests.support.twin_files import made_up_card, small_hybrid, write_twin

@@ -12,7 +12,9 @@ from pipeline.config.models import BusConfig
 from pipeline.replay.live.listeners import Listeners, Present, conflict, made_by_stages
 from pipeline.runtime.stage import load_stage
 from schemas.codec import encode, type_name
-from schemas.messages import Header, Health, Input, Output, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Input, Output
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from tests.support.running_chain import eventually
 

@@ -17,7 +17,8 @@ from pipeline.replay.offline.alarm_episodes import episodes
 from pipeline.replay.offline.comparison import CannotCompareError
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import rescore
-from schemas.messages import Action, Alarm, FanState, Score, Transition
+from schemas.enums import Action, FanState, Transition
+from schemas.messages import Alarm, Score
 from schemas.units import NS_PER_S
 from tests.support.killed_site import CHAIN, Site
 from tests.support.offline_replay import alarms_of, changed, made_equal, recorded, verified

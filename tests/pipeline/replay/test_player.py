@@ -12,8 +12,9 @@ import pytest
 from pipeline.replay.live.keyboard import Key
 from pipeline.replay.live.pace import Pace
 from pipeline.replay.live.player import BEAT_S, Player, Progress, Stopped
+from schemas.enums import Severity, StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, NewTwin, Severity, StageStatus
+from schemas.messages import Alarm, NewTwin
 from tests.support.replay_data import START_NS, STEP_NS, raw_of
 
 

@@ -23,7 +23,8 @@ from pipeline.replay.live.recorded_versions import ComingVersions, read_versions
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from pipeline.runtime.stage import Context, load_stage
 from schemas.envelope import Envelope
-from schemas.messages import Grid, Header, ModelCard, NewTwin, Prediction, Raw
+from schemas.header import Header
+from schemas.messages import Grid, ModelCard, NewTwin, Prediction, Raw
 from schemas.topics import alive_key, tray_key
 from tests.pipeline.replay.test_player import FakeTime, Sent
 from tests.support.killed_site import FANS, SITE, TRAY, Site

@@ -15,9 +15,11 @@ from mcap.records import ChunkIndex
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.live.recording_playback import RecordingPlayback, TimeExtent, shifted
+from schemas.enums import InvalidReason, Severity
 from schemas.envelope import Envelope
 from schemas.fields import columns
-from schemas.messages import MESSAGE_TYPES, Alarm, Grid, Header, InvalidReason, ModelCard, Severity
+from schemas.header import Header
+from schemas.messages import MESSAGE_TYPES, Alarm, Grid, ModelCard
 from schemas.topics import tray_key
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.support.replay_data import START_NS, STEP_NS, raw_of, write_raw

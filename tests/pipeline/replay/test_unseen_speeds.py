@@ -14,7 +14,8 @@ import onnx
 import pytest
 
 from pipeline.recordings.reading import read_recording
-from schemas.messages import Alarm, Array, Score, Transition
+from schemas.enums import Transition
+from schemas.messages import Alarm, Array, Score
 from schemas.twin_card import CARD_PROPERTY
 from tests.support.fan_data import rough_run
 from tests.support.fantwin_command import fantwin

@@ -8,7 +8,8 @@ import pytest
 
 from pipeline.replay.offline.comparison import Comparison
 from pipeline.replay.offline.verify import compare_alarms
-from schemas.messages import Alarm, Diagnosis, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.messages import Alarm, Diagnosis
 
 
 def alarm(transition: Transition, message: str) -> Alarm:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from pipeline.runtime.clock import StageClock, is_of_replay
-from schemas.messages import Clock, Header
+from schemas.header import Header
+from schemas.messages import Clock
 
 HOST_NS = 1_800_000_000_000_000_000
 
@@ -25,7 +26,7 @@ def clock_of(host: Host, *, owner: str = "replay-all-1") -> StageClock:
     """The clock of a stage while a replay owns the site."""
     clock = StageClock(host, host.monotonic_s)
     clock.set_replay_alive(True)
-    clock.add_replay_health(owner, has_stopped=False)
+    clock.add_replay_health(owner, has_ended=False)
     return clock
 
 
@@ -59,7 +60,7 @@ def test_there_is_no_age_while_a_replay_is_paused_or_runs_as_fast_as_it_can():
 def test_the_hosts_time_applies_again_once_the_replay_has_left():
     for leave in (
         lambda clock: clock.set_replay_alive(False),
-        lambda clock: clock.add_replay_health("replay-all-1", has_stopped=True),
+        lambda clock: clock.add_replay_health("replay-all-1", has_ended=True),
     ):
         clock = clock_of(Host())
         clock.update(clock_message(1000, 1.0))
@@ -75,14 +76,14 @@ def test_row_12_a_clock_is_taken_from_the_replay_that_owns_the_site_only():
     nobody = StageClock(host, host.monotonic_s)
     assert not nobody.update(clock_message(1000, 0.0))
     announced = StageClock(host, host.monotonic_s)
-    announced.add_replay_health("replay-all-1", has_stopped=False)
+    announced.add_replay_health("replay-all-1", has_ended=False)
     assert not announced.update(clock_message(1000, 0.0)), "without the liveliness token"
     for clock in (nobody, announced):
         host.ns += 10**9
         assert clock.tick_ns("a") == host.ns, "a silent line is still reported"
     owned = clock_of(host)
     owned.update(clock_message(1000, 1.0))
-    owned.add_replay_health("replay-forged", has_stopped=False)
+    owned.add_replay_health("replay-forged", has_ended=False)
     assert not owned.update(clock_message(5000, 0.0, producer="replay-forged"))
     assert owned.tick_ns("a") == 1000
 
@@ -95,7 +96,7 @@ def test_row_12_a_clock_that_is_not_renewed_expires_and_another_replay_may_follo
     assert clock.tick_ns("a") == 1000, "a paused replay renews it 20 times a second"
     host.ns += round(0.2e9)
     assert clock.tick_ns("a") == clock.now_ns("a", host.ns) == host.ns
-    clock.add_replay_health("replay-all-2", has_stopped=False)
+    clock.add_replay_health("replay-all-2", has_ended=False)
     assert clock.update(clock_message(3000, 1.0, producer="replay-all-2"))
     assert clock.tick_ns("a") == 3000
 

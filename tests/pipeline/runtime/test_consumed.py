@@ -10,7 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.runtime.consumed import PERIOD_NS, ConsumedReports
-from schemas.messages import Alarm, Consumed, Grid, Header, InputPosition, Severity
+from schemas.enums import Severity
+from schemas.header import Header, InputPosition
+from schemas.messages import Alarm, Consumed, Grid
 from schemas.streams import continues
 
 STEP_NS = 1_000_000_000

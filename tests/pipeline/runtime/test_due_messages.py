@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 
 from pipeline.runtime.due_messages import MOST_JOINED_VALUES, DueMessages
 from schemas.blocks import can_join
+from schemas.enums import Action
 from schemas.envelope import Envelope
-from schemas.messages import Action, Header, Message, Raw, Request
+from schemas.header import Header
+from schemas.messages import Message, Raw, Request
 from schemas.topics import tray_key
 
 TRAYS = ("a", "b")

@@ -11,7 +11,10 @@ from pipeline.bus.session import Bus
 from pipeline.runtime.sequence_tracker import REFUSAL_SHOWN_S, Found, SequenceTracker
 from pipeline.runtime.tracked_streams import Request
 from schemas.codec import encode, type_name
-from schemas.messages import Grid, Header, Health, Output, Raw, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
+from schemas.messages import Grid, Raw
 from schemas.topics import BY_NAME, health_key, tray_key
 from tests.pipeline.runtime.test_sequence_tracker import KEY, PRODUCER, health, packet, sequences
 from tests.support.toy_stage import TRAY_A, Bench, raw, toy

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from pipeline.runtime.health import AWAITED_AFTER_NS, LATENCY_WINDOW_S, HealthBuilder
-from schemas.messages import AwaitedInput, Health, StageStatus
+from schemas.enums import StageStatus
+from schemas.health import AwaitedInput, Health
 
 KEY = "fantwin/s/tray1/grid"
 START_NS = 1_800_000_000_000_000_000

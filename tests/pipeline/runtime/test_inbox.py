@@ -5,7 +5,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from pipeline.runtime.inbox import MOST_PATIENT, FromBus, Inbox, Item
+import pytest
+
+from pipeline.runtime.inbox import INBOX_SIZE, MOST_PATIENT, FromBus, FromSource, Inbox, Item, Liveness
+from schemas.topics import health_key, tray_key
 
 LONG_S = 20.0
 MOMENT_S = 0.1
@@ -57,3 +60,27 @@ def test_a_stage_that_asks_gets_what_is_there() -> None:
     inbox.put(item(1), is_urgent=False)
     assert inbox.get(LONG_S) == item(1)
     assert inbox.get(0) is None
+
+
+@pytest.mark.parametrize("waiting", [FromSource("a", None), FromBus(tray_key("s", "a", "raw"), b"", 1)])
+def test_row_16_health_and_liveness_of_others_are_no_input(waiting: Item) -> None:
+    inbox = Inbox(drops_oldest=True)
+    inbox.put(FromBus(health_key("s", "scorer", "all"), b"", 1))
+    inbox.put(Liveness("key", alive=True))
+    assert not inbox.has_input
+    inbox.put(waiting)
+    assert inbox.has_input
+    for _ in range(3):
+        inbox.get(0)
+    assert not inbox.has_input
+
+
+def test_row_16_what_was_dropped_is_no_input() -> None:
+    inbox = Inbox(drops_oldest=True)
+    for number in range(INBOX_SIZE + 1):
+        inbox.put(item(number))
+    assert inbox.dropped == 1
+    for _ in range(INBOX_SIZE):
+        assert inbox.has_input
+        inbox.get(0)
+    assert not inbox.has_input

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 import pytest
 
+from pipeline.bus.errors import NoAnswerError
 from pipeline.bus.kept_messages import KeptQuery
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
@@ -14,7 +15,8 @@ from pipeline.runtime.kept_snapshots import KeptForOthers, KeptSnapshots
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode
 from schemas.envelope import Envelope
-from schemas.messages import Header, ScorerSnapshot
+from schemas.header import Header
+from schemas.messages import ScorerSnapshot
 from schemas.topics import tray_key
 from tests.support.running_chain import eventually
 from tests.support.written_recordings import alarm
@@ -118,6 +120,20 @@ def test_a_recorder_of_other_trays_is_not_the_one_that_is_waited_for(buses):
     assert len(looked) == 1, "the recorder of this tray is there"
     assert found.of("c", is_patient=True) == ([], "no recorder of this tray was there within 0.3 s")
     assert len(looked) > 2, "no recorder has this tray: it may still start"
+
+
+def test_row_18_where_nobody_says_who_is_there_no_recorder_is_waited_for_longer(buses):
+    recorder, scorer = buses
+    keeping(recorder, by_key(snapshot("a", 4)))
+
+    def unknown(_key: str) -> set[str]:
+        raise NoAnswerError("who is on the bus is not known")
+
+    found = asking(scorer, keeper_limit_s=0.3)
+    scorer.alive = unknown
+    kept, why = found.of("a", is_patient=True)
+    assert [each.t_ns for each in kept] == [4], "it is asked all the same"
+    assert why == "no recorder of this tray was there within 0.3 s"
 
 
 def test_a_recorder_that_starts_meanwhile_is_waited_for(buses):

@@ -13,7 +13,8 @@ from pipeline.runtime.newest_messages import MOST_UNDER_WAY, PAUSE_S, PERIOD_S, 
 from pipeline.runtime.stage import BuiltStage
 from schemas.codec import encode
 from schemas.envelope import Envelope
-from schemas.messages import Header, Message
+from schemas.header import Header
+from schemas.messages import Message
 from schemas.topics import tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Silent, raw, toy

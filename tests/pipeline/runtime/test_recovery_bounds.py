@@ -19,7 +19,8 @@ from pipeline.runtime.sequence_tracker import MOST_HELD_MESSAGES, Found, Sequenc
 from pipeline.runtime.sessions import Session, Sessions
 from pipeline.runtime.tracked_streams import MOST_HEALTH_PRODUCERS, MOST_PRODUCERS, SILENT_S, Request
 from schemas.codec import encode, type_name
-from schemas.messages import Grid, Header, Raw
+from schemas.header import Header
+from schemas.messages import Grid, Raw
 from schemas.topics import BY_NAME, health_key, tray_key
 from tests.pipeline.runtime.test_sequence_tracker import KEY, health, packet, sequences
 from tests.support.running_chain import eventually

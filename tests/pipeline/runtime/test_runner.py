@@ -13,10 +13,14 @@ import pytest
 from pipeline.bus.session import Bus
 from pipeline.config.models import TrayConfig
 from pipeline.launch.loss_accounting import losses
+from pipeline.runtime.runner import TICK_S
 from pipeline.runtime.stage import BuiltStage, Context, Core
 from schemas.codec import encode, type_name
+from schemas.enums import StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import Command, Grid, Header, Health, InputPosition, Message, Output, Raw, StageStatus
+from schemas.header import Header, InputPosition
+from schemas.health import Health, Note, Output
+from schemas.messages import Command, Grid, Message, Raw
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from schemas.units import NS_PER_S
 from tests.support.running_chain import eventually
@@ -147,6 +151,33 @@ def test_a_producer_that_publishes_one_message_and_leaves_causes_no_loss(config)
     assert losses([health, last]) == {"resampler": 0}
 
 
+def test_row_16_a_stage_that_was_held_up_says_that_its_input_is_not_all_processed(config, monkeypatch):
+    monkeypatch.setattr("pipeline.runtime.runner.HEALTH_PERIOD_S", 0.0)
+    may_step, waits = threading.Semaphore(0), threading.Event()
+
+    class HeldUp(Answers):
+        def step(self, item):
+            waits.set()
+            assert may_step.acquire(timeout=20)
+            return super().step(item)
+
+    bench = Bench(toy(lambda _context: BuiltStage(HeldUp())), config)
+    try:
+        assert not bench.next(Health).has_unprocessed
+        for number in range(3):
+            bench.feed(TRAY_A, number)
+        assert waits.wait(20)
+        threading.Event().wait(2 * TICK_S)
+        may_step.release()
+        healths = [bench.next(Health)]
+        while not any(line.received for line in healths[-1].inputs):
+            healths.append(bench.next(Health))
+    finally:
+        may_step.release(2)
+    assert healths[-1].has_unprocessed
+    assert not bench.end().has_unprocessed
+
+
 def test_health_accounts_for_inputs_outputs_counters_and_losses(config):
     bench = Bench(toy(), config)
     for t_ns in range(5):
@@ -224,6 +255,7 @@ def test_row_18_undecodable_bytes_of_a_stranger_are_counted_and_are_no_loss_of_t
     assert bench.next(Grid).t_ns.tolist() == [1]
     last = bench.end()
     assert {c.name: c.value for c in last.counters}["undecodable"] == 1
+    assert Note(tray="", text=f"messages that cannot be read: 1 on raw of {TRAY_A}") in last.notes
     assert last.lost == 4  # the counters of the two cores
 
 

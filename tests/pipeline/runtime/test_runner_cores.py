@@ -13,7 +13,10 @@ from pipeline.runtime.inbox import INBOX_SIZE
 from pipeline.runtime.joint_step import step_together
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, StageError
-from schemas.messages import Grid, Header, Health, InputPosition, Message, Raw, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header, InputPosition
+from schemas.health import Health
+from schemas.messages import Grid, Message, Raw
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, toy
 

@@ -19,7 +19,9 @@ from pipeline.errors import UserError
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Context, Stage
 from schemas.codec import decode
-from schemas.messages import Health, Message, StageStatus
+from schemas.enums import StageStatus
+from schemas.health import Health
+from schemas.messages import Message
 from schemas.topics import health_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, toy
@@ -95,6 +97,7 @@ def test_row_04_a_core_that_raises_while_it_is_closed_keeps_no_other_from_closin
     assert closed == [TRAY_B]
     assert isinstance(ended.error, OSError)
     assert ended.healths[-1].status == StageStatus.DEGRADED
+    assert [health.is_last for health in ended.healths[-2:]] == [False, True]
     assert "closing a failed: OSError: [Errno 30] Read-only file system" in ended.problem
 
 
@@ -110,6 +113,8 @@ def test_row_04_a_stage_that_crashed_and_cannot_be_aborted_reports_the_crash(con
     bench.bus.close()
     assert str(bench.crashes[0]) == "on purpose"
     assert "ZeroDivisionError: on purpose" in last.problem
+    assert last.is_last
+    assert last.has_ended
 
 
 def test_row_04_a_core_that_hangs_while_it_is_closed_is_left_behind_in_time(config):
@@ -200,7 +205,7 @@ def test_row_04_counts_that_no_health_can_hold_do_not_keep_the_stage_on_the_bus(
     bench.thread.join(20)
     bench.bus.close()
     assert not bench.thread.is_alive()
-    assert last.status == StageStatus.DEGRADED
+    assert (last.status, last.is_last) == (StageStatus.DEGRADED, True)
 
 
 class StopRaises(Burst):

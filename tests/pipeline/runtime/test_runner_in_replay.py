@@ -10,7 +10,10 @@ from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.runtime.stage import BuiltStage, Context
 from schemas.codec import encode, type_name
-from schemas.messages import Clock, Command, Grid, Header, Health, Message, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health
+from schemas.messages import Clock, Command, Grid, Message
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, toy

@@ -12,7 +12,10 @@ import pytest
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Context, StageError
 from schemas.codec import decode, encode, type_name
-from schemas.messages import Grid, Header, Health, Message, ScorerSnapshot, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health
+from schemas.messages import Grid, Message, ScorerSnapshot
 from schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, Silent, ToyConfig, toy

@@ -9,8 +9,11 @@ from hypothesis import strategies as st
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.sessions import Session, Sessions
 from pipeline.runtime.tracked_streams import Request
+from schemas.enums import Severity, StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Header, Health, Output, Severity, StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
+from schemas.messages import Alarm
 from schemas.topics import CATCH_UP_MESSAGES, tray_key
 
 KEY = tray_key("site", "tray", "alarm")

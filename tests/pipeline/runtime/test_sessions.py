@@ -17,7 +17,9 @@ from pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
 from pipeline.runtime.snapshot_store import SnapshotStore
 from pipeline.runtime.stage import BuiltStage, StageError
 from schemas.codec import encode, type_name
-from schemas.messages import Alarm, Grid, Header, Raw, Severity
+from schemas.enums import Severity
+from schemas.header import Header
+from schemas.messages import Alarm, Grid, Raw
 from schemas.topics import BY_NAME, alive_key, sessions_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, raw, toy

@@ -2,67 +2,212 @@
 
 from __future__ import annotations
 
-from pipeline.runtime.silences import Silences
-from schemas.messages import Header, Health, Output, StageStatus
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from pipeline.runtime.killed_sessions import KilledSessions
+from pipeline.runtime.sessions import Session, this_host
+from pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, RESTART_S, Silences
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import Health, Output
 from schemas.topics import tray_key
+from schemas.units import NS_PER_S
 
 KEY = tray_key("s", "a", "raw")
+STARTING, OK, DEGRADED, STOPPED = StageStatus.STARTING, StageStatus.OK, StageStatus.DEGRADED, StageStatus.STOPPED
 
 
-def health(published: int, status: StageStatus = StageStatus.OK) -> Health:
-    return Health(
-        header=Header("p", 0, ""),
-        stage="acquisition",
-        instance="a",
-        status=status,
-        t_ns=0,
-        uptime_s=0.0,
-        outputs=(Output(key=KEY, published=published), Output(key="another", published=9)),
-    )
+class Consumer:
+    """A stage with one main input; a health is on its way for no time, unless it says when it was sent."""
 
-
-class Arrived:
     def __init__(self) -> None:
-        self.number = 0
+        self.now_s = 1e6
+        self.arrived = 0
+        self.silences = Silences({KEY: "a"}, lambda: self.now_s)
 
-    def has_all_of(self, stream: tuple[str, str], published: int) -> bool:
-        assert stream == (KEY, "p")
-        return self.number >= published
+    def hear(self, published: int, status: StageStatus = OK, producer: str = "p", **fields: object) -> None:
+        health = Health(
+            header=Header(producer, 0, ""),
+            stage="acquisition",
+            instance="a",
+            status=status,
+            t_ns=round(self.now_s * NS_PER_S),
+            uptime_s=0.0,
+            outputs=(Output(key=KEY, published=published), Output(key="another", published=9)),
+        )
+        self.silences.add_health(replace(health, **fields), self._has_all_of)  # type: ignore[arg-type]
 
+    def _has_all_of(self, stream: tuple[str, str], published: int) -> bool:
+        assert stream[0] == KEY
+        return self.arrived >= published
 
-def test_row_16_a_silence_is_shown_once_by_each_health_that_says_that_all_has_arrived():
-    silences, arrived = Silences({KEY: "a"}), Arrived()
-    assert silences.take("a"), "a producer that never publishes health shows nothing else"
-    silences.add_health(health(5), arrived.has_all_of)
-    assert not silences.take("a"), "five messages are on the way"
-    arrived.number = 5
-    assert not silences.take("a"), "that they have arrived now says nothing about later ones"
-    silences.add_health(health(5), arrived.has_all_of)
-    assert silences.take("a")
-    assert not silences.take("a")
-
-
-def test_after_a_producer_that_has_stopped_in_order_nothing_more_is_waited_for():
-    silences, arrived = Silences({KEY: "a"}), Arrived()
-    silences.add_health(health(5), arrived.has_all_of)
-    arrived.number = 5
-    silences.add_health(health(5, StageStatus.STOPPED), arrived.has_all_of)
-    assert silences.take("a")
-    assert silences.take("a")
+    def is_shown(self) -> bool:
+        return self.silences.take("a")
 
 
-def test_what_a_producer_that_has_stopped_in_order_has_sent_is_still_waited_for():
-    silences, arrived = Silences({KEY: "a"}), Arrived()
-    silences.add_health(health(5, StageStatus.STOPPED), arrived.has_all_of)
-    assert not silences.take("a"), "its last messages are still being fetched"
-    arrived.number = 5
-    assert silences.take("a")
-    assert silences.take("a")
+@pytest.fixture
+def consumer() -> Consumer:
+    return Consumer()
 
 
-def test_a_producer_that_begins_again_is_waited_for_again():
-    silences, arrived = Silences({KEY: "a"}), Arrived()
-    silences.add_health(health(5, StageStatus.STOPPED), arrived.has_all_of)
-    silences.add_health(health(7), arrived.has_all_of)
-    arrived.number = 5
-    assert not silences.take("a"), "the seventh is on the way"
+def test_row_16_a_silence_is_shown_once_by_each_health_that_says_that_all_has_arrived(consumer):
+    assert consumer.is_shown(), "a producer that never publishes health shows nothing else"
+    consumer.hear(5)
+    assert not consumer.is_shown(), "five messages are on the way"
+    consumer.arrived = 5
+    assert not consumer.is_shown(), "that they have arrived now says nothing about later ones"
+    consumer.hear(5)
+    assert consumer.is_shown()
+    assert not consumer.is_shown()
+
+
+def test_row_16_a_producer_that_has_not_processed_its_input_shows_nothing(consumer):
+    consumer.arrived = 5
+    consumer.hear(5, has_unprocessed=True)
+    assert not consumer.is_shown(), "it could not send for a while, and samples wait in it"
+    consumer.hear(5)
+    assert consumer.is_shown()
+
+
+def test_row_16_a_health_that_was_cut_off_on_its_way_shows_nothing(consumer):
+    consumer.arrived = 5
+    consumer.hear(5)
+    assert consumer.is_shown()
+    sent_ns = round(consumer.now_s * NS_PER_S)
+    consumer.now_s += MOST_DELAY_S + 0.1
+    consumer.hear(5, t_ns=sent_ns)
+    assert not consumer.is_shown(), "samples were sent after it, and come next"
+    consumer.hear(5)
+    assert consumer.is_shown()
+
+
+def test_a_clock_that_is_set_back_delays_what_is_shown_for_a_while_only(consumer):
+    consumer.arrived = 5
+    consumer.hear(5)
+    assert consumer.is_shown()
+    shown = []
+    for _ in range(20):
+        consumer.now_s += 1.0
+        consumer.hear(5, t_ns=round((consumer.now_s - 3600.0) * NS_PER_S))
+        shown.append(consumer.is_shown())
+    assert (shown[0], shown[-1]) == (False, True)
+
+
+def test_row_16_a_session_that_has_just_begun_shows_nothing_before_its_first_message(consumer):
+    """It may still read what its device kept while none ran."""
+    consumer.hear(0, STARTING)
+    consumer.now_s += BEGINS_NS / NS_PER_S + 1.0
+    for status in (STARTING, OK):
+        consumer.hear(0, status)
+        assert not consumer.is_shown()
+    consumer.now_s += BEGINS_NS / NS_PER_S - 0.1
+    consumer.hear(0)
+    assert not consumer.is_shown(), "it counts from the end of its start"
+    consumer.hear(1)
+    assert not consumer.is_shown()
+    consumer.arrived = 1
+    consumer.hear(1)
+    assert consumer.is_shown()
+
+
+def test_a_session_whose_device_is_silent_from_the_beginning_shows_it(consumer):
+    consumer.hear(0, STARTING)
+    consumer.hear(0)
+    consumer.now_s += BEGINS_NS / NS_PER_S
+    consumer.hear(0)
+    assert consumer.is_shown()
+
+
+def test_after_a_producer_that_has_stopped_in_order_nothing_more_is_waited_for(consumer):
+    consumer.hear(5)
+    consumer.arrived = 5
+    consumer.hear(5, STOPPED)
+    assert consumer.is_shown()
+    assert consumer.is_shown()
+
+
+@pytest.mark.parametrize("status", [STOPPED, DEGRADED])
+def test_what_a_producer_that_has_ended_has_sent_is_still_waited_for(consumer, status):
+    consumer.hear(5, status, is_last=True)
+    consumer.now_s += RESTART_S
+    assert not consumer.is_shown(), "its last messages are still being fetched"
+    consumer.arrived = 5
+    assert consumer.is_shown()
+    assert consumer.is_shown()
+
+
+def test_a_producer_that_begins_again_is_waited_for_again(consumer):
+    consumer.hear(5, STOPPED)
+    consumer.hear(7)
+    consumer.arrived = 5
+    assert not consumer.is_shown(), "the seventh is on the way"
+
+
+def test_row_11_after_a_crash_the_next_session_is_waited_for_a_few_seconds_only(consumer):
+    consumer.arrived = 5
+    consumer.hear(5, DEGRADED, is_last=True)
+    consumer.now_s += RESTART_S - 0.1
+    assert not consumer.is_shown(), "the next one reads what the device keeps meanwhile"
+    consumer.now_s += 0.2
+    assert consumer.is_shown()
+    assert consumer.is_shown()
+
+
+def test_row_11_a_stage_that_crashes_at_each_start_does_not_hide_it(consumer):
+    consumer.arrived = 5
+    consumer.hear(5, DEGRADED, is_last=True)
+    for session in ("q", "r", "s"):
+        consumer.now_s += RESTART_S / 2
+        consumer.hear(0, STARTING, session)
+        consumer.hear(0, DEGRADED, session, is_last=True)
+    assert consumer.is_shown()
+    consumer.arrived = 0
+    consumer.hear(3, OK, "t")
+    assert not consumer.is_shown()
+    consumer.arrived = 3
+    consumer.hear(3, DEGRADED, "t", is_last=True)
+    assert not consumer.is_shown(), "this one has worked: its successor may read what its device keeps"
+
+
+def test_row_11_a_killed_session_has_ended(consumer):
+    consumer.hear(5)
+    consumer.silences.end("another")
+    consumer.silences.end("p")
+    consumer.now_s += RESTART_S
+    assert not consumer.is_shown(), "its last messages are still being fetched"
+    consumer.arrived = 5
+    assert consumer.is_shown()
+    assert consumer.is_shown()
+
+
+def token(process_id: int, host: str = this_host()) -> str:
+    return Session("acquisition", "a", 1, "acquisition-a-01", host, process_id).key("s")
+
+
+def test_row_11_a_session_without_a_token_was_killed_if_its_process_runs_no_more():
+    sessions = KilledSessions(this_host())
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    key = token(process.pid)
+    try:
+        sessions.update(key, alive=True)
+        sessions.update(key, alive=False)
+        assert sessions.take() == [], "only its link was cut"
+    finally:
+        process.kill()
+        process.communicate()
+    assert sessions.take() == ["acquisition-a-01"]
+    assert sessions.take() == []
+
+
+def test_row_11_whether_a_process_elsewhere_runs_is_not_known():
+    sessions = KilledSessions(this_host())
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    for key in (token(process.pid), token(1, "elsewhere")):  # the first never ran where it can be seen from here
+        sessions.update(key, alive=True)
+        sessions.update(key, alive=False)
+    assert sessions.take() == []

@@ -19,7 +19,8 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.viewing import band_plot
 from pipeline.viewing.band_plot import Fault, plot_bands, plot_recording, read_trace
 from pipeline.viewing.trace import trace_of
-from schemas.messages import Alarm, FanState, Score
+from schemas.enums import FanState
+from schemas.messages import Alarm, Score
 from schemas.topics import tray_key
 from tests.support.score_data import START_NS, made_up_tray
 
@@ -79,6 +80,17 @@ def test_title_axis_and_legend_name_everything_with_its_unit(tmp_path: Path) -> 
     assert texts[:5] == ["measured", "twin", "twin ± 2σ", "outside the band (1 in 20 when healthy)", "alarm active"]
     assert set(texts[5:]) == {"true fault", "state: normal", "suspect", "alarm", "returning", "unknown: not scored"}
     assert (tmp_path / "bands.svg").stat().st_size > 0
+
+
+def test_what_was_measured_beside_has_a_panel_with_its_unit_below_each_fan() -> None:
+    scores, _ = made_up_tray(fans=3)
+    volts = [replace(score, supply_voltage_v=np.full(score.command.shape, 12.0, np.float32)) for score in scores]
+    figure = band_plot._figure(trace_of("tray1", volts, "rpm"), [1, 2], [FAULT])
+    assert [axes.get_ylabel() for axes in figure.axes] == ["speed (rpm)", "supply\n(V)", ""] * 2
+    (line,) = figure.axes[1].lines
+    assert np.nanmax(np.asarray(line.get_ydata(), float)) == 12.0
+    unknown = [replace(score, supply_voltage_v=np.full(score.command.shape, np.nan, np.float32)) for score in scores]
+    assert len(band_plot._figure(trace_of("tray1", unknown, "rpm"), [1, 2], [FAULT]).axes) == 4
 
 
 def test_the_legend_and_the_title_are_not_drawn_over() -> None:

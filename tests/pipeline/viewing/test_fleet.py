@@ -11,7 +11,9 @@ import pytest
 from pipeline.config.models import TrayConfig
 from pipeline.viewing.fleet import NORMAL_LEVELS, Fan, Fleet, class_names
 from pipeline.viewing.worst_page import FANS_LISTED, worst_page
-from schemas.messages import Alarm, FanState, Header, InvalidReason, Score, Severity, Transition
+from schemas.enums import FanState, InvalidReason, Severity, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Score
 from tests.support.score_data import START_NS
 
 SECOND_NS = 1_000_000_000

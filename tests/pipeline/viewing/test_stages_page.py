@@ -3,7 +3,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pipeline.viewing.stages_page import CHANGES_SHOWN, PROBLEMS_LISTED, SILENT_AFTER_NS, StagesPage, rounded
-from schemas.messages import AwaitedInput, Header, Health, ModelCard, StageStatus
+from schemas.enums import StageStatus
+from schemas.header import Header
+from schemas.health import AwaitedInput, Health
+from schemas.messages import ModelCard
 
 NOW_NS = 1_760_000_000_000_000_000  # 2025-10-09 08:53:20
 

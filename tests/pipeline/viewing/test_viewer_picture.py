@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,16 @@ def test_a_healthy_fan_shows_a_green_band_and_a_faulty_one_a_red_deviation_too(v
     assert healthy["deviation"] < 1e-3 and faulty["deviation"] > 0.02
     assert faulty["red points"] > 3 * healthy["red points"] > 0
     assert healthy["measured"] > 0.002
+
+
+def test_a_picture_has_a_plot_of_each_column_that_was_drawn_beside_the_speeds(view_file: Path, tmp_path: Path) -> None:
+    assert rerun_picture._read(view_file).trays["tray1"].auxiliary == []
+    scores, _ = made_up_tray(seconds=1)
+    core = build(context(tmp_path)).core
+    play(core, [replace(score, temperature_c=np.full(score.score.shape, 21.0, np.float32)) for score in scores])
+    core.close()
+    drawn = rerun_picture._read(tmp_path / "view.rrd").trays["tray1"]
+    assert [column.name for column in drawn.auxiliary] == ["temperature_c"]
 
 
 @pytest.mark.slow

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from schemas.messages import Alarm, Severity
+from schemas.enums import Severity
+from schemas.messages import Alarm
 from scoring.alarms.alarm_flags import is_listed, is_presented, is_retained, is_silenced
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, AlarmState
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from schemas.messages import Alarm, Diagnosis, Severity, Statistic, Transition
+from schemas.enums import Severity, Statistic, Transition
+from schemas.messages import Alarm, Diagnosis
 from schemas.units import SpeedUnit
 from scoring.alarms.alarm_text import AlarmText
 from scoring.diagnosis.diagnosis import CANNOT_TELL, DROPOUT, STUCK

@@ -9,7 +9,9 @@ from typing import Any
 
 import pytest
 
-from schemas.messages import Alarm, Diagnosis, Header, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Diagnosis
 from scoring.alarms.alarm_flags import is_retained
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS

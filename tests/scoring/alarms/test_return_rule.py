@@ -12,7 +12,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.messages import Action, FanState, Transition
+from schemas.enums import Action, FanState, Transition
 from scoring.alarms.fan_condition import ConditionSettings
 from scoring.alarms.return_rule import TOGETHER_NS, HoldingDetector
 from scoring.alarms.tray_conditions import TrayConditions

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.messages import Action, FanState, Severity, Transition
+from schemas.enums import Action, FanState, Severity, Transition
 from scoring.alarms.alarm_flags import is_retained, is_silenced
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, ConditionSettings
 from scoring.alarms.tray_conditions import BlockResult, TrayConditions

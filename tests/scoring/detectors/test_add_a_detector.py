@@ -9,7 +9,8 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from schemas.messages import Alarm, Array, Statistic, Transition
+from schemas.enums import Statistic, Transition
+from schemas.messages import Alarm, Array
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.detectors import table
 from scoring.detectors.alarm_units import AlarmUnits

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from schemas.messages import Diagnosis, Transition
+from schemas.enums import Transition
+from schemas.messages import Diagnosis
 from scoring.detectors.deviation import summed_deviation
 from scoring.diagnosis.diagnoser import MAX_SAMPLES, Diagnoser
 from scoring.diagnosis.shown_causes import FALLING, MIN_PROBABILITY

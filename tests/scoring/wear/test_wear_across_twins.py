@@ -21,7 +21,9 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.stage import Context, load_stage
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.blocks import select
-from schemas.messages import Action, Alarm, Header, Message, ModelCard, ScorerSnapshot
+from schemas.enums import Action
+from schemas.header import Header
+from schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 from scoring.diagnosis.regression_window import HealthyBalance, Window

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from schemas.blocks import cut
-from schemas.messages import Action, Alarm, Header, Prediction, ScorerSnapshot, Transition
+from schemas.enums import Action, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Prediction, ScorerSnapshot
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.torque_balance import BalanceModel, TorqueBalance
 from scoring.wear.slow_change import WEAR_HINT

@@ -12,7 +12,8 @@ import pytest
 from onnx import helper
 
 from pipeline.runtime.twin_file import TwinFile
-from schemas.messages import Grid, InvalidReason, Prediction
+from schemas.enums import InvalidReason
+from schemas.messages import Grid, Prediction
 from schemas.twin_card import NetworkCard, StateLayout
 from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from tests.support import fan_data

@@ -513,3 +513,15 @@ def test_what_the_twin_knows_is_drawn_where_its_card_says_it(twin, hybrid, monke
         known, std_rad_s=(((0.1, 0.2), (0.1, 0.2)),), seen_std_rad_s=(), settled_speed_rad_s=(), **CORNERS
     )
     assert figures.OUTSIDE not in figures.what_is_known(content, content.fans[0], everywhere), "no line where none is"
+
+
+def test_what_is_measured_beside_command_and_speed_has_its_curve_and_what_is_not_has_none(twin):
+    run = published_run(4, duration_s=20.0)
+    volts = np.full_like(run.command, 12.0)
+    volts[1000:] = np.nan
+    nothing = np.full_like(volts, np.nan)
+    measured = replace(run, auxiliary={"supply_voltage_v": volts, "current_a": nothing})
+    for one, units in ((run, ()), (measured, ("(V)",))):
+        content = report_content(twin, [one], [DataCard("r", "", 1, run.samples)], RAD_S)
+        drawn = figures.over_time(content, content.fans[0], narrow=False)
+        assert tuple(unit for unit in ("(V)", "(A)", "(°C)") if unit in drawn) == units

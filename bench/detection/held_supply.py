@@ -1,0 +1,114 @@
+"""Whether a twin of 4-pin fans should allow for their supply: fans that hold their speed, and fans that follow it.
+
+For each seed and kind, a physical twin is trained on half an hour of a thermostat's commands, with the measured supply
+voltage and temperature and without, and run freely over another half hour. Printed are its errors, what it has found,
+and the errors of physics alone (`identify`) on the training run.
+
+    python -m bench.detection.held_supply [--seeds 3] [--seconds 1800]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from schemas.reference_conditions import ReferenceConditions
+from schemas.tacho import Tacho
+from simulation.surroundings import Surroundings
+from simulation.tacho import TachoSettings
+from simulation.tray import TraySettings
+from simulation.tray_run import run_of
+from twin.build import evaluate, train_twin
+from twin.finishing import TrainedTwin
+from twin.fitting.identification import identify
+from twin.reference import at_reference, reference_of
+from twin.runs import Run
+
+FANS, RATE_HZ, FANS_SEED = 3, 10.0, 7
+TACHO = Tacho(kind="count", window_s=1.0, pulses=2)
+WANDERS = (0.05, 0.0)
+HELD = {1.0: "hold their speed", 0.0: "follow the supply"}
+
+
+def simulated(seed: int, held: float, wander: float, seconds: float) -> Run:
+    """A run with supply voltage and temperature."""
+    return run_of(
+        TraySettings(
+            fans=FANS,
+            fan="4-pin",
+            rate_hz=RATE_HZ,
+            duration_s=seconds,
+            profile="thermostat",
+            seed=seed,
+            fans_seed=FANS_SEED,
+            tacho=TachoSettings((TACHO,)),
+            surroundings=Surroundings(
+                supply_wander=wander,
+                supply_held=held,
+                temperature_swing_c=8.0,
+                measured=("supply_voltage_v", "temperature_c"),
+            ),
+        )
+    )
+
+
+def found(twin: TrainedTwin) -> str:
+    """What the twin is made of."""
+    used = " and ".join(twin.card.conditions.needed) if twin.card.conditions else "no columns"
+    return f"{'a drive' if twin.card.drive else 'no drive'}, {used}"
+
+
+def of_physics(run: Run, reference: ReferenceConditions | None) -> float:
+    """The free-run error of physics alone on the run that it is fitted to, rad/s."""
+    identified = identify(at_reference([run], reference))
+    return float(np.sqrt(np.mean(identified.rmse_rad_s**2)))
+
+
+def error_rad_s(twin: TrainedTwin, run: Run) -> float:
+    """Of the free run; NaN where nothing is measured."""
+    rmse_rad_s = evaluate(twin, [run]).pooled.rmse_rad_s
+    return float("nan") if rmse_rad_s is None else rmse_rad_s
+
+
+def _range(values: Sequence[float]) -> str:
+    return f"{min(values):.2f} to {max(values):.2f}"
+
+
+def main() -> None:
+    """Print a line for each kind of fans and supply."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=1800.0)
+    arguments = parser.parse_args()
+    for held, words in HELD.items():
+        for wander in WANDERS:
+            made: list[str] = []
+            errors: list[tuple[float, float, float, float]] = []
+            for seed in range(arguments.seeds):
+                training, other = (simulated(100 * seed + k, held, wander, arguments.seconds) for k in (1, 2))
+                twin = train_twin([training], [], "physical", name="knows")
+                blind = train_twin([replace(training, auxiliary={})], [], "physical", name="blind")
+                made.append(found(twin))
+                both = reference_of([training])
+                assert both is not None
+                errors.append(
+                    (
+                        error_rad_s(twin, other),
+                        error_rad_s(blind, replace(other, auxiliary={})),
+                        of_physics(training, both),
+                        of_physics(training, replace(both, supply_voltage_v=None)),
+                    )
+                )
+            own, without, with_both, with_air = map(_range, zip(*errors, strict=True))
+            print(
+                f"supply wanders by {100 * wander:.0f} %, fans {words}: {'; '.join(sorted(set(made)))}: {own} rad/s, "
+                f"without columns {without}; physics with both {with_both}, with temperature {with_air}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

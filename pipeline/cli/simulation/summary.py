@@ -1,0 +1,77 @@
+"""What `fantwin simulate` says of a playback: the ground truth as JSON, and a line of counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.devices.simulated_device import PlaybackCounts
+from pipeline.devices.table_device import TableDevice
+from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    from simulation.tray import SimulatedTray
+
+Summary = dict[str, Any]
+
+
+def _counts(played: PlaybackCounts) -> Summary:
+    counts = asdict(played)
+    del counts["start_ns"]
+    return counts
+
+
+def summary_of_tray(tray: SimulatedTray, played: PlaybackCounts, *, complete: bool) -> Summary:
+    """The ground truth of a simulated tray, with what became of its samples."""
+    from simulation.truth import truth  # noqa: PLC0415
+
+    return truth(tray, played.start_ns, complete=complete, counts=_counts(played))
+
+
+def summary_of_file(path: Path, table: TableDevice, played: PlaybackCounts, *, complete: bool) -> Summary:
+    """The same of a played file: it has no faults that are known."""
+    return {
+        "complete": complete,
+        "start_ns": played.start_ns,
+        **_counts(played),
+        "faults": [],
+        "fans": table.fans,
+        "file": str(path),
+    }
+
+
+def save(path: Path | None, summary: Summary) -> None:
+    """Write the summary, where a file is named.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    from simulation.truth import write_truth  # noqa: PLC0415
+
+    if path is None:
+        return
+    try:
+        write_truth(path, summary)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}; name another file with --truth") from error
+
+
+def save_start(path: Path | None, summary_of: Callable[..., Summary], start_ns: int) -> None:
+    """Write when the playback has begun."""
+    save(path, summary_of(PlaybackCounts(start_ns=start_ns), complete=False))
+
+
+def count_text(played: PlaybackCounts) -> str:
+    """What became of the samples, in one line."""
+    parts = [f"{played.samples_sent} samples sent"]
+    if played.samples_dropped:
+        parts.append(f"{played.samples_dropped} lost as simulated")
+    if played.samples_unsent:
+        parts.append(f"{played.samples_unsent} not sent because no program read the port, or too slowly")
+    if played.bytes_unread:
+        parts.append(f"the last {played.bytes_unread} bytes were not read")
+    if played.samples_late:
+        parts.append(f"{played.samples_late} sent late, by up to {played.worst_lateness_s * 1e3:.0f} ms")
+    return "; ".join(parts)

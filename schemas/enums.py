@@ -1,0 +1,115 @@
+"""The enumerations of the messages; the values are those of `fan.proto`."""
+
+from __future__ import annotations
+
+from schemas.fields import OpenEnum
+
+
+class InvalidReason(OpenEnum):
+    """Why a sample is not scored."""
+
+    NONE = 0
+    STALE = 1
+    GAP = 2
+    WARMING_UP = 3
+    OUT_OF_RANGE = 4
+    SATURATED = 5
+    NO_SPEED = 6
+    NO_TWIN = 7
+    CLOCK_RESTARTED = 8
+    STOPPED = 9
+    STARTING = 10
+    CONDITIONS_UNKNOWN = 11
+
+
+class FanState(OpenEnum):
+    """The state of a fan at one sample, as the scorer sees it."""
+
+    UNKNOWN = 0
+    NORMAL = 1
+    SUSPECT = 2
+    ALARM = 3
+    RETURNING = 4
+    COMMISSIONING = 5
+    STOPPED = 6
+    STARTING = 7
+
+
+class Statistic(OpenEnum):
+    """The statistics that are compared with limits; the values number them across messages and snapshots."""
+
+    NONE = 0
+    SPEED_SMOOTHED = 1
+    SPEED_DRIFT = 2
+    SPEED_VARIANCE_GROWTH = 3
+    BALANCE_SMOOTHED = 4
+    BALANCE_DRIFT = 5
+    BALANCE_VARIANCE_GROWTH = 6
+    SENSOR = 7
+    STANDSTILL = 8
+
+
+class Transition(OpenEnum):
+    """What happened to an alarm, in the terms of OPC UA Part 9."""
+
+    NONE = 0
+    RAISED = 1
+    SEVERITY = 2
+    DIAGNOSED = 3
+    CLEARED = 4
+    ACKNOWLEDGED = 5
+    CONFIRMED = 6
+    RESET = 7
+    SHELVED = 8
+    UNSHELVED = 9
+    SUPPRESSED = 10
+    UNSUPPRESSED = 11
+    OUT_OF_SERVICE = 12
+    IN_SERVICE = 13
+    COMMISSIONING = 14
+    REPUBLISHED = 15
+    REFUSED = 16
+    DATA_LOST = 17
+    DATA_RESTORED = 18
+
+
+class Action(OpenEnum):
+    """What an operator can request."""
+
+    NONE = 0
+    ACKNOWLEDGE = 1
+    CONFIRM = 2
+    RESET = 3
+    SHELVE = 4
+    UNSHELVE = 5
+    SUPPRESS = 6
+    UNSUPPRESS = 7
+    OUT_OF_SERVICE = 8
+    IN_SERVICE = 9
+    COMMISSION = 10
+
+
+class Severity(OpenEnum):
+    """Severity of an alarm."""
+
+    NONE = 0
+    WARNING = 1
+    ALARM = 2
+
+
+class StageStatus(OpenEnum):
+    """Status that a stage reports of itself."""
+
+    STARTING = 0
+    OK = 1
+    DEGRADED = 2
+    STOPPED = 3
+
+
+class TachoKind(OpenEnum):
+    """How a speed is measured, as schemas.tacho explains."""
+
+    INSTANTANEOUS = 0
+    COUNT = 1
+    PERIOD = 2
+    AVERAGE = 3

@@ -1,0 +1,113 @@
+"""The health of a stage: what it received and published, what it counts, and what is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from schemas.enums import StageStatus
+from schemas.header import Header
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counter:
+    """One counter of a stage; it only grows within a session."""
+
+    name: str
+    value: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Input:
+    """One input of a stage: messages on one key from one producer.
+
+    Attributes:
+        missing: gaps in the sequence, never filled.
+        missing_at_start: those of them before the first message that was received.
+        refused: those of the received ones that were ignored, because another process owns the stage of their producer.
+        unsaved: the last of the received ones, so many, that are lost if the stage is killed now.
+    """
+
+    key: str
+    producer: str
+    received: int
+    missing: int
+    duplicated: int
+    next_sequence: int
+    missing_at_start: int = 0
+    refused: int = 0
+    unsaved: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """One output of a stage; `published` is also the next sequence number."""
+
+    key: str
+    published: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class AwaitedInput:
+    """An input that a stage waits for, and since when, host time."""
+
+    key: str
+    since_t_ns: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Note:
+    """What a stage works with and has done for a tray, one line; an empty tray: for all."""
+
+    tray: str
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceptedSamples:
+    """What an acquisition accepts of the clients that push samples of a tray; commands in the tray's unit."""
+
+    tray: str
+    fans: int
+    command_min: float
+    command_max: float
+    speed_max_rad_s: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Health:
+    """Status of a process of a stage, and what it has received, sent and lost.
+
+    Attributes:
+        trays: those that it has, separated by commas; empty: all of the site. Earlier versions do not say it: there, a
+            stage with a process for each tray has the one that its instance names.
+        is_last: of its session, whatever its status. Earlier versions do not say it: see `has_ended`.
+        has_unprocessed: input has arrived of which outputs may still be made, so `outputs` do not show that none came.
+    """
+
+    header: Header = Header()
+    stage: str
+    instance: str
+    status: StageStatus
+    t_ns: int
+    uptime_s: float
+    problem: str = ""
+    inputs: tuple[Input, ...] = ()
+    outputs: tuple[Output, ...] = ()
+    counters: tuple[Counter, ...] = ()
+    latency_p50_ms: float = 0.0
+    latency_p99_ms: float = 0.0
+    lost: int = 0
+    process_id: int = 0
+    waiting_for: tuple[AwaitedInput, ...] = ()
+    newest_input_t_ns: int = 0
+    newest_output_t_ns: int = 0
+    notes: tuple[Note, ...] = ()
+    trays: str = ""
+    accepts: tuple[AcceptedSamples, ...] = ()
+    is_last: bool = False
+    has_unprocessed: bool = False
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether its session has ended, in order or with an error, and sends no more."""
+        return self.is_last or self.status == StageStatus.STOPPED
