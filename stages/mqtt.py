@@ -9,15 +9,14 @@ sent when the broker has room. After each connection all retained topics are pub
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
-from typing import Any
 
 from pipeline.broker.config import MqttConfig
 from pipeline.broker.fan_states import FanStates, shown_alarm, topics_of
 from pipeline.broker.home_assistant import OFFLINE, ONLINE, HomeAssistant
+from pipeline.broker.json_text import json_text
 from pipeline.broker.link import BrokerLink, Link
 from pipeline.broker.outbox import Outbox, Outgoing
 from pipeline.broker.requests import Requests
@@ -188,7 +187,7 @@ class MqttCore(Core):
             self._has_news = True
         for fan in self._changed_alarms:
             current = self._model.current_alarm(fan)
-            text = _text(shown_alarm(current) if current else None)
+            text = json_text(shown_alarm(current) if current else None)
             self._outbox.retain(self._topics.alarm(fan), text, is_urgent=True)
         is_full = abs(now_ns - self._full_ns) >= self._config.period_s * NS_PER_S
         if is_full:
@@ -198,7 +197,7 @@ class MqttCore(Core):
             self._full_ns = now_ns if is_full else self._full_ns
             self._changes_ns, self._has_news = now_ns, False
             for fan, state in self._states.changed(is_full=is_full, with_silent=knows_all).items():
-                self._outbox.retain(self._topics.state(fan), _text(state))
+                self._outbox.retain(self._topics.state(fan), json_text(state))
         self._changed_alarms.clear()
         if abs(now_ns - self._site_ns) >= SITE_PERIOD_NS:
             self._site_ns = now_ns
@@ -207,8 +206,8 @@ class MqttCore(Core):
     def _update_site(self) -> None:
         counts = {name.replace(" ", "_"): count for name, count in self._model.counts().items()}
         fans = sum(tray.fans for tray in self._model.trays)
-        self._outbox.retain(self._topics.summary, _text({"fans": fans} | counts))
-        self._outbox.retain(self._topics.stages, _text(stages_json(self._model.stages())))
+        self._outbox.retain(self._topics.summary, json_text({"fans": fans} | counts))
+        self._outbox.retain(self._topics.stages, json_text(stages_json(self._model.stages())))
         if not self._has_devices:
             self._has_devices = True
             for topic, text in self._devices.items():
@@ -222,7 +221,7 @@ class MqttCore(Core):
         room = self._link.room()
         for number, alarm in self._queue.take((room + 1) // 2):
             topic = self._topics.transitions(Fan(alarm.header.tray, alarm.fan))
-            sent = self._link.publish(Outgoing(topic, _text(transition_json(number, alarm)), is_retained=False))
+            sent = self._link.publish(Outgoing(topic, json_text(transition_json(number, alarm)), is_retained=False))
             self._numbers[sent] = number
             self._counts["published_transitions"] += 1
             room -= 1
@@ -241,10 +240,6 @@ def _number_of(text: str) -> int:
     return int(text) if text.isascii() and text.isdigit() and len(text) < 6 else -1
 
 
-def _text(value: Any) -> str:
-    return json.dumps(value, separators=(",", ":"))
-
-
 def build(context: Context) -> BuiltStage:
     """Open the history, and begin to connect.
 
@@ -261,6 +256,7 @@ def build(context: Context) -> BuiltStage:
     link = BrokerLink(
         config,
         context.folder,
+        topics.client_id,
         Outgoing(topics.status, OFFLINE, is_retained=True),
         [topics.requests(tray.name) for tray in context.trays] if config.accept else [],
         patterns_of_retained(config, topics, HomeAssistant(config, topics, context.trays)),

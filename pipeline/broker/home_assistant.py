@@ -13,6 +13,7 @@ from importlib.metadata import version
 from typing import Any
 
 from pipeline.broker.config import MqttConfig
+from pipeline.broker.json_text import json_text
 from pipeline.broker.topics import Topics
 from pipeline.config.models import TrayConfig
 from pipeline.viewing.fleet import Fan
@@ -55,7 +56,7 @@ class HomeAssistant:
         """The text of each device by its topic."""
         devices = {SITE_DEVICE: self._site()}
         devices |= {f"{fan.tray}-{fan.number}": self._fan(fan, unit) for fan, unit in self._fans}
-        return {f"{self._path}/{name}/config": json.dumps(device) for name, device in devices.items()}
+        return {f"{self._path}/{name}/config": json_text(device) for name, device in devices.items()}
 
     def _site(self) -> dict[str, Any]:
         def count(name: str, key: str, icon: str) -> dict[str, Any]:

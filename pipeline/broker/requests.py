@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
+from pipeline.broker.json_text import json_text
 from pipeline.broker.topics import ALL_FANS, ANSWER, REQUEST, Topics
 from pipeline.config.models import TrayConfig
 from pipeline.presenting.request_desk import ANSWERED_WITHIN_S, RequestDesk
@@ -143,7 +143,7 @@ def _granted(answers: Sequence[Alarm]) -> dict[str, Any]:
 
 
 def _answer(topic: str, name: str, body: dict[str, Any]) -> tuple[str, str]:
-    return f"{topic}/{ANSWER}", json.dumps(({"id": name} if name else {}) | {"ok": "error" not in body} | body)
+    return f"{topic}/{ANSWER}", json_text(({"id": name} if name else {}) | {"ok": "error" not in body} | body)
 
 
 def _why(error: ValueError) -> str:

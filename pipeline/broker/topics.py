@@ -32,6 +32,12 @@ class Topics:
         return f"{self.prefix}/{self.site}"
 
     @property
+    def client_id(self) -> str:
+        """Of the process. It has one so that the broker ends a connection of before, and says `offline` for it, when
+        there is a new one, and not later."""
+        return f"{self.prefix}-{self.site}-{self.instance}"
+
+    @property
     def status(self) -> str:
         """Whether the stage is there: online or offline."""
         return self._own("status")

@@ -36,11 +36,14 @@ def refusal(reason: object) -> str:
     return f"the broker refuses this client: {reason}; check username and password"
 
 
-def new_client(settings: BrokerSettings, folder: Path, what: str, process: str, client_id: str = "") -> Client:
+def new_client(
+    settings: BrokerSettings, folder: Path, what: str, process: str, client_id: str = "", *, is_kept: bool = False
+) -> Client:
     """A client that is not connected yet.
 
     folder: relative paths start here. what: who it is for, in errors. process: of that name, which needs the
-    environment. client_id: with it the broker keeps what comes while the client is away.
+    environment. client_id: the broker ends an older connection of the same one. is_kept: the broker keeps what comes
+    while the client is away; needs client_id.
 
     Raises:
         UserError: a password or certificate cannot be read.
@@ -48,7 +51,7 @@ def new_client(settings: BrokerSettings, folder: Path, what: str, process: str, 
     from paho.mqtt import client as paho  # noqa: PLC0415  an extra
     from paho.mqtt.enums import CallbackAPIVersion  # noqa: PLC0415
 
-    client = paho.Client(CallbackAPIVersion.VERSION2, client_id, clean_session=not client_id, protocol=paho.MQTTv311)
+    client = paho.Client(CallbackAPIVersion.VERSION2, client_id, clean_session=not is_kept, protocol=paho.MQTTv311)
     client.reconnect_delay_set(RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S)
     if settings.username:
         password = None

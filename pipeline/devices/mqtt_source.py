@@ -120,7 +120,8 @@ class MqttSource:
         return connection_problems(client, self._config, self.name)
 
     def _new_client(self, client_id: str) -> Client:
-        client = new_client(self._config, self._context.folder, "source mqtt", "acquisition", client_id)
+        folder, is_kept = self._context.folder, bool(client_id)
+        client = new_client(self._config, folder, "source mqtt", "acquisition", client_id, is_kept=is_kept)
         client.on_connect = self._on_connect
         client.on_connect_fail = self._on_connect_fail
         client.on_disconnect = self._on_disconnect

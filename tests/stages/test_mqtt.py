@@ -11,8 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import paho.mqtt.client as paho
 import pytest
 import trustme
+from paho.mqtt.enums import CallbackAPIVersion
 
 from pipeline.broker.config import MqttConfig
 from pipeline.config.models import TrayConfig
@@ -202,6 +204,21 @@ def test_the_last_will_says_that_a_killed_stage_is_gone(tmp_path, broker, listen
         eventually(lambda: listener.last(f"{ROOT}/status") == "offline", "the broker says that it is gone")
     finally:
         running.kill()
+
+
+def test_the_last_will_of_a_connection_that_is_dead_comes_before_the_next_one_says_online(tmp_path, broker, listener):
+    dead = paho.Client(CallbackAPIVersion.VERSION2, f"fantwin-{SITE}-all")
+    dead.will_set(f"{ROOT}/status", "offline", 1, retain=True)
+    dead.connect("127.0.0.1", broker.port, keepalive=60)
+    dead.loop_start()
+    eventually(dead.is_connected, "it is connected")
+    dead._thread_terminate = True  # its thread ends, as if the host had gone: its connection stays
+    stage = RunningMqtt(tmp_path, broker.port)
+    try:
+        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
+        assert listener.of(f"{ROOT}/status") == ["offline", "online"]
+    finally:
+        stage.close()
 
 
 def test_requests_are_passed_on_under_the_configured_name_and_answered(tmp_path, broker, listener):

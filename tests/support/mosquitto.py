@@ -71,7 +71,7 @@ class Listener:
         assert self._subscribed.wait(20)
 
     def _on_connect(self, client: paho.Client, *_rest: Any) -> None:
-        client.subscribe("#", 1)
+        client.subscribe("#", 0)
 
     def _on_message(self, _client: Any, _data: Any, message: paho.MQTTMessage) -> None:
         self.heard.append((message.topic, message.payload.decode(), message.retain))
