@@ -127,6 +127,14 @@ STAGES: dict[str, StageRow] = {
             reads=("score", "alarm", "twin"),
             writes=("request",),
         ),
+        StageRow(
+            "mqtt",
+            "stages.mqtt:STAGE",
+            has_common_shards=False,
+            may_drop=True,
+            reads=("score", "alarm", "health"),
+            writes=("request",),
+        ),
         StageRow("notifier", "stages.notifier:STAGE", has_common_shards=False, reads=("alarm",), writes=()),
     )
 }

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from pipeline.devices.broker_settings import BrokerSettings
 from pipeline.devices.sample_source import SourceConfig
 
 FAN = "{fan}"
 """stands for the number of a fan in a topic"""
 
 
-class MqttConfig(SourceConfig, frozen=True):
+class MqttConfig(SourceConfig, BrokerSettings, frozen=True):
     """A broker, and the topics that have the samples: JSON on one topic, or a number for each fan on topics of its own
     (docs/how-to/sources.md)."""
 
     kind: Literal["mqtt"] = "mqtt"
-    host: str = Field(min_length=1, description="name or address of the broker")
-    port: int = Field(default=1883, ge=1, le=65535, description="port of the broker; with TLS usually 8883")
     topic: str = Field(default="", description="topic of samples in JSON; may have the wildcards + and #")
     speed_topic: str = Field(
         default="",
@@ -38,25 +36,6 @@ class MqttConfig(SourceConfig, frozen=True):
         description="id of this client, another one for each tray; with it, the broker keeps messages while "
         "acquisition is away",
     )
-    keepalive_s: int = Field(
-        default=30, ge=5, le=3600, description="this client sends the broker something at least this often"
-    )
-    username: str = Field(default="", description="user of the broker")
-    password_file: Path | None = Field(
-        default=None, description="file with the password in its first line; only its owner may be able to read it"
-    )
-    password_env: str = Field(
-        default="", description="instead of password_file: environment variable that holds the password"
-    )
-    tls: bool = Field(
-        default=False, description="whether the connection is encrypted and the certificate of the broker checked"
-    )
-    ca: Path | None = Field(
-        default=None,
-        description="certificate of the authority that signed the broker's; without it those of the system",
-    )
-    certificate: Path | None = Field(default=None, description="certificate of this client, if the broker asks for one")
-    key: Path | None = Field(default=None, description="private key of that certificate")
 
     @property
     def has_values(self) -> bool:
@@ -93,16 +72,4 @@ class MqttConfig(SourceConfig, frozen=True):
             raise ValueError("speed_topic and command_topic are the same")
         if "+" in self.send_topic or "#" in self.send_topic:
             raise ValueError("send_topic: commands go to one topic, without + and #")
-        return self
-
-    @model_validator(mode="after")
-    def _secrets_fit(self) -> Self:
-        if self.password_file and self.password_env:
-            raise ValueError("give password_file or password_env, not both")
-        if (self.password_file or self.password_env) and not self.username:
-            raise ValueError("a password needs username")
-        if not self.tls and (self.ca or self.certificate or self.key):
-            raise ValueError("ca, certificate and key need tls = true")
-        if bool(self.certificate) != bool(self.key):
-            raise ValueError("give certificate and key, or neither")
         return self

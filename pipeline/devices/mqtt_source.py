@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import json
 import math
-import ssl
-import threading
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from pipeline.devices.broker_client import NOT_REACHED, connection_problems, new_client, refusal, require_paho
 from pipeline.devices.fan_values import FanValues
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.devices.json_samples import JsonSamplesError, batches_of, parse_samples
@@ -29,16 +28,10 @@ from pipeline.devices.sample_source import (
     SourceContext,
     SourceEvent,
 )
-from pipeline.devices.secret_file import read_secret, secret_of_environment
-from pipeline.errors import UserError
-from pipeline.optional_dependencies import how_to_install, is_installed
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client, MQTTMessage
 
-RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 1, 10
-ANSWER_S = 5.0
-"""for a check"""
 MOST_RECENT = 64
 """messages by which one that the broker sends again is recognised"""
 LONGEST_NUMBER = 40
@@ -54,8 +47,7 @@ class MqttSource:
         Raises:
             UserError: the extra is not installed, or a password or certificate cannot be read.
         """
-        if not is_installed("paho"):
-            raise UserError(f"source mqtt needs paho-mqtt; {how_to_install('mqtt')}")
+        require_paho("source mqtt")
         self._config = config
         self._deliver: Callable[[SourceEvent], None] = lambda _event: None
         self._receipts = ReceiptTimes()
@@ -123,56 +115,13 @@ class MqttSource:
 
     def check(self) -> list[str]:
         """Whether the broker answers and accepts this client."""
-        problems: list[str] = []
         # with an id of its own: the broker ends the connection of another client with the same one
-        client, has_answered = self._new_client(""), threading.Event()
-
-        def on_connect(_client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-            if reason.is_failure:
-                problems.append(f"{self.name}: the broker refuses: {reason}; check username and password")
-            has_answered.set()
-
-        client.on_connect = on_connect
-        client.on_connect_fail = client.on_disconnect = None
-        try:
-            client.connect(self._config.host, self._config.port, keepalive=self._config.keepalive_s)
-        except OSError as error:  # errors of TLS are such, too
-            return [f"{self.name}: cannot be reached: {error.strerror or error}; check host and port"]
-        client.loop_start()
-        if not has_answered.wait(ANSWER_S):
-            problems.append(f"{self.name}: what listens there does not answer as a broker; check host, port and tls")
-        client.disconnect()
-        client.loop_stop()
-        return problems
+        client = new_client(self._config, self._context.folder, "source mqtt", "acquisition")
+        return connection_problems(client, self._config, self.name)
 
     def _new_client(self, client_id: str) -> Client:
-        from paho.mqtt import client as paho  # noqa: PLC0415  an extra
-        from paho.mqtt.enums import CallbackAPIVersion  # noqa: PLC0415
-
-        config, context = self._config, self._context
-        client = paho.Client(
-            CallbackAPIVersion.VERSION2,
-            client_id,
-            clean_session=not client_id,
-            protocol=paho.MQTTv311,
-        )
-        client.reconnect_delay_set(RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S)
-        if config.username:
-            password = None
-            if config.password_file:
-                password = read_secret(context.folder / config.password_file)
-            elif config.password_env:
-                password = secret_of_environment(config.password_env)
-            client.username_pw_set(config.username, password)
-        if config.tls:
-            ca, certificate, key = (
-                None if path is None else str(context.folder / path)
-                for path in (config.ca, config.certificate, config.key)
-            )
-            try:
-                client.tls_set(ca, certificate, key)
-            except (OSError, ssl.SSLError, ValueError) as error:
-                raise UserError(f"a certificate of source mqtt cannot be used: {error}") from error
+        folder, is_kept = self._context.folder, bool(client_id)
+        client = new_client(self._config, folder, "source mqtt", "acquisition", client_id, is_kept=is_kept)
         client.on_connect = self._on_connect
         client.on_connect_fail = self._on_connect_fail
         client.on_disconnect = self._on_disconnect
@@ -191,20 +140,20 @@ class MqttSource:
     def _on_connect(self, client: Client, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
             self._is_refused = True
-            self._down(f"the broker refuses this client: {reason}; check username and password")
+            self._down(refusal(reason))
             return
         client.subscribe([(topic, self._config.qos) for topic in self._topics])
 
     def _on_subscribe(self, _client: Any, _data: Any, _mid: Any, reasons: Any, _properties: Any) -> None:
-        refused = [str(reason) for reason in reasons if reason.is_failure]
-        if refused:
-            self._down(f"the broker refuses the subscription: {refused[0]}; check the rights of this user")
+        failures = [str(reason) for reason in reasons if reason.is_failure]
+        if failures:
+            self._down(f"the broker refuses the subscription: {failures[0]}; check the rights of this user")
             return
         self._is_up = True
         self._deliver(LinkUp())
 
     def _on_connect_fail(self, _client: Any, _data: Any) -> None:
-        self._down("the broker cannot be reached; check host and port, and whether it runs")
+        self._down(NOT_REACHED)
 
     def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if not self._is_refused:

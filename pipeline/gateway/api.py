@@ -16,11 +16,12 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from pipeline.config.models import TrayConfig
 from pipeline.gateway.access import Access, Visitor, require_own_page, require_token
-from pipeline.gateway.forms import LoginForm, RequestForm
+from pipeline.gateway.forms import LoginForm
 from pipeline.gateway.live_feed import LiveFeed, encoded
 from pipeline.gateway.metrics import metrics_text
 from pipeline.presenting.fan_history import HISTORY_S
 from pipeline.presenting.request_desk import RequestDesk
+from pipeline.presenting.request_form import RequestForm
 from pipeline.presenting.shown import (
     alarm_json,
     curves_json,

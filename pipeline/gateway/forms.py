@@ -1,55 +1,16 @@
-"""What a client sends, checked."""
+"""What a client sends beside requests, checked."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from schemas.enums import Action
 
-LONGEST_SHELVING_S = 30 * 86400.0
-LONGEST_COMMENT = 500
-
-OperatorAction = Literal[
-    "acknowledge",
-    "confirm",
-    "reset",
-    "shelve",
-    "unshelve",
-    "suppress",
-    "unsuppress",
-    "out_of_service",
-    "in_service",
-    "commission",
-]
-
-
-class _Form(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class LoginForm(_Form):
+class LoginForm(BaseModel):
     """Name and password."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(min_length=1, max_length=64)]
     password: Annotated[str, Field(min_length=1, max_length=128)]
-
-
-class RequestForm(_Form):
-    """What an operator asks of a fan, or of all fans of a tray.
-
-    Attributes:
-        action: what is asked.
-        duration_s: how long to shelve, s; 0: until the alarm clears. Only for shelve.
-        comment: why, for the record.
-    """
-
-    action: OperatorAction
-    duration_s: Annotated[float, Field(ge=0, le=LONGEST_SHELVING_S, allow_inf_nan=False)] = 0.0
-    comment: Annotated[str, Field(max_length=LONGEST_COMMENT)] = ""
-
-    @property
-    def message_action(self) -> Action:
-        """As the scorer is asked."""
-        return Action[self.action.upper()]

@@ -9,7 +9,8 @@ from typing import Any
 from pydantic.json_schema import models_json_schema
 
 from pipeline.gateway.access import CSRF_HEADER
-from pipeline.gateway.forms import LoginForm, RequestForm
+from pipeline.gateway.forms import LoginForm
+from pipeline.presenting.request_form import RequestForm
 
 _FORMS = {"/login": LoginForm, "/fans/{tray}/{fan}/requests": RequestForm}
 _QUERY = {

@@ -24,7 +24,7 @@ from pipeline.notification.fan_alarm import FanAlarm
 from pipeline.notification.outbox import FiringKey, Outbox
 from pipeline.notification.sending import FIRST_DELAY_S, LONGEST_DELAY_S, Failure
 from pipeline.notification.wording import Place, describe
-from schemas.messages import Severity
+from schemas.enums import Severity
 from schemas.units import NS_PER_S
 
 RESEND_S = 60.0

@@ -6,7 +6,8 @@ import json
 from dataclasses import asdict, dataclass, replace
 from typing import Self
 
-from schemas.messages import Alarm, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.messages import Alarm
 from scoring.alarms.alarm_flags import is_presented, is_silenced
 
 FanName = tuple[str, int]

@@ -11,7 +11,7 @@ from typing import Self
 from pipeline.notification.config import NotifierConfig, QuietHours
 from pipeline.notification.deciding import Kind
 from pipeline.notification.fan_alarm import FanName
-from schemas.messages import Severity
+from schemas.enums import Severity
 from schemas.units import NS_PER_S
 
 LONGEST_S = 600.0

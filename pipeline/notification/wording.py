@@ -12,7 +12,7 @@ from urllib.parse import quote
 from pipeline.notification.deciding import Kind
 from pipeline.notification.fan_alarm import FanAlarm, NamedCause
 from pipeline.notification.gathering import Happened, ranges
-from schemas.messages import Severity
+from schemas.enums import Severity
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY
 

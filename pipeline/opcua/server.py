@@ -65,7 +65,7 @@ class RequestLimits(TransportLimits):
         largest, chunks = self.max_message_size, self.max_chunk_count
         answer = super().create_acknowledge_and_set_limits(msg)
         self.max_message_size, self.max_chunk_count = largest, chunks
-        answer.MaxMessageSize, answer.MaxChunkCount = largest, chunks
+        answer.MaxMessageSize, answer.MaxChunkCount = ua.UInt32(largest), ua.UInt32(chunks)
         return answer
 
 

@@ -29,6 +29,7 @@ CREATE TABLE IF NOT EXISTS transition (
     UNIQUE (producer, tray, sequence)
 );
 CREATE INDEX IF NOT EXISTS of_fan ON transition (tray, fan, number);
+CREATE TABLE IF NOT EXISTS reader (name TEXT PRIMARY KEY, number INTEGER NOT NULL);
 """
 
 
@@ -85,6 +86,30 @@ class AlarmStore:
             (tray, fan, before, most),
         )
         return [(number, alarm) for number, data in rows if (alarm := _decoded(data)) is not None]
+
+    def after(self, number: int, most: int) -> Sequence[tuple[int, Alarm]]:
+        """The transitions that came after one, oldest first, each with its number."""
+        rows = self._file.execute(
+            "SELECT number, alarm FROM transition WHERE number > ? ORDER BY number LIMIT ?", (number, most)
+        )
+        return [(number, alarm) for number, data in rows if (alarm := _decoded(data)) is not None]
+
+    def newest_number(self) -> int:
+        """The number of the last transition; 0: there is none."""
+        (number,) = self._file.execute("SELECT MAX(number) FROM transition").fetchone()
+        return number or 0
+
+    def position(self, reader: str) -> int:
+        """The number of the transition up to which a reader has come; 0: it has not begun."""
+        row = self._file.execute("SELECT number FROM reader WHERE name = ?", (reader,)).fetchone()
+        return row[0] if row else 0
+
+    def set_position(self, reader: str, number: int) -> None:
+        """A reader has come up to a transition."""
+        try:
+            self._file.execute("INSERT OR REPLACE INTO reader (name, number) VALUES (?, ?)", (reader, number))
+        except sqlite3.Error as error:
+            self.problem = f"{self._path}: {error}: after a restart, transitions will be sent twice"
 
     def close(self) -> None:
         """Leave a complete file."""

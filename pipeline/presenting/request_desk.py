@@ -44,12 +44,21 @@ class RequestDesk:
         Raises:
             TimeoutError: an answer is missing after ANSWERED_WITHIN_S, or too many requests are under way.
         """
+        return await asyncio.wait_for(asyncio.wrap_future(self.begin(tray, request, fans)), ANSWERED_WITHIN_S)
+
+    def begin(self, tray: str, request: Request, fans: Sequence[int]) -> Future[list[Alarm]]:
+        """Send a request; returns where the answers of its fans will be, in the order of their numbers. If one is
+        missing after ANSWERED_WITHIN_S, none will come.
+
+        Raises:
+            TimeoutError: too many requests are under way.
+        """
         under_way = _UnderWay(frozenset(fans), time.monotonic())
         with self._lock:
             if len(self._under_way) + len(self._waiting) >= MOST_UNDER_WAY:
                 raise TimeoutError(f"{MOST_UNDER_WAY} requests are waiting for their scorers")
             self._waiting.append((replace(request, header=Header(tray=tray)), under_way))
-        return await asyncio.wait_for(asyncio.wrap_future(under_way.done), ANSWERED_WITHIN_S)
+        return under_way.done
 
     def take(self) -> list[Request]:
         """The requests to be sent now."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
+import json
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,19 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from pipeline.broker.config import MqttConfig
+from pipeline.broker.link import Received
+from pipeline.broker.outbox import Outgoing
+from pipeline.broker.topics import Topics
 from pipeline.config.models import TrayConfig
 from pipeline.notification.config import NotifierConfig
 from pipeline.notification.notifications import Notifications, Saved
 from pipeline.notification.outbox import Outbox
 from pipeline.notification.wording import Place
-from pipeline.runtime.stage import Core
+from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.request_desk import RequestDesk
+from pipeline.presenting.site_model import SiteModel
+from pipeline.runtime.stage import Context, Core
 from pipeline.runtime.twin_file import TwinFile
 from pipeline.viewing.fleet import Fan
 from pipeline.viewing.fleet_view import FleetView
@@ -28,6 +36,8 @@ from schemas.header import Header
 from schemas.health import Health
 from schemas.messages import Alarm, Grid, Message, ModelCard, Prediction, Raw, Request, Score, ScorerSnapshot
 from schemas.topics import TOPICS
+from stages.mqtt import STAGE as MQTT_STAGE
+from stages.mqtt import MqttCore
 from stages.notifier import NotifierCore
 from stages.resampler import ResamplerConfig, ResamplerCore
 from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
@@ -157,7 +167,7 @@ def test_the_viewer_survives_any_message(session: list[Message], tray: str, is_f
 def test_the_notifier_survives_any_alarm(session: list[Message]) -> None:
     target = {"name": "hook", "url_env": "FANTWIN_TEST_URL", "quiet_hours": {"begin": "00:00", "end": "12:00"}}
     config = NotifierConfig.model_validate({"target": [target], "gather_s": 0})
-    with tempfile.TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder:
         outbox = Outbox(Path(folder) / "outbox", ["hook"])
         notifications = Notifications(config, Place("hall"), Saved(is_first=False), outbox.was_sent)
         core = NotifierCore(config, (TrayConfig(name="tray1", fans=FANS),), notifications, outbox, {})
@@ -165,3 +175,62 @@ def test_the_notifier_survives_any_alarm(session: list[Message]) -> None:
         left = Outbox(Path(folder) / "outbox", ["hook"])
         left.load()
         left.close()
+
+
+class FakeLink:
+    """A broker that acknowledges everything at once, and sends what it is given."""
+
+    dropped_requests = 0
+    sessions = 1
+
+    def __init__(self, received: list[Received]) -> None:
+        self._received = received
+        self.published: list[Outgoing] = []
+
+    def room(self) -> int:
+        return 200
+
+    def publish(self, message: Outgoing) -> int:
+        self.published.append(message)
+        return len(self.published)
+
+    def acknowledged(self) -> list[int]:
+        return [len(self.published)]
+
+    def received(self) -> list[Received]:
+        taken, self._received = self._received, []
+        return taken
+
+    def forget(self, patterns: Any) -> None: ...
+
+    def problem(self) -> str:
+        return ""
+
+    def stop(self, last: Outgoing) -> None:
+        self.published.append(last)
+
+
+@NO_SLOW_CHECK
+@given(
+    sessions(Score, Alarm, Health),
+    st.sampled_from(["tray1", "tray1", "elsewhere"]),
+    st.lists(st.tuples(st.sampled_from(["0", "1", "9", "all", "x"]), st.binary() | st.text().map(str.encode))),
+)
+def test_the_mqtt_stage_survives_any_message(session: list[Message], tray: str, asked: list[tuple[str, bytes]]) -> None:
+    config = MqttConfig(host="broker", accept=("acknowledge",), operator_name="desk", home_assistant="publish")
+    trays = (TrayConfig(name="tray1", fans=FANS),)
+    received = [Received(f"fantwin/site/tray1/{fan}/request", payload, is_retained=False) for fan, payload in asked]
+    link = FakeLink(received)
+    with TemporaryDirectory() as folder:
+        store = AlarmStore(Path(folder) / "alarms.sqlite")
+        model = SiteModel("site", trays, store, keeps_curves=False)
+        context = Context("site", trays, config, Path(folder), Path(folder), 0)
+        core = MqttCore(context, model, store, RequestDesk("p"), Topics("fantwin", "site"), link)
+        core.tick(-20_000_000_000)
+        survives(core, session, tray, MQTT_STAGE.undecoded)
+    for message in link.published:
+        if message.text not in ("online", "offline"):
+            json.loads(message.text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert len([message for message in link.published if message.topic.endswith("/answer")]) == sum(
+        bool(payload) for _, payload in asked
+    )

@@ -20,7 +20,8 @@ from pipeline.notification import sending
 from pipeline.notification.config import NotifierConfig
 from pipeline.notification.sending import MAY_BE_REPEATED
 from pipeline.runtime.stage import StageError
-from schemas.messages import Alarm, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.messages import Alarm
 from schemas.units import NS_PER_S
 from stages.notifier import OUTBOX, STOPPED_WITHIN_S, NotifierCore
 from tests.support.message_receivers import ALERTMANAGER, HttpReceiver, MailServer, RunningAlertmanager, free_port

@@ -9,7 +9,9 @@ from typing import Any
 from pipeline.config.models import TrayConfig
 from pipeline.notification.config import NotifierConfig
 from pipeline.runtime.stage import Context
-from schemas.messages import Alarm, Diagnosis, Header, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.header import Header
+from schemas.messages import Alarm, Diagnosis
 from schemas.units import NS_PER_S
 from stages.notifier import NotifierCore, build
 

@@ -11,7 +11,8 @@ import pytest
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from schemas.codec import decode, encode, type_name
-from schemas.messages import Alarm, Health
+from schemas.health import Health
+from schemas.messages import Alarm
 from schemas.topics import BY_NAME, health_key, tray_key
 from stages.notifier import OUTBOX
 from tests.support.message_receivers import MailServer

@@ -19,7 +19,7 @@ from pwdlib import PasswordHash
 from pwdlib.hashers.argon2 import Argon2Hasher
 from pydantic import ValidationError
 
-from pipeline.devices import mqtt_source
+from pipeline.devices import broker_client, mqtt_source
 from pipeline.devices.fan_values import FanValues
 from pipeline.devices.mqtt_config import MqttConfig
 from pipeline.devices.mqtt_source import MqttSource
@@ -177,7 +177,7 @@ def test_a_changed_command_ends_the_reading_that_waits() -> None:
 
 
 def test_a_broker_that_is_restarted_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mqtt_source, "RECONNECT_DELAY_MAX_S", 1)
+    monkeypatch.setattr(broker_client, "RECONNECT_DELAY_MAX_S", 1)
     broker = MqttBroker()
     broker.start()
     with running(source_of(broker.port)) as events:
@@ -266,7 +266,7 @@ def test_a_broker_that_is_not_there_is_one_line() -> None:
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mqtt_source, "is_installed", lambda _module: False)
+    monkeypatch.setattr(broker_client, "is_installed", lambda _module: False)
     with pytest.raises(UserError, match=r"source mqtt needs paho-mqtt; in the checkout: .*\[mqtt\]"):
         source_of(1883)
 

@@ -12,7 +12,8 @@ from pipeline.notification.config import NotifierConfig
 from pipeline.notification.deciding import Event
 from pipeline.notification.notifications import FIRST_LOOK_NS, Changes, Notifications, Saved
 from pipeline.notification.wording import Level, Place, Text
-from schemas.messages import Alarm, Diagnosis, Severity, Transition
+from schemas.enums import Severity, Transition
+from schemas.messages import Alarm, Diagnosis
 from schemas.units import NS_PER_S
 from tests.support.notified_alarms import START_NS, alarm, cleared
 

@@ -1,0 +1,1 @@
+"""The site on an MQTT broker: retained states and alarms, discovery by Home Assistant, requests of operators."""

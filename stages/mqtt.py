@@ -1,0 +1,313 @@
+"""MQTT: publishes states and alarms to a broker, and passes on requests that come from there (docs/how-to/mqtt.md).
+
+Reads `score`, `alarm` and `health`, and writes `request`. One core serves all trays; the newest score of each tray is
+asked for once a second.
+
+The broker is never waited for: what is retained has one text a topic, transitions of alarms wait on disk, and both are
+sent when the broker has room. After each connection all retained topics are published again.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence, Set
+from pathlib import Path
+
+from pipeline.broker.config import MqttConfig
+from pipeline.broker.fan_states import FanStates, shown_alarm, topics_of
+from pipeline.broker.home_assistant import OFFLINE, ONLINE, HomeAssistant
+from pipeline.broker.json_text import json_text
+from pipeline.broker.link import BrokerLink, Link
+from pipeline.broker.outbox import Outbox, Outgoing
+from pipeline.broker.requests import Requests
+from pipeline.broker.topics import Topics, do_overlap
+from pipeline.broker.transition_queue import TransitionQueue
+from pipeline.devices.broker_client import connection_problems, new_client, require_paho
+from pipeline.devices.mqtt_config import FAN
+from pipeline.devices.mqtt_config import MqttConfig as MqttSourceConfig
+from pipeline.errors import UserError
+from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.request_desk import RequestDesk
+from pipeline.presenting.shown import stages_json, transition_json
+from pipeline.presenting.site_model import SiteModel
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from pipeline.viewing.fleet import Fan
+from schemas.envelope import Envelope
+from schemas.health import Health
+from schemas.messages import Alarm, Message
+from schemas.topics import ALL_TRAYS
+from schemas.units import NS_PER_S
+
+HISTORY = "mqtt-alarms.sqlite"
+SETTLED_AFTER_NS = 2 * NS_PER_S
+"""after the start: alarms of before are being heard again, and nothing is published yet"""
+KNOWN_AFTER_NS = 10 * NS_PER_S
+"""after the start: a fan of which no alarm was heard has none, a tray without a score is silent"""
+FOUND_WITHIN_NS = 10 * NS_PER_S
+"""after connecting: what the broker had retained has come"""
+CHANGES_PERIOD_NS = NS_PER_S // 2
+SITE_PERIOD_NS = 5 * NS_PER_S
+
+
+class MqttCore(Core):
+    """Knows what the broker should have, and what it has."""
+
+    def __init__(
+        self, context: Context, model: SiteModel, store: AlarmStore, desk: RequestDesk, topics: Topics, link: Link
+    ) -> None:
+        config: MqttConfig = context.config
+        self._config, self._model, self._desk, self._topics, self._link = config, model, desk, topics, link
+        self._is_whole = context.instance == ALL_TRAYS
+        self._states = FanStates(model)
+        self._outbox = Outbox()
+        self._queue = TransitionQueue(store, config.most_waiting)
+        self._requests = Requests(topics, model.trays, config.accept, config.operator_name, desk)
+        self._home_assistant = HomeAssistant(config, topics, model.trays)
+        self._devices = self._home_assistant.messages() if config.home_assistant == "publish" else {}
+        self._counts: Counter[str] = Counter()
+        self._numbers: dict[int, int] = {}
+        """transitions under way: by the number of the message, that of the transition"""
+        self._changed_alarms: set[Fan] = set()
+        self._has_news = False
+        self._has_devices = False
+        self._knows_all = False
+        self._session = 0
+        self._began_ns: int | None = None
+        self._full_ns = self._changes_ns = self._site_ns = -(1 << 62)
+        self._forget_ns: int | None = None
+
+    def step(self, item: Message | Envelope) -> Sequence[Message]:
+        """Keep what has arrived."""
+        if isinstance(item, Health):
+            self._model.add_health(item)
+            return ()
+        tray = self._model.tray(item.header.tray)
+        if tray is None:
+            self._counts["unknown_tray"] += 1
+        elif isinstance(item, Envelope):
+            self._has_news |= self._model.add_score(item) is not None
+        elif isinstance(item, Alarm):
+            self._add_alarm(item, tray.fans)
+        return ()
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        """Publish what has changed, as far as the broker has room, and pass on requests."""
+        if self._began_ns is None or now_ns < self._began_ns:
+            self._began_ns = now_ns
+        if self._link.sessions != self._session:
+            self._session = self._link.sessions
+            self._forget_ns = now_ns + FOUND_WITHIN_NS
+            self._outbox.renew()
+        self._receive(now_ns)
+        if now_ns - self._began_ns >= SETTLED_AFTER_NS:
+            self._update(now_ns, now_ns - self._began_ns >= KNOWN_AFTER_NS)
+        self._send()
+        return self._desk.take()
+
+    def close(self) -> Sequence[Message]:
+        """Send what there is room for, leave the broker, and close the history."""
+        self._send()
+        self._link.stop(Outgoing(self._topics.status, OFFLINE, is_retained=True))
+        self._model.close()
+        return ()
+
+    def abort(self) -> None:
+        """The same after a crash, sending nothing more."""
+        self._link.stop(Outgoing(self._topics.status, OFFLINE, is_retained=True))
+        self._model.close()
+
+    def counters(self) -> Mapping[str, int]:
+        """What was published, what waits, and what became of requests."""
+        return {
+            "connections": self._link.sessions,
+            "waiting_transitions": self._queue.waiting,
+            "waiting_topics": len(self._outbox),
+            "lost_transitions": self._queue.lost,
+            "refused_scores": self._model.refused_scores,
+            "dropped_requests": self._link.dropped_requests,
+            **self._counts,
+            **self._requests.counts,
+        }
+
+    def followed(self) -> Set[str]:
+        """None: the newest score of each tray is enough."""
+        return set()
+
+    def notes(self) -> Sequence[str]:
+        """Fans that are left out of Home Assistant."""
+        left_out = self._home_assistant.left_out if self._devices else 0
+        if not left_out:
+            return ()
+        return (f"Home Assistant: {left_out} fans have no entities; home_assistant_trays chooses those that have",)
+
+    def problem(self) -> str:
+        """Of the broker, and of the history."""
+        broker = self._link.problem()
+        if broker and self._queue.lost:
+            broker += f"; more than {self._config.most_waiting} transitions of alarms wait, the oldest are lost"
+        return "; ".join(filter(None, (broker, self._model.problem())))
+
+    def _add_alarm(self, alarm: Alarm, fans: int) -> None:
+        if alarm.fan >= fans:
+            self._counts["unknown_fan"] += 1
+            return
+        if self._model.add_alarm(alarm):
+            self._queue.notice_new()
+        self._desk.add(alarm)
+        self._changed_alarms.add(Fan(alarm.header.tray, alarm.fan))
+
+    def _receive(self, now_ns: int) -> None:
+        for topic, payload, is_retained in self._link.received():
+            if answer := self._requests.take(topic, payload, is_retained=is_retained):
+                self._outbox.answer(*answer)
+            elif is_retained and self._is_left_over(topic):
+                self._counts["removed_topics"] += 1
+                self._outbox.remove(topic)
+        for answer in self._requests.answers():
+            self._outbox.answer(*answer)
+        if self._forget_ns is not None and now_ns >= self._forget_ns:
+            self._forget_ns = None
+            self._link.forget(patterns_of_retained(self._config, self._topics, self._home_assistant))
+
+    def _is_left_over(self, topic: str) -> bool:
+        """Whether a retained topic is of a device or fan that is not configured any more."""
+        if self._home_assistant.is_own(topic):
+            return topic not in self._devices
+        parts = self._topics.parts(topic)
+        if parts is None or topic not in topics_of(self._topics, Fan(parts[0], _number_of(parts[1]))):
+            return False
+        tray = self._model.tray(parts[0])
+        return self._is_whole if tray is None else _number_of(parts[1]) >= tray.fans
+
+    def _update(self, now_ns: int, knows_all: bool) -> None:
+        """Put what has changed into the outbox. knows_all: what was not heard so far is not there."""
+        if knows_all and not self._knows_all:
+            self._knows_all = True
+            self._changed_alarms |= {Fan(tray.name, fan) for tray in self._model.trays for fan in range(tray.fans)}
+            self._has_news = True
+        for fan in self._changed_alarms:
+            current = self._model.current_alarm(fan)
+            text = json_text(shown_alarm(current) if current else None)
+            self._outbox.retain(self._topics.alarm(fan), text, is_urgent=True)
+        is_full = abs(now_ns - self._full_ns) >= self._config.period_s * NS_PER_S
+        if is_full:
+            self._model.notice_silence()
+        is_due = self._has_news and abs(now_ns - self._changes_ns) >= CHANGES_PERIOD_NS
+        if is_full or is_due or self._changed_alarms:
+            self._full_ns = now_ns if is_full else self._full_ns
+            self._changes_ns, self._has_news = now_ns, False
+            for fan, state in self._states.changed(is_full=is_full, with_silent=knows_all).items():
+                self._outbox.retain(self._topics.state(fan), json_text(state))
+        self._changed_alarms.clear()
+        if abs(now_ns - self._site_ns) >= SITE_PERIOD_NS:
+            self._site_ns = now_ns
+            self._update_site()
+
+    def _update_site(self) -> None:
+        counts = {name.replace(" ", "_"): count for name, count in self._model.counts().items()}
+        fans = sum(tray.fans for tray in self._model.trays)
+        self._outbox.retain(self._topics.summary, json_text({"fans": fans} | counts))
+        self._outbox.retain(self._topics.stages, json_text(stages_json(self._model.stages())))
+        if not self._has_devices:
+            self._has_devices = True
+            for topic, text in self._devices.items():
+                self._outbox.retain(topic, text)
+            self._outbox.retain(self._topics.status, ONLINE, is_urgent=True)
+
+    def _send(self) -> None:
+        for message in self._link.acknowledged():
+            if (number := self._numbers.pop(message, None)) is not None:
+                self._queue.acknowledge(number)
+        room = self._link.room()
+        for number, alarm in self._queue.take((room + 1) // 2):
+            topic = self._topics.transitions(Fan(alarm.header.tray, alarm.fan))
+            sent = self._link.publish(Outgoing(topic, json_text(transition_json(number, alarm)), is_retained=False))
+            self._numbers[sent] = number
+            self._counts["published_transitions"] += 1
+            room -= 1
+        for message in self._outbox.take(room):
+            self._link.publish(message)
+            self._counts["published_messages"] += 1
+
+
+def patterns_of_retained(config: MqttConfig, topics: Topics, home_assistant: HomeAssistant) -> tuple[str, ...]:
+    """What is looked at after connecting, for topics of fans that are not configured any more."""
+    devices = () if config.home_assistant == "off" else (home_assistant.pattern,)
+    return (*topics.of_fans(), *devices)
+
+
+def _number_of(text: str) -> int:
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 6 else -1
+
+
+def build(context: Context) -> BuiltStage:
+    """Open the history, and begin to connect.
+
+    Raises:
+        StageError: the extra is not installed, a file cannot be read or written, or topics overlap.
+    """
+    config: MqttConfig = context.config
+    require_paho("stage mqtt")
+    if overlapping := overlaps(context):
+        raise StageError(overlapping[0])
+    topics = Topics(config.prefix, context.site, context.instance)
+    store = AlarmStore(context.own_file(Path(HISTORY)))
+    model = SiteModel(context.site, context.trays, store, keeps_curves=False)
+    link = BrokerLink(
+        config,
+        context.folder,
+        topics.client_id,
+        Outgoing(topics.status, OFFLINE, is_retained=True),
+        [topics.requests(tray.name) for tray in context.trays] if config.accept else [],
+        patterns_of_retained(config, topics, HomeAssistant(config, topics, context.trays)),
+    )
+    core = MqttCore(context, model, store, RequestDesk(context.producer), topics, link)
+    link.start()
+    return BuiltStage(core)
+
+
+def overlaps(context: Context) -> list[str]:
+    """Sources of samples that would take what is published here for samples, or the other way; one line each."""
+    config: MqttConfig = context.config
+    own = f"{config.prefix}/{context.site}/#"
+    found: list[str] = []
+    for tray in context.trays:
+        source = tray.source
+        if isinstance(source, MqttSourceConfig) and (source.host, source.port) == (config.host, config.port):
+            for topic in filter(None, (*source.patterns, source.send_topic)):
+                unshared = topic.split("/", 2)[-1] if topic.startswith("$share/") else topic
+                if do_overlap(unshared.replace(FAN, "+"), own):
+                    found.append(
+                        f"[mqtt] publishes to {own}, which topic {topic} of tray {tray.name} has part of: change prefix"
+                    )
+    return found
+
+
+def check(context: Context) -> list[str]:
+    """Report a missing extra, overlapping topics, files that cannot be read, and a broker that does not answer."""
+    config: MqttConfig = context.config
+    try:
+        require_paho("stage mqtt")
+        client = new_client(config, context.folder, "stage mqtt", "mqtt")
+    except UserError as error:
+        return [str(error)]
+    unknown = sorted(set(config.home_assistant_trays) - {tray.name for tray in context.trays})
+    return [
+        *overlaps(context),
+        *(f"[mqtt] home_assistant_trays: there is no tray {name}" for name in unknown if context.instance == ALL_TRAYS),
+        *connection_problems(client, config, f"broker {config.host}:{config.port}"),
+    ]
+
+
+STAGE = Stage(
+    name="mqtt",
+    about="publishes states and alarms to an MQTT broker, also for Home Assistant, and takes requests from there",
+    reads=("score", "alarm", "health"),
+    writes=("request",),
+    config=MqttConfig,
+    build=build,
+    core_per_tray=False,
+    undecoded=("score",),
+    may_drop=True,
+    check=check,
+)

@@ -1,0 +1,371 @@
+"""The stage `mqtt` at a real broker: retained states and alarms, last will, broker away, requests, Home Assistant."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import paho.mqtt.client as paho
+import pytest
+import trustme
+from paho.mqtt.enums import CallbackAPIVersion
+
+from pipeline.broker.config import MqttConfig
+from pipeline.config.models import TrayConfig
+from pipeline.devices.mqtt_config import MqttConfig as SourceConfig
+from pipeline.runtime.stage import Context, StageError
+from schemas.enums import Action, FanState, Transition
+from schemas.messages import Alarm, Request
+from stages.mqtt import build, check
+from tests.stages.test_gateway import alarm, granted, score
+from tests.support.mosquitto import Listener, Mosquitto, needs_mosquitto, retained_by
+from tests.support.mqtt_broker import free_port
+from tests.support.running_chain import RunningCommand, eventually
+from tests.support.running_mqtt import ROOT, SITE, TRAY, RunningMqtt
+
+pytestmark = needs_mosquitto
+FAN = f"{ROOT}/{TRAY}/2"
+ACCEPTING: dict[str, Any] = {"accept": ("acknowledge", "shelve"), "operator_name": "desk"}
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Mosquitto]:
+    broker = Mosquitto(tmp_path)
+    broker.start()
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture
+def listener(broker: Mosquitto) -> Iterator[Listener]:
+    listener = Listener(broker.port)
+    yield listener
+    listener.close()
+
+
+def state_of(listener: Listener, topic: str = FAN) -> dict[str, Any]:
+    return json.loads(listener.last(f"{topic}/state") or "{}")
+
+
+def refused(_request: Request) -> list[Alarm]:
+    return [alarm(Transition.REFUSED, message="fan 2: there is nothing to acknowledge")]
+
+
+def test_states_alarms_and_status_are_retained(tmp_path, broker, listener):
+    stage = RunningMqtt(tmp_path, broker.port)
+    try:
+        stage.feed(score())
+        eventually(lambda: state_of(listener).get("state") == "normal", "the state is there")
+        assert state_of(listener) == {
+            "state": "normal",
+            "in_alarm": False,
+            "judged": True,
+            "score": 0.5,
+            "speed": 1000.0,
+            "predicted_speed": 1010.0,
+            "speed_unit": "rpm",
+            "since": "2026-09-21T14:13:20.040Z",
+            "time": "2026-09-21T14:13:20.040Z",
+        }
+        unjudged = state_of(listener, f"{ROOT}/{TRAY}/3")
+        assert (unjudged["state"], unjudged["judged"]) == ("unknown: gap", False)
+        assert (unjudged["predicted_speed"], unjudged["score"]) == (None, 0.5)
+        eventually(lambda: listener.last(f"{FAN}/alarm") == "null", "without an alarm it says so")
+        stage.feed(alarm())
+        eventually(lambda: state_of(listener)["in_alarm"], "an alarm changes the state at once")
+        shown = json.loads(listener.last(f"{FAN}/alarm") or "")
+        assert (shown["severity"], shown["causes"][0]["cause"], shown["presented"]) == ("alarm", "drag", True)
+        assert json.loads(listener.last(f"{FAN}/alarm/transitions") or "")["transition"] == "raised"
+        eventually(lambda: listener.last(f"{ROOT}/summary"), "the summary is there")
+        assert isinstance(json.loads(listener.last(f"{ROOT}/stages") or ""), list)
+        kept = retained_by(broker.port)
+        assert kept[f"{ROOT}/status"] == "online"
+        assert f"{FAN}/alarm/transitions" not in kept
+        stage.feed(alarm(Transition.CLEARED, 1, active=False, acknowledged=True, confirmed=True))
+        eventually(lambda: listener.last(f"{FAN}/alarm") == "null", "the alarm is over")
+    finally:
+        stage.close()
+    assert retained_by(broker.port)[f"{ROOT}/status"] == "offline"
+
+
+def test_what_has_not_changed_is_not_published_again(tmp_path, broker, listener):
+    stage = RunningMqtt(tmp_path, broker.port, period_s=5.0)
+    try:
+        stage.feed(score())
+        eventually(lambda: len(listener.of(f"{FAN}/state")) == 1, "it is published")
+        stage.feed(score(1.0), score(2.0), score(3.0))
+        before = len(listener.of(f"{ROOT}/stages"))
+        time.sleep(0.5)  # 25 s of the stage's time
+        assert len(listener.of(f"{FAN}/state")) == 1
+        assert len(listener.of(f"{ROOT}/stages")) == before
+        stage.feed(score(4.0, state=FanState.SUSPECT))
+        eventually(lambda: state_of(listener)["state"] == "suspect", "a change is published")
+        assert len(listener.of(f"{FAN}/state")) == 2
+        assert len(listener.of(f"{ROOT}/{TRAY}/0/state")) == 1
+    finally:
+        stage.close()
+
+
+def test_a_broker_that_was_away_gets_all_that_is_retained_and_all_transitions_in_order(tmp_path, broker):
+    stage = RunningMqtt(tmp_path, broker.port)
+    try:
+        stage.feed(score())
+        eventually(lambda: f"{FAN}/state" in retained_by(broker.port), "it is published")
+        broker.stop()
+        eventually(lambda: "is away" in stage.problem(), "it says that the broker is away")
+        said = stage.problem()
+        for number in range(600):  # more than are under way at once
+            raised = number % 2 == 0
+            stage.feed(alarm(Transition.RAISED if raised else Transition.CLEARED, number, active=raised))
+        stage.feed(score(1.0, state=FanState.ALARM))
+        assert stage.counters()["waiting_transitions"] == 600
+        assert stage.problem() == said, "it is said once, not at each try"
+        broker.start()
+        listener = Listener(broker.port)
+        topic = f"{FAN}/alarm/transitions"
+        eventually(lambda: len(listener.of(topic)) >= 600, "all transitions have come")
+        numbers = [json.loads(text)["number"] for text in listener.of(topic)]
+        assert numbers == sorted(numbers)
+        assert len(set(numbers)) == 600
+        kept = retained_by(broker.port)
+        assert {kept[f"{ROOT}/status"], json.loads(kept[f"{FAN}/state"])["state"]} == {"online", "alarm"}
+        assert f"{ROOT}/{TRAY}/0/state" in kept, "also what has not changed: the broker had forgotten it"
+        eventually(lambda: stage.counters()["waiting_transitions"] == 0, "all are acknowledged")
+        assert stage.problem() == ""
+        listener.close()
+    finally:
+        stage.close()
+
+
+def test_transitions_wait_over_a_restart_of_the_stage_and_the_oldest_of_too_many_are_counted(tmp_path, broker):
+    port = free_port()
+    first = RunningMqtt(tmp_path, port, most_waiting=3)
+    for number in range(5):
+        first.feed(alarm(Transition.SEVERITY, number))
+    assert first.counters()["lost_transitions"] == 2
+    eventually(lambda: "the oldest are lost" in first.problem(), "it says so")
+    first.close()
+    listener = Listener(broker.port)
+    second = RunningMqtt(tmp_path, broker.port, most_waiting=3)
+    try:
+        topic = f"{FAN}/alarm/transitions"
+        eventually(lambda: len(listener.of(topic)) == 3, "what waited has come")
+        second.feed(*(alarm(Transition.SEVERITY, number) for number in range(5)))  # the bus sends them again
+        second.feed(alarm(Transition.CLEARED, 5, active=False))
+        eventually(lambda: len(listener.of(topic)) == 4, "all that wait have come")
+        assert [json.loads(text)["number"] for text in listener.of(topic)] == [3, 4, 5, 6]
+        eventually(lambda: second.counters()["waiting_transitions"] == 0, "they are acknowledged")
+    finally:
+        second.close()
+        listener.close()
+    third = RunningMqtt(tmp_path, broker.port)
+    assert third.counters()["waiting_transitions"] == 0, "nothing is sent twice"
+    third.close()
+
+
+def test_a_broker_that_hangs_holds_nobody_up_and_is_named(tmp_path, broker, monkeypatch):
+    monkeypatch.setattr("pipeline.broker.link.SILENT_AFTER_S", 0.2)
+    stage = RunningMqtt(tmp_path, broker.port)
+    stage.feed(score())
+    eventually(lambda: f"{FAN}/state" in retained_by(broker.port), "it is published")
+    broker.hang()
+    began_s = time.monotonic()
+    for number in range(1000):
+        stage.feed(alarm(Transition.SEVERITY, number))
+    assert time.monotonic() - began_s < 20
+    eventually(lambda: "acknowledges nothing" in stage.problem(), "it is named")
+    assert stage.counters()["waiting_transitions"] == 1000
+    broker.go_on()
+    eventually(lambda: stage.counters()["waiting_transitions"] == 0, "it goes on")
+    broker.hang()
+    began_s = time.monotonic()
+    stage.close()
+    assert time.monotonic() - began_s < 10
+
+
+@pytest.mark.slow
+def test_the_last_will_says_that_a_killed_stage_is_gone(tmp_path, broker, listener):
+    config = tmp_path / "site.toml"
+    config.write_text(
+        f'site = "{SITE}"\nrun_folder = "run"\n[bus]\nendpoint = "tcp/127.0.0.1:{free_port()}"\n'
+        f'[[tray]]\nname = "{TRAY}"\nfans = 4\n[mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n'
+    )
+    running = RunningCommand(["run", "mqtt", "-c", config])
+    try:
+        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
+        eventually(lambda: state_of(listener).get("state") == "silent", "a tray that sends nothing is silent")
+        os.kill(running.process.pid, signal.SIGKILL)
+        eventually(lambda: listener.last(f"{ROOT}/status") == "offline", "the broker says that it is gone")
+    finally:
+        running.kill()
+
+
+def test_the_last_will_of_a_connection_that_is_dead_comes_before_the_next_one_says_online(tmp_path, broker, listener):
+    dead = paho.Client(CallbackAPIVersion.VERSION2, f"fantwin-{SITE}-all")
+    dead.will_set(f"{ROOT}/status", "offline", 1, retain=True)
+    dead.connect("127.0.0.1", broker.port, keepalive=60)
+    dead.loop_start()
+    eventually(dead.is_connected, "it is connected")
+    dead._thread_terminate = True  # its thread ends, as if the host had gone: its connection stays
+    stage = RunningMqtt(tmp_path, broker.port)
+    try:
+        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
+        assert listener.of(f"{ROOT}/status") == ["offline", "online"]
+    finally:
+        stage.close()
+
+
+def test_requests_are_passed_on_under_the_configured_name_and_answered(tmp_path, broker, listener):
+    stage = RunningMqtt(tmp_path, broker.port, granted, **ACCEPTING)
+    topic = f"{FAN}/request"
+
+    def ask(text: str, where: str = topic) -> dict[str, Any]:
+        before = len(listener.of(f"{where}/answer"))
+        listener.publish(where, text)
+        eventually(lambda: len(listener.of(f"{where}/answer")) > before, "it is answered")
+        return json.loads(listener.last(f"{where}/answer") or "")
+
+    try:
+        stage.feed(score(), alarm())
+        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
+        answer = ask('{"action": "acknowledge", "comment": "seen", "name": "ann", "id": "7"}')
+        assert (answer["ok"], answer["id"], answer["answers"][0]["transition"]) == (True, "7", "acknowledged")
+        (sent,) = stage.sent
+        assert (sent.action, sent.fan, sent.header.tray) == (Action.ACKNOWLEDGE, 2, TRAY)
+        assert (sent.operator_name, sent.comment) == ("mqtt:desk", "seen (sent as ann)"), "nobody chooses his name"
+        assert ask('{"action": "commission"}')["error"].startswith("commission is not accepted by MQTT here")
+        assert "no such fan" in ask('{"action": "acknowledge"}', f"{ROOT}/{TRAY}/9/request")["error"]
+        for malformed in ("{", "[]", '{"action": "explode"}', '{"action": "shelve", "duration_s": -1}', "x" * 9999):
+            assert not ask(malformed)["ok"]
+        assert "operator_name" in ask('{"action": "acknowledge", "operator_name": "root"}')["error"]
+        counts = stage.counters()
+        assert (counts["malformed_requests"], counts["refused_requests"], counts["accepted_requests"]) == (6, 2, 1)
+        assert len(stage.sent) == 1
+    finally:
+        stage.close()
+
+
+def test_what_the_scorer_refuses_is_an_error_and_a_scorer_that_is_silent_too(tmp_path, broker, listener, monkeypatch):
+    stage = RunningMqtt(tmp_path, broker.port, refused, **ACCEPTING)
+    try:
+        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
+        listener.publish(f"{FAN}/request", '{"action": "acknowledge"}')
+        answer = json.loads(eventually(lambda: listener.last(f"{FAN}/request/answer"), "it is answered"))
+        assert (answer["ok"], answer["error"]) == (False, "fan 2: there is nothing to acknowledge")
+        monkeypatch.setattr("pipeline.broker.requests.ANSWERED_WITHIN_S", 0.1)
+        listener.publish(f"{ROOT}/{TRAY}/all/request", '{"action": "acknowledge"}')
+        silent = eventually(lambda: listener.last(f"{ROOT}/{TRAY}/all/request/answer"), "it is answered")
+        assert json.loads(silent)["error"] == f"tray {TRAY}: no scorer has answered"
+        assert stage.sent[-1].fan == -1
+    finally:
+        stage.close()
+
+
+def test_a_retained_request_is_not_acted_on_again(tmp_path, broker, listener):
+    listener.publish(f"{FAN}/request", '{"action": "acknowledge"}', retain=True)
+    stage = RunningMqtt(tmp_path, broker.port, granted, **ACCEPTING)
+    try:
+        answer = eventually(lambda: listener.last(f"{FAN}/request/answer"), "it is answered")
+        assert "retained requests are ignored" in answer
+        assert (stage.counters()["retained_requests"], stage.sent) == (1, [])
+    finally:
+        stage.close()
+
+
+def test_by_default_no_request_is_heard(tmp_path, broker, listener):
+    stage = RunningMqtt(tmp_path, broker.port, granted)
+    try:
+        stage.feed(score(), alarm())
+        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
+        listener.publish(f"{FAN}/request", '{"action": "acknowledge"}')
+        before = len(listener.of(f"{FAN}/state"))
+        stage.feed(score(1.0, state=FanState.SUSPECT))
+        eventually(lambda: len(listener.of(f"{FAN}/state")) > before, "it goes on")
+        assert (stage.sent, listener.of(f"{FAN}/request/answer")) == ([], [])
+    finally:
+        stage.close()
+
+
+def test_home_assistant_loses_the_fans_that_are_gone_and_all_on_request(tmp_path, broker, listener):
+    def devices() -> set[str]:
+        found = [
+            topic for topic, text in retained_by(broker.port).items() if text and topic.startswith("homeassistant/")
+        ]
+        return {topic.removeprefix(f"homeassistant/device/fantwin_{SITE}/").removesuffix("/config") for topic in found}
+
+    listener.publish("homeassistant/device/other/x/config", '{"of": "another"}', retain=True)
+    for fans, expected in ((4, 4), (2, 2)):
+        stage = RunningMqtt(tmp_path, broker.port, fans=fans, home_assistant="publish")
+        wanted = {"site", *(f"{TRAY}-{fan}" for fan in range(expected)), "homeassistant/device/other/x"}
+        try:
+            eventually(lambda: devices() == wanted, f"{fans} fans are known")  # noqa: B023  called in this round
+            kept = retained_by(broker.port)
+            numbers = {int(topic.split("/")[3]) for topic in kept if topic.startswith(f"{ROOT}/{TRAY}/")}
+            assert numbers <= set(range(fans)), "states of fans that are gone are removed, too"
+        finally:
+            stage.close()
+    stage = RunningMqtt(tmp_path, broker.port, fans=2, home_assistant="remove")
+    eventually(lambda: devices() == {"homeassistant/device/other/x"}, "only that of others is left")
+    stage.close()
+
+
+def test_a_user_a_password_and_tls(tmp_path):
+    authority = trustme.CA()
+    authority.cert_pem.write_to_path(str(tmp_path / "ca.pem"))
+    server = authority.issue_cert("127.0.0.1")
+    server.private_key_pem.write_to_path(str(tmp_path / "server.key"))
+    server.cert_chain_pems[0].write_to_path(str(tmp_path / "server.pem"))
+    users = tmp_path / "users"
+    subprocess.run(["mosquitto_passwd", "-b", "-c", users, "plant", "secret"], check=True, capture_output=True)
+    broker = Mosquitto(
+        tmp_path,
+        f"certfile {tmp_path / 'server.pem'}",
+        f"keyfile {tmp_path / 'server.key'}",
+        "allow_anonymous false",
+        f"password_file {users}",
+    )
+    broker.start()
+    settings = {"tls": True, "ca": "ca.pem", "username": "plant", "password_file": "password"}
+    password = tmp_path / "password"
+    try:
+        for text, is_right in (("secret", True), ("wrong", False)):
+            password.write_text(f"{text}\n")
+            password.chmod(0o600)
+            stage = RunningMqtt(tmp_path, broker.port, **settings)
+            if is_right:
+                eventually(lambda: stage.counters()["connections"] == 1, "it is let in")  # noqa: B023
+            else:
+                eventually(lambda: "the broker refuses this client" in stage.problem(), "it is not")  # noqa: B023
+            stage.close()
+        config = MqttConfig(host="127.0.0.1", port=broker.port, **settings)
+        context = Context(SITE, (), config, tmp_path, tmp_path, 0)
+        assert "check username and password" in check(context)[0]
+        password.chmod(0o644)
+        assert "chmod 600" in check(context)[0]
+    finally:
+        broker.stop()
+
+
+def test_doctor_names_a_broker_that_is_not_there_and_topics_that_overlap(tmp_path):
+    port = free_port()
+    tray = TrayConfig(
+        name=TRAY,
+        fans=4,
+        source=SourceConfig(host="127.0.0.1", port=port, topic="fantwin/+/tray1/#"),
+    )
+    config = MqttConfig(host="127.0.0.1", port=port, home_assistant_trays=("tray9",))
+    context = Context(SITE, (tray,), config, tmp_path, tmp_path, 0)
+    overlapping, unknown, away = check(context)
+    assert overlapping == (
+        "[mqtt] publishes to fantwin/hall/#, which topic fantwin/+/tray1/# of tray tray1 has part of: change prefix"
+    )
+    assert unknown == "[mqtt] home_assistant_trays: there is no tray tray9"
+    assert away == f"broker 127.0.0.1:{port}: cannot be reached: Connection refused; check host and port"
+    with pytest.raises(StageError, match="change prefix"):
+        build(context)
