@@ -6,6 +6,7 @@ alarm counts from the moment at which the trace shows the block.
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -103,9 +104,11 @@ def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: C
     assert {alarm.fan for alarm in raised} == {FAN}, [alarm.message for alarm in raised]
     received_s = np.concatenate([raw.host_receive_t_ns for raw in raws]) / NS_PER_S
     blocked_s = trace.blocked_s[FAN][0]
-    # By the clock of the board, which a busy machine may let fall behind the host's.
+    # By the clock of the board. A busy machine lets it fall behind the host, and the times of samples are as wrong.
+    behind = re.search(r"at most ([0-9.]+) s behind real time", pace)
+    assert behind, pace
     delay_s = np.interp(raised[0].t_ns / NS_PER_S, received_s, clock_s) - blocked_s
-    assert 0.0 < delay_s < LONGEST_DELAY_S, pace
+    assert -float(behind[1]) < delay_s < LONGEST_DELAY_S + float(behind[1]), pace
     print(f"blocked at {blocked_s:.3f} s of the trace, alarm {delay_s:.3f} s later; {pace}")
 
 
