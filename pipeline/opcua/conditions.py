@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from pipeline.opcua.identifiers import FAN_ALARM_TYPE, condition_identifier
-from pipeline.opcua.requests import MAX_TIME_SHELVED_S
+from pipeline.presenting.request_form import LONGEST_SHELVING_S
 from pipeline.viewing.fleet import Fan
 from schemas.enums import Severity, Transition
 from schemas.messages import Alarm
@@ -183,7 +183,7 @@ def _shelving(until_t_ns: int, now_ns: int) -> tuple[str, StandardNode, float]:
     if not until_t_ns:
         return "Unshelved", StandardNode("ShelvedStateMachineType_Unshelved"), 0.0
     if until_t_ns == UNTIL_IT_CLEARS_T_NS:
-        return "One Shot Shelved", StandardNode("ShelvedStateMachineType_OneShotShelved"), MAX_TIME_SHELVED_S * 1e3
+        return "One Shot Shelved", StandardNode("ShelvedStateMachineType_OneShotShelved"), LONGEST_SHELVING_S * 1e3
     remaining_ms = max(0.0, (until_t_ns - now_ns) / NS_PER_MS)
     return "Timed Shelved", StandardNode("ShelvedStateMachineType_TimedShelved"), remaining_ms
 
@@ -239,7 +239,7 @@ def _fields(condition: Condition, now_ns: int) -> dict[str, Any]:
         "ShelvingState/CurrentState/Id": shelving_node,
         "ShelvingState/UnshelveTime": unshelve_ms,
         "SuppressedOrShelved": bool(newest and is_silenced(newest)),
-        "MaxTimeShelved": MAX_TIME_SHELVED_S * 1e3,
+        "MaxTimeShelved": LONGEST_SHELVING_S * 1e3,
         "LatchedState": "Latched" if latched else "Unlatched",
         "LatchedState/Id": latched,
         "Cause": CAUSES.get(first.cause, first.cause) if first else "",

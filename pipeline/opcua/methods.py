@@ -22,8 +22,6 @@ from pipeline.opcua.requests import (
     EVENT_ID,
     FAN_METHODS,
     GOOD,
-    LONGEST_COMMENT,
-    MAX_TIME_SHELVED_S,
     METHODS,
     SHELVING_METHODS,
     SHELVING_TIME,
@@ -34,6 +32,7 @@ from pipeline.opcua.sessions import CURRENT_SESSION
 from pipeline.opcua.site_nodes import SiteNodes
 from pipeline.opcua.templates import method_nodes
 from pipeline.presenting.request_desk import RequestDesk
+from pipeline.presenting.request_form import LONGEST_COMMENT, LONGEST_SHELVING_S
 from pipeline.presenting.site_model import SiteModel
 from pipeline.viewing.fleet import Fan
 from schemas.enums import Action
@@ -160,5 +159,5 @@ def _shelving_refusal(shelving_ms: Any) -> str:
     is another method."""
     if not isinstance(shelving_ms, float | int) or isinstance(shelving_ms, bool):
         return "BadTypeMismatch"
-    fits = math.isfinite(shelving_ms) and 0 < shelving_ms <= MAX_TIME_SHELVED_S * 1e3
+    fits = math.isfinite(shelving_ms) and 0 < shelving_ms <= LONGEST_SHELVING_S * 1e3
     return "" if fits else "BadShelvingTimeOutOfRange"

@@ -11,8 +11,6 @@ from schemas.enums import Action, Severity, Transition
 from schemas.messages import Alarm
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
-LONGEST_COMMENT = 500
-MAX_TIME_SHELVED_S = 30 * 86400.0
 GOOD = "Good"
 
 
