@@ -33,6 +33,7 @@ CREATE TABLE IF NOT EXISTS transition (
     UNIQUE (producer, tray, sequence)
 );
 CREATE INDEX IF NOT EXISTS of_fan ON transition (tray, fan, number);
+CREATE INDEX IF NOT EXISTS of_time ON transition (t_ns, number);
 CREATE TABLE IF NOT EXISTS reader (name TEXT PRIMARY KEY, number INTEGER NOT NULL);
 """
 
@@ -127,6 +128,22 @@ class AlarmStore:
             (tray, fan, before, most),
         )
         return [(number, alarm) for number, data in rows if (alarm := _decoded(data)) is not None]
+
+    def between(
+        self, begin_ns: int, end_ns: int, most: int, *, tray: str = "", fan: int = -1, is_backwards: bool = False
+    ) -> Sequence[Alarm]:
+        """The first transitions of a stretch of time, its end left out; is_backwards: the last ones, newest first.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        order = "DESC" if is_backwards else "ASC"
+        rows = self._read(
+            "SELECT alarm FROM transition WHERE t_ns >= ?1 AND t_ns < ?2 AND (?3 = '' OR tray = ?3)"
+            f" AND (?4 < 0 OR fan = ?4) ORDER BY t_ns {order}, number {order} LIMIT ?5",
+            (begin_ns, end_ns, tray, fan, most),
+        )
+        return [alarm for (data,) in rows if (alarm := _decoded(data)) is not None]
 
     def after(self, number: int, most: int) -> Sequence[tuple[int, Alarm]]:
         """The transitions that came after one, oldest first, each with its number.
