@@ -51,18 +51,18 @@ class WebServer:
         self._expires = expiry_of(tls[0]) if tls else None
         config = uvicorn.Config(
             app,
-            http=partial(_Connection, Connections(unlimited)),  # type: ignore[arg-type]  it is called as the class
+            http=partial(_Connection, Connections(unlimited, most_connections())),  # type: ignore[arg-type]  it is called as the class
             lifespan="off",
             log_config=None,
             access_log=False,
             server_header=False,
             proxy_headers=False,
-            limit_concurrency=most_connections(),
             timeout_graceful_shutdown=1,
             ssl_certfile=tls[0] if tls else None,
             ssl_keyfile=tls[1] if tls else None,
         )
-        logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
+        for name in ("uvicorn", "asyncio"):  # of each client that leaves without a word they say a lot
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._run, name="web server", daemon=True)
         self._thread.start()
@@ -97,16 +97,19 @@ class _Loop(asyncio.SelectorEventLoop):
 
 
 class Connections:
-    """How many there are from each address."""
+    """How many there are, and from each address."""
 
-    def __init__(self, unlimited: Set[str]) -> None:
-        self._unlimited = unlimited
+    def __init__(self, unlimited: Set[str], most: int) -> None:
+        """unlimited: addresses that may have all of them."""
+        self._unlimited, self._most = unlimited, most
         self._open: Counter[str] = Counter()
 
     def begin(self, address: str) -> bool:
         """One more; returns whether there are too many."""
-        self._open[network_of(address)] += 1
-        return address not in self._unlimited and self._open[network_of(address)] > MOST_OF_AN_ADDRESS
+        network = network_of(address)
+        self._open[network] += 1
+        is_limited = address not in self._unlimited
+        return self._open.total() > self._most or (is_limited and self._open[network] > MOST_OF_AN_ADDRESS)
 
     def end(self, address: str) -> None:
         """One less."""

@@ -223,15 +223,34 @@ def is_ended(connection: socket.socket) -> bool:
     return True
 
 
-def test_one_address_elsewhere_cannot_take_all_connections(monkeypatch):
+def test_one_address_elsewhere_cannot_take_all_connections_and_all_are_never_too_many(tmp_path, monkeypatch):
     monkeypatch.setattr(server, "MOST_OF_AN_ADDRESS", 2)
-    connections = server.Connections(frozenset({"127.0.0.1"}))
+    connections = server.Connections(frozenset({"127.0.0.1"}), most=7)
     assert [connections.begin("192.0.2.1") for _ in range(3)] == [False, False, True]
-    assert [connections.begin("127.0.0.1") for _ in range(3)] == [False] * 3
+    connections.end("192.0.2.1")
+    assert [connections.begin("127.0.0.1") for _ in range(4)] == [False] * 4
     assert not connections.begin("192.0.2.2")
-    for _ in range(2):
-        connections.end("192.0.2.1")
+    assert connections.begin("192.0.2.3"), "more than there may be"
+    for address in ("192.0.2.1", "192.0.2.1", "192.0.2.3"):
+        connections.end(address)
     assert not connections.begin("192.0.2.1")
+    monkeypatch.setattr(server, "most_connections", lambda: 3)
+    gateway = RunningGateway(tmp_path)
+    try:
+        held = [socket.create_connection(("127.0.0.1", gateway.port), timeout=30) for _ in range(5)]
+        assert is_ended(held[3])
+        assert is_ended(held[4])
+        held[0].close()
+        eventually(lambda: answers(gateway), "there is room again")
+    finally:
+        gateway.close()
+
+
+def answers(gateway: RunningGateway) -> bool:
+    try:
+        return Client(gateway).ask("GET", "/healthz")[0] == 200
+    except (OSError, http.client.HTTPException):
+        return False
 
 
 def test_a_body_that_comes_little_by_little_is_given_up(gateway, monkeypatch):
