@@ -83,7 +83,8 @@ class Users:
         from argon2.exceptions import Argon2Error, InvalidHashError  # noqa: PLC0415  an extra
 
         try:
-            self._hasher.verify(user.password_hash if user else self._nobody_hash, password[:LONGEST_PASSWORD])
+            given = password if len(password) <= LONGEST_PASSWORD else ""
+            self._hasher.verify(user.password_hash if user else self._nobody_hash, given)
         except (Argon2Error, InvalidHashError):
             return False
         return user is not None
