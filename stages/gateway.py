@@ -1,7 +1,8 @@
 """Gateway: the web server of a site: operators' page, API, live events and metrics (docs/how-to/gateway.md).
 
-Reads `score`, `alarm`, `twin` and `health`, and writes `request`. One core serves all trays. With many fans, the newest
-score of each tray is asked for once a second; all samples arrive only of those trays that somebody looks at.
+Reads `score`, `alarm`, `twin`, `health`, and `snapshot` for the wear, and writes `request`. One core serves all trays.
+With many fans, the newest score of each tray is asked for once a second; all samples arrive only of those trays that
+somebody looks at.
 
 The server runs in a thread of its own: it reads what the core has collected, and leaves requests for the core to send.
 """
@@ -13,12 +14,15 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from pathlib import Path
 
 from pipeline.config.models import TrayConfig
+from pipeline.config.registry import RECORDER
 from pipeline.errors import UserError
 from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.live_feed import LiveFeed
 from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.fan_history import curves_of
+from pipeline.presenting.other_stages import configured, recordings_of, viewer_urls
+from pipeline.presenting.recorded_alarms import RecordedAlarms
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stages_json
 from pipeline.presenting.site_model import SiteModel
@@ -26,7 +30,7 @@ from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from pipeline.viewing.fleet import Fan
 from schemas.envelope import Envelope
 from schemas.health import Health
-from schemas.messages import Alarm, Message, ModelCard
+from schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 from schemas.units import NS_PER_S
 
 NEEDED = ("starlette", "uvicorn", "prometheus_client", "argon2")
@@ -43,8 +47,11 @@ HISTORY = "alarms.sqlite"
 class GatewayCore(Core):
     """Collects what the server shows, and sends what operators ask."""
 
-    def __init__(self, model: SiteModel, feed: LiveFeed, desk: RequestDesk, serve: Server) -> None:
+    def __init__(
+        self, model: SiteModel, feed: LiveFeed, desk: RequestDesk, serve: Server, recorded: RecordedAlarms
+    ) -> None:
         self._model = model
+        self._recorded = recorded
         self._feed = feed
         self._desk = desk
         self._server = serve
@@ -67,6 +74,8 @@ class GatewayCore(Core):
             self._add_alarm(tray, item)
         elif isinstance(item, ModelCard):
             self._model.add_twin(item)
+        elif isinstance(item, ScorerSnapshot):
+            self._model.add_snapshot(item)
         return ()
 
     def tick(self, now_ns: int) -> Sequence[Message]:
@@ -87,6 +96,7 @@ class GatewayCore(Core):
     def close(self) -> Sequence[Message]:
         """Stop the server, and close the history."""
         self._server.stop()
+        self._recorded.stop()
         self._model.close()
         return ()
 
@@ -111,7 +121,7 @@ class GatewayCore(Core):
 
     def problem(self) -> str:
         """Of the server, the users and the history."""
-        return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
+        return "; ".join(filter(None, (self._server.problem(), self._model.problem(), self._recorded.problem)))
 
     def _add_score(self, tray: TrayConfig, envelope: Envelope) -> None:
         score = self._model.add_score(envelope)
@@ -144,7 +154,9 @@ class Server:
 
 
 class _Running(Server):
-    def __init__(self, context: Context, model: SiteModel, feed: LiveFeed, desk: RequestDesk) -> None:
+    def __init__(
+        self, context: Context, model: SiteModel, feed: LiveFeed, desk: RequestDesk, recorded: RecordedAlarms
+    ) -> None:
         from pipeline.gateway.access import Access  # noqa: PLC0415  the extra may not be installed
         from pipeline.gateway.api import Api  # noqa: PLC0415
         from pipeline.gateway.app import application  # noqa: PLC0415
@@ -158,7 +170,8 @@ class _Running(Server):
             check_certificate(*tls)
         self._access = Access(config, Users(context.resolve(config.users)) if config.users else None)
         listening = listen(config.host, config.port + context.shard_number - 1)
-        app = application(Api(model, self._access, feed, desk), config)
+        site = configured(context, "viewer")
+        app = application(Api(model, self._access, feed, desk, recorded, viewer_urls(site) if site else {}), config)
         self._server = WebServer(app, listening, tls, feed.end)
 
     def stop(self) -> None:
@@ -176,9 +189,16 @@ def build(context: Context) -> BuiltStage:
     """
     if not all(map(is_installed, NEEDED)):
         raise StageError(NOT_INSTALLED)
-    model = SiteModel(context.site, context.trays, AlarmStore(context.own_file(Path(HISTORY))))
+    store = AlarmStore(context.own_file(Path(HISTORY)))
+    if context.started_t_ns:
+        store.begins(context.started_t_ns)
+    model = SiteModel(context.site, context.trays, store)
     feed, desk = LiveFeed(), RequestDesk(context.producer)
-    return BuiltStage(GatewayCore(model, feed, desk, _Running(context, model, feed, desk)))
+    site = configured(context, RECORDER)
+    recorded = RecordedAlarms(model, recordings_of(site) if site else ())
+    core = GatewayCore(model, feed, desk, _Running(context, model, feed, desk, recorded), recorded)
+    recorded.start()
+    return BuiltStage(core)
 
 
 def check(context: Context) -> list[str]:
@@ -211,7 +231,7 @@ def check(context: Context) -> list[str]:
 STAGE = Stage(
     name="gateway",
     about="serves the operators' page, the API, live events and metrics by HTTP",
-    reads=("score", "alarm", "twin", "health"),
+    reads=("score", "alarm", "twin", "snapshot", "health"),
     writes=("request",),
     config=GatewayConfig,
     build=build,

@@ -35,11 +35,24 @@ def free_port() -> int:
 class RunningGateway:
     """answer: what the scorer says to a request; the answers are passed back as the bus would."""
 
-    def __init__(self, folder: Path, answer: Callable[[Request], list[Alarm]] | None = None, **settings: Any) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        answer: Callable[[Request], list[Alarm]] | None = None,
+        *,
+        configuration: str = "",
+        started_t_ns: int = 0,
+        **settings: Any,
+    ) -> None:
+        """configuration: the text of a configuration file in the folder; empty: there is none."""
         self.port = free_port()
         config = GatewayConfig(port=self.port, **settings)
         trays = (TrayConfig(name=TRAY, fans=FANS, speed_unit="rpm"),)
-        built = build(Context(SITE, trays, config, folder, folder, 0, producer=PRODUCER))
+        context = Context(SITE, trays, config, folder, folder, started_t_ns, producer=PRODUCER)
+        if configuration:
+            path = folder / "fantwin.toml"
+            context = replace(context, configuration_path=path, configuration_text=configuration)
+        built = build(context)
         assert isinstance(built.core, GatewayCore)
         self.core = built.core
         self.sent: list[Request] = []
