@@ -16,7 +16,7 @@ from pathlib import Path
 from pipeline.config.models import TrayConfig
 from pipeline.config.registry import RECORDER
 from pipeline.errors import UserError
-from pipeline.gateway.config import GatewayConfig
+from pipeline.gateway.config import NEEDED, GatewayConfig
 from pipeline.gateway.live_feed import LiveFeed
 from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.presenting.alarm_store import AlarmStore
@@ -33,7 +33,6 @@ from schemas.health import Health
 from schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 from schemas.units import NS_PER_S
 
-NEEDED = ("starlette", "uvicorn", "prometheus_client", "argon2")
 NOT_INSTALLED = f"the gateway needs its extra: take [gateway] out of the configuration, or {how_to_install('gateway')}"
 FLEET_PERIOD_NS = NS_PER_S
 STAGES_PERIOD_NS = 2 * NS_PER_S

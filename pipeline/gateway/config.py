@@ -9,6 +9,9 @@ from pydantic import Field, model_validator
 from pipeline.devices.host_address import is_of_this_host_only
 from pipeline.runtime.stage import StageConfig
 
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "argon2")
+"""the modules of the extra `gateway`"""
+
 
 class GatewayConfig(StageConfig):
     """Where the page is served, and who may see it and act.

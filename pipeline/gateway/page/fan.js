@@ -32,8 +32,8 @@ export class FanView {
     this.history = new HistoryView({ tray, fan });
     this.windows = element("div", { class: "actions", role: "group", "aria-label": "Time shown" }, ...WINDOWS.map(([text, s]) =>
       element("button", { type: "button", "aria-pressed": String(s === this.window_s), onclick: (event) => this.show(s, event.target) }, text)));
-    this.root = element("div", {}, element("p", {}, element("a", { href: "#/fans" }, "← All fans"), " (Esc)"),
-      element("h2", {}, `${tray} fan ${fan}`), element("p", {}, this.state, this.score, " ", rerunLink(viewerUrl, 0)),
+    this.root = element("div", {}, element("div", { class: "title" }, element("h2", {}, `${tray} fan ${fan}`),
+      element("a", { href: "#/fans" }, "← all fans (Esc)")), element("p", {}, this.state, this.score, " ", rerunLink(viewerUrl, 0)),
       this.alarm, this.windows, this.charts, element("h2", {}, "Wear"), this.wear, element("h2", {}, "Twin"), this.twin,
       this.history.root);
     this.updateAlarm(alarm);
