@@ -11,6 +11,7 @@ const GROUPS = [
   { name: "normal", title: "Normal", mark: "●" },
 ];
 const LARGE_UP_TO = 64;
+const LARGE_GROUPS = 2;
 export const HIGHEST_LEVEL = 250;
 export const NO_LEVEL = 255;
 const REST = ["stopped", "starting"];
@@ -35,18 +36,16 @@ export class FansView {
   }
 
   build() {
-    this.isLarge = this.fans.length <= LARGE_UP_TO;
-    const large = this.isLarge ? " large" : "";
     this.tray = element("select", { id: "tray", onchange: () => this.filter() }, element("option", { value: "" }, "all trays"),
       ...this.site.trays.map((tray) => element("option", { value: tray.name }, tray.name)));
     this.state = element("select", { id: "state", onchange: () => this.filter() }, element("option", { value: "" }, "all states"),
       ...GROUPS.map((group) => element("option", { value: group.name }, group.title.toLowerCase())));
     this.sections = GROUPS.map((group, number) => {
       const count = element("span");
-      const cells = element("div", { class: `cells${large}`, role: "group", "aria-label": group.title,
+      const cells = element("div", { class: "cells", role: "group", "aria-label": group.title,
         onclick: (event) => this.chosen(event), onkeydown: (event) => this.moved(event) });
       const root = element("section", { hidden: true }, element("h2", {}, `${group.mark} ${group.title} `, count), cells);
-      return { root, cells, count, number };
+      return { root, cells, count, number, isLarge: false };
     });
     this.cells = this.fans.map((fan, index) => this.cell(fan, index));
     const legend = element("ul", { class: "legend" }, ...GROUPS.map((group) => element("li", {}, `${group.mark} ${group.title.toLowerCase()}`)),
@@ -63,7 +62,7 @@ export class FansView {
     const words = element("span", { class: "words" });
     const level = element("span", { class: "level", "aria-hidden": "true" });
     const root = element("button", { class: "cell", type: "button", tabindex: "-1" }, mark,
-      element("span", { class: "name" }, `${fan.tray} ${fan.fan}`), words, level);
+      element("span", { class: "name" }, `${fan.tray} fan ${fan.fan}`), words, level);
     root.index = index;
     return { root, mark, words, level, text: "", group: -1, class: -1, percent: -1 };
   }
@@ -98,13 +97,13 @@ export class FansView {
       cell.level.style.transform = `scaleX(${Math.min(1, percent / 100)})`;
     }
     const share = percent ? `, ${percent} %${percent >= HIGHEST_LEVEL ? " or more" : ""}` : "";
-    const text = `${fan.tray} fan ${fan.fan}: ${words}${share}${share && " of the limit"}`;
+    const text = `${fan.tray} fan ${fan.fan} ${words}${share}${share && " of the limit"}`;
     if (cell.text !== text) {
       cell.text = text;
       cell.root.title = text;
       cell.root.setAttribute("aria-label", text);
       if (cell.mark.textContent !== group.mark) cell.mark.textContent = group.mark;
-      if (this.isLarge) cell.words.textContent = `${words}${share}`;
+      if (this.sections[cell.group].isLarge) cell.words.textContent = `${words}${share}`;
       const kind = `cell ${group.name}`;
       if (cell.root.className !== kind) cell.root.className = kind;
     }
@@ -130,10 +129,21 @@ export class FansView {
     const wanted = this.state.value;
     this.sections.forEach((section, number) => {
       section.count.textContent = shown[number] === counts[number] ? `(${counts[number]})` : `(${shown[number]} of ${counts[number]})`;
+      this.enlarge(section, counts[number] <= LARGE_UP_TO && (number < LARGE_GROUPS || this.fans.length <= LARGE_UP_TO));
       section.root.hidden = shown[number] === 0 || (wanted !== "" && wanted !== GROUPS[number].name);
     });
     this.nothing.hidden = this.sections.some((section) => !section.root.hidden);
     this.offer(this.root.querySelector("section:not([hidden]) .cell:not([hidden])"));
+  }
+
+  // Cells with names and words, where they are few.
+  enlarge(section, isLarge) {
+    if (section.isLarge === isLarge) return;
+    section.isLarge = isLarge;
+    section.cells.classList.toggle("large", isLarge);
+    this.cells.forEach((cell, index) => {
+      if (cell.group === section.number) this.label(Object.assign(cell, { text: "" }), index, cell.percent);
+    });
   }
 
   // One cell is reached by Tab: the one that had the focus last, as long as it is shown.
