@@ -79,7 +79,7 @@ def application(api: Api, config: GatewayConfig) -> ASGIApp:
         middleware=[
             Middleware(_WithHeaders, headers=_HEADERS | (_BY_HTTPS_ONLY if config.certificate else {})),
             Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False),
-            Middleware(GZipMiddleware, minimum_size=1000),
+            Middleware(GZipMiddleware, minimum_size=1000, compresslevel=5),
         ],
         exception_handlers={HTTPException: failed},
     )

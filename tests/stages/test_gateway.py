@@ -160,7 +160,14 @@ def test_metrics_are_those_of_prometheus_and_an_unjudged_fan_has_no_score(gatewa
     assert samples["fantwin_fan_scored", "3", None] == 0.0
     assert samples["fantwin_fan_alarm_active", "2", "alarm"] == 1.0
     assert samples["fantwin_fan_alarm_active", "2", "warning"] == 0.0
-    assert samples["fantwin_alarms_total", "2", "alarm"] == 1.0
+    assert samples["fantwin_fan_alarm_unacknowledged", "2", "alarm"] == 1.0
+    assert samples["fantwin_alarms_total", None, "alarm"] == 1.0
+    assert samples["fantwin_alarms_total", None, "warning"] == 0.0, "counted from zero, so that the first one is seen"
+    gateway.feed(alarm(Transition.ACKNOWLEDGED, 1, acknowledged=True))
+    assert (
+        'fantwin_fan_alarm_unacknowledged{fan="2",severity="alarm",site="hall",tray="tray1"} 0.0'
+        in (Client(gateway).ask("GET", "/metrics")[1])
+    )
 
 
 def test_an_operator_acts_under_his_own_name_and_nobody_else_acts(gateway):
@@ -282,4 +289,6 @@ def test_nothing_of_a_fan_is_shown_as_now_once_its_tray_is_silent(gateway, monke
     gateway.feed(score())
     client = Client(gateway)
     eventually(lambda: client.ask("GET", "/api/v1/fans")[1]["fans"][0]["state"] == "silent", "the tray is silent")
-    assert "fantwin_fan_speed_rpm{" not in client.ask("GET", "/metrics")[1]
+    metrics = client.ask("GET", "/metrics")[1]
+    assert "fantwin_fan_speed_rpm{" not in metrics
+    assert 'fantwin_fan_scored{fan="0",site="hall",tray="tray1"} 0.0' in metrics
