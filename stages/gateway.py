@@ -8,12 +8,11 @@ The server runs in a thread of its own: it reads what the core has collected, an
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence, Set
+from functools import partial
 from pathlib import Path
 
-from pipeline.config.models import TrayConfig
-from pipeline.errors import UserError
+from pipeline.errors import refusals
 from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.live_feed import LiveFeed
 from pipeline.optional_dependencies import how_to_install, is_installed
@@ -21,12 +20,12 @@ from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.fan_history import curves_of
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stages_json
+from pipeline.presenting.site_core import SiteCore
 from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
 from pipeline.viewing.fleet import Fan
 from schemas.envelope import Envelope
-from schemas.health import Health
-from schemas.messages import Alarm, Message, ModelCard
+from schemas.messages import Alarm, Message
 from schemas.units import NS_PER_S
 
 NEEDED = ("starlette", "uvicorn", "prometheus_client", "argon2")
@@ -40,34 +39,34 @@ MOST_FOLLOWED = 32
 HISTORY = "alarms.sqlite"
 
 
-class GatewayCore(Core):
+class GatewayCore(SiteCore):
     """Collects what the server shows, and sends what operators ask."""
 
     def __init__(self, model: SiteModel, feed: LiveFeed, desk: RequestDesk, serve: Server) -> None:
-        self._model = model
+        super().__init__(model, desk)
         self._feed = feed
-        self._desk = desk
         self._server = serve
-        self._counts: Counter[str] = Counter()
         self._is_small = sum(tray.fans for tray in model.trays) <= ALL_FOLLOWED
         self._fleet_ns = self._stages_ns = 0
         self._requests = 0
 
-    def step(self, item: Message | Envelope) -> Sequence[Message]:
-        """Keep what has arrived, and send it to the pages that show it."""
-        if isinstance(item, Health):
-            self._model.add_health(item)
-            return ()
-        tray = self._model.tray(item.header.tray)
-        if tray is None:
-            self._counts["unknown_tray"] += 1
-        elif isinstance(item, Envelope):
-            self._add_score(tray, item)
-        elif isinstance(item, Alarm):
-            self._add_alarm(tray, item)
-        elif isinstance(item, ModelCard):
-            self._model.add_twin(item)
-        return ()
+    def add_score(self, envelope: Envelope) -> None:
+        """Keep it, and send it to the pages that show one of its fans."""
+        score = self._model.add_score(envelope)
+        tray = self._model.tray(envelope.header.tray)
+        if score is None or tray is None:
+            return
+        for name, fan in self._feed.looked_at():
+            if name == tray.name:
+                self._feed.publish("samples", curves_json(curves_of(score, fan), tray), about=(name, fan))
+
+    def add_alarm(self, alarm: Alarm) -> None:
+        """Keep it, and send a transition to all pages."""
+        is_new = self._model.add_alarm(alarm)
+        self._desk.add(alarm)
+        current = self._model.current_alarm(Fan(alarm.header.tray, alarm.fan))
+        if is_new and current is not None:
+            self._feed.publish("alarm", alarm_json(current))
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Send the pages the state of the fleet, and the scorers what operators ask."""
@@ -112,24 +111,6 @@ class GatewayCore(Core):
     def problem(self) -> str:
         """Of the server, the users and the history."""
         return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
-
-    def _add_score(self, tray: TrayConfig, envelope: Envelope) -> None:
-        score = self._model.add_score(envelope)
-        if score is None:
-            return
-        for name, fan in self._feed.looked_at():
-            if name == tray.name:
-                self._feed.publish("samples", curves_json(curves_of(score, fan), tray), about=(name, fan))
-
-    def _add_alarm(self, tray: TrayConfig, alarm: Alarm) -> None:
-        if alarm.fan >= tray.fans:
-            self._counts["unknown_fan"] += 1
-            return
-        is_new = self._model.add_alarm(alarm)
-        self._desk.add(alarm)
-        current = self._model.current_alarm(Fan(tray.name, alarm.fan))
-        if is_new and current is not None:
-            self._feed.publish("alarm", alarm_json(current))
 
 
 class Server:
@@ -189,23 +170,14 @@ def check(context: Context) -> list[str]:
     from pipeline.presenting.users import read_users  # noqa: PLC0415
 
     config: GatewayConfig = context.config
-    problems: list[str] = []
-
-    def attempt(check: Callable[[], object]) -> None:
-        try:
-            check()
-        except UserError as error:
-            problems.append(str(error))
-
+    attempts: list[Callable[[], object]] = []
     if config.certificate and config.key:
-        certificate, key = context.resolve(config.certificate), context.resolve(config.key)
-        attempt(lambda: check_certificate(certificate, key))
+        attempts.append(partial(check_certificate, context.resolve(config.certificate), context.resolve(config.key)))
     if config.users:
-        users = context.resolve(config.users)
-        attempt(lambda: read_users(users))
+        attempts.append(partial(read_users, context.resolve(config.users)))
     if not context.is_running:
-        attempt(lambda: listen(config.host, config.port + context.shard_number - 1).close())
-    return problems
+        attempts.append(lambda: listen(config.host, config.port + context.shard_number - 1).close())
+    return refusals(*attempts)
 
 
 STAGE = Stage(

@@ -96,6 +96,7 @@ class Bus:
         if self.credentials and site:
             role, is_client = self.credentials.role, config.mode == "client"
             self.rights = OwnRights(self._session, site, role, is_client=is_client)
+        self._stop = stop or threading.Event()
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
         self.spool: Spool | None = None
@@ -181,7 +182,7 @@ class Bus:
         answered twice: a client that has just lost its router gets that answer, too, until it has noticed.
 
         Raises:
-            NoAnswerError: no complete answer came: which tokens exist is not known.
+            NoAnswerError: no complete answer came, or `stop` was set before: which tokens exist is not known.
         """
         timeout_s = self._config.recovery_timeout_s
         until_s = time.monotonic() + _ALIVE_TIMEOUTS * timeout_s
@@ -193,13 +194,14 @@ class Bus:
             if is_complete and (found or was_empty):
                 return found
             was_empty = is_complete
+            if self._stop.wait(_ROUTER_RETRY_S):
+                raise NoAnswerError(f"bus.endpoint = {self._config.endpoint!r}: stopped before an answer came")
             if time.monotonic() > until_s:
                 raise NoAnswerError(
                     f"bus.endpoint = {self._config.endpoint!r}: no complete answer within "
                     f"{_ALIVE_TIMEOUTS * timeout_s:g} s to the question who is on the bus: check that the router runs "
                     "and is not overloaded"
                 )
-            time.sleep(_ROUTER_RETRY_S)
 
     def _has_its_router(self) -> bool:
         """Whether a client is connected; without its router it sees no token. Peers need no router."""

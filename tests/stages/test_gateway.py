@@ -18,7 +18,8 @@ from schemas.header import Header
 from schemas.messages import Alarm, Diagnosis, Request, Score
 from schemas.units import RAD_S_PER_UNIT
 from tests.support.running_chain import eventually
-from tests.support.running_gateway import FANS, SITE, TRAY, Client, RunningGateway
+from tests.support.running_core import FANS, SITE, TRAY
+from tests.support.running_gateway import Client, RunningGateway
 
 NOW_NS = 1_790_000_000_000_000_000
 STEP_NS = 10_000_000

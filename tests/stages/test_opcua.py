@@ -37,7 +37,8 @@ from schemas.messages import Alarm, Request
 from stages.opcua import STAGE, check
 from tests.stages.test_gateway import alarm, score
 from tests.support.running_chain import eventually
-from tests.support.running_opcua import OPERATOR, PASSWORD, SITE, TRAY, VIEWER, RunningOpcua
+from tests.support.running_core import SITE, TRAY
+from tests.support.running_opcua import OPERATOR, PASSWORD, VIEWER, RunningOpcua
 
 ALARM = f"ns=2;s={TRAY}/2/Alarm"
 SUPPRESS = ua.NodeId(ua.ObjectIds.AlarmConditionType_Suppress)
