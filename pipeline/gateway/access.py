@@ -8,10 +8,12 @@ the token of its session, which no other page can read.
 from __future__ import annotations
 
 import hmac
+from base64 import b64decode
 from collections.abc import Mapping
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 
@@ -23,6 +25,7 @@ from pipeline.presenting.users import NAME, UserRole, Users
 COOKIE, SECURE_COOKIE = "fantwin", "__Host-fantwin"
 CSRF_HEADER = "X-CSRF-Token"
 _OWN_SITE = {"same-origin"}
+_ASK_FOR_PASSWORD = {"WWW-Authenticate": 'Basic realm="fantwin"'}
 
 
 @dataclass(frozen=True)
@@ -109,15 +112,49 @@ class Access:
         """
         if self._users is None:
             raise HTTPException(404, "nobody logs in here")
-        counted = (f"name {name}", f"address {address}")
-        if wait_s := self._failures.wait_s(*counted):
-            raise HTTPException(429, "too many wrong passwords: try again later", {"Retry-After": f"{wait_s:.0f}"})
+        counted = self._counted(name, address)
         user = self._users.verified(name, password)
         if user is None:
             self._failures.add(*counted)
             raise HTTPException(401, "no such user, or another password")
         self._failures.forget(*counted)
         return self.sessions.begin(user.name)
+
+    async def require_scraper(self, request: Request) -> None:
+        """Let whoever may read have the metrics, and a program that sends name and password of a user each time (HTTP
+        Basic). A password takes long to verify, in which the server goes on.
+
+        Raises:
+            HTTPException: 401 or 429, he may not.
+        """
+        kind, _, encoded = request.headers.get("authorization", "").partition(" ")
+        if self._users is None or kind.lower() != "basic":
+            try:
+                self.reader(request)
+            except HTTPException as error:
+                error.headers = _ASK_FOR_PASSWORD if self.has_login else None
+                raise
+            return
+        try:
+            name, _, password = b64decode(encoded, validate=True).decode().partition(":")
+        except ValueError as error:
+            raise HTTPException(401, "this is no name and password", _ASK_FOR_PASSWORD) from error
+        counted = self._counted(name, request.client.host if request.client else "")
+        if await run_in_threadpool(self._users.verified, name, password) is None:
+            self._failures.add(*counted)
+            raise HTTPException(401, "no such user, or another password", _ASK_FOR_PASSWORD)
+        self._failures.forget(*counted)
+
+    def _counted(self, name: str, address: str) -> tuple[str, str]:
+        """Under what a wrong password is counted.
+
+        Raises:
+            HTTPException: 429, there were too many.
+        """
+        counted = (f"name {name}", f"address {address}")
+        if wait_s := self._failures.wait_s(*counted):
+            raise HTTPException(429, "too many wrong passwords: try again later", {"Retry-After": f"{wait_s:.0f}"})
+        return counted
 
     def _of_proxy(self, request: Request) -> Visitor:
         """The name counts only if the proxy has sent it; whoever else reaches the server is nobody."""

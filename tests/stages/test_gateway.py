@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import http.client
 import json
 from collections.abc import Iterator
@@ -251,6 +252,27 @@ def test_openapi_names_every_path_and_the_forms(gateway):
     assert "/api/v1/fans/{tray}/{fan}/requests" in document["paths"]
     form = document["components"]["schemas"]["RequestForm"]
     assert "shelve" in form["properties"]["action"]["enum"]
+
+
+def test_prometheus_sends_the_password_of_a_user_and_gets_nothing_else_with_it(tmp_path, users, monkeypatch):
+    gateway = RunningGateway(tmp_path, granted, users=users)
+    monkeypatch.setattr(GatewayConfig, "is_loopback", False)  # from here on, as if others could reach it
+
+    def basic(words: str) -> dict[str, str]:
+        return {"Authorization": f"Basic {base64.b64encode(words.encode()).decode()}"}
+
+    try:
+        client, right = Client(gateway), basic(f"vic:{PASSWORD}")
+        status, _, headers = client.ask("GET", "/metrics")
+        assert (status, headers["www-authenticate"]) == (401, 'Basic realm="fantwin"')
+        status, text, _ = client.ask("GET", "/metrics", None, right)
+        assert (status, "fantwin_gateway_pages" in text) == (200, True)
+        assert client.ask("GET", "/api/v1/fans", None, right)[0] == 401, "a browser sends it to every path"
+        assert client.ask("GET", "/metrics", None, {"Authorization": "Basic ÿÿ"})[0] == 401
+        wrong = [client.ask("GET", "/metrics", None, basic("vic:wrong wrong wrong"))[0] for _ in range(6)]
+        assert wrong == [401] * 5 + [429], "who guesses must wait"
+    finally:
+        gateway.close()
 
 
 def test_a_proxy_names_the_user_and_others_cannot(tmp_path):
