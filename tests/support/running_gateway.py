@@ -10,7 +10,7 @@ from typing import Any
 
 from pipeline.gateway.config import GatewayConfig
 from stages.gateway import STAGE, GatewayCore
-from tests.support.running_core import Answer, RunningCore
+from tests.support.running_core import FANS, Answer, RunningCore
 
 
 def free_port() -> int:
@@ -23,9 +23,9 @@ def free_port() -> int:
 class RunningGateway(RunningCore[GatewayCore]):
     """It listens at `port`."""
 
-    def __init__(self, folder: Path, answer: Answer | None = None, **settings: Any) -> None:
+    def __init__(self, folder: Path, answer: Answer | None = None, fans: int = FANS, **settings: Any) -> None:
         self.port = free_port()
-        super().__init__(STAGE, GatewayConfig(port=self.port, **settings), folder, answer)
+        super().__init__(STAGE, GatewayConfig(port=self.port, **settings), folder, answer, fans)
 
 
 class Client:
