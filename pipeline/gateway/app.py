@@ -78,7 +78,7 @@ def application(api: Api, config: GatewayConfig) -> ASGIApp:
         routes=[*routes, Mount("/page", StaticFiles(directory=PAGE))],
         middleware=[
             Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False),
-            Middleware(GZipMiddleware, minimum_size=1000),
+            Middleware(GZipMiddleware, minimum_size=1000, compresslevel=5),
         ],
         exception_handlers={HTTPException: failed, Exception: partial(broken, api)},
     )

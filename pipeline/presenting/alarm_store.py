@@ -141,13 +141,10 @@ class AlarmStore:
         return len(room)
 
     def begins(self, t_ns: int) -> None:
-        """The history is complete from this time on, or from an earlier one that was given before.
-
-        Raises:
-            UserError: the file cannot be read.
-        """
-        kept = self.begins_t_ns()
+        """The history is complete from this time on, or from an earlier one that was given before. `problem` says it if
+        that cannot be kept."""
         try:
+            kept = self.begins_t_ns()
             if kept is None:
                 (first_t_ns,) = self._file.execute("SELECT MIN(t_ns) FROM transition").fetchone()
                 self._file.execute("INSERT INTO beginning VALUES (?)", (min(t_ns, first_t_ns or t_ns),))
@@ -155,6 +152,8 @@ class AlarmStore:
                 self._file.execute("UPDATE beginning SET t_ns = ?", (t_ns,))
         except sqlite3.Error as error:
             self._why_unsaved = f"{self._path}: {error}: how far back the history reaches is not kept"
+        except UserError:
+            return
 
     def begins_t_ns(self) -> int | None:
         """From when on the history is complete; None: nobody has said it.

@@ -1,5 +1,7 @@
 """The history of alarms by OPC UA: what a client asks for and no more is read."""
 
+# pyright: reportPrivateImportUsage=false, reportArgumentType=false
+# (the library declares its names and integers otherwise than it uses them)
 from __future__ import annotations
 
 import asyncio
