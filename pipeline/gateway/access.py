@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import ipaddress
+from base64 import b64decode
 from collections.abc import Mapping
 from dataclasses import dataclass
 from urllib.parse import urlsplit
@@ -21,7 +22,7 @@ from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.sessions import LoginSessions, Session
 from pipeline.presenting.login_failures import LoginFailures
 from pipeline.presenting.security_log import SecurityLog
-from pipeline.presenting.users import NAME, UserRole, Users
+from pipeline.presenting.users import NAME, User, UserRole, Users
 
 COOKIE, SECURE_COOKIE = "fantwin", "__Host-fantwin"
 CSRF_HEADER = "X-CSRF-Token"
@@ -29,6 +30,7 @@ MOST_LOGINS = 16
 """that wait for their password to be checked, which takes memory and time"""
 _OWN_SITE = {"same-origin"}
 _OF_PROXIES = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
+_ASK_FOR_PASSWORD = {"WWW-Authenticate": 'Basic realm="fantwin"'}
 
 
 @dataclass(frozen=True)
@@ -130,26 +132,53 @@ class Access:
         """
         if self._users is None:
             raise HTTPException(404, "nobody logs in here")
+        user = await self._verified(self._users, name, password, request)
+        self.log.add("login", user=user.name, role=str(user.role), **address_of(request))
+        self.sessions.end(request.cookies.get(self.cookie_name, ""))
+        return self.sessions.begin(user.name, user.password_hash)
+
+    async def require_scraper(self, request: Request) -> None:
+        """Let whoever may read have the metrics, and a program that sends name and password of a user each time (HTTP
+        Basic).
+
+        Raises:
+            HTTPException: 401, 429 or 503, he may not.
+        """
+        kind, _, encoded = request.headers.get("authorization", "").partition(" ")
+        try:
+            if self._users is None or kind.lower() != "basic":
+                self.reader(request)
+            else:
+                await self._verified(self._users, *_name_and_password(encoded), request)
+        except HTTPException as error:
+            if self.has_login and error.status_code == 401:
+                error.headers = _ASK_FOR_PASSWORD
+            raise
+
+    async def _verified(self, users: Users, name: str, password: str, request: Request) -> User:
+        """The user with this name and password. To check one takes long; the server goes on meanwhile.
+
+        Raises:
+            HTTPException: 401, 429 or 503.
+        """
         where = address_of(request)
         if self._logins >= MOST_LOGINS:
             raise HTTPException(503, "too many log in at once: try again")
         if wait_s := self._failures.begin(name, where["address"]):
             self.log.add("login refused: too many wrong passwords", user=name, **where)
             raise HTTPException(429, "too many wrong passwords: try again later", {"Retry-After": f"{wait_s:.0f}"})
-        user = self._users.of(name)
+        user = users.of(name)
         self._logins += 1
         try:
             async with self._one_at_a_time:  # each takes 64 MB and much of a processor
-                is_right = await asyncio.to_thread(self._users.is_password, user, password)
+                is_right = await asyncio.to_thread(users.is_password, user, password)
         finally:
             self._logins -= 1
         if user is None or not is_right:
             self.log.add("login refused: wrong name or password", user=name, **where)
             raise HTTPException(401, "no such user, or another password")
         self._failures.succeed(name, where["address"])
-        self.log.add("login", user=user.name, role=str(user.role), **where)
-        self.sessions.end(request.cookies.get(self.cookie_name, ""))
-        return self.sessions.begin(user.name, user.password_hash)
+        return user
 
     def _is_free(self, request: Request) -> bool:
         """Whether whoever asks may read without a login: only on this host, and not through a proxy that has its users
@@ -167,6 +196,15 @@ class Access:
         if len(names) != 1 or not NAME.fullmatch(names[0]):
             return Visitor("", may_read=False, may_act=False)
         return Visitor(names[0], may_read=True, may_act=names[0] in self._config.operators)
+
+
+def _name_and_password(encoded: str) -> tuple[str, str]:
+    """Those of HTTP Basic. HTTPException 401: there are none."""
+    try:
+        name, _, password = b64decode(encoded, validate=True).decode().partition(":")
+    except ValueError as error:
+        raise HTTPException(401, "this is no name and password") from error
+    return name, password
 
 
 def address_of(request: Request) -> dict[str, str]:

@@ -11,6 +11,8 @@ from pipeline.devices.host_address import is_of_this_host_only
 from pipeline.runtime.stage import StageConfig
 
 _OWN_HOSTS = ("localhost", "127.0.0.1", "[::1]")
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "argon2")
+"""the modules of the extra `gateway`"""
 
 
 class GatewayConfig(StageConfig):

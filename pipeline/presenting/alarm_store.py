@@ -1,6 +1,7 @@
 """The history of alarms: each transition that was heard, in a file that survives a restart of the gateway.
 
-The bus keeps the last transitions too, and a gateway that starts asks for them: each is kept once.
+The bus keeps the last transitions too, and a gateway that starts asks for them: each is kept once. Those of before its
+first start may be in recordings: they get numbers below 0, so that the order by number is that of time.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ CREATE TABLE IF NOT EXISTS transition (
 CREATE INDEX IF NOT EXISTS of_fan ON transition (tray, fan, number);
 CREATE INDEX IF NOT EXISTS of_time ON transition (t_ns, number);
 CREATE TABLE IF NOT EXISTS reader (name TEXT PRIMARY KEY, number INTEGER NOT NULL);
+CREATE TABLE IF NOT EXISTS beginning (t_ns INTEGER NOT NULL);
 """
 
 
@@ -111,22 +113,72 @@ class AlarmStore:
         self._added += done.rowcount
         if self._added >= _DELETED_EVERY:
             self._added = 0
-            self._file.execute(
+            deleted = self._file.execute(
                 "DELETE FROM transition WHERE number <= (SELECT MAX(number) FROM transition) - ?", (MOST_TRANSITIONS,)
             )
+            if deleted.rowcount > 0:
+                self._file.execute("UPDATE beginning SET t_ns = (SELECT MIN(t_ns) FROM transition)")
         return done.rowcount > 0
 
-    def newest(self, most: int, *, tray: str = "", fan: int = -1, before: int = 0) -> Sequence[tuple[int, Alarm]]:
+    def add_earlier(self, alarms: Sequence[Alarm]) -> int:
+        """Keep transitions of before all others, the last first, as far as there is room; returns how many had room.
+
+        Raises:
+            UserError: they cannot be kept.
+        """
+        try:
+            first, last = self._file.execute("SELECT MIN(number), MAX(number) FROM transition").fetchone()
+            number = min(first or 0, 0)
+            lowest = max(last or 0, 0) - MOST_TRANSITIONS + 1
+            room = alarms[: max(0, number - lowest)]
+            self._file.execute("BEGIN")
+            for alarm in room:
+                number -= 1
+                header = alarm.header
+                row = (number, header.tray, alarm.fan, alarm.t_ns, header.producer, header.sequence, encode(alarm))
+                self._file.execute("INSERT OR IGNORE INTO transition VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+            self._file.execute("COMMIT")
+        except sqlite3.Error as error:
+            raise UserError(f"{self._path}: {error}: alarms of recordings are not in the history") from error
+        return len(room)
+
+    def begins(self, t_ns: int) -> None:
+        """The history is complete from this time on, or from an earlier one that was given before. `problem` says it if
+        that cannot be kept."""
+        try:
+            kept = self.begins_t_ns()
+            if kept is None:
+                (first_t_ns,) = self._file.execute("SELECT MIN(t_ns) FROM transition").fetchone()
+                self._file.execute("INSERT INTO beginning VALUES (?)", (min(t_ns, first_t_ns or t_ns),))
+            elif t_ns < kept:
+                self._file.execute("UPDATE beginning SET t_ns = ?", (t_ns,))
+        except sqlite3.Error as error:
+            self._why_unsaved = f"{self._path}: {error}: how far back the history reaches is not kept"
+        except UserError:
+            return
+
+    def begins_t_ns(self) -> int | None:
+        """From when on the history is complete; None: nobody has said it.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        rows = self._read("SELECT t_ns FROM beginning")
+        return rows[0][0] if rows else None
+
+    def newest(
+        self, most: int, *, tray: str = "", fan: int = -1, before: int | None = None
+    ) -> Sequence[tuple[int, Alarm]]:
         """The last transitions, newest first, each with its number, by which the next page is asked for.
 
-        tray, fan: of these only. before: only those with a lower number; 0: all.
+        tray, fan: of these only. before: only those with a lower number; None: all.
 
         Raises:
             UserError: the file cannot be read.
         """
         rows = self._read(
             "SELECT number, alarm FROM transition WHERE (?1 = '' OR tray = ?1) AND (?2 < 0 OR fan = ?2)"
-            " AND (?3 = 0 OR number < ?3) ORDER BY number DESC LIMIT ?4",
+            " AND (?3 IS NULL OR number < ?3) ORDER BY number DESC LIMIT ?4",
             (tray, fan, before, most),
         )
         return [(number, alarm) for number, data in rows if (alarm := _decoded(data)) is not None]

@@ -134,6 +134,19 @@ def test_an_own_account_buys_no_more_guesses_and_an_ipv6_network_counts_as_one_a
     assert guesses <= 100, "in an hour"
 
 
+def test_guesses_from_elsewhere_do_not_lock_out_who_has_logged_in_where_he_is():
+    failures = login_failures.LoginFailures(lambda: 0.0)
+    assert failures.begin("ann", "192.0.2.1") == 0
+    failures.succeed("ann", "192.0.2.1")
+    for number in range(login_failures.FAILURES):
+        assert failures.begin("ann", f"198.51.100.{number}") == 0
+    assert failures.begin("ann", "198.51.100.77") > 0
+    assert failures.begin("ann", "192.0.2.1") == 0
+    failures.succeed("ann", "192.0.2.1")
+    guesses = sum(failures.begin("ann", "192.0.2.1") == 0 for _ in range(20))
+    assert guesses == login_failures.FAILURES, "there he has no more guesses than others"
+
+
 def test_a_new_password_and_another_login_end_the_session_of_before(gateway, users):
     first = logged_in(gateway)
     again = Client(gateway)
