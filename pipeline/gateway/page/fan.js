@@ -98,7 +98,7 @@ export class FanView {
     const first = samples.t_s.findIndex((t_s) => t_s > newest);
     if (samples.t_s.length && samples.t_s.at(-1) < newest - 10) COLUMNS.forEach((name) => { mine[name] = samples[name]; });
     else if (first >= 0) {
-      if (samples.t_s[first] - newest > HOLE_S) COLUMNS.forEach((name) => mine[name].push(name === "t_s" ? newest + HOLE_S / 2 : null));
+      if (newest > 0 && samples.t_s[first] - newest > HOLE_S) COLUMNS.forEach((name) => mine[name].push(name === "t_s" ? newest + HOLE_S / 2 : null));
       COLUMNS.forEach((name) => mine[name].push(...samples[name].slice(first)));
     } else return;
     const old = mine.t_s.findIndex((t_s) => t_s > mine.t_s.at(-1) - KEPT_S);
