@@ -150,7 +150,7 @@ class _Running(Server):
         listening = listen(config.host, config.port + context.shard_number - 1)
         site = configured(context, VIEWER)
         app = application(Api(model, self._access, feed, desk, recorded, viewer_urls(site) if site else {}), config)
-        self._server = WebServer(app, listening, tls, feed.end)
+        self._server = WebServer(app, listening, tls, feed.end, frozenset({"127.0.0.1", "::1", *config.proxies}))
 
     def stop(self) -> None:
         self._server.stop()
@@ -183,13 +183,14 @@ def check(context: Context) -> list[str]:
     """Report a missing extra, a port that another program has taken, and files that cannot be read."""
     if not all(map(is_installed, NEEDED)):
         return [NOT_INSTALLED]
-    from pipeline.gateway.server import check_certificate, listen  # noqa: PLC0415  the extra may not be installed
+    from pipeline.gateway.server import check_certificate, check_expiry, listen  # noqa: PLC0415  the extra may not be installed
     from pipeline.presenting.users import read_users  # noqa: PLC0415
 
     config: GatewayConfig = context.config
     attempts: list[Callable[[], object]] = []
     if config.certificate and config.key:
         attempts.append(partial(check_certificate, context.resolve(config.certificate), context.resolve(config.key)))
+        attempts.append(partial(check_expiry, context.resolve(config.certificate)))
     if config.users:
         attempts.append(partial(read_users, context.resolve(config.users)))
     if not context.is_running:

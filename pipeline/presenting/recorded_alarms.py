@@ -43,9 +43,10 @@ class RecordedAlarms:
         """why alarms of recordings are missing; empty if none are"""
 
     def start(self) -> None:
-        """Begin."""
-        if not self._model.has_read(READER):
-            self._thread.start()
+        """Begin, unless it has been done, or the history cannot be read, which it says itself."""
+        with suppress(UserError):
+            if not self._model.has_read(READER):
+                self._thread.start()
 
     def stop(self) -> None:
         """End, even if there is more to read: it is read after the next start."""

@@ -253,6 +253,13 @@ class SiteModel:
         with self._lock:
             return self._store.newest(most, tray=tray, fan=fan, before=before)
 
+    def alarms_between(
+        self, begin_ns: int, end_ns: int, most: int, *, tray: str = "", fan: int = -1, is_backwards: bool = False
+    ) -> Sequence[Alarm]:
+        """The transitions of a stretch of time: `AlarmStore.between`."""
+        with self._lock:
+            return self._store.between(begin_ns, end_ns, most, tray=tray, fan=fan, is_backwards=is_backwards)
+
     def history_begins_t_ns(self) -> int | None:
         """How far back the history of alarms reaches; None: nobody has said it."""
         with self._lock:

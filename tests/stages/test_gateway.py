@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import http.client
 import json
 import math
@@ -167,7 +168,14 @@ def test_metrics_are_those_of_prometheus_and_an_unjudged_fan_has_no_score(gatewa
     assert samples["fantwin_fan_scored", "3", None] == 0.0
     assert samples["fantwin_fan_alarm_active", "2", "alarm"] == 1.0
     assert samples["fantwin_fan_alarm_active", "2", "warning"] == 0.0
-    assert samples["fantwin_alarms_total", "2", "alarm"] == 1.0
+    assert samples["fantwin_fan_alarm_unacknowledged", "2", "alarm"] == 1.0
+    assert samples["fantwin_alarms_total", None, "alarm"] == 1.0
+    assert samples["fantwin_alarms_total", None, "warning"] == 0.0, "counted from zero, so that the first one is seen"
+    gateway.feed(alarm(Transition.ACKNOWLEDGED, 1, acknowledged=True))
+    assert (
+        'fantwin_fan_alarm_unacknowledged{fan="2",severity="alarm",site="hall",tray="tray1"} 0.0'
+        in (Client(gateway).ask("GET", "/metrics")[1])
+    )
 
 
 def test_an_operator_acts_under_his_own_name_and_nobody_else_acts(gateway):
@@ -252,6 +260,27 @@ def test_openapi_names_every_path_and_the_forms(gateway):
     assert "shelve" in form["properties"]["action"]["enum"]
 
 
+def test_prometheus_sends_the_password_of_a_user_and_gets_nothing_else_with_it(tmp_path, users, monkeypatch):
+    gateway = RunningGateway(tmp_path, granted, users=users)
+    monkeypatch.setattr(GatewayConfig, "is_loopback", False)  # from here on, as if others could reach it
+
+    def basic(words: str) -> dict[str, str]:
+        return {"Authorization": f"Basic {base64.b64encode(words.encode()).decode()}"}
+
+    try:
+        client, right = Client(gateway), basic(f"vic:{PASSWORD}")
+        status, _, headers = client.ask("GET", "/metrics")
+        assert (status, headers["www-authenticate"]) == (401, 'Basic realm="fantwin"')
+        status, text, _ = client.ask("GET", "/metrics", None, right)
+        assert (status, "fantwin_gateway_pages" in text) == (200, True)
+        assert client.ask("GET", "/api/v1/fans", None, right)[0] == 401, "a browser sends it to every path"
+        assert client.ask("GET", "/metrics", None, {"Authorization": "Basic ÿÿ"})[0] == 401
+        wrong = [client.ask("GET", "/metrics", None, basic("vic:wrong wrong wrong"))[0] for _ in range(6)]
+        assert wrong == [401] * 5 + [429], "who guesses must wait"
+    finally:
+        gateway.close()
+
+
 def test_a_proxy_names_the_user_and_others_cannot(tmp_path):
     gateway = RunningGateway(tmp_path, granted, user_header="X-User", operators=("ann",))
     try:
@@ -289,7 +318,9 @@ def test_nothing_of_a_fan_is_shown_as_now_once_its_tray_is_silent(gateway, monke
     gateway.feed(score())
     client = Client(gateway)
     eventually(lambda: client.ask("GET", "/api/v1/fans")[1]["fans"][0]["state"] == "silent", "the tray is silent")
-    assert "fantwin_fan_speed_rpm{" not in client.ask("GET", "/metrics")[1]
+    metrics = client.ask("GET", "/metrics")[1]
+    assert "fantwin_fan_speed_rpm{" not in metrics
+    assert 'fantwin_fan_scored{fan="0",site="hall",tray="tray1"} 0.0' in metrics
 
 
 def test_alarms_of_before_the_first_start_are_read_from_the_recordings_once(tmp_path):

@@ -10,7 +10,7 @@ from typing import Any
 
 from pipeline.gateway.config import GatewayConfig
 from stages.gateway import STAGE, GatewayCore
-from tests.support.running_core import Answer, RunningCore
+from tests.support.running_core import FANS, Answer, RunningCore
 
 
 def free_port() -> int:
@@ -27,6 +27,7 @@ class RunningGateway(RunningCore[GatewayCore]):
         self,
         folder: Path,
         answer: Answer | None = None,
+        fans: int = FANS,
         *,
         configuration: str = "",
         started_t_ns: int = 0,
@@ -36,7 +37,7 @@ class RunningGateway(RunningCore[GatewayCore]):
         self.port = free_port()
         path = folder / "fantwin.toml" if configuration else None
         context = {"configuration_path": path, "configuration_text": configuration, "started_t_ns": started_t_ns}
-        super().__init__(STAGE, GatewayConfig(port=self.port, **settings), folder, answer, **context)
+        super().__init__(STAGE, GatewayConfig(port=self.port, **settings), folder, answer, fans, **context)
 
 
 class Client:
