@@ -46,7 +46,8 @@ def running_browser() -> Iterator[Browser]:
 
 def opened(browser: Browser, url: str, errors: list[str], user: str = "", **context: Any) -> Page:
     """The page in a browser of its own, logged in as a user if one is named. errors: those of its scripts."""
-    page = browser.new_context(**({"viewport": {"width": 1280, "height": 900}} | context)).new_page()
+    settings: dict[str, Any] = {"viewport": {"width": 1280, "height": 900}} | context
+    page = browser.new_context(**settings).new_page()
     page.set_default_timeout(DEADLINE_MS)
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(url)

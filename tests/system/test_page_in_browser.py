@@ -176,7 +176,7 @@ class other_site:  # noqa: N801  a context manager
                 self.end_headers()
                 self.wfile.write(page)
 
-            def log_message(self, *_: object) -> None:
+            def log_message(self, format: str, *args: object) -> None:
                 pass
 
         self._server = HTTPServer(("127.0.0.1", 0), Handler)
