@@ -152,7 +152,7 @@ class Api:
         return StreamingResponse(events, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 
     async def metrics(self, request: Request) -> Response:
-        """For Prometheus. Of 5,000 fans they take a tenth of a second, in which live events must not wait."""
+        """For Prometheus. Meanwhile live events go on."""
         await self.access.require_scraper(request)
         text = await run_in_threadpool(metrics_text, self.model, self.feed.readers)
         return Response(text, media_type=METRICS_TYPE)

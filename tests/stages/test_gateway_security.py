@@ -416,5 +416,5 @@ def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_old
 
 
 def open_connections(gateway: RunningGateway) -> int:
-    running: Any = gateway.core._server
-    return len(running._server._server.server_state.tasks)
+    web_server: Any = gateway.core._server
+    return len(web_server._server._server.server_state.tasks)
