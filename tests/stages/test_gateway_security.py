@@ -368,12 +368,17 @@ def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_na
     finally:
         gateway.close()
     with pytest.raises(StageError, match="it is over since"):
-        server.check_expiry(files["certificate"])
+        server.check_files(**files)
 
 
-def test_a_key_with_a_password_is_refused_and_not_asked_for(tmp_path):
+def test_a_key_that_everybody_reads_is_named_and_one_with_a_password_is_refused_and_not_asked_for(tmp_path):
     certificates = SiteCertificates(tmp_path)
     certificates.issue("page")
+    (tmp_path / "page.key").chmod(0o640)
+    server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
+    (tmp_path / "page.key").chmod(0o644)
+    with pytest.raises(StageError, match="everybody may read it"):
+        server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
     key = load_pem_private_key((tmp_path / "page.key").read_bytes(), None)
     encrypted = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))
     (tmp_path / "page.key").write_bytes(encrypted)
