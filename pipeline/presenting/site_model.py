@@ -8,8 +8,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +27,10 @@ from schemas.codec import CodecError, decode_columns, encode
 from schemas.enums import StageStatus, Transition
 from schemas.envelope import Envelope
 from schemas.health import Health
-from schemas.messages import Alarm, Array, ModelCard, Score
+from schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST
+from scoring.wear.recorded_wear import wear_in, wear_rows
 
 SILENT_AFTER_S = 5.0
 """a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus"""
@@ -96,6 +98,8 @@ class SiteModel:
         self._store = store
         self._stages: dict[tuple[str, str], _Heard] = {}
         self._twins: dict[str, ModelCard] = {}
+        self._wear: dict[str, tuple[int, Sequence[Mapping[str, Any]]]] = {}
+        """by tray: the time of the snapshot, and its rows"""
         self.refused_scores = 0
         """with another number of fans than the configuration says, or not to be decoded"""
 
@@ -217,10 +221,59 @@ class SiteModel:
         with self._lock:
             return self._alarms.of(fan.tray, fan.number)
 
-    def past_alarms(self, most: int, *, tray: str = "", fan: int = -1, before: int = 0) -> Sequence[tuple[int, Alarm]]:
+    def past_alarms(
+        self, most: int, *, tray: str = "", fan: int = -1, before: int | None = None
+    ) -> Sequence[tuple[int, Alarm]]:
         """The last transitions: `AlarmStore.newest`."""
         with self._lock:
             return self._store.newest(most, tray=tray, fan=fan, before=before)
+
+    def alarms_between(
+        self, begin_ns: int, end_ns: int, most: int, *, tray: str = "", fan: int = -1, is_backwards: bool = False
+    ) -> Sequence[Alarm]:
+        """The transitions of a stretch of time: `AlarmStore.between`."""
+        with self._lock:
+            return self._store.between(begin_ns, end_ns, most, tray=tray, fan=fan, is_backwards=is_backwards)
+
+    def history_begins_t_ns(self) -> int | None:
+        """How far back the history of alarms reaches; None: nobody has said it."""
+        with self._lock:
+            return self._store.begins_t_ns()
+
+    def add_earlier_alarms(self, alarms: Sequence[Alarm]) -> int:
+        """Transitions of before all others: `AlarmStore.add_earlier`."""
+        with self._lock:
+            return self._store.add_earlier(alarms)
+
+    def has_read(self, reader: str) -> bool:
+        """Whether a reader of earlier alarms has finished, in this process or one before."""
+        with self._lock:
+            return self._store.position(reader) != 0
+
+    def finish_reading(self, reader: str, begins_t_ns: int | None) -> None:
+        """A reader of earlier alarms has finished. begins_t_ns: from when on they are complete; None: it is unknown."""
+        with self._lock:
+            self._store.set_position(reader, 1)
+            if begins_t_ns is not None:
+                self._store.begins(begins_t_ns)
+
+    def add_snapshot(self, snapshot: ScorerSnapshot) -> None:
+        """A scorer has sent its state, of which the wear is kept."""
+        tray = snapshot.header.tray
+        with self._lock:
+            kept = self._wear.get(tray)
+            if kept is not None and kept[0] > snapshot.t_ns:
+                return
+        wear = wear_in(snapshot)
+        if wear is not None and len(wear["fans"]) == self._by_name[tray].fans:
+            with self._lock:
+                self._wear[tray] = (snapshot.t_ns, wear_rows(tray, snapshot.t_ns, wear))
+
+    def wear(self, fan: Fan) -> Sequence[Mapping[str, Any]]:
+        """The wear of a fan, a row for each parameter, as of the last snapshot of its scorer; empty: none is known."""
+        with self._lock:
+            _, rows = self._wear.get(fan.tray, (0, ()))
+        return [row for row in rows if row["fan"] == fan.number]
 
     def twin(self, tray: str) -> ModelCard | None:
         """The twin in force; None: it has not been heard."""

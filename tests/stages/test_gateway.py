@@ -5,8 +5,11 @@ from __future__ import annotations
 import base64
 import http.client
 import json
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +17,11 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from pipeline.gateway.config import GatewayConfig
 from pipeline.presenting.users import User, UserRole, hasher, write_users
+from pipeline.recordings.writing import RecordingWriter
 from schemas.enums import Action, FanState, InvalidReason, Severity, Transition
 from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis, Request, Score
+from schemas.messages import Alarm, Diagnosis, Request, Score, ScorerSnapshot
+from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
@@ -26,6 +31,7 @@ NOW_NS = 1_790_000_000_000_000_000
 STEP_NS = 10_000_000
 PASSWORD = "correct horse battery"
 SCRIPT = "<script>alert(1)</script>"
+CONFIGURATION = f'site = "{SITE}"\nrun_folder = "."\n[[tray]]\nname = "{TRAY}"\nfans = {FANS}\nport = "p"\n[gateway]\n'
 
 
 def score(seconds: float = 0.0, *, state: FanState = FanState.NORMAL, samples: int = 5) -> Score:
@@ -315,3 +321,70 @@ def test_nothing_of_a_fan_is_shown_as_now_once_its_tray_is_silent(gateway, monke
     metrics = client.ask("GET", "/metrics")[1]
     assert "fantwin_fan_speed_rpm{" not in metrics
     assert 'fantwin_fan_scored{fan="0",site="hall",tray="tray1"} 0' in metrics
+
+
+def test_alarms_of_before_the_first_start_are_read_from_the_recordings_once(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    for number, began_s in ((1, 0), (2, 10)):
+        with RecordingWriter(run / ("recording.mcap" if number == 1 else "recording-2.mcap"), {}) as writer:
+            for sequence in range(3):
+                each = alarm(
+                    sequence=sequence, t_ns=NOW_NS + round((began_s + sequence) * 1e9), message=f"{number}.{sequence}"
+                )
+                each = replace(each, header=Header(f"scorer-{number}", sequence, TRAY))
+                writer.add_message(tray_key(SITE, TRAY, "alarm"), each, each.t_ns)
+                writer.add_message(tray_key("elsewhere", TRAY, "alarm"), each, each.t_ns)
+    began_t_ns = NOW_NS + 60 * 10**9
+
+    def history(gateway: RunningGateway, query: str = "") -> dict[str, Any]:
+        client = Client(gateway)
+        return eventually(
+            lambda: (
+                (h := client.ask("GET", f"/api/v1/alarms/history?{query}")[1]) and not h["is_reading_recordings"] and h
+            ),
+            "the recordings are read",
+        )
+
+    gateway = RunningGateway(run, configuration=CONFIGURATION, started_t_ns=began_t_ns)
+    try:
+        gateway.feed(alarm(t_ns=began_t_ns, message="live"))
+        found = history(gateway)
+        assert [each["message"] for each in found["transitions"]] == ["live", "2.2", "2.1", "2.0", "1.2", "1.1", "1.0"]
+        assert found["begins_t_ns"] == NOW_NS
+        older = history(gateway, f"limit=2&before={found['transitions'][3]['number']}")["transitions"]
+        assert [each["message"] for each in older] == ["1.2", "1.1"]
+    finally:
+        gateway.close()
+    for path in run.glob("*.mcap"):
+        path.unlink()
+    gateway = RunningGateway(run, configuration=CONFIGURATION, started_t_ns=began_t_ns + 1)
+    try:
+        assert len(history(gateway)["transitions"]) == 7
+        assert history(gateway)["begins_t_ns"] == NOW_NS
+    finally:
+        gateway.close()
+
+
+def test_a_fan_shows_its_wear_its_advice_and_where_rerun_is(tmp_path):
+    gateway = RunningGateway(tmp_path, configuration=CONFIGURATION)
+    values = {"unit": "relative", "change": 0.2, "per_day": None, "days": None, "limit": math.nan, "reached_t_ns": None}
+    parameter = {**values, "unknown_reason": "too few points so far", "series": {"std_error": [0.01]}}
+    fans = [{"t_ns": NOW_NS, "parameters": {"drag": parameter if fan == 2 else {}}} for fan in range(FANS)]
+    state = json.dumps({"wear": {"command_unit": "", "fans": fans}})
+    try:
+        snapshot = ScorerSnapshot(header=Header("scorer-all-1", 0, TRAY), t_ns=NOW_NS, twin_sha256="", state_json=state)
+        gateway.feed(
+            score(), alarm(causes=(Diagnosis(cause="drag_up", probability=0.8, evidence="drag +20 %"),)), snapshot
+        )
+        gateway.feed(replace(snapshot, state_json="{"), replace(snapshot, t_ns=NOW_NS - 1, state_json='{"wear": {}}'))
+        client = Client(gateway)
+        worn = client.ask("GET", f"/api/v1/fans/{TRAY}/2")[1]
+        (row,) = worn["wear"]
+        assert (row["parameter"], row["change"], row["error"], row["limit"]) == ("drag", 0.2, 0.01, None)
+        assert "filter" in worn["alarm"]["advice"]
+        assert client.ask("GET", f"/api/v1/fans/{TRAY}/1")[1]["wear"] == []
+        (tray,) = client.ask("GET", "/api/v1/site")[1]["trays"]
+        assert tray["viewer_url"] == "http://127.0.0.1:9090/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9876%2Fproxy"
+    finally:
+        gateway.close()
