@@ -107,7 +107,7 @@ def test_everything_is_done_by_keyboard(gateway, browser):
 def test_the_page_is_accessible_and_fits_a_phone(scheme, gateway, browser):
     errors: list[str] = []
     url = f"http://127.0.0.1:{gateway.port}/"
-    phone = opened(browser, url, errors, "ann", viewport={"width": 390, "height": 844}, color_scheme=scheme)
+    phone = opened(browser, url, errors, "ann", size=(390, 844), scheme=scheme)
     found: dict[str, list[str]] = {}
     views = {
         "fans": CELL,
@@ -176,7 +176,7 @@ class other_site:  # noqa: N801  a context manager
                 self.end_headers()
                 self.wfile.write(page)
 
-            def log_message(self, *_: object) -> None:
+            def log_message(self, format: str, *args: object) -> None:
                 pass
 
         self._server = HTTPServer(("127.0.0.1", 0), Handler)
