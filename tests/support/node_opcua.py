@@ -11,7 +11,7 @@ from typing import Any
 
 from tests.support.node_packages import node_modules
 
-PACKAGE, VERSION = "node-opcua-client", "2.182.2"
+PACKAGE, VERSION, WHAT = "node-opcua-client", "2.182.2", "OPC UA client of another make"
 
 
 class NodeOpcua:
@@ -21,7 +21,7 @@ class NodeOpcua:
         """folder: for its certificate."""
         self._folder = folder
         environment = os.environ | {
-            "NODE_PATH": str(node_modules(PACKAGE, VERSION, "OPC UA client of another make")),
+            "NODE_PATH": str(node_modules(PACKAGE, VERSION, WHAT)),
             "HOME": str(folder),
         }
         folder.mkdir(parents=True, exist_ok=True)

@@ -107,7 +107,7 @@ def test_everything_is_done_by_keyboard(gateway, browser):
 def test_the_page_is_accessible_and_fits_a_phone(scheme, gateway, browser):
     errors: list[str] = []
     url = f"http://127.0.0.1:{gateway.port}/"
-    phone = opened(browser, url, errors, "ann", size=(390, 844), scheme=scheme)
+    phone = opened(browser, url, errors, "ann", viewport={"width": 390, "height": 844}, color_scheme=scheme)
     found: dict[str, list[str]] = {}
     views = {
         "fans": CELL,
