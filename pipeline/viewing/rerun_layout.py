@@ -55,7 +55,7 @@ LayoutName = Literal["all", "alarms", "wear"]
 ALARMS_ON_A_PAGE = 4
 MARGIN_FOR_LEGEND = {1: 0.12, 2: 0.25, 4: 0.02}
 """columns of plots -> share of the window kept free at the right; four columns leave no room for legends"""
-MIN_LANE_SHARE = 0.2
+MIN_LANE_SHARE = 0.24
 """of the height, for state lanes, alarms and log"""
 LINKED = rrb.TimeAxis(link="LinkToGlobal")
 _SHARED_VIEW = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc"

@@ -16,7 +16,7 @@ from schemas.codec import type_name
 from schemas.topics import BY_NAME, tray_key
 
 LAYOUT = Path(__file__).parents[2] / "deploy" / "foxglove" / "fan.json"
-FUNCTIONS = {"sqrt", "negative"}
+FUNCTIONS = {"abs", "sqrt"}
 """of Foxglove, see its page "Message path syntax" """
 PATH = re.compile(
     r"(?P<topic>[\w/-]+)(?P<filter>\{(\w+)==\$(\w+)\})?(?P<fields>(\.\w+(\[[^\]]*\])?)*)(?P<functions>(\.@\w+)*)"
