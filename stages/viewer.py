@@ -29,6 +29,7 @@ from pipeline.runtime.stage import BuiltStage, Context, Stage, StageConfig, Stag
 from pipeline.viewing.fleet import Fan
 from pipeline.viewing.loopback import check_free
 
+READS = ("score", "alarm", "twin", "health", "snapshot")
 NO_RERUN = f"the viewer needs the extra `view`: take viewer out of launcher.stages, or {how_to_install('view')}"
 
 
@@ -153,10 +154,16 @@ def check(context: Context) -> list[str]:
     return problems
 
 
+def topics_read(config: ViewerConfig, trays: Sequence[TrayConfig]) -> tuple[str, ...]:
+    """Of a fleet, the wear is not drawn: the snapshots of its scorers are many megabytes a minute."""
+    is_fleet = sum(tray.fans for tray in trays) > config.fleet_above
+    return tuple(topic for topic in READS if not (is_fleet and topic == "snapshot"))
+
+
 STAGE = Stage(
     name="viewer",
     about="shows measured speed, twin, band, alarms and states live in Rerun, and keeps them in a file",
-    reads=("score", "alarm", "twin", "health", "snapshot"),
+    reads=READS,
     writes=(),
     config=ViewerConfig,
     build=build,
@@ -164,4 +171,5 @@ STAGE = Stage(
     undecoded=("score",),
     may_drop=True,
     check=check,
+    chooses=topics_read,
 )

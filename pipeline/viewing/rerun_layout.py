@@ -161,24 +161,23 @@ def alarms_blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_pictur
 
 
 def wear_blueprint(trays: Sequence[str], *, for_picture: bool = False) -> rrb.Blueprint:
-    """The layout `wear`: a tab for each of these trays; without any, one for all fans of a fleet that had a plot."""
-    tabs = [_wear_tab(tray) for tray in trays] if trays else [_wear_tab(None)]
+    """The layout `wear`: a tab for each of these trays."""
+    tabs = [_wear_tab(tray) for tray in trays]
     everything = rr.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
     return _tabbed(tabs, DAYS, everything, for_picture=for_picture)
 
 
-def _wear_tab(tray: str | None) -> rrb.Container:
-    where = f"{tray} / " if tray else ""
+def _wear_tab(tray: str) -> rrb.Container:
     views = [
         rrb.TimeSeriesView(
             origin=f"/{wear_path(name, tray)}",
-            name=f"{where}{words.title} since commissioning ({words.unit})",
+            name=f"{tray} / {words.title} since commissioning ({words.unit})",
             axis_x=LINKED,
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
         )
         for name, words in PARAMETERS.items()
     ]
-    return rrb.Grid(*views, grid_columns=2, name=tray or "wear")
+    return rrb.Grid(*views, grid_columns=2, name=tray)
 
 
 def columns_of(plots: int) -> int:

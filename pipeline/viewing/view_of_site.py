@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.config.models import TrayConfig
+from pipeline.runtime.stage import StageError
 from pipeline.viewing.fleet import Fan
 from pipeline.viewing.fleet_view import FleetView
 from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
@@ -14,6 +15,8 @@ from pipeline.viewing.rerun_layout import LayoutName
 from pipeline.viewing.rerun_sink import RerunSink
 from pipeline.viewing.viewer_core import ViewerCore
 from schemas.units import NS_PER_S
+
+NO_WEAR = 'viewer.layout = "wear": not with more than {fleet_above} fans (fleet_above); fantwin wear lists the changes'
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,11 @@ def view_of_site(
     """Open the file and serve the viewers; None leaves one out.
 
     Raises:
-        StageError: a port is taken, or the file cannot be written.
+        StageError: a port is taken, the file cannot be written, or the layout is not one of a fleet.
     """
     is_fleet = sum(tray.fans for tray in trays) > options.fleet_above
+    if is_fleet and options.layout == "wear":
+        raise StageError(NO_WEAR.format(fleet_above=options.fleet_above))
     plots = FleetPlots(options.show, options.alarm_plots)
     sink = RerunSink(
         name=site,

@@ -38,7 +38,7 @@ class _TrayView:
         newest: the newest score that the overview has not seen.
         drawn_t_ns: by fan, the time of the last sample drawn.
         before_t_ns: the last sample of the last flush; None: its samples have not been followed since.
-        wear: the points of the newest snapshot.
+        wear: the points of a snapshot that came since the last flush.
     """
 
     config: TrayConfig
@@ -52,7 +52,6 @@ class _TrayView:
     drawn_t_ns: dict[int, int] = field(default_factory=dict)
     before_t_ns: int | None = None
     wear: Sequence[WearPoints] = ()
-    has_new_wear: bool = False
 
 
 class ViewerCore(Core):
@@ -93,8 +92,8 @@ class ViewerCore(Core):
             self._alarms.add(item)
             if self._fleet:
                 self._fleet.add_alarm(item)
-        elif isinstance(item, ScorerSnapshot):
-            view.wear, view.has_new_wear = wear_points(item), True
+        elif isinstance(item, ScorerSnapshot) and not self._fleet:
+            view.wear = wear_points(item)
         elif isinstance(item, ModelCard):
             self._page.add_twin(view.config.name, item)
         return ()
@@ -180,8 +179,9 @@ class ViewerCore(Core):
             self._sink.log(self._lines)
             self._lines = []
         for view in self._views.values():
-            if view.has_new_wear:
-                self._draw_wear(view)
+            if view.wear:
+                self._sink.draw_wear(view.config.name, view.wear)
+                view.wear = ()
         self._show_alarms()
         self._sink.flush()
 
@@ -191,13 +191,6 @@ class ViewerCore(Core):
             self._draw(view, with_holes(trace, view.scores[-1].period_ns, view.before_t_ns), view.samples)
             view.before_t_ns = self._newest_t_ns = int(trace.t_ns[-1])
         view.scores, view.samples = [], 0
-
-    def _draw_wear(self, view: _TrayView) -> None:
-        """Draw the wear of the fans that are drawn."""
-        view.has_new_wear = False
-        shown = [each for each in view.wear if view.fans is None or each.fan in view.fans]
-        if shown:
-            self._sink.draw_wear(view.config.name, shown)
 
     def _show_alarms(self) -> None:
         """Show the table of alarms when it has changed, and now and then for viewers that join late."""
@@ -271,4 +264,3 @@ class ViewerCore(Core):
         if before:
             trace = trace_of(fan.tray, before, view.config.speed_unit, (fan.number,))
             self._draw(view, trace, len(trace.t_ns))
-        self._draw_wear(view)

@@ -61,9 +61,9 @@ def resolve(path: str, variables: set[str]) -> FieldDescriptor | Descriptor:
         raise LookupError(f"{path}: nothing to filter by")
     found: FieldDescriptor | Descriptor = message
     for name, index in re.findall(r"\.(\w+)(\[[^\]]*\])?", match["fields"]):
-        if not isinstance(found, Descriptor) and found.message_type is None:
-            raise LookupError(f"{path}: {found.name} has no fields")
         inside = found if isinstance(found, Descriptor) else found.message_type
+        if inside is None:
+            raise LookupError(f"{path}: {found.name} has no fields")
         if name not in inside.fields_by_name:
             raise LookupError(f"{path}: {inside.name} has no field {name}")
         found = inside.fields_by_name[name]

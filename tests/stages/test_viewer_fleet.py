@@ -19,7 +19,7 @@ from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
 from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from schemas.codec import decode_columns
 from schemas.messages import Alarm, Score
-from stages.viewer import ViewerConfig, build, check
+from stages.viewer import ViewerConfig, build, check, topics_read
 from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
 from tests.support.score_data import START_NS, STEP_NS, made_up_tray
 
@@ -237,6 +237,8 @@ def test_a_site_of_more_than_64_fans_is_a_fleet(tmp_path: Path, fans: int, is_fl
     core.close()
     rows = rows_of(tmp_path / "view.rrd")
     assert ("/fleet/map/cells" in rows, "/tray1/fan_0/speed" in rows) == (is_fleet, not is_fleet)
+    trays = [TrayConfig(name="a", fans=fans), TrayConfig(name="b", fans=fans)]
+    assert ("snapshot" in topics_read(ViewerConfig(), trays)) == (not is_fleet), "wear is not drawn of a fleet"
 
 
 def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Path) -> None:
