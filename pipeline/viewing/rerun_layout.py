@@ -253,16 +253,18 @@ def _fan_rows(tray: TrayLayout, fan: int, columns: int) -> rrb.Container:
     )
     page, number = divmod(fan, FANS_ON_A_PAGE)
     on_page = min(FANS_ON_A_PAGE, tray.all_fans - page * FANS_ON_A_PAGE)
-    name = f"fan {fan}" if columns == 4 else f"{tray.name} / fan {fan}"
+    names = (f"{tray.name} / fan {fan} torque balance", f"{tray.name} / fan {fan} score")
+    if columns == 4:  # narrow: a longer name is cut off
+        names = (f"balance {fan}", f"score {fan}")
     places = tray.places.get(fan, ())
     styles = {BALANCE: balance_style(on_page, number), SCORE: score_style(on_page, number)}
     kinds = [
         judged_view(
             [place_beside(place, kind) for place in places] or [judged_path(tray.name, kind, page)],
-            f"{name} {title}",
+            name,
             None if places else style,
         )
-        for (kind, style), title in zip(styles.items(), ("torque balance", "score"), strict=True)
+        for (kind, style), name in zip(styles.items(), names, strict=True)
     ]
     return rrb.Vertical(speed, rrb.Horizontal(*kinds), row_shares=[5, 3])
 
