@@ -16,7 +16,7 @@ from pipeline.errors import refusals
 from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.live_feed import LiveFeed
 from pipeline.optional_dependencies import how_to_install, is_installed
-from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.alarm_store import HISTORY, AlarmStore
 from pipeline.presenting.fan_history import curves_of
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stages_json
@@ -36,7 +36,6 @@ ALL_FOLLOWED = 64
 """with no more fans than this, all samples of all trays arrive"""
 MOST_FOLLOWED = 32
 """trays that somebody looks at; of more, the samples come once a second"""
-HISTORY = "alarms.sqlite"
 
 
 class GatewayCore(SiteCore):
@@ -157,7 +156,7 @@ def build(context: Context) -> BuiltStage:
     """
     if not all(map(is_installed, NEEDED)):
         raise StageError(NOT_INSTALLED)
-    model = SiteModel(context.site, context.trays, AlarmStore(context.own_file(Path(HISTORY))))
+    model = SiteModel(context.site, context.trays, AlarmStore(context.own_file(Path(HISTORY))), counts_judged=True)
     feed, desk = LiveFeed(), RequestDesk(context.producer)
     return BuiltStage(GatewayCore(model, feed, desk, _Running(context, model, feed, desk)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
 from collections.abc import Awaitable, Callable
@@ -28,6 +29,7 @@ from pipeline.presenting.shown import (
     fan_in_full,
     fan_json,
     fleet_json,
+    rates_json,
     site_json,
     stages_json,
     transition_json,
@@ -111,7 +113,16 @@ class Api:
             fan=_number(request, "fan", -1),
             before=_number(request, "before", 0),
         )
-        return JSONResponse({"transitions": [transition_json(number, alarm) for number, alarm in found]})
+        rows = [
+            transition_json(number, alarm, self.model.feedback(alarm.header.tray, alarm.fan, alarm.onset_t_ns))
+            for number, alarm in found
+        ]
+        return JSONResponse({"transitions": rows})
+
+    @reads
+    async def alarm_rate(self, request: Request) -> Response:
+        """The rate of false alarms that really was beside the declared one, of each tray and of the site."""
+        return JSONResponse(await asyncio.to_thread(rates_json, self.model))
 
     @reads
     async def stages(self, request: Request) -> Response:
@@ -180,6 +191,7 @@ class Api:
             duration_s=form.duration_s,
             operator_name=visitor.name,
             comment=form.comment,
+            onset_t_ns=form.onset_t_ns,
         )
         try:
             answers = await self.desk.ask(name, asked, range(tray.fans) if is_all else [fan])

@@ -20,15 +20,17 @@ from pipeline.launch.site_watcher import StageView
 from pipeline.launch.watched_alarms import WatchedAlarms
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.fan_history import COLUMNS, Curves, FanHistory, values_of
+from pipeline.presenting.judged_time import LEARNED, JudgedTime
 from pipeline.viewing.fleet import Fan, FanNow, Fleet
 from pipeline.viewing.fleet_view import last_sample
 from schemas.codec import CodecError, decode_columns, encode
-from schemas.enums import StageStatus, Transition
+from schemas.enums import Feedback, StageStatus, Transition
 from schemas.envelope import Envelope
 from schemas.health import Health
 from schemas.messages import Alarm, Array, ModelCard, Score
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST
+from scoring.calibration.observed_rate import ObservedRate, declared_per_day
 
 SILENT_AFTER_S = 5.0
 """a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus"""
@@ -87,10 +89,11 @@ class SiteModel:
         store: AlarmStore,
         *,
         keeps_curves: bool = True,
+        counts_judged: bool = False,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 72 MB. now_s: a clock
-        that is never set."""
+        """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 72 MB.
+        counts_judged: for how long fans are judged, for `observed_rates`. now_s: a clock that is never set."""
         self._now_s = now_s
         self.site = site
         self.trays = tuple(trays)
@@ -108,6 +111,9 @@ class SiteModel:
         self._store = store
         self._stages: dict[tuple[str, str], _Heard] = {}
         self._twins: dict[str, ModelCard] = {}
+        self._judged = JudgedTime() if counts_judged else None
+        self._judging: dict[str, tuple[str, float | None]] = {}
+        """by tray, the name of its twin for the judged time, and the rate that it declares"""
         self.refused_scores = 0
         """with another number of fans than the configuration says, or not to be decoded"""
 
@@ -128,6 +134,8 @@ class SiteModel:
             self._fleet.update(score)
             if self._history is not None:
                 self._history.add(score)
+            if self._judged is not None and tray.name in self._judging:
+                self._store.add_judged(self._judged.add(score, *self._judging[tray.name]))
         return score
 
     def add_alarm(self, alarm: Alarm) -> bool:
@@ -150,8 +158,11 @@ class SiteModel:
 
     def add_twin(self, card: ModelCard) -> None:
         """A tray has another twin."""
+        tray = self._by_name.get(card.header.tray)
+        name = LEARNED if tray and tray.twin is None else card.sha256
         with self._lock:
             self._twins[card.header.tray] = card
+            self._judging[card.header.tray] = (name, declared_per_day(card.card_json))
 
     def notice_silence(self) -> None:
         """Trays that have sent no score for long are silent."""
@@ -247,6 +258,17 @@ class SiteModel:
         with self._lock:
             return self._store.newest(most, tray=tray, fan=fan, before=before)
 
+    def feedback(self, tray: str, fan: int, onset_t_ns: int) -> Feedback:
+        """What operators said of an alarm."""
+        with self._lock:
+            return self._store.feedback(tray, fan, onset_t_ns)
+
+    def observed_rates(self) -> dict[str, ObservedRate]:
+        """Of each tray, the rate of false alarms beside the declared one: `AlarmStore.observed_rates`."""
+        with self._lock:
+            self._keep_judged()
+            return self._store.observed_rates()
+
     def twin(self, tray: str) -> ModelCard | None:
         """The twin in force; None: it has not been heard."""
         return self._twins.get(tray)
@@ -270,4 +292,9 @@ class SiteModel:
     def close(self) -> None:
         """Leave complete files."""
         with self._lock:
+            self._keep_judged()
             self._store.close()
+
+    def _keep_judged(self) -> None:
+        if self._judged is not None:
+            self._store.add_judged(self._judged.growing())

@@ -1,11 +1,12 @@
 // The list of alarms, and the history of their transitions.
 
-import { buttons } from "./actions.js";
+import { ACTIONS, askFor, buttons, feedbackOn } from "./actions.js";
 import { age, clock, element, percent } from "./dom.js";
-import { ask } from "./server.js";
+import { ask, me } from "./server.js";
 
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
 const PAGE = 100;
+const RATE_EVERY_MS = 10000;
 
 const name = (alarm) => `${alarm.tray}/${alarm.fan}`;
 const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.tray)}/${alarm.fan}` }, `${alarm.tray} fan ${alarm.fan}`);
@@ -31,7 +32,17 @@ export class AlarmsView {
   constructor(alarms) {
     this.alarms = alarms;
     this.root = element("div");
+    this.rate = element("p", { class: "muted", id: "alarm-rate" });
+    this.rated_ms = -RATE_EVERY_MS;
     this.update();
+  }
+
+  // How many alarms really were false, beside how many are declared.
+  async showRate() {
+    if (performance.now() - this.rated_ms < RATE_EVERY_MS) return;
+    this.rated_ms = performance.now();
+    const { site } = await ask("/alarm-rate");
+    if (site.since_t_ns) this.rate.textContent = `Since ${clock(site.since_t_ns)}: ${site.text}.`;
   }
 
   update() {
@@ -39,7 +50,8 @@ export class AlarmsView {
     const listed = [...this.alarms.values()].filter((alarm) => alarm.listed);
     listed.sort((one, other) => rank(one) - rank(other) || other.onset_t_ns - one.onset_t_ns);
     this.root.replaceChildren(element("h2", {}, `Alarms (${listed.length})`),
-      ...(listed.length ? listed.map(card) : [element("p", { class: "muted" }, "No alarms.")]));
+      ...(listed.length ? listed.map(card) : [element("p", { class: "muted" }, "No alarms.")]), this.rate);
+    this.showRate().catch(() => {});  // the page says elsewhere that the server is away
   }
 }
 
@@ -69,6 +81,14 @@ export class HistoryView {
     const what = each.transition.replaceAll("_", " ");
     return element("tr", {}, cell("Time", clock(each.t_ns)), cell("Fan", link(each)),
       cell("What happened", badge(each.active ? each.severity : "none", what)), cell("By", each.operator_name),
-      cell("Message", each.message, each.comment ? ` “${each.comment}”` : ""));
+      cell("Message", each.message, each.comment ? ` “${each.comment}”` : "", each.transition === "raised" ? this.feedback(each) : ""));
+  }
+
+  // What was said of an alarm, and the buttons to say it.
+  feedback(each) {
+    const said = each.feedback === "none" ? "" : ` (${each.feedback.replaceAll("_", " ")})`;
+    if (!me.may_act) return said;
+    return element("span", {}, said, element("span", { class: "actions" }, ...feedbackOn(each).map((action) => element("button", {
+      type: "button", "data-action": action, onclick: () => askFor(action, each.tray, each.fan, each) }, ACTIONS[action].title))));
   }
 }
