@@ -60,7 +60,7 @@ class MqttCore(SiteCore):
         self._is_whole = context.instance == ALL_TRAYS
         self._states = FanStates(model)
         self._outbox = Outbox()
-        self._queue = TransitionQueue(store, config.most_waiting)
+        self._store, self._queue = store, TransitionQueue(store, config.most_waiting)
         self._requests = Requests(topics, model.trays, config.accept, config.operator_name, desk)
         self._home_assistant = HomeAssistant(config, topics, model.trays)
         self._devices = self._home_assistant.messages() if config.home_assistant == "publish" else {}
@@ -118,7 +118,7 @@ class MqttCore(SiteCore):
             "connections": self._link.sessions,
             "waiting_transitions": self._queue.waiting,
             "waiting_topics": len(self._outbox),
-            "lost_transitions": self._queue.lost,
+            "lost_transitions": self._queue.lost + self._store.lost,
             "refused_scores": self._model.refused_scores,
             "dropped_requests": self._link.dropped_requests,
             **self._counts,
@@ -179,6 +179,8 @@ class MqttCore(SiteCore):
         is_full = abs(now_ns - self._full_ns) >= self._config.period_s * NS_PER_S
         if is_full:
             self._model.notice_silence()
+            if self._store.save_again():
+                self._queue.notice_new()
         is_due = self._has_news and abs(now_ns - self._changes_ns) >= CHANGES_PERIOD_NS
         if is_full or is_due or self._changed_alarms:
             self._full_ns = now_ns if is_full else self._full_ns

@@ -6,11 +6,10 @@ time since the one before.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.presenting.alarm_store import JudgedStretch
 from schemas.messages import Score
 from schemas.units import NS_PER_S
 
@@ -19,6 +18,23 @@ LONGEST_STEP_NS = 5 * NS_PER_S
 SAVED_EVERY_NS = 10 * NS_PER_S
 LEARNED = "learned"
 """names the twins of a tray that learns them: each version continues the time of the one before"""
+
+
+@dataclass(frozen=True)
+class JudgedStretch:
+    """A time in which the fans of a tray were judged by one twin, or by learned ones.
+
+    Attributes:
+        fan_ns: judged time, summed over fans.
+        declared_per_day: false alarms per fan and day that the twin declares; None: none.
+    """
+
+    tray: str
+    twin: str
+    first_t_ns: int
+    last_t_ns: int
+    fan_ns: int
+    declared_per_day: float | None = None
 
 
 class JudgedTime:

@@ -11,7 +11,7 @@ from pipeline.presenting.site_model import SiteModel
 from pipeline.runtime.stage import Core
 from schemas.envelope import Envelope
 from schemas.health import Health
-from schemas.messages import Alarm, Message, ModelCard
+from schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 
 
 class SiteCore(Core):
@@ -33,6 +33,8 @@ class SiteCore(Core):
             self.add_score(item)
         elif isinstance(item, ModelCard):
             self._model.add_twin(item)
+        elif isinstance(item, ScorerSnapshot):
+            self._model.add_snapshot(item)
         elif isinstance(item, Alarm):
             if item.fan < tray.fans:
                 self.add_alarm(item)

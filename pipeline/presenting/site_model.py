@@ -8,8 +8,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from pipeline.config.registry import STAGES
 from pipeline.launch.site_state import StageState, stage_states
 from pipeline.launch.site_watcher import StageView
 from pipeline.launch.watched_alarms import WatchedAlarms
+from pipeline.presenting.alarm_rates import AlarmRates
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.fan_history import COLUMNS, Curves, FanHistory, values_of
 from pipeline.presenting.judged_time import LEARNED, JudgedTime
@@ -27,10 +29,11 @@ from schemas.codec import CodecError, decode_columns, encode
 from schemas.enums import Feedback, StageStatus, Transition
 from schemas.envelope import Envelope
 from schemas.health import Health
-from schemas.messages import Alarm, Array, ModelCard, Score
+from schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST
 from scoring.calibration.observed_rate import ObservedRate, declared_per_day
+from scoring.wear.recorded_wear import wear_in, wear_rows
 
 SILENT_AFTER_S = 5.0
 """a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus"""
@@ -89,11 +92,11 @@ class SiteModel:
         store: AlarmStore,
         *,
         keeps_curves: bool = True,
-        counts_judged: bool = False,
+        rates: AlarmRates | None = None,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 72 MB.
-        counts_judged: for how long fans are judged, for `observed_rates`. now_s: a clock that is never set."""
+        rates: takes for how long fans are judged, for `observed_rates`. now_s: a clock that is never set."""
         self._now_s = now_s
         self.site = site
         self.trays = tuple(trays)
@@ -111,7 +114,10 @@ class SiteModel:
         self._store = store
         self._stages: dict[tuple[str, str], _Heard] = {}
         self._twins: dict[str, ModelCard] = {}
-        self._judged = JudgedTime() if counts_judged else None
+        self._wear: dict[str, tuple[int, Sequence[Mapping[str, Any]]]] = {}
+        """by tray: the time of the snapshot, and its rows"""
+        self._rates = rates
+        self._judged = JudgedTime()
         self._judging: dict[str, tuple[str, float | None]] = {}
         """by tray, the name of its twin for the judged time, and the rate that it declares"""
         self.refused_scores = 0
@@ -134,8 +140,10 @@ class SiteModel:
             self._fleet.update(score)
             if self._history is not None:
                 self._history.add(score)
-            if self._judged is not None and tray.name in self._judging:
-                self._store.add_judged(self._judged.add(score, *self._judging[tray.name]))
+            if self._rates is not None and tray.name in self._judging:
+                stretches = self._judged.add(score, *self._judging[tray.name])
+                if stretches:
+                    self._rates.catch_up(self._store, stretches)
         return score
 
     def add_alarm(self, alarm: Alarm) -> bool:
@@ -253,21 +261,75 @@ class SiteModel:
         with self._lock:
             return self._alarms.of(fan.tray, fan.number)
 
-    def past_alarms(self, most: int, *, tray: str = "", fan: int = -1, before: int = 0) -> Sequence[tuple[int, Alarm]]:
+    def past_alarms(
+        self, most: int, *, tray: str = "", fan: int = -1, before: int | None = None
+    ) -> Sequence[tuple[int, Alarm]]:
         """The last transitions: `AlarmStore.newest`."""
         with self._lock:
             return self._store.newest(most, tray=tray, fan=fan, before=before)
 
-    def feedback(self, tray: str, fan: int, onset_t_ns: int) -> Feedback:
-        """What operators said of an alarm."""
+    def alarms_between(
+        self, begin_ns: int, end_ns: int, most: int, *, tray: str = "", fan: int = -1, is_backwards: bool = False
+    ) -> Sequence[Alarm]:
+        """The transitions of a stretch of time: `AlarmStore.between`."""
         with self._lock:
-            return self._store.feedback(tray, fan, onset_t_ns)
+            return self._store.between(begin_ns, end_ns, most, tray=tray, fan=fan, is_backwards=is_backwards)
+
+    def history_begins_t_ns(self) -> int | None:
+        """How far back the history of alarms reaches; None: nobody has said it."""
+        with self._lock:
+            return self._store.begins_t_ns()
+
+    def add_earlier_alarms(self, alarms: Sequence[Alarm]) -> int:
+        """Transitions of before all others: `AlarmStore.add_earlier`."""
+        with self._lock:
+            return self._store.add_earlier(alarms)
+
+    def has_read(self, reader: str) -> bool:
+        """Whether a reader of earlier alarms has finished, in this process or one before."""
+        with self._lock:
+            return self._store.position(reader) != 0
+
+    def finish_reading(self, reader: str, begins_t_ns: int | None) -> None:
+        """A reader of earlier alarms has finished. begins_t_ns: from when on they are complete; None: it is unknown."""
+        with self._lock:
+            self._store.set_position(reader, 1)
+            if begins_t_ns is not None:
+                self._store.begins(begins_t_ns)
+
+    def add_snapshot(self, snapshot: ScorerSnapshot) -> None:
+        """A scorer has sent its state, of which the wear is kept."""
+        tray = snapshot.header.tray
+        with self._lock:
+            kept = self._wear.get(tray)
+            if kept is not None and kept[0] > snapshot.t_ns:
+                return
+        wear = wear_in(snapshot)
+        if wear is not None and len(wear["fans"]) == self._by_name[tray].fans:
+            with self._lock:
+                self._wear[tray] = (snapshot.t_ns, wear_rows(tray, snapshot.t_ns, wear))
+
+    def wear(self, fan: Fan) -> Sequence[Mapping[str, Any]]:
+        """The wear of a fan, a row for each parameter, as of the last snapshot of its scorer; empty: none is known."""
+        with self._lock:
+            _, rows = self._wear.get(fan.tray, (0, ()))
+        return [row for row in rows if row["fan"] == fan.number]
+
+    def feedback_on(self, alarms: Sequence[Alarm]) -> list[Feedback]:
+        """What operators said last of the alarm that each of these messages is about."""
+        if self._rates is None:
+            return [alarm.feedback for alarm in alarms]
+        with self._lock:
+            self._rates.catch_up(self._store, ())
+            return [self._rates.feedback(alarm.header.tray, alarm.fan, alarm.onset_t_ns) for alarm in alarms]
 
     def observed_rates(self) -> dict[str, ObservedRate]:
-        """Of each tray, the rate of false alarms beside the declared one: `AlarmStore.observed_rates`."""
+        """Of each tray, the rate of false alarms beside the declared one: `AlarmRates.observed`."""
+        if self._rates is None:
+            return {}
         with self._lock:
-            self._keep_judged()
-            return self._store.observed_rates()
+            self._rates.catch_up(self._store, self._judged.growing())
+            return self._rates.observed()
 
     def twin(self, tray: str) -> ModelCard | None:
         """The twin in force; None: it has not been heard."""
@@ -287,14 +349,12 @@ class SiteModel:
 
     def problem(self) -> str:
         """What is wrong with the history of alarms; empty if nothing is."""
-        return self._store.problem
+        return "; ".join(filter(None, (self._store.problem, self._rates.problem if self._rates else "")))
 
     def close(self) -> None:
         """Leave complete files."""
         with self._lock:
-            self._keep_judged()
+            if self._rates is not None:
+                self._rates.catch_up(self._store, self._judged.growing())
+                self._rates.close()
             self._store.close()
-
-    def _keep_judged(self) -> None:
-        if self._judged is not None:
-            self._store.add_judged(self._judged.growing())

@@ -30,12 +30,14 @@ Answer = Callable[[Request], list[Alarm]]
 class RunningCore(Generic[CoreType]):
     """answer: what the scorer says to a request; the answers are passed back as the bus would."""
 
-    def __init__(self, stage: Stage, config: Any, folder: Path, answer: Answer | None = None, fans: int = FANS) -> None:
+    def __init__(
+        self, stage: Stage, config: Any, folder: Path, answer: Answer | None = None, fans: int = FANS, **more: Any
+    ) -> None:
+        """more: of the context."""
         self.producer = f"{stage.name}-all-0123"
         trays = (TrayConfig(name=TRAY, fans=fans, speed_unit="rpm"),)
-        self.core: CoreType = stage.build(  # type: ignore[assignment]
-            Context(SITE, trays, config, folder, folder, 0, producer=self.producer)
-        ).core
+        context = replace(Context(SITE, trays, config, folder, folder, 0, producer=self.producer), **more)
+        self.core: CoreType = stage.build(context).core  # type: ignore[assignment]
         self.sent: list[Request] = []
         self._answer = answer or (lambda _request: [])
         self._answers = 0

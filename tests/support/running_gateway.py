@@ -10,7 +10,7 @@ from typing import Any
 
 from pipeline.gateway.config import GatewayConfig
 from stages.gateway import STAGE, GatewayCore
-from tests.support.running_core import Answer, RunningCore
+from tests.support.running_core import FANS, Answer, RunningCore
 
 
 def free_port() -> int:
@@ -23,9 +23,21 @@ def free_port() -> int:
 class RunningGateway(RunningCore[GatewayCore]):
     """It listens at `port`."""
 
-    def __init__(self, folder: Path, answer: Answer | None = None, **settings: Any) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        answer: Answer | None = None,
+        fans: int = FANS,
+        *,
+        configuration: str = "",
+        started_t_ns: int = 0,
+        **settings: Any,
+    ) -> None:
+        """configuration: the text of a configuration file in the folder; empty: there is none."""
         self.port = free_port()
-        super().__init__(STAGE, GatewayConfig(port=self.port, **settings), folder, answer)
+        path = folder / "fantwin.toml" if configuration else None
+        context = {"configuration_path": path, "configuration_text": configuration, "started_t_ns": started_t_ns}
+        super().__init__(STAGE, GatewayConfig(port=self.port, **settings), folder, answer, fans, **context)
 
 
 class Client:

@@ -16,7 +16,8 @@ from pipeline.cli.progress import working
 from pipeline.config.models import Config
 from pipeline.config.shards import own_file, shards_of
 from pipeline.errors import UserError
-from pipeline.presenting.alarm_store import HISTORY, AlarmStore
+from pipeline.presenting.alarm_rates import AlarmRates
+from pipeline.presenting.alarm_store import HISTORY
 from pipeline.recordings.dates import format_local
 from pipeline.recordings.rare_messages import rare_messages
 from pipeline.recordings.reading import read_metadata, read_recording
@@ -197,10 +198,10 @@ def _kept_by_gateway(config: Config) -> _Past:
     alarms: list[Alarm] = []
     rates: dict[str, ObservedRate] = {}
     for file in present:
-        store = AlarmStore(file, read_only=True)
+        alarms += [alarm for _, alarm in alarms_in(file)]
+        kept = AlarmRates(file, read_only=True)
         try:
-            alarms += [alarm for _, alarm in store.after(0, -1)]
-            rates |= store.observed_rates()
+            rates |= kept.observed()
         finally:
-            store.close()
+            kept.close()
     return _Past(episodes(alarms), rates)

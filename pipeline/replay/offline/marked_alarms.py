@@ -25,6 +25,8 @@ BEFORE_ALARM_NS = 600 * NS_PER_S
 """a fault begins before its alarm: so long before the onset is left out, too, as a learner holds back"""
 FILE_OF_GATEWAY = ".sqlite"
 _NEVER_NS = 2**63 - 1
+_FIRST = -(2**62)
+"""number of a transition: those from recordings are below 0"""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def alarms_in(path: Path) -> list[tuple[str, Alarm]]:
         return [(site, message) for site, message in found if isinstance(message, Alarm)]
     store = AlarmStore(path, read_only=True)
     try:
-        return [("", alarm) for _, alarm in store.after(0, -1)]
+        return [("", alarm) for _, alarm in store.after(_FIRST, -1)]
     finally:
         store.close()
 

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from pipeline.cli.main import expand_variadic
-from pipeline.presenting.alarm_store import AlarmStore, JudgedStretch
+from pipeline.presenting.alarm_rates import AlarmRates
+from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.judged_time import JudgedStretch
 from pipeline.recordings.rare_messages import rare_messages
 from pipeline.recordings.reading import read_recording
 from pipeline.recordings.writing import RecordingWriter
@@ -104,9 +106,11 @@ def test_a_gateway_on_this_host_has_kept_the_history(tmp_path: Path) -> None:
     for alarm in [*alarms, marked(alarms[-1], Feedback.FALSE_ALARM, 0, "the door was open")]:
         store.add(alarm)
     first_t_ns = alarms[0].t_ns - 10**9
-    store.add_judged([JudgedStretch("tray1", "abc", first_t_ns, first_t_ns + 10**13, 3_600 * 10**9, 0.5)])
+    rates = AlarmRates(tmp_path / "alarms.sqlite")
+    rates.catch_up(store, [JudgedStretch("tray1", "abc", first_t_ns, first_t_ns + 10**13, 3_600 * 10**9, 0.5)])
     found = history("-c", DEMO / "demo.toml", "--set", f"run_folder='{tmp_path}'")
     store.close()
+    rates.close()
     assert [alarm["feedback"] for alarm in found["alarms"]] == ["false_alarm"]
     rate = found["rate"]
     assert (rate["fan_hours"], rate["false_alarms"], rate["declared_per_day"]) == (1.0, 1, 0.5)
