@@ -51,7 +51,7 @@ class ObservedRate:
         declared = "no rate is declared" if self.declared_per_day is None else f"declared {self.declared_per_day:.3g}"
         if not self.fan_hours:
             return f"{count}, and how long fans were judged is not known; {declared}"
-        found = f"{count} in {self.fan_hours:.3g} judged fan-hours: {self._rate(self.false_alarms)}"
+        found = f"{count} in {_number(self.fan_hours)} judged fan-hours: {self._rate(self.false_alarms)}"
         if self.unmarked:
             are, them = ("is", "it") if self.unmarked == 1 else ("are", "them")
             possible = self._rate(self.false_alarms + self.unmarked)
@@ -78,7 +78,12 @@ class ObservedRate:
 
     def _rate(self, alarms: int) -> str:
         low, high = self.interval_95(alarms)
-        return f"{self.per_day(alarms):.2g} per fan and day (95 %: {low:.2g} to {high:.2g})"
+        return f"{_number(self.per_day(alarms))} per fan and day (95 %: {_number(low)} to {_number(high)})"
+
+
+def _number(value: float) -> str:
+    """For people: two digits are enough, and large numbers have no exponent."""
+    return f"{value:,.0f}" if value >= 10.0 else f"{value:.2g}"
 
 
 def declared_per_day(card_json: str) -> float | None:

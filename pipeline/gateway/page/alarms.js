@@ -25,7 +25,8 @@ export function rerunLink(url, t_ns) {
 // One alarm. viewerUrl: of Rerun's viewer; empty: none.
 export function card(alarm, viewerUrl) {
   const kind = alarm.presented ? alarm.severity : "silenced";
-  const states = alarm.states.join(", ") + (alarm.acknowledged_by ? ` by ${alarm.acknowledged_by}` : "");
+  const by = (state) => (state === "acknowledged" && alarm.acknowledged_by ? `${state} by ${alarm.acknowledged_by}` : state);
+  const states = alarm.states.map(by).join(", ");
   return element("article", { class: `card ${kind}`, "data-fan": name(alarm), "aria-label": `Alarm of ${alarm.tray} fan ${alarm.fan}` },
     element("p", {}, badge(alarm.active ? alarm.severity : "none", alarm.active ? alarm.severity : "over"), " ",
       element("strong", {}, link(alarm)), ` since ${clock(alarm.onset_t_ns)} (`, age(alarm.onset_t_ns), ")"),
@@ -94,6 +95,10 @@ export class HistoryView {
     const found = await ask(`/alarms/history?limit=${PAGE}${before === null ? "" : `&before=${before}`}${of}`);
     const { transitions } = found;
     const isNew = (each) => this.newest === null || each.number > this.newest;
+    if (before === null && this.newest !== null && transitions.some((each) => isNew(each) && each.transition.startsWith("marked"))) {
+      this.begin();  // what was said of an alarm is in its row
+      return;
+    }
     if (before === null) this.body.prepend(...transitions.filter(isNew).map((each) => this.row(each)));
     else this.body.append(...transitions.map((each) => this.row(each)));
     if (this.oldest === null || before !== null) {

@@ -28,7 +28,7 @@ def test_the_interval_is_that_of_the_tables_of_garwood(alarms: int, low: float, 
 def test_only_false_alarms_count_and_those_that_nobody_marked_are_counted_apart() -> None:
     found = rate(2, true=5, unmarked=3)
     assert found.text == (
-        "2 false alarms in 2.4e+03 judged fan-hours: 0.02 per fan and day (95 %: 0.0024 to 0.072); 3 more are not "
+        "2 false alarms in 2,400 judged fan-hours: 0.02 per fan and day (95 %: 0.0024 to 0.072); 3 more are not "
         "marked, with them 0.05 per fan and day (95 %: 0.016 to 0.12); declared 0.03"
     )
     shown = found.as_json()
