@@ -21,6 +21,8 @@ HISTORY = "alarms.sqlite"
 MOST_TRANSITIONS = 200_000
 """those that are older are deleted"""
 _DELETED_EVERY = 1000
+WAIT_S = 0.2
+"""for another program that writes into the file; what it holds up is kept later"""
 MOST_UNSAVED = 10_000
 """that wait for room on the disk; of more, the oldest are not kept"""
 
@@ -64,7 +66,7 @@ class AlarmStore:
                 self._file.execute("SELECT 1 FROM transition LIMIT 1")
                 return
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+            self._file = sqlite3.connect(path, WAIT_S, check_same_thread=False, isolation_level=None)
             self._file.executescript(f"PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; {_SCHEMA}")
         except (OSError, sqlite3.Error) as error:
             what = "it has no history of alarms" if read_only else "the history of alarms cannot be kept there"

@@ -36,7 +36,7 @@ def one_line(text: str) -> str:
     return _NOT_SHOWN.sub(" ", text)
 
 
-Line = Annotated[str, AfterValidator(one_line)]
+OneLine = Annotated[str, AfterValidator(one_line)]
 
 
 class RequestForm(BaseModel):
@@ -54,7 +54,7 @@ class RequestForm(BaseModel):
 
     action: OperatorAction
     duration_s: Annotated[float, Field(ge=0, le=LONGEST_SHELVING_S, allow_inf_nan=False)] = 0.0
-    comment: Annotated[Line, Field(max_length=LONGEST_COMMENT)] = ""
+    comment: Annotated[OneLine, Field(max_length=LONGEST_COMMENT)] = ""
     onset_t_ns: Annotated[int, Field(ge=0, lt=2**63)] = 0
 
     @model_validator(mode="after")

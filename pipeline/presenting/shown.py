@@ -141,6 +141,12 @@ def alarm_json(current: CurrentAlarm) -> dict[str, Any]:
     }
 
 
+def alarms_json(model: SiteModel, *, everything: bool) -> dict[str, Any]:
+    """All current alarms. everything: also those that are over."""
+    found = [each for each in model.current_alarms() if everything or is_listed(each.newest)]
+    return {"alarms": [alarm_json(each) for each in found]}
+
+
 def transition_json(number: int, alarm: Alarm, feedback: Feedback = Feedback.NONE) -> dict[str, Any]:
     """A transition of the history. feedback: the last one on its alarm."""
     return {

@@ -366,3 +366,42 @@ def test_a_key_with_a_password_is_refused_and_not_asked_for(tmp_path):
     (tmp_path / "page.key").write_bytes(encrypted)
     with pytest.raises(StageError, match="the key has no password"):
         server.check_certificate(tmp_path / "page.pem", tmp_path / "page.key")
+
+
+def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question(
+    gateway, monkeypatch
+):
+    goes_on, is_making, made = threading.Event(), threading.Event(), []
+    make = gateway.core._model.current_alarms
+
+    def slowly() -> list[Any]:
+        made.append(make())
+        is_making.set()
+        assert goes_on.wait(30)
+        return made[-1]
+
+    monkeypatch.setattr(gateway.core._model, "current_alarms", slowly)
+    answers: list[int] = []
+    pages = [
+        threading.Thread(target=lambda: answers.append(len(Client(gateway).ask("GET", "/api/v1/alarms")[1]["alarms"])))
+        for _ in range(9)
+    ]
+    pages[0].start()
+    assert is_making.wait(30)
+    gateway.feed(alarm())
+    for page in pages[1:]:
+        page.start()
+    assert Client(gateway).ask("GET", "/healthz")[0] == 200, "whoever asks for something else does not wait"
+    eventually(lambda: open_connections(gateway) >= len(pages), "all have asked")
+    goes_on.set()
+    for page in pages:
+        page.join()
+    assert sorted(answers) == [0] + [1] * 8
+    assert len(made) == 2
+    headers = Client(gateway).ask("GET", "/api/v1/alarms?all=1", None, {"Accept-Encoding": "identity"})[2]
+    assert headers["content-type"] == "application/json"
+
+
+def open_connections(gateway: RunningGateway) -> int:
+    web_server: Any = gateway.core._server
+    return len(web_server._server._server.server_state.tasks)

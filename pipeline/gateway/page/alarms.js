@@ -2,7 +2,7 @@
 
 import { ACTIONS, askFor, buttons, feedbackOn } from "./actions.js";
 import { age, clock, element, facts, keepFocus, percent } from "./dom.js";
-import { ask, me } from "./server.js";
+import { ask, learn, me } from "./server.js";
 
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
 const PAGE = 100;
@@ -25,8 +25,8 @@ export function rerunLink(url, t_ns) {
 // One alarm. viewerUrl: of Rerun's viewer; empty: none.
 export function card(alarm, viewerUrl) {
   const kind = alarm.presented ? alarm.severity : "silenced";
-  const by = (state) => (state === "acknowledged" && alarm.acknowledged_by ? `${state} by ${alarm.acknowledged_by}` : state);
-  const states = alarm.states.map(by).join(", ");
+  const by = alarm.acknowledged_by ? ` by ${alarm.acknowledged_by}` : "";
+  const states = alarm.states.map((state) => (state === "acknowledged" ? state + by : state)).join(", ");
   return element("article", { class: `card ${kind}`, "data-fan": name(alarm), "aria-label": `Alarm of ${alarm.tray} fan ${alarm.fan}` },
     element("p", {}, badge(alarm.active ? alarm.severity : "none", alarm.active ? alarm.severity : "over"), " ",
       element("strong", {}, link(alarm)), ` since ${clock(alarm.onset_t_ns)} (`, age(alarm.onset_t_ns), ")"),
@@ -72,7 +72,7 @@ export class AlarmsView {
       ...(listed.length ? listed.slice(0, this.most).map((alarm) => card(alarm, this.viewerUrl(alarm.tray)))
         : [element("p", { class: "muted" }, "No alarms.")]),
       more > 0 ? element("button", { type: "button", onclick: () => { this.most += SHOWN; this.draw(); } }, `${more} more`) : "", this.rate));
-    this.showRate().catch(() => {});  // the page says elsewhere that the server is away
+    learn(() => this.showRate());
   }
 }
 
@@ -80,7 +80,7 @@ export class HistoryView {
   constructor(fan = null) {
     this.fan = fan;
     this.body = element("tbody");
-    this.more = element("button", { type: "button", onclick: () => this.load(this.oldest), hidden: true }, "Older");
+    this.more = element("button", { type: "button", onclick: () => learn(() => this.load(this.oldest)), hidden: true }, "Older");
     this.reach = element("p", { class: "muted" });
     const heads = ["Time", ...(fan ? [] : ["Fan"]), "What happened", "By", "Message"].map((text) => element("th", { scope: "col" }, text));
     this.root = element("div", {}, element("h2", {}, fan ? "History of its alarms" : "History of alarms"), this.reach,
@@ -118,12 +118,12 @@ export class HistoryView {
   begin() {
     this.body.replaceChildren();
     this.newest = this.oldest = null;
-    this.load();
+    learn(() => this.load());
   }
 
   // A transition has come.
   update() {
-    this.due ||= setTimeout(() => { this.due = 0; if (this.root.isConnected) this.load(); }, 200);
+    this.due ||= setTimeout(() => { this.due = 0; if (this.root.isConnected) learn(() => this.load()); }, 200);
   }
 
   row(each) {

@@ -89,6 +89,22 @@ export class FansView {
     if (came.size) this.count();
   }
 
+  // An alarm was raised; what the fan's next sample says comes up to a second later. Many that come at once are shown
+  // together.
+  raise(index) {
+    const cell = this.cells[index];
+    if (!cell || cell.group === 0) return;
+    Object.assign(cell, { class: this.site.classes.indexOf("alarm"), group: 0 });
+    this.label(cell, index, Math.max(0, cell.percent));
+    this.raised ??= [];
+    this.raised.push(index);
+    this.due ||= requestAnimationFrame(() => {
+      this.place(0, this.raised.filter((each) => this.cells[each].group === 0));
+      this.count();
+      this.due = this.raised = null;
+    });
+  }
+
   label(cell, index, percent) {
     const group = GROUPS[cell.group], fan = this.fans[index];
     const words = cell.group === 4 ? "normal" : this.site.classes[cell.class];
@@ -101,7 +117,8 @@ export class FansView {
     if (cell.text !== text) {
       cell.text = text;
       cell.root.title = text;
-      cell.root.setAttribute("aria-label", text);
+      if (this.sections[cell.group].isLarge) cell.root.removeAttribute("aria-label");
+      else cell.root.setAttribute("aria-label", text);
       if (cell.mark.textContent !== group.mark) cell.mark.textContent = group.mark;
       if (this.sections[cell.group].isLarge) cell.words.textContent = `${words}${share}`;
       const kind = `cell ${group.name}`;

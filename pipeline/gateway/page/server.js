@@ -16,6 +16,16 @@ export async function ask(path) {
   return answered(await fetch(PREFIX + path));
 }
 
+// Ask for what a view shows. What fails is asked for again when the server is back.
+export async function learn(asked) {
+  try {
+    await asked();
+  } catch (failure) {
+    if (failure instanceof Refused || failure instanceof TypeError) console.info(failure.message);
+    else throw failure;
+  }
+}
+
 export async function send(path, body) {
   const headers = { "Content-Type": "application/json", "X-CSRF-Token": me.csrf_token };
   return answered(await fetch(PREFIX + path, { method: "POST", headers, body: JSON.stringify(body) }));

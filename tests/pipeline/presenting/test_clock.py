@@ -36,7 +36,7 @@ def test_a_tray_without_a_score_is_silent_after_a_while_and_until_its_next_score
 
     def is_shown() -> tuple[bool, bool]:
         model.notice_silence()
-        return model.fan_now(Fan(TRAY, 0)).state == "silent", bool(model.newest_samples())
+        return model.fan_now(Fan(TRAY, 0)).state == "silent", model.trays_now()[0].is_heard
 
     model.add_score(envelope)
     clock.now_s += SILENT_AFTER_S
