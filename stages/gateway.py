@@ -18,7 +18,8 @@ from pipeline.errors import refusals
 from pipeline.gateway.config import NEEDED, GatewayConfig
 from pipeline.gateway.live_feed import LiveFeed
 from pipeline.optional_dependencies import how_to_install, is_installed
-from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.alarm_rates import AlarmRates
+from pipeline.presenting.alarm_store import HISTORY, AlarmStore
 from pipeline.presenting.fan_history import curves_of
 from pipeline.presenting.other_stages import VIEWER, configured, recordings_of, viewer_urls
 from pipeline.presenting.recorded_alarms import RecordedAlarms
@@ -39,7 +40,6 @@ ALL_FOLLOWED = 64
 """with no more fans than this, all samples of all trays arrive"""
 MOST_FOLLOWED = 32
 """trays that somebody looks at; of more, the samples come once a second"""
-HISTORY = "alarms.sqlite"
 
 
 class GatewayCore(SiteCore):
@@ -167,10 +167,11 @@ def build(context: Context) -> BuiltStage:
     """
     if not all(map(is_installed, NEEDED)):
         raise StageError(NOT_INSTALLED)
-    store = AlarmStore(context.own_file(Path(HISTORY)))
+    path = context.own_file(Path(HISTORY))
+    store = AlarmStore(path)
     if context.started_t_ns:
         store.begins(context.started_t_ns)
-    model = SiteModel(context.site, context.trays, store)
+    model = SiteModel(context.site, context.trays, store, rates=AlarmRates(path))
     feed, desk = LiveFeed(), RequestDesk(context.producer)
     site = configured(context, RECORDER)
     recorded = RecordedAlarms(model, recordings_of(site) if site else ())

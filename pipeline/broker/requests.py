@@ -98,6 +98,7 @@ class Requests:
             duration_s=form.duration_s,
             operator_name=self._operator_name,
             comment=form.full_comment,
+            onset_t_ns=form.onset_t_ns,
         )
         try:
             answers = self._desk.begin(parts[0], asked, fans)

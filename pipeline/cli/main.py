@@ -59,7 +59,8 @@ VARIADIC: dict[str, tuple[str, ...]] = {
     "train": ("--validate",),
     "place": ("--validate",),
     "compare": ("--validate", "--test"),
-    "calibrate": ("--verify",),
+    "calibrate": ("--verify", "--feedback"),
+    "alarms": ("--recordings",),
 }
 """command -> options that take all words up to the next option"""
 

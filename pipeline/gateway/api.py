@@ -35,6 +35,7 @@ from pipeline.presenting.shown import (
     fan_in_full,
     fan_json,
     fleet_json,
+    rates_json,
     site_json,
     stages_json,
     transition_json,
@@ -126,15 +127,26 @@ class Api:
                 before=_whole(request, "before"),
             )
             begins_t_ns = self.model.history_begins_t_ns()
+            feedback = self.model.feedback_on([alarm for _, alarm in found])
         except UserError as error:
             raise HTTPException(503, "the history cannot be read: see the problem of the gateway") from error
         return JSONResponse(
             {
-                "transitions": [transition_json(number, alarm) for number, alarm in found],
+                "transitions": [
+                    transition_json(number, alarm, said) for (number, alarm), said in zip(found, feedback, strict=True)
+                ],
                 "begins_t_ns": begins_t_ns,
                 "is_reading_recordings": self.recorded.is_reading,
             }
         )
+
+    @reads
+    async def alarm_rate(self, request: Request) -> Response:
+        """The rate of false alarms that really was beside the declared one, of each tray and of the site."""
+        try:
+            return JSONResponse(await asyncio.to_thread(rates_json, self.model))
+        except UserError as error:
+            raise HTTPException(503, "the rate cannot be read: see the problem of the gateway") from error
 
     @reads
     async def stages(self, request: Request) -> Response:
@@ -201,6 +213,7 @@ class Api:
             duration_s=form.duration_s,
             operator_name=visitor.name,
             comment=form.comment,
+            onset_t_ns=form.onset_t_ns,
         )
         where = f"{name} {'all' if is_all else fan}"
         self.access.log.add("request", user=visitor.name, action=form.action, fan=where, **address_of(request))

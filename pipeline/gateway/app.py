@@ -43,6 +43,7 @@ PATHS: Mapping[str, tuple[str, Callable[..., object]]] = {
     "/fans/{tray}/{fan}/requests": ("POST", Api.act),
     "/alarms": ("GET", Api.alarms),
     "/alarms/history": ("GET", Api.alarm_history),
+    "/alarm-rate": ("GET", Api.alarm_rate),
     "/stages": ("GET", Api.stages),
     "/events": ("GET", Api.events),
     "/me": ("GET", Api.me),

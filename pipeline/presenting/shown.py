@@ -14,11 +14,13 @@ from pipeline.launch.site_state import StageState
 from pipeline.presenting.fan_history import Curves
 from pipeline.presenting.site_model import SiteModel
 from pipeline.viewing.fleet import Fan, FanNow, class_names
+from schemas.enums import Feedback
 from schemas.messages import Alarm, Array, ModelCard
 from schemas.twin_card import CardError, TwinCard
 from schemas.units import RAD_S_PER_UNIT
 from scoring.alarms.alarm_flags import is_listed
 from scoring.alarms.current_alarms import CurrentAlarm, words_of
+from scoring.calibration.observed_rate import together
 from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, WHAT_TO_DO, short_name
 
 LEVELS, NO_LEVEL = 250, 255
@@ -145,8 +147,8 @@ def alarms_json(model: SiteModel, *, everything: bool) -> dict[str, Any]:
     return {"alarms": [alarm_json(each) for each in found]}
 
 
-def transition_json(number: int, alarm: Alarm) -> dict[str, Any]:
-    """A transition of the history."""
+def transition_json(number: int, alarm: Alarm, feedback: Feedback = Feedback.NONE) -> dict[str, Any]:
+    """A transition of the history. feedback: the last one on its alarm."""
     return {
         "number": number,
         "t_ns": alarm.t_ns,
@@ -159,7 +161,15 @@ def transition_json(number: int, alarm: Alarm) -> dict[str, Any]:
         "message": words_of(alarm),
         "operator_name": alarm.operator_name,
         "comment": alarm.comment,
+        "feedback": feedback.name.lower(),
     }
+
+
+def rates_json(model: SiteModel) -> dict[str, Any]:
+    """The rate of false alarms that really was beside the declared one, of each tray and of all."""
+    rates = model.observed_rates()
+    trays = {tray: rate.as_json() for tray, rate in rates.items()}
+    return {"trays": trays, "site": together(list(rates.values())).as_json()}
 
 
 def stages_json(states: Iterable[StageState]) -> list[dict[str, Any]]:

@@ -17,10 +17,11 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from pipeline.gateway.config import GatewayConfig
 from pipeline.presenting.users import User, UserRole, hasher, write_users
+from pipeline.recordings.rare_messages import rare_messages
 from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import Action, FanState, InvalidReason, Severity, Transition
+from schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Transition
 from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis, Request, Score, ScorerSnapshot
+from schemas.messages import Alarm, Diagnosis, ModelCard, Request, Score, ScorerSnapshot
 from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT
 from tests.support.running_chain import eventually
@@ -29,6 +30,7 @@ from tests.support.running_gateway import Client, RunningGateway
 
 NOW_NS = 1_790_000_000_000_000_000
 STEP_NS = 10_000_000
+GOLDEN = Path(__file__).parents[1] / "support" / "data" / "golden.mcap"
 PASSWORD = "correct horse battery"
 SCRIPT = "<script>alert(1)</script>"
 CONFIGURATION = f'site = "{SITE}"\nrun_folder = "."\n[[tray]]\nname = "{TRAY}"\nfans = {FANS}\nport = "p"\n[gateway]\n'
@@ -388,3 +390,54 @@ def test_a_fan_shows_its_wear_its_advice_and_where_rerun_is(tmp_path):
         assert tray["viewer_url"] == "http://127.0.0.1:9090/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9876%2Fproxy"
     finally:
         gateway.close()
+
+
+def marked(feedback: Feedback, sequence: int, reason: str = "") -> Alarm:
+    transition = Transition.MARKED_TRUE if feedback == Feedback.TRUE_ALARM else Transition.MARKED_FALSE
+    more = {"feedback": feedback, "feedback_by": "ann", "feedback_reason": reason, "comment": reason}
+    return alarm(transition, sequence, marked_onset_t_ns=NOW_NS, t_ns=NOW_NS + sequence, operator_name="ann", **more)
+
+
+def test_the_rate_of_false_alarms_is_over_the_judged_time_and_beside_the_declared_one(tmp_path, users):
+    (card, *_) = (envelope.message for envelope in rare_messages(GOLDEN, "twin"))
+    assert isinstance(card, ModelCard)
+    twin = replace(card, header=Header("integrator", 0, TRAY))
+    for number in range(2):  # the second process continues with the file of the first
+        gateway = RunningGateway(tmp_path, granted, users=users)
+        try:
+            gateway.feed(twin, score(0.0 + 100 * number), score(4.0 + 100 * number), score(90.0 + 100 * number))
+            if not number:
+                gateway.feed(alarm(t_ns=NOW_NS + 10**9), alarm(sequence=1, onset_t_ns=5, t_ns=NOW_NS + 20 * 10**9))
+                gateway.feed(marked(Feedback.TRUE_ALARM, 2), marked(Feedback.FALSE_ALARM, 3, "the door was open"))
+            body = Client(gateway).ask("GET", "/api/v1/alarm-rate")[1]
+            rows = Client(gateway).ask("GET", "/api/v1/alarms/history")[1]["transitions"]
+        finally:
+            gateway.close()
+        tray = body["trays"][TRAY]
+        judged_s = 4.0 * (FANS - 1) * (number + 1)  # fan 3 is not judged, and nobody in the pauses
+        assert tray["fan_hours"] == pytest.approx(judged_s / 3600)
+        counts = (tray["false_alarms"], tray["true_alarms"], tray["unmarked"])
+        assert counts == (1, 0, 0), "one is counted, as marked last; the other came in a pause"
+        assert (tray["declared_per_day"], body["site"]["declared_per_day"]) == (24.0, 24.0)
+        assert tray["interval_95"][1] == pytest.approx(5.5716 / (judged_s / 86400), rel=1e-4)
+        assert {each["onset_t_ns"]: each["feedback"] for each in rows if each["transition"] == "raised"} == {
+            NOW_NS: "false_alarm",
+            5: "none",
+        }
+        assert tray["since_t_ns"] == NOW_NS + 4 * STEP_NS
+
+
+def test_feedback_names_its_alarm_and_a_false_alarm_needs_a_reason(gateway):
+    client, path = Client(gateway), f"/api/v1/fans/{TRAY}/2/requests"
+    client.log_in("ann", PASSWORD)
+    for form, why in (
+        ({"action": "false_alarm", "comment": " "}, "a false alarm needs a reason"),
+        ({"action": "shelve", "onset_t_ns": NOW_NS}, "onset_t_ns is for true_alarm and false_alarm only"),
+    ):
+        status, body, _ = client.ask("POST", path, form)
+        assert (status, why in body["error"]) == (422, True)
+    asked = {"action": "false_alarm", "comment": "the door was open", "onset_t_ns": NOW_NS}
+    assert client.ask("POST", path, asked)[0] == 200
+    (sent,) = gateway.sent
+    assert (sent.action, sent.onset_t_ns, sent.comment) == (Action.FALSE_ALARM, NOW_NS, "the door was open")
+    assert sent.operator_name == "ann"

@@ -1,12 +1,13 @@
 // The list of alarms, and the history of their transitions.
 
-import { buttons } from "./actions.js";
+import { ACTIONS, askFor, buttons, feedbackOn } from "./actions.js";
 import { age, clock, element, facts, keepFocus, percent } from "./dom.js";
-import { ask, learn } from "./server.js";
+import { ask, learn, me } from "./server.js";
 
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
 const PAGE = 100;
 const SHOWN = 100;
+const RATE_EVERY_MS = 10000;
 
 const name = (alarm) => `${alarm.tray}/${alarm.fan}`;
 const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.tray)}/${alarm.fan}` }, `${alarm.tray} fan ${alarm.fan}`);
@@ -43,7 +44,17 @@ export class AlarmsView {
   constructor(alarms, viewerUrl) {
     Object.assign(this, { alarms, viewerUrl, most: SHOWN, due: 0 });
     this.root = element("div");
+    this.rate = element("p", { class: "muted", id: "alarm-rate" });
+    this.rated_ms = -RATE_EVERY_MS;
     this.draw();
+  }
+
+  // How many alarms really were false, beside how many are declared.
+  async showRate() {
+    if (performance.now() - this.rated_ms < RATE_EVERY_MS) return;
+    this.rated_ms = performance.now();
+    const { site } = await ask("/alarm-rate");
+    if (site.since_t_ns) this.rate.textContent = `Since ${clock(site.since_t_ns)}: ${site.text}.`;
   }
 
   // When many come at once, they are drawn together.
@@ -60,7 +71,8 @@ export class AlarmsView {
     keepFocus(this.root, () => this.root.replaceChildren(element("h2", {}, `Alarms (${listed.length})`),
       ...(listed.length ? listed.slice(0, this.most).map((alarm) => card(alarm, this.viewerUrl(alarm.tray)))
         : [element("p", { class: "muted" }, "No alarms.")]),
-      more > 0 ? element("button", { type: "button", onclick: () => { this.most += SHOWN; this.draw(); } }, `${more} more`) : ""));
+      more > 0 ? element("button", { type: "button", onclick: () => { this.most += SHOWN; this.draw(); } }, `${more} more`) : "", this.rate));
+    learn(() => this.showRate());
   }
 }
 
@@ -83,6 +95,10 @@ export class HistoryView {
     const found = await ask(`/alarms/history?limit=${PAGE}${before === null ? "" : `&before=${before}`}${of}`);
     const { transitions } = found;
     const isNew = (each) => this.newest === null || each.number > this.newest;
+    if (before === null && this.newest !== null && transitions.some((each) => isNew(each) && each.transition.startsWith("marked"))) {
+      this.begin();  // what was said of an alarm is in its row
+      return;
+    }
     if (before === null) this.body.prepend(...transitions.filter(isNew).map((each) => this.row(each)));
     else this.body.append(...transitions.map((each) => this.row(each)));
     if (this.oldest === null || before !== null) {
@@ -115,6 +131,14 @@ export class HistoryView {
     const what = each.transition.replaceAll("_", " ");
     return element("tr", {}, cell("Time", clock(each.t_ns)), this.fan ? "" : cell("Fan", link(each)),
       cell("What happened", badge(each.active ? each.severity : "none", what)), cell("By", each.operator_name),
-      cell("Message", each.message, each.comment ? ` “${each.comment}”` : ""));
+      cell("Message", each.message, each.comment ? ` “${each.comment}”` : "", each.transition === "raised" ? this.feedback(each) : ""));
+  }
+
+  // What was said of an alarm, and the buttons to say it.
+  feedback(each) {
+    const said = each.feedback === "none" ? "" : ` (${each.feedback.replaceAll("_", " ")})`;
+    if (!me.may_act) return said;
+    return element("span", {}, said, element("span", { class: "actions" }, ...feedbackOn(each).map((action) => element("button", {
+      type: "button", "data-action": action, onclick: () => askFor(action, each.tray, each.fan, each) }, ACTIONS[action].title))));
   }
 }

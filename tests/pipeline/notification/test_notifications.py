@@ -12,7 +12,7 @@ from pipeline.notification.config import NotifierConfig
 from pipeline.notification.deciding import Event
 from pipeline.notification.notifications import FIRST_LOOK_NS, Changes, Notifications, Saved
 from pipeline.notification.wording import Level, Place, Text
-from schemas.enums import Severity, Transition
+from schemas.enums import Feedback, Severity, Transition
 from schemas.messages import Alarm, Diagnosis
 from schemas.units import NS_PER_S
 from tests.support.notified_alarms import START_NS, alarm, cleared
@@ -103,6 +103,19 @@ def test_it_is_sent_again_until_it_is_acknowledged_and_silenced_fans_send_nothin
     assert desk.wait(2000) == []
     desk.hear(alarm(Transition.UNSHELVED, fan=3, onset_s=5))
     assert titles(desk.wait(10)) == ["WARNING, fan 3 of tray1"], "from now on it is presented"
+
+
+def test_feedback_on_an_alarm_sends_nothing():
+    desk = Desk()
+    desk.hear(alarm())
+    assert len(desk.wait(10)) == 1
+    said = {"operator_name": "ann", "comment": "a door was open", "marked_onset_t_ns": START_NS}
+    desk.hear(alarm(Transition.MARKED_FALSE, feedback=Feedback.FALSE_ALARM, **said))
+    assert desk.wait(1000) == []
+    desk.hear(cleared())
+    assert titles(desk.wait(10)) == ["Cleared: alarm, fan 2 of tray1"]
+    desk.hear(alarm(Transition.MARKED_TRUE, active=False, feedback=Feedback.TRUE_ALARM, **said))
+    assert desk.wait(1000) == []
 
 
 def test_what_an_operator_shelves_while_its_message_waits_is_not_sent_and_sent_again_when_that_ends():
