@@ -59,8 +59,8 @@ twin: $(VENV)/.development
 	sh pipeline/demo/train_twin.sh $(BIN)/fantwin
 
 lock: $(VENV)/.development
-	$(COMPILE) --extra view --output-file requirements.lock
-	$(COMPILE) --extra view --extra dev --constraint requirements.lock --output-file requirements-dev.lock
+	$(COMPILE) --extra view --extra gateway --output-file requirements.lock
+	$(COMPILE) --extra view --extra gateway --extra dev --constraint requirements.lock --output-file requirements-dev.lock
 	@echo "torch; sys_platform == 'none'" > $(VENV)/without-torch.txt
 	$(COMPILE) --extra bench --constraint requirements-dev.lock --override $(VENV)/without-torch.txt \
 		--output-file requirements-bench.lock

@@ -649,8 +649,16 @@ class AcceptedSamples(_message.Message):
     speed_max_rad_s: float
     def __init__(self, tray: _Optional[str] = ..., fans: _Optional[int] = ..., command_min: _Optional[float] = ..., command_max: _Optional[float] = ..., speed_max_rad_s: _Optional[float] = ...) -> None: ...
 
+class LatencyBucket(_message.Message):
+    __slots__ = ("upper_s", "count")
+    UPPER_S_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    upper_s: float
+    count: int
+    def __init__(self, upper_s: _Optional[float] = ..., count: _Optional[int] = ...) -> None: ...
+
 class Health(_message.Message):
-    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays", "accepts", "is_last")
+    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays", "accepts", "is_last", "latencies", "latency_sum_s")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STAGE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
@@ -672,6 +680,8 @@ class Health(_message.Message):
     TRAYS_FIELD_NUMBER: _ClassVar[int]
     ACCEPTS_FIELD_NUMBER: _ClassVar[int]
     IS_LAST_FIELD_NUMBER: _ClassVar[int]
+    LATENCIES_FIELD_NUMBER: _ClassVar[int]
+    LATENCY_SUM_S_FIELD_NUMBER: _ClassVar[int]
     header: Header
     stage: str
     instance: str
@@ -693,4 +703,6 @@ class Health(_message.Message):
     trays: str
     accepts: _containers.RepeatedCompositeFieldContainer[AcceptedSamples]
     is_last: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ..., accepts: _Optional[_Iterable[_Union[AcceptedSamples, _Mapping]]] = ..., is_last: _Optional[bool] = ...) -> None: ...
+    latencies: _containers.RepeatedCompositeFieldContainer[LatencyBucket]
+    latency_sum_s: float
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ..., accepts: _Optional[_Iterable[_Union[AcceptedSamples, _Mapping]]] = ..., is_last: _Optional[bool] = ..., latencies: _Optional[_Iterable[_Union[LatencyBucket, _Mapping]]] = ..., latency_sum_s: _Optional[float] = ...) -> None: ...

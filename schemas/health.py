@@ -80,11 +80,25 @@ class AcceptedSamples:
     speed_max_rad_s: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class LatencyBucket:
+    """How many outputs were at most `upper_s` old when they were sent; the last bucket has no limit.
+
+    They count from when the stage had caught up with what came before its start.
+    """
+
+    upper_s: float
+    count: int
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Health:
     """Status of a process of a stage, and what it has received, sent and lost.
 
     Attributes:
+        latency_p50_ms: of the outputs of the last ten seconds, as latency_p99_ms.
+        latencies: a histogram of all outputs of its session, whose latencies add up to latency_sum_s; earlier versions,
+            and a stage without outputs, send none.
         trays: those that it has, separated by commas; empty: all of the site. Earlier versions do not say it: there, a
             stage with a process for each tray has the one that its instance names.
         is_last: the last message of its session, whatever its status. Earlier versions do not set it: see `has_ended`.
@@ -111,6 +125,8 @@ class Health:
     trays: str = ""
     accepts: tuple[AcceptedSamples, ...] = ()
     is_last: bool = False
+    latencies: tuple[LatencyBucket, ...] = ()
+    latency_sum_s: float = 0.0
 
     @property
     def has_ended(self) -> bool:

@@ -1,35 +1,37 @@
 """Gateway: the web server of a site: operators' page, API, live events and metrics (docs/how-to/gateway.md).
 
-Reads `score`, `alarm`, `twin` and `health`, and writes `request`. One core serves all trays. With many fans, the newest
-score of each tray is asked for once a second; all samples arrive only of those trays that somebody looks at.
+Reads `score`, `alarm`, `twin`, `health`, and `snapshot` for the wear, and writes `request`. One core serves all trays.
+With many fans, the newest score of each tray is asked for once a second; all samples arrive only of those trays that
+somebody looks at.
 
 The server runs in a thread of its own: it reads what the core has collected, and leaves requests for the core to send.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence, Set
+from functools import partial
 from pathlib import Path
 
-from pipeline.config.models import TrayConfig
-from pipeline.errors import UserError
-from pipeline.gateway.config import GatewayConfig
+from pipeline.config.registry import RECORDER
+from pipeline.errors import refusals
+from pipeline.gateway.config import NEEDED, GatewayConfig
 from pipeline.gateway.live_feed import LiveFeed
 from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.fan_history import curves_of
+from pipeline.presenting.other_stages import VIEWER, configured, recordings_of, viewer_urls
+from pipeline.presenting.recorded_alarms import RecordedAlarms
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stages_json
+from pipeline.presenting.site_core import SiteCore
 from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
 from pipeline.viewing.fleet import Fan
 from schemas.envelope import Envelope
-from schemas.health import Health
-from schemas.messages import Alarm, Message, ModelCard
+from schemas.messages import Alarm, Message
 from schemas.units import NS_PER_S
 
-NEEDED = ("starlette", "uvicorn", "prometheus_client", "argon2")
 NOT_INSTALLED = f"the gateway needs its extra: take [gateway] out of the configuration, or {how_to_install('gateway')}"
 FLEET_PERIOD_NS = NS_PER_S
 STAGES_PERIOD_NS = 2 * NS_PER_S
@@ -40,34 +42,37 @@ MOST_FOLLOWED = 32
 HISTORY = "alarms.sqlite"
 
 
-class GatewayCore(Core):
+class GatewayCore(SiteCore):
     """Collects what the server shows, and sends what operators ask."""
 
-    def __init__(self, model: SiteModel, feed: LiveFeed, desk: RequestDesk, serve: Server) -> None:
-        self._model = model
+    def __init__(
+        self, model: SiteModel, feed: LiveFeed, desk: RequestDesk, serve: Server, recorded: RecordedAlarms
+    ) -> None:
+        super().__init__(model, desk)
+        self._recorded = recorded
         self._feed = feed
-        self._desk = desk
         self._server = serve
-        self._counts: Counter[str] = Counter()
         self._is_small = sum(tray.fans for tray in model.trays) <= ALL_FOLLOWED
         self._fleet_ns = self._stages_ns = 0
         self._requests = 0
 
-    def step(self, item: Message | Envelope) -> Sequence[Message]:
-        """Keep what has arrived, and send it to the pages that show it."""
-        if isinstance(item, Health):
-            self._model.add_health(item)
-            return ()
-        tray = self._model.tray(item.header.tray)
-        if tray is None:
-            self._counts["unknown_tray"] += 1
-        elif isinstance(item, Envelope):
-            self._add_score(tray, item)
-        elif isinstance(item, Alarm):
-            self._add_alarm(tray, item)
-        elif isinstance(item, ModelCard):
-            self._model.add_twin(item)
-        return ()
+    def add_score(self, envelope: Envelope) -> None:
+        """Keep it, and send it to the pages that show one of its fans."""
+        score = self._model.add_score(envelope)
+        tray = self._model.tray(envelope.header.tray)
+        if score is None or tray is None:
+            return
+        for name, fan in self._feed.looked_at():
+            if name == tray.name:
+                self._feed.publish("samples", curves_json(curves_of(score, fan), tray), about=(name, fan))
+
+    def add_alarm(self, alarm: Alarm) -> None:
+        """Keep it, and send a transition to all pages."""
+        is_new = self._model.add_alarm(alarm)
+        self._desk.add(alarm)
+        current = self._model.current_alarm(Fan(alarm.header.tray, alarm.fan))
+        if is_new and current is not None:
+            self._feed.publish("alarm", alarm_json(current))
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Send the pages the state of the fleet, and the scorers what operators ask."""
@@ -87,6 +92,7 @@ class GatewayCore(Core):
     def close(self) -> Sequence[Message]:
         """Stop the server, and close the history."""
         self._server.stop()
+        self._recorded.stop()
         self._model.close()
         return ()
 
@@ -111,25 +117,7 @@ class GatewayCore(Core):
 
     def problem(self) -> str:
         """Of the server, the users and the history."""
-        return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
-
-    def _add_score(self, tray: TrayConfig, envelope: Envelope) -> None:
-        score = self._model.add_score(envelope)
-        if score is None:
-            return
-        for name, fan in self._feed.looked_at():
-            if name == tray.name:
-                self._feed.publish("samples", curves_json(curves_of(score, fan), tray), about=(name, fan))
-
-    def _add_alarm(self, tray: TrayConfig, alarm: Alarm) -> None:
-        if alarm.fan >= tray.fans:
-            self._counts["unknown_fan"] += 1
-            return
-        is_new = self._model.add_alarm(alarm)
-        self._desk.add(alarm)
-        current = self._model.current_alarm(Fan(tray.name, alarm.fan))
-        if is_new and current is not None:
-            self._feed.publish("alarm", alarm_json(current))
+        return "; ".join(filter(None, (self._server.problem(), self._model.problem(), self._recorded.problem)))
 
 
 class Server:
@@ -144,7 +132,9 @@ class Server:
 
 
 class _Running(Server):
-    def __init__(self, context: Context, model: SiteModel, feed: LiveFeed, desk: RequestDesk) -> None:
+    def __init__(
+        self, context: Context, model: SiteModel, feed: LiveFeed, desk: RequestDesk, recorded: RecordedAlarms
+    ) -> None:
         from pipeline.gateway.access import Access  # noqa: PLC0415  the extra may not be installed
         from pipeline.gateway.api import Api  # noqa: PLC0415
         from pipeline.gateway.app import application  # noqa: PLC0415
@@ -158,8 +148,9 @@ class _Running(Server):
             check_certificate(*tls)
         self._access = Access(config, Users(context.resolve(config.users)) if config.users else None)
         listening = listen(config.host, config.port + context.shard_number - 1)
-        app = application(Api(model, self._access, feed, desk), config)
-        self._server = WebServer(app, listening, tls, feed.end)
+        site = configured(context, VIEWER)
+        app = application(Api(model, self._access, feed, desk, recorded, viewer_urls(site) if site else {}), config)
+        self._server = WebServer(app, listening, tls, feed.end, frozenset({"127.0.0.1", "::1", *config.proxies}))
 
     def stop(self) -> None:
         self._server.stop()
@@ -176,42 +167,41 @@ def build(context: Context) -> BuiltStage:
     """
     if not all(map(is_installed, NEEDED)):
         raise StageError(NOT_INSTALLED)
-    model = SiteModel(context.site, context.trays, AlarmStore(context.own_file(Path(HISTORY))))
+    store = AlarmStore(context.own_file(Path(HISTORY)))
+    if context.started_t_ns:
+        store.begins(context.started_t_ns)
+    model = SiteModel(context.site, context.trays, store)
     feed, desk = LiveFeed(), RequestDesk(context.producer)
-    return BuiltStage(GatewayCore(model, feed, desk, _Running(context, model, feed, desk)))
+    site = configured(context, RECORDER)
+    recorded = RecordedAlarms(model, recordings_of(site) if site else ())
+    core = GatewayCore(model, feed, desk, _Running(context, model, feed, desk, recorded), recorded)
+    recorded.start()
+    return BuiltStage(core)
 
 
 def check(context: Context) -> list[str]:
     """Report a missing extra, a port that another program has taken, and files that cannot be read."""
     if not all(map(is_installed, NEEDED)):
         return [NOT_INSTALLED]
-    from pipeline.gateway.server import check_certificate, listen  # noqa: PLC0415  the extra may not be installed
+    from pipeline.gateway.server import check_certificate, check_expiry, listen  # noqa: PLC0415  the extra may not be installed
     from pipeline.presenting.users import read_users  # noqa: PLC0415
 
     config: GatewayConfig = context.config
-    problems: list[str] = []
-
-    def attempt(check: Callable[[], object]) -> None:
-        try:
-            check()
-        except UserError as error:
-            problems.append(str(error))
-
+    attempts: list[Callable[[], object]] = []
     if config.certificate and config.key:
-        certificate, key = context.resolve(config.certificate), context.resolve(config.key)
-        attempt(lambda: check_certificate(certificate, key))
+        attempts.append(partial(check_certificate, context.resolve(config.certificate), context.resolve(config.key)))
+        attempts.append(partial(check_expiry, context.resolve(config.certificate)))
     if config.users:
-        users = context.resolve(config.users)
-        attempt(lambda: read_users(users))
+        attempts.append(partial(read_users, context.resolve(config.users)))
     if not context.is_running:
-        attempt(lambda: listen(config.host, config.port + context.shard_number - 1).close())
-    return problems
+        attempts.append(lambda: listen(config.host, config.port + context.shard_number - 1).close())
+    return refusals(*attempts)
 
 
 STAGE = Stage(
     name="gateway",
     about="serves the operators' page, the API, live events and metrics by HTTP",
-    reads=("score", "alarm", "twin", "health"),
+    reads=("score", "alarm", "twin", "snapshot", "health"),
     writes=("request",),
     config=GatewayConfig,
     build=build,

@@ -9,7 +9,6 @@ sent when the broker has room. After each connection all retained topics are pub
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
@@ -29,11 +28,11 @@ from pipeline.errors import UserError
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.shown import stages_json, transition_json
+from pipeline.presenting.site_core import SiteCore
 from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
 from pipeline.viewing.fleet import Fan
 from schemas.envelope import Envelope
-from schemas.health import Health
 from schemas.messages import Alarm, Message
 from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S
@@ -49,22 +48,22 @@ CHANGES_PERIOD_NS = NS_PER_S // 2
 SITE_PERIOD_NS = 5 * NS_PER_S
 
 
-class MqttCore(Core):
+class MqttCore(SiteCore):
     """Knows what the broker should have, and what it has."""
 
     def __init__(
         self, context: Context, model: SiteModel, store: AlarmStore, desk: RequestDesk, topics: Topics, link: Link
     ) -> None:
         config: MqttConfig = context.config
-        self._config, self._model, self._desk, self._topics, self._link = config, model, desk, topics, link
+        super().__init__(model, desk)
+        self._config, self._topics, self._link = config, topics, link
         self._is_whole = context.instance == ALL_TRAYS
         self._states = FanStates(model)
         self._outbox = Outbox()
-        self._queue = TransitionQueue(store, config.most_waiting)
+        self._store, self._queue = store, TransitionQueue(store, config.most_waiting)
         self._requests = Requests(topics, model.trays, config.accept, config.operator_name, desk)
         self._home_assistant = HomeAssistant(config, topics, model.trays)
         self._devices = self._home_assistant.messages() if config.home_assistant == "publish" else {}
-        self._counts: Counter[str] = Counter()
         self._numbers: dict[int, int] = {}
         """transitions under way: by the number of the message, that of the transition"""
         self._changed_alarms: set[Fan] = set()
@@ -76,19 +75,16 @@ class MqttCore(Core):
         self._full_ns = self._changes_ns = self._site_ns = -(1 << 62)
         self._forget_ns: int | None = None
 
-    def step(self, item: Message | Envelope) -> Sequence[Message]:
-        """Keep what has arrived."""
-        if isinstance(item, Health):
-            self._model.add_health(item)
-            return ()
-        tray = self._model.tray(item.header.tray)
-        if tray is None:
-            self._counts["unknown_tray"] += 1
-        elif isinstance(item, Envelope):
-            self._has_news |= self._model.add_score(item) is not None
-        elif isinstance(item, Alarm):
-            self._add_alarm(item, tray.fans)
-        return ()
+    def add_score(self, envelope: Envelope) -> None:
+        """Keep it."""
+        self._has_news |= self._model.add_score(envelope) is not None
+
+    def add_alarm(self, alarm: Alarm) -> None:
+        """Keep it; a new transition waits to be published."""
+        if self._model.add_alarm(alarm):
+            self._queue.notice_new()
+        self._desk.add(alarm)
+        self._changed_alarms.add(Fan(alarm.header.tray, alarm.fan))
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Publish what has changed, as far as the broker has room, and pass on requests."""
@@ -122,7 +118,7 @@ class MqttCore(Core):
             "connections": self._link.sessions,
             "waiting_transitions": self._queue.waiting,
             "waiting_topics": len(self._outbox),
-            "lost_transitions": self._queue.lost,
+            "lost_transitions": self._queue.lost + self._store.lost,
             "refused_scores": self._model.refused_scores,
             "dropped_requests": self._link.dropped_requests,
             **self._counts,
@@ -146,15 +142,6 @@ class MqttCore(Core):
         if broker and self._queue.lost:
             broker += f"; more than {self._config.most_waiting} transitions of alarms wait, the oldest are lost"
         return "; ".join(filter(None, (broker, self._model.problem())))
-
-    def _add_alarm(self, alarm: Alarm, fans: int) -> None:
-        if alarm.fan >= fans:
-            self._counts["unknown_fan"] += 1
-            return
-        if self._model.add_alarm(alarm):
-            self._queue.notice_new()
-        self._desk.add(alarm)
-        self._changed_alarms.add(Fan(alarm.header.tray, alarm.fan))
 
     def _receive(self, now_ns: int) -> None:
         for topic, payload, is_retained in self._link.received():
@@ -192,6 +179,8 @@ class MqttCore(Core):
         is_full = abs(now_ns - self._full_ns) >= self._config.period_s * NS_PER_S
         if is_full:
             self._model.notice_silence()
+            if self._store.save_again():
+                self._queue.notice_new()
         is_due = self._has_news and abs(now_ns - self._changes_ns) >= CHANGES_PERIOD_NS
         if is_full or is_due or self._changed_alarms:
             self._full_ns = now_ns if is_full else self._full_ns

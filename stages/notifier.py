@@ -162,7 +162,8 @@ def build(context: Context) -> BuiltStage:
         raise StageError("; ".join(problems))
     place = Place(context.site, config.page, config.zone)
     outbox = Outbox(context.own_file(OUTBOX), [target.name for target in config.target])
-    notifications = Notifications(config, place, outbox.load(), outbox.was_sent)
+    saved = outbox.load().of_fans({tray.name: tray.fans for tray in context.trays})
+    notifications = Notifications(config, place, saved, outbox.was_sent)
     senders = {target.name: sender_of(target, context.resolve, outbox, place) for target in config.target}
     return BuiltStage(NotifierCore(config, context.trays, notifications, outbox, senders))
 

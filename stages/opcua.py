@@ -8,22 +8,23 @@ The server runs in a thread of its own: it reads what the core has collected, an
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence, Set
+from functools import partial
 from pathlib import Path
 
-from pipeline.errors import UserError
+from pipeline.errors import refusals
 from pipeline.opcua.conditions import Condition, ConditionBook
 from pipeline.opcua.config import OpcuaConfig
 from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.request_desk import RequestDesk
+from pipeline.presenting.site_core import SiteCore
 from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
 from pipeline.viewing.fleet import Fan
 from schemas.enums import Transition
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Message, ModelCard
+from schemas.messages import Alarm, Message
 from schemas.units import NS_PER_S
 
 NEEDED = ("asyncua", "argon2")
@@ -51,29 +52,28 @@ class Server:
         return {}
 
 
-class OpcuaCore(Core):
+class OpcuaCore(SiteCore):
     """Collects what the server shows, and sends what operators ask."""
 
     def __init__(self, model: SiteModel, book: ConditionBook, desk: RequestDesk, server: Server) -> None:
-        self._model, self._book, self._desk = model, book, desk
+        super().__init__(model, desk)
+        self._book = book
         self._server = server
-        self._counts: Counter[str] = Counter()
         self._silence_ns = 0
 
-    def step(self, item: Message | Envelope) -> Sequence[Message]:
-        """Keep what has arrived; a transition becomes an event."""
-        tray = self._model.tray(item.header.tray)
-        if tray is None:
-            self._counts["unknown_tray"] += 1
-        elif isinstance(item, Envelope):
-            self._model.add_score(item)
-        elif isinstance(item, ModelCard):
-            self._model.add_twin(item)
-        elif isinstance(item, Alarm):
-            self._counts["unknown_fan"] += item.fan >= tray.fans
-            if item.fan < tray.fans:
-                self._add_alarm(item)
-        return ()
+    def add_score(self, envelope: Envelope) -> None:
+        """Keep it."""
+        self._model.add_score(envelope)
+
+    def add_alarm(self, alarm: Alarm) -> None:
+        """Keep it; a transition becomes an event."""
+        is_new = self._model.add_alarm(alarm)
+        current = self._model.current_alarm(Fan(alarm.header.tray, alarm.fan))
+        if current is not None:
+            condition = self._book.add(alarm, current)
+            if is_new and alarm.transition != Transition.REFUSED:
+                self._server.publish(condition)
+        self._desk.add(alarm)
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Send the scorers what operators ask."""
@@ -105,15 +105,6 @@ class OpcuaCore(Core):
     def problem(self) -> str:
         """Of the server, the users and the history."""
         return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
-
-    def _add_alarm(self, alarm: Alarm) -> None:
-        is_new = self._model.add_alarm(alarm)
-        current = self._model.current_alarm(Fan(alarm.header.tray, alarm.fan))
-        if current is not None:
-            condition = self._book.add(alarm, current)
-            if is_new and alarm.transition != Transition.REFUSED:
-                self._server.publish(condition)
-        self._desk.add(alarm)
 
 
 class _Running(Server):
@@ -181,24 +172,16 @@ def check(context: Context) -> list[str]:
     from pipeline.presenting.users import read_users  # noqa: PLC0415
 
     config: OpcuaConfig = context.config
-    problems: list[str] = []
-
-    def attempt(check: Callable[[], object]) -> None:
-        try:
-            check()
-        except UserError as error:
-            problems.append(str(error))
-
+    attempts: list[Callable[[], object]] = []
     if config.certificate and config.key:
-        certificate, key = context.resolve(config.certificate), context.resolve(config.key)
-        attempt(lambda: check_certificate(certificate, key))
+        attempts.append(partial(check_certificate, context.resolve(config.certificate), context.resolve(config.key)))
     if config.users:
-        users = context.resolve(config.users)
-        attempt(lambda: read_users(users))
+        attempts.append(partial(read_users, context.resolve(config.users)))
+    if not context.is_running:
+        attempts.append(partial(check_port, config.host, config.port + context.shard_number - 1))
+    problems = refusals(*attempts)
     if config.trusted and not context.resolve(config.trusted).is_dir():
         problems.append(f"opcua.trusted = {str(config.trusted)!r}: there is no such folder")
-    if not context.is_running:
-        attempt(lambda: check_port(config.host, config.port + context.shard_number - 1))
     return problems
 
 

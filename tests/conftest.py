@@ -17,6 +17,16 @@ settings.register_profile("house", derandomize=True, deadline=None)
 settings.load_profile("house")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _without_power_cuts() -> Iterator[None]:
+    """A process reads what it has written without a flush to the disk, which would take half of the time of the tests
+    that write much. Tests of the flush itself put their own in its place."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _descriptor: None)
+        patch.setattr(os, "fdatasync", lambda _descriptor: None)
+        yield
+
+
 @pytest.fixture
 def endpoint() -> str:
     """A bus endpoint on loopback that nothing else uses."""

@@ -7,7 +7,9 @@ again after a restart, with the same number.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 
+from pipeline.errors import UserError
 from pipeline.presenting.alarm_store import AlarmStore
 from schemas.messages import Alarm
 
@@ -18,6 +20,9 @@ class TransitionQueue:
     """lost: how many were dropped because too many waited."""
 
     def __init__(self, store: AlarmStore, most_waiting: int) -> None:
+        """Raises:
+        UserError: the history cannot be read.
+        """
         self._store = store
         self._most_waiting = most_waiting
         self._done = store.position(READER)
@@ -36,7 +41,8 @@ class TransitionQueue:
 
     def notice_new(self) -> None:
         """The history has grown."""
-        self._newest = self._store.newest_number()
+        with suppress(UserError):  # the store says it
+            self._newest = self._store.newest_number()
         too_many = self._newest - self._sent - self._most_waiting
         if too_many > 0:
             self.lost += too_many
@@ -47,7 +53,10 @@ class TransitionQueue:
         """The next ones, each with its number."""
         if self._sent >= self._newest or most <= 0:
             return ()
-        found = self._store.after(self._sent, most)
+        try:
+            found = self._store.after(self._sent, most)
+        except UserError:  # the store says it
+            return ()
         self._under_way |= {number: False for number, _ in found}
         self._sent = found[-1][0] if found else self._newest
         self._settle()

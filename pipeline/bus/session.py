@@ -1,59 +1,35 @@
 """A session on the bus. Only this room knows Zenoh.
 
-Processes are peers that need no router. The first to start on a host listens on the configured endpoint; the others
-connect there and discover each other. When the first dies, the rest stay connected, and the next process to start
-listens on the endpoint. (Retrying to listen would take the endpoint over at once, but a session that still retries
-takes at least ten seconds to close: measured with Zenoh 1.10.) A command that connects only briefly does not listen:
-after it left, a new process would find no listener at the endpoint and discover the others late.
-
-Zenoh's shared memory is off: it would copy messages of 3 kB or more into a pool, and watch the pool 20 times a second
-in every process. Over a socket they cost no more, and the processes of a small site take 60 MB less.
-
 Data is published with congestion control BLOCK. Each publisher keeps its last messages, so that a consumer that was not
 yet connected, or was restarted, can request what it missed.
 """
 
 from __future__ import annotations
 
-import json
 import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import zenoh
 
-from pipeline.bus.access_rules import SiteRoles, access_control
-from pipeline.bus.endpoint import (
-    accepts_connections,
-    endpoint_problem,
-    foreign_program,
-    require_tls_with_security,
-    somebody_listens,
-)
-from pipeline.bus.errors import BusError, NoAnswerError, reason
+from pipeline.bus.access_rules import SiteRoles
+from pipeline.bus.endpoint import endpoint_problem, somebody_listens
+from pipeline.bus.errors import BusError, NoAnswerError
 from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept, kept_key
-from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
+from pipeline.bus.opening import MEETING_LIMIT_S, ROUTER_RETRY_S, answers, credentials_of, open_session
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
 from pipeline.bus.rights import UNANSWERED_LIMIT_S, OwnRights, granted_rights
-from pipeline.bus.settings import Settings
 from pipeline.bus.spool import Spool
 from pipeline.config.models import BusConfig, Config
 from pipeline.config.roles import READERS
 from schemas.topics import Topic, key_in_words, largest_bytes
 
-if TYPE_CHECKING:
-    from pipeline.bus.certificates import Credentials
-
-_ROUTER_TIMEOUT_MS = 1000
-_ROUTER_RETRY_S = 0.2
 SAID_AFTER_S = 3.0
 """a client that waits so long for its router says so"""
-MEETING_LIMIT_S = 10.0
-"""by then a process that listens at the endpoint has answered, however busy the machine"""
 _MEETING_POLL_S = 0.01
 _ALIVE_TIMEOUTS = 2
 """`Bus.alive` asks again for so many times `recovery_timeout_s`"""
@@ -89,13 +65,14 @@ class Bus:
         """what this session shows; None: without `bus.security`"""
         self.came_second = somebody_listens(config.endpoint)
         """Whether another process listened before: discovering the others takes a moment."""
-        self._has_answered = config.mode == "client" or (self.came_second and _answers(config, self.credentials, stop))
-        self._session = _open(config, self.credentials, stop, listens, site)
+        self._has_answered = config.mode == "client" or (self.came_second and answers(config, self.credentials, stop))
+        self._session = open_session(config, self.credentials, stop, listens, site)
         self.rights: OwnRights | None = None
         """what this session may do; None: everything, as far as is known"""
         if self.credentials and site:
             role, is_client = self.credentials.role, config.mode == "client"
             self.rights = OwnRights(self._session, site, role, is_client=is_client)
+        self._stop = stop or threading.Event()
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
         self.spool: Spool | None = None
@@ -181,7 +158,7 @@ class Bus:
         answered twice: a client that has just lost its router gets that answer, too, until it has noticed.
 
         Raises:
-            NoAnswerError: no complete answer came: which tokens exist is not known.
+            NoAnswerError: no complete answer came, or `stop` was set before: which tokens exist is not known.
         """
         timeout_s = self._config.recovery_timeout_s
         until_s = time.monotonic() + _ALIVE_TIMEOUTS * timeout_s
@@ -193,13 +170,14 @@ class Bus:
             if is_complete and (found or was_empty):
                 return found
             was_empty = is_complete
+            if self._stop.wait(ROUTER_RETRY_S):
+                raise NoAnswerError(f"bus.endpoint = {self._config.endpoint!r}: stopped before an answer came")
             if time.monotonic() > until_s:
                 raise NoAnswerError(
                     f"bus.endpoint = {self._config.endpoint!r}: no complete answer within "
                     f"{_ALIVE_TIMEOUTS * timeout_s:g} s to the question who is on the bus: check that the router runs "
                     "and is not overloaded"
                 )
-            time.sleep(_ROUTER_RETRY_S)
 
     def _has_its_router(self) -> bool:
         """Whether a client is connected; without its router it sees no token. Peers need no router."""
@@ -262,7 +240,7 @@ class Bus:
         role = self.credentials.role
         until_s = time.monotonic() + UNANSWERED_LIMIT_S
         while (granted := granted_rights(self._session, site, role)) is None and time.monotonic() < until_s:
-            time.sleep(_ROUTER_RETRY_S)
+            time.sleep(ROUTER_RETRY_S)
         whose = f"{self.credentials.certificate} is a certificate of role {role!r}"
         if granted is None and not self._has_its_router():
             raise NoAnswerError(f"no router answers at {self._config.endpoint}")
@@ -310,113 +288,3 @@ def join_bus(
         return Bus(config.bus, stop, listens=listens, roles=roles, site=site)
     finally:
         waiting.cancel()
-
-
-def credentials_of(config: BusConfig, roles: Sequence[str]) -> Credentials | None:
-    """The checked files of the first of these roles that has a certificate here; None without `bus.security`.
-
-    Raises:
-        BusError: one cannot be used, or the endpoint does not fit.
-    """
-    require_tls_with_security(config)
-    if config.security is None:
-        return None
-    from pipeline.bus.certificates import checked_credentials  # noqa: PLC0415  takes 0.1 s, which most do without
-
-    return checked_credentials(config.security, roles)
-
-
-def _answers(config: BusConfig, credentials: Credentials | None, stop: threading.Event | None) -> bool:
-    """Whether a process of fantwin listens at the endpoint of a peer; False if nobody does, or `stop` is set.
-
-    Raises:
-        BusError: a program listens there and does not answer.
-    """
-    if not accepts_connections(config.endpoint):
-        return False
-    conf = _short_lived_config(config, credentials)
-    until_s = time.monotonic() + MEETING_LIMIT_S
-    while True:
-        try:
-            zenoh.open(conf).close()  # a peer would try again for ever, and takes ten seconds to close
-            return True
-        except zenoh.ZError as error:
-            if time.monotonic() > until_s:
-                raise BusError(foreign_program(config.endpoint, is_secure=credentials is not None)) from error
-            if stop is not None and stop.is_set():
-                return False
-
-
-def _short_lived_config(config: BusConfig, credentials: Credentials | None) -> zenoh.Config:
-    """Of a client that only sees whether anybody answers."""
-    settings = Settings()
-    settings.set("mode", "client")
-    settings.set("connect/endpoints", [config.endpoint])
-    settings.set("connect/timeout_ms", _ROUTER_TIMEOUT_MS)
-    settings.set("scouting/multicast/enabled", False)
-    settings.secure(credentials)
-    return settings.config
-
-
-def _open(
-    config: BusConfig,
-    credentials: Credentials | None,
-    stop: threading.Event | None,
-    listens: bool,
-    site: SiteRoles | None,
-) -> zenoh.Session:
-    try:
-        conf = _zenoh_config(config, credentials, site, listens=listens)
-        if config.mode == "peer":
-            return zenoh.open(conf)
-    except zenoh.ZError as error:
-        raise BusError(f"bus.endpoint = {config.endpoint!r} cannot be used: {reason(error)}") from error
-    until_s = time.monotonic() + (MEETING_LIMIT_S if stop else 0.0)
-    attempts = 0
-    while True:  # Zenoh can wait for the router itself, but then ignores Ctrl-C
-        first = attempts % len(config.endpoints)
-        endpoints = (*config.endpoints[first:], *config.endpoints[:first])  # it never gets to one after one that hangs
-        try:
-            conf.insert_json5("connect/endpoints", json.dumps(endpoints))
-            return zenoh.open(conf)
-        except zenoh.ZError as error:
-            attempts += 1
-            if attempts < len(endpoints):
-                continue
-            if stop is None and attempts == len(endpoints) and accepts_connections(config.endpoint):
-                time.sleep(_ROUTER_RETRY_S)  # a router that is just starting accepts connections before it answers
-                continue
-            if time.monotonic() > until_s and accepts_connections(config.endpoint):
-                raise BusError(foreign_program(config.endpoint, is_secure=credentials is not None)) from error
-            if stop is None or stop.wait(_ROUTER_RETRY_S):
-                raise BusError(
-                    f"bus.endpoint = {config.endpoint!r}: no router answers: {reason(error)}; start `fantwin router`"
-                ) from error
-
-
-def _zenoh_config(
-    config: BusConfig, credentials: Credentials | None = None, site: SiteRoles | None = None, *, listens: bool
-) -> zenoh.Config:
-    settings = Settings()
-    settings.set("mode", config.mode)
-    settings.set("connect/endpoints", list(config.endpoints))
-    settings.set("connect/timeout_ms", -1 if config.mode == "peer" else _ROUTER_TIMEOUT_MS)
-    settings.set("connect/exit_on_failure", False)
-    settings.set("connect/retry", RETRY)
-    if config.mode == "client":
-        settings.set("transport/link/tx/lease", int(LEASE_MS))
-        settings.set("transport/unicast/open_timeout", OPEN_TIMEOUT_MS)
-    settings.set("scouting/multicast/enabled", False)
-    settings.set("transport/shared_memory/enabled", False)
-    if config.mode == "peer":
-        host = config.endpoint.rsplit(":", 1)[0]
-        settings.set("listen/endpoints", [*([config.endpoint] if listens else []), f"{host}:0"])
-        settings.set("listen/timeout_ms", 0)
-        settings.set("listen/exit_on_failure", False)
-        settings.set("scouting/gossip/enabled", True)
-        settings.set("transport/link/tx/queue/congestion_control/block/wait_before_close", PEER_WAIT_US)
-        if credentials and site:
-            settings.set("access_control", access_control(site))
-    settings.secure(credentials)
-    settings.pass_through(config.zenoh)
-    return settings.config

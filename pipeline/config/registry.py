@@ -116,7 +116,7 @@ STAGES: dict[str, StageRow] = {
             "stages.gateway:STAGE",
             has_common_shards=False,
             may_drop=True,
-            reads=("score", "alarm", "twin", "health"),
+            reads=("score", "alarm", "twin", "snapshot", "health"),
             writes=("request",),
         ),
         StageRow(

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import re
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import aclosing
 from dataclasses import dataclass
 from functools import wraps
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from pipeline.config.models import TrayConfig
-from pipeline.gateway.access import Access, Visitor, require_own_page, require_token
+from pipeline.errors import UserError
+from pipeline.gateway.access import Access, Visitor, address_of, require_own_page, require_token
 from pipeline.gateway.forms import LoginForm
 from pipeline.gateway.live_feed import LiveFeed, encoded
 from pipeline.gateway.metrics import metrics_text
 from pipeline.presenting.fan_history import HISTORY_S
+from pipeline.presenting.recorded_alarms import RecordedAlarms
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.request_form import RequestForm
 from pipeline.presenting.shown import (
@@ -39,7 +45,9 @@ from schemas.messages import Request as OperatorRequest
 from schemas.units import NS_PER_S
 
 MOST_LISTED = 500
-LARGEST_BODY_BYTES = 16_384
+LARGEST_BODY_BYTES, BODY_WITHIN_S = 16_384, 10.0
+CHECKED_EVERY_S = 5.0
+"""so often it is looked whether a reader of live events may still read"""
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 ALL_FANS = "all"
 
@@ -66,13 +74,14 @@ class Api:
     access: Access
     feed: LiveFeed
     desk: RequestDesk
-    viewer_url: str = ""
-    """of Rerun's web viewer; empty: there is none"""
+    recorded: RecordedAlarms
+    viewer_urls: Mapping[str, str]
+    """by tray, of Rerun's viewer for browsers; none where it is not served"""
 
     @reads
     async def site(self, request: Request) -> Response:
         """Trays, fans and what the classes of cells mean."""
-        return JSONResponse({**site_json(self.model), "viewer_url": self.viewer_url})
+        return JSONResponse(site_json(self.model, self.viewer_urls))
 
     @reads
     async def fans(self, request: Request) -> Response:
@@ -104,14 +113,25 @@ class Api:
 
     @reads
     async def alarm_history(self, request: Request) -> Response:
-        """The last transitions, newest first; ?tray=, ?fan=, ?limit=, and ?before=NUMBER for the next page."""
-        found = self.model.past_alarms(
-            min(MOST_LISTED, _number(request, "limit", 100)),
-            tray=request.query_params.get("tray", ""),
-            fan=_number(request, "fan", -1),
-            before=_number(request, "before", 0),
+        """The last transitions, newest first; ?tray=, ?fan=, ?limit=, and ?before=NUMBER for the next page. With them,
+        how far back the history reaches, and whether earlier alarms are still being read from recordings."""
+        try:
+            found = self.model.past_alarms(
+                min(MOST_LISTED, _number(request, "limit", 100)),
+                tray=request.query_params.get("tray", ""),
+                fan=_number(request, "fan", -1),
+                before=_whole(request, "before"),
+            )
+            begins_t_ns = self.model.history_begins_t_ns()
+        except UserError as error:
+            raise HTTPException(503, "the history cannot be read: see the problem of the gateway") from error
+        return JSONResponse(
+            {
+                "transitions": [transition_json(number, alarm) for number, alarm in found],
+                "begins_t_ns": begins_t_ns,
+                "is_reading_recordings": self.recorded.is_reading,
+            }
         )
-        return JSONResponse({"transitions": [transition_json(number, alarm) for number, alarm in found]})
 
     @reads
     async def stages(self, request: Request) -> Response:
@@ -125,14 +145,14 @@ class Api:
         if name := request.query_params.get("fan", ""):
             fan = self._named(*name.rpartition("/")[::2])
         first = encoded("fleet", fleet_json(self.model))
-        return StreamingResponse(
-            self.feed.events(first, fan), media_type="text/event-stream", headers={"X-Accel-Buffering": "no"}
-        )
+        events = self._while_allowed(request, self.feed.events(first, fan))
+        return StreamingResponse(events, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 
-    @reads
     async def metrics(self, request: Request) -> Response:
-        """For Prometheus."""
-        return Response(metrics_text(self.model, self.feed.readers), media_type=METRICS_TYPE)
+        """For Prometheus. Of 5,000 fans they take a tenth of a second, in which live events must not wait."""
+        await self.access.require_scraper(request)
+        text = await run_in_threadpool(metrics_text, self.model, self.feed.readers)
+        return Response(text, media_type=METRICS_TYPE)
 
     async def me(self, request: Request) -> Response:
         """Who asks, and what he may do; the token that a page sends with what it changes."""
@@ -142,15 +162,10 @@ class Api:
         """Begin a session."""
         require_own_page(request)
         form = await _form(request, LoginForm)
-        address = request.client.host if request.client else ""
-        cookie, session = self.access.log_in(form.name, form.password, address)
+        cookie, session = await self.access.log_in(form.name, form.password, request)
         answer = JSONResponse({"name": session.user, "csrf_token": session.csrf_token})
         answer.set_cookie(
-            self.access.cookie_name,
-            cookie,
-            httponly=True,
-            samesite="strict",
-            secure=self.access.cookie_name.startswith("__Host-"),
+            self.access.cookie_name, cookie, httponly=True, samesite="strict", secure=self.access.is_cookie_secure
         )
         return answer
 
@@ -161,8 +176,11 @@ class Api:
         if visitor.session is not None:
             require_token(request, visitor.session)
             self.access.sessions.end(request.cookies[self.access.cookie_name])
+            self.access.log.add("logout", user=visitor.name, **address_of(request))
         answer = JSONResponse({})
-        answer.delete_cookie(self.access.cookie_name)
+        answer.delete_cookie(
+            self.access.cookie_name, httponly=True, samesite="strict", secure=self.access.is_cookie_secure
+        )
         return answer
 
     async def act(self, request: Request) -> Response:
@@ -181,6 +199,8 @@ class Api:
             operator_name=visitor.name,
             comment=form.comment,
         )
+        where = f"{name} {'all' if is_all else fan}"
+        self.access.log.add("request", user=visitor.name, action=form.action, fan=where, **address_of(request))
         try:
             answers = await self.desk.ask(name, asked, range(tray.fans) if is_all else [fan])
         except TimeoutError as error:
@@ -195,6 +215,17 @@ class Api:
         if len(refused) == len(answers):
             return JSONResponse({"error": refused[0].message, **body}, 409)
         return JSONResponse(body)
+
+    async def _while_allowed(self, request: Request, events: AsyncIterator[bytes]) -> AsyncGenerator[bytes]:
+        """The events, until the reader may not read any more. A page that is open keeps its session from being idle."""
+        checked_s = time.monotonic()
+        async with aclosing(events):  # type: ignore[type-var]  it is a generator
+            async for event in events:
+                if time.monotonic() - checked_s >= CHECKED_EVERY_S:
+                    checked_s = time.monotonic()
+                    if not self.access.visitor(request).may_read:
+                        return
+                yield event
 
     def _me(self, visitor: Visitor) -> dict[str, Any]:
         return {
@@ -221,6 +252,13 @@ class Api:
         return found
 
 
+async def broken(api: Api, request: Request, error: Exception) -> Response:
+    """The answer to a request at which the gateway itself has failed; why, only the log says."""
+    why = f"{type(error).__name__}: {error}"
+    api.access.log.add("gateway failed", path=request.url.path, why=why, **address_of(request))
+    return JSONResponse({"error": "the gateway has failed; its log says why"}, 500)
+
+
 async def failed(_request: Request, error: Exception) -> Response:
     """The answer to what cannot be done: {"error": why}."""
     assert isinstance(error, HTTPException)
@@ -231,10 +269,14 @@ async def _form(request: Request, kind: type[Form]) -> Form:
     if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
         raise HTTPException(415, "send application/json")
     body = bytearray()
-    async for piece in request.stream():
-        body += piece
-        if len(body) > LARGEST_BODY_BYTES:
-            raise HTTPException(413, f"at most {LARGEST_BODY_BYTES} bytes are accepted")
+    try:
+        async with asyncio.timeout(BODY_WITHIN_S):
+            async for piece in request.stream():
+                body += piece
+                if len(body) > LARGEST_BODY_BYTES:
+                    raise HTTPException(413, f"at most {LARGEST_BODY_BYTES} bytes are accepted")
+    except TimeoutError as error:
+        raise HTTPException(408, "the request takes too long") from error
     try:
         return kind.model_validate_json(bytes(body))
     except ValidationError as error:
@@ -244,9 +286,18 @@ async def _form(request: Request, kind: type[Form]) -> Form:
 
 
 def _number(request: Request, name: str, default: int) -> int:
+    number = _whole(request, name)
+    if number is None:
+        return default
+    if number < 0:
+        raise HTTPException(422, f"{name}: no number below 0, please")
+    return number
+
+
+def _whole(request: Request, name: str) -> int | None:
     text = request.query_params.get(name, "")
     if not text:
-        return default
-    if not (text.isascii() and text.isdigit() and len(text) < 16):
+        return None
+    if not re.fullmatch("-?[0-9]{1,15}", text):
         raise HTTPException(422, f"{name}: a whole number, please")
     return int(text)

@@ -17,7 +17,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from pipeline.gateway.api import Api, failed
+from pipeline.gateway.api import Api, broken, failed
 from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.openapi import description
 
@@ -25,7 +25,7 @@ PAGE = Path(__file__).parent / "page"
 PREFIX = "/api/v1"
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "connect-src 'self'; object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -74,19 +74,19 @@ def application(api: Api, config: GatewayConfig) -> ASGIApp:
         Route("/", page),
     ]
     hosts = list(config.hosts) if config.is_loopback else ["*"]
-    return Starlette(
+    app = Starlette(
         routes=[*routes, Mount("/page", StaticFiles(directory=PAGE))],
         middleware=[
-            Middleware(_WithHeaders, headers=_HEADERS | (_BY_HTTPS_ONLY if config.certificate else {})),
             Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False),
-            Middleware(GZipMiddleware, minimum_size=1000),
+            Middleware(GZipMiddleware, minimum_size=1000, compresslevel=5),
         ],
-        exception_handlers={HTTPException: failed},
+        exception_handlers={HTTPException: failed, Exception: partial(broken, api)},
     )
+    return _WithHeaders(app, _HEADERS | (_BY_HTTPS_ONLY if config.certificate else {}))
 
 
 class _WithHeaders:
-    """Adds headers to every answer."""
+    """Adds headers to every answer, that to a failure too."""
 
     def __init__(self, app: ASGIApp, headers: Mapping[str, str]) -> None:
         self._app = app

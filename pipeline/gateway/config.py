@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import ipaddress
 from pathlib import Path
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from pipeline.devices.host_address import is_of_this_host_only
 from pipeline.runtime.stage import StageConfig
+
+_OWN_HOSTS = ("localhost", "127.0.0.1", "[::1]")
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "argon2")
+"""the modules of the extra `gateway`"""
 
 
 class GatewayConfig(StageConfig):
@@ -35,7 +40,7 @@ class GatewayConfig(StageConfig):
         default=(), description="users of the proxy who may act; all others may only look"
     )
     hosts: tuple[str, ...] = Field(
-        default=("localhost", "127.0.0.1", "[::1]"),
+        default=_OWN_HOSTS,
         description='names under which browsers may ask for the page on loopback; add that of a proxy, "*": any',
     )
 
@@ -43,6 +48,19 @@ class GatewayConfig(StageConfig):
     def is_loopback(self) -> bool:
         """Whether only this host reaches it."""
         return is_of_this_host_only(self.host)
+
+    @property
+    def has_other_hosts(self) -> bool:
+        """Whether browsers ask for the page by another name than that of loopback, so through a proxy."""
+        return not set(self.hosts) <= set(_OWN_HOSTS)
+
+    @field_validator("proxies")
+    @classmethod
+    def _are_addresses(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        try:
+            return tuple(str(ipaddress.ip_address(each.strip("[]"))) for each in value)
+        except ValueError as error:
+            raise ValueError(f"{error}: give the address of the proxy, not its name") from error
 
     @model_validator(mode="after")
     def _check(self) -> GatewayConfig:

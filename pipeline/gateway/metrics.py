@@ -1,28 +1,35 @@
 """Metrics in the text format of Prometheus, made of what is known when they are asked for.
 
 Names follow Prometheus: a prefix, base units, `_total` on counters; revolutions a minute are the accepted exception for
-fans. A fan that is not judged has no score, so that an old one does not go on.
+fans. A fan that is not judged has no score, so that an old one does not go on. What is counted begins with zero, so
+that Prometheus sees the first one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 
-from prometheus_client import CollectorRegistry
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client import CollectorRegistry, ProcessCollector
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.exposition import generate_latest
 from prometheus_client.registry import Collector
 
-from pipeline.launch.site_state import AT_WORK, StageState
+from pipeline.launch.site_state import AT_WORK, StageState, Word
 from pipeline.presenting.site_model import SiteModel
 from schemas.enums import Severity
+from schemas.health import LatencyBucket
 from schemas.units import RAD_S_PER_UNIT
 from scoring.alarms.alarm_flags import is_presented
 
 _PER_RPM = RAD_S_PER_UNIT["rpm"]
-_FAN = ["site", "tray", "fan"]
+_TRAY = ["site", "tray"]
+_FAN = [*_TRAY, "fan"]
 _STAGE = ["site", "stage"]
+_SEVERITIES = (Severity.WARNING, Severity.ALARM)
+_MOST_BUCKETS = 64
 
 
 class SiteMetrics(Collector):
@@ -38,57 +45,76 @@ class SiteMetrics(Collector):
         yield from self._of_fans()
         yield from self._of_alarms()
         yield from self._of_stages(self._model.stages())
-        pages = GaugeMetricFamily("fantwin_gateway_pages", "pages that receive live events", labels=["site"])
+        pages = GaugeMetricFamily("fantwin_gateway_pages", "Pages that receive live events.", labels=["site"])
         pages.add_metric([self._model.site], self._readers)
         yield pages
 
     def _of_fans(self) -> Iterable[Metric]:
-        speed = GaugeMetricFamily("fantwin_fan_speed_rpm", "measured speed", labels=_FAN)
-        predicted = GaugeMetricFamily("fantwin_fan_predicted_speed_rpm", "speed of the healthy twin", labels=_FAN)
-        score = GaugeMetricFamily("fantwin_fan_score_ratio", "score relative to its limit", labels=_FAN)
-        scored = GaugeMetricFamily("fantwin_fan_scored", "1: the newest sample is judged", labels=_FAN)
+        speed = GaugeMetricFamily("fantwin_fan_speed_rpm", "Measured speed.", labels=_FAN)
+        predicted = GaugeMetricFamily("fantwin_fan_predicted_speed_rpm", "Speed of the healthy twin.", labels=_FAN)
+        score = GaugeMetricFamily("fantwin_fan_score_ratio", "Score relative to its limit.", labels=_FAN)
+        scored = GaugeMetricFamily(
+            "fantwin_fan_scored", "1: the newest sample is judged; 0: it is not, or there is none.", labels=_FAN
+        )
+        heard: set[str] = set()
         for sample in self._model.newest_samples():
+            heard.add(sample.tray)
             labels = [self._model.site, sample.tray, str(sample.fan)]
             scored.add_metric(labels, float(sample.is_judged))
-            for family, value in (
-                (speed, sample.measured_rad_s / _PER_RPM),
-                (predicted, sample.predicted_rad_s / _PER_RPM),
-                (score, sample.score),
+            for family, value, digits in (
+                (speed, sample.measured_rad_s / _PER_RPM, 2),
+                (predicted, sample.predicted_rad_s / _PER_RPM, 2),
+                (score, sample.score, 4),
             ):
                 if not math.isnan(value):
-                    family.add_metric(labels, value)
+                    family.add_metric(labels, round(value, digits))
+        for tray in self._model.trays:
+            if tray.name not in heard:
+                for fan in range(tray.fans):
+                    scored.add_metric([self._model.site, tray.name, str(fan)], 0.0)
         return speed, predicted, score, scored
 
     def _of_alarms(self) -> Iterable[Metric]:
-        active = GaugeMetricFamily(
-            "fantwin_fan_alarm_active", "1: an alarm of this severity is active", labels=[*_FAN, "severity"]
+        of_fan = [*_FAN, "severity"]
+        active = GaugeMetricFamily("fantwin_fan_alarm_active", "1: an alarm of this severity is active.", labels=of_fan)
+        unacknowledged = GaugeMetricFamily(
+            "fantwin_fan_alarm_unacknowledged",
+            "1: an alarm of this severity is neither acknowledged nor silenced; it may be over.",
+            labels=of_fan,
         )
         presented = GaugeMetricFamily(
-            "fantwin_alarms_presented", "alarms that need attention: neither silenced nor dealt with", labels=["site"]
+            "fantwin_alarms_presented", "Alarms that need attention: neither silenced nor dealt with.", labels=["site"]
         )
         total = CounterMetricFamily(
-            "fantwin_alarms", "alarms that were raised since the gateway began", labels=[*_FAN, "severity"]
+            "fantwin_alarms", "Alarms that were raised since the gateway began.", labels=[*_TRAY, "severity"]
         )
         alarms = self._model.current_alarms()
         for each in alarms:
             alarm = each.newest
-            for severity in (Severity.WARNING, Severity.ALARM):
+            is_open = is_presented(alarm) and not alarm.acknowledged
+            for severity in _SEVERITIES:
                 labels = [self._model.site, alarm.header.tray, str(alarm.fan), severity.name.lower()]
                 active.add_metric(labels, float(alarm.active and alarm.severity == severity))
-        for (tray, fan, severity), count in self._model.raised().items():
-            total.add_metric([self._model.site, tray, str(fan), severity], count)
+                unacknowledged.add_metric(labels, float(is_open and alarm.severity == severity))
+        raised: Counter[tuple[str, str]] = Counter()
+        for (tray, _, severity), count in self._model.raised().items():
+            raised[tray, severity] += count
+        for tray in self._model.trays:
+            for severity in _SEVERITIES:
+                name = severity.name.lower()
+                total.add_metric([self._model.site, tray.name, name], raised[tray.name, name])
         presented.add_metric([self._model.site], sum(is_presented(each.newest) for each in alarms))
-        return active, presented, total
+        return active, unacknowledged, presented, total
 
     def _of_stages(self, states: Iterable[StageState]) -> Iterable[Metric]:
-        up = GaugeMetricFamily("fantwin_stage_up", "1: the stage is at work", labels=_STAGE)
-        lost = CounterMetricFamily("fantwin_stage_lost", "what the stage has lost since it started", labels=_STAGE)
-        received = CounterMetricFamily("fantwin_stage_received_messages", "messages received", labels=_STAGE)
-        published = CounterMetricFamily("fantwin_stage_published_messages", "messages published", labels=_STAGE)
-        latency = GaugeMetricFamily(
-            "fantwin_stage_latency_seconds",
-            "age of the newest sample of an output when it is sent, over the last 10 s",
-            labels=[*_STAGE, "quantile"],
+        up = GaugeMetricFamily("fantwin_stage_up", "1: the stage is at work.", labels=_STAGE)
+        degraded = GaugeMetricFamily("fantwin_stage_degraded", "1: the stage reports a problem.", labels=_STAGE)
+        uptime = GaugeMetricFamily("fantwin_stage_uptime_seconds", "Time since its process started.", labels=_STAGE)
+        lost = CounterMetricFamily("fantwin_stage_lost", "What the stage has lost since it started.", labels=_STAGE)
+        received = CounterMetricFamily("fantwin_stage_received_messages", "Messages received.", labels=_STAGE)
+        published = CounterMetricFamily("fantwin_stage_published_messages", "Messages published.", labels=_STAGE)
+        latency = HistogramMetricFamily(
+            "fantwin_stage_latency_seconds", "Age of the newest sample of an output when it was sent.", labels=_STAGE
         )
         for state in states:
             labels = [self._model.site, state.label]
@@ -96,16 +122,33 @@ class SiteMetrics(Collector):
             if state.view is None:
                 continue
             health = state.view.health
+            degraded.add_metric(labels, float(state.word == Word.DEGRADED))
+            uptime.add_metric(labels, round(health.uptime_s, 1))
             lost.add_metric(labels, health.lost)
             received.add_metric(labels, sum(each.received for each in health.inputs))
             published.add_metric(labels, sum(each.published for each in health.outputs))
-            latency.add_metric([*labels, "0.5"], health.latency_p50_ms / 1e3)
-            latency.add_metric([*labels, "0.99"], health.latency_p99_ms / 1e3)
-        return up, lost, received, published, latency
+            if _is_histogram(health.latencies):
+                buckets = [(_bound(each.upper_s), float(each.count)) for each in health.latencies]
+                latency.add_metric(labels, buckets, health.latency_sum_s)
+        return up, degraded, uptime, lost, received, published, latency
 
 
 def metrics_text(model: SiteModel, readers: int) -> bytes:
-    """All metrics now."""
+    """All metrics now, with those of the process itself."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(SiteMetrics(model, readers))
+    ProcessCollector(registry=registry)
     return generate_latest(registry)
+
+
+def _is_histogram(buckets: Sequence[LatencyBucket]) -> bool:
+    """Whether these are buckets as a stage sends them: another program may send what it likes."""
+    return (
+        0 < len(buckets) <= _MOST_BUCKETS
+        and buckets[-1].upper_s == math.inf
+        and all(one.upper_s < next_.upper_s and one.count <= next_.count for one, next_ in pairwise(buckets))
+    )
+
+
+def _bound(upper_s: float) -> str:
+    return "+Inf" if upper_s == math.inf else repr(upper_s)

@@ -10,16 +10,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 IDLE_S = 30 * 60.0
-"""a session without a request for so long is over (ASVS 3.3.2)"""
+"""a session without a request, and without a page that is open, for so long is over"""
 LONGEST_S = 12 * 3600.0
-MOST_SESSIONS = 1000
+MOST_SESSIONS, MOST_OF_A_USER = 1000, 20
+"""of more, those that were seen longest ago end"""
 
 
 @dataclass(slots=True)
 class Session:
-    """A user who is logged in; times of a monotonic clock. csrf_token: a page sends it with all that it changes."""
+    """A user who is logged in; times of a monotonic clock.
+
+    Attributes:
+        password_hash: with which he has logged in: with another password, the session is over.
+        csrf_token: a page sends it with all that it changes.
+    """
 
     user: str
+    password_hash: str
     csrf_token: str
     began_s: float
     seen_s: float
@@ -33,10 +40,13 @@ class LoginSessions:
         self._sessions: OrderedDict[str, Session] = OrderedDict()
         """by the hash of the cookie; the ones seen last come last"""
 
-    def begin(self, user: str) -> tuple[str, Session]:
+    def begin(self, user: str, password_hash: str) -> tuple[str, Session]:
         """A new session and its cookie."""
         cookie, now_s = secrets.token_urlsafe(32), self._now_s()
-        session = Session(user, secrets.token_urlsafe(32), now_s, now_s)
+        of_user = [name for name, each in self._sessions.items() if each.user == user]
+        for name in of_user[: len(of_user) + 1 - MOST_OF_A_USER]:
+            del self._sessions[name]
+        session = Session(user, password_hash, secrets.token_urlsafe(32), now_s, now_s)
         self._sessions[_hashed(cookie)] = session
         while len(self._sessions) > MOST_SESSIONS:
             self._sessions.popitem(last=False)

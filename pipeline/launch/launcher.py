@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.bus.errors import NoAnswerError
-from pipeline.bus.session import Bus, credentials_of, join_bus
+from pipeline.bus.opening import credentials_of
+from pipeline.bus.session import Bus, join_bus
 from pipeline.config.models import Config
 from pipeline.config.registry import LEARNER, RECORDER, STAGES
 from pipeline.config.roles import role_names, roles_of

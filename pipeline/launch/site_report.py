@@ -9,7 +9,7 @@ from pipeline.launch.event_log import without_figures
 from pipeline.launch.site_state import OFF_THE_BUS, WHY_SILENT, StageState, Word
 from pipeline.launch.site_watcher import StageView
 from pipeline.launch.stage_notes import note_lines
-from pipeline.runtime.health import LATENCY_WINDOW_S
+from pipeline.runtime.latencies import LATENCY_WINDOW_S
 from schemas.health import Health
 from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm

@@ -42,6 +42,22 @@ class Saved:
     gathered: dict[tuple[str, Basket], Gathered] = field(default_factory=dict)
     """by target"""
 
+    def of_fans(self, fans: Mapping[str, int]) -> Saved:
+        """Without what is about fans that are not there any more. fans: how many each tray has."""
+
+        def is_there(fan: FanName) -> bool:
+            return fan[1] < fans.get(fan[0], 0)
+
+        return Saved(
+            self.is_first,
+            {name: alarm for name, alarm in self.alarms.items() if is_there(name)},
+            {key: announced for key, announced in self.announced.items() if is_there(key[1])},
+            {
+                key: replace(each, fans={name: happened for name, happened in each.fans.items() if is_there(name)})
+                for key, each in self.gathered.items()
+            },
+        )
+
 
 @dataclass(frozen=True)
 class Outgoing:
@@ -124,9 +140,10 @@ class Notifications:
 
     def _look(self, now_ns: int) -> None:
         """Until the first look ends; then what is presented now is what is to be said first."""
-        if self._first_look_ends_ns is None:
-            self._first_look_ends_ns = now_ns + FIRST_LOOK_NS
-        if now_ns < self._first_look_ends_ns:
+        ends_ns = self._first_look_ends_ns
+        if ends_ns is None or ends_ns - now_ns > FIRST_LOOK_NS:  # the clock was set back
+            self._first_look_ends_ns = ends_ns = now_ns + FIRST_LOOK_NS
+        if now_ns < ends_ns:
             return
         self._is_looking = False
         for name in sorted(self._open):

@@ -58,6 +58,8 @@ class Sender:
         self._wake = threading.Event()
         self._failing = ""
         self._delivery_began_s: float | None = None
+        self._taken: Waiting | None = None
+        """the last message that has arrived, until the outbox knows it"""
         self._refused_number = self._refusals = 0
         """of the message that was refused last, how often"""
         self.sent = self.attempts = 0
@@ -101,6 +103,7 @@ class Sender:
 
     def _send_next(self, delay_s: float) -> float:
         """Send all that waits, up to the first failure; returns after how long to try again, 0 if nothing waits."""
+        self._forget_taken()
         while not self._stop.is_set():
             waiting = self._outbox.next_for(self._target)
             if waiting is None:
@@ -125,9 +128,16 @@ class Sender:
         if failure is not None:
             self._outbox.failed(waiting, is_uncertain=failure.is_uncertain)
         else:
-            self._outbox.delivered(self._target, waiting)
             self.sent += 1
+            self._taken = waiting
+            self._forget_taken()
         return failure
+
+    def _forget_taken(self) -> None:
+        """Take what has arrived out of the outbox. Where that fails, as on a full disk, it is not sent again."""
+        if self._taken is not None:
+            self._outbox.delivered(self._target, self._taken)
+            self._taken = None
 
     def _is_refused_alone(self, waiting: Waiting) -> bool:
         """Whether the target refuses this message again and again, and takes the next one, which it then has."""

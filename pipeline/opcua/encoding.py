@@ -30,6 +30,11 @@ def time_of(t_ns: int) -> datetime | None:
     return _EPOCH + timedelta(microseconds=t_ns // 1000) if t_ns else None
 
 
+def micros_of(at: datetime) -> int:
+    """Microseconds since 1970. Without a time zone it is that of the library, UTC."""
+    return (at.replace(tzinfo=at.tzinfo or UTC) - _EPOCH) // timedelta(microseconds=1)
+
+
 def node_id(node: StandardNode | OwnNode, namespace: int) -> ua.NodeId:
     """namespace: index of this server's own nodes."""
     if isinstance(node, StandardNode):

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from datetime import datetime, timedelta
 from typing import Any
 
@@ -12,14 +13,14 @@ from asyncua import ua
 from asyncua.server.history import HistoryStorageInterface
 
 from pipeline.opcua.conditions import past_condition
-from pipeline.opcua.encoding import time_of
+from pipeline.opcua.encoding import micros_of, time_of
 from pipeline.opcua.events import SiteEvent, condition_event
 from pipeline.opcua.identifiers import fan_of
 from pipeline.presenting.site_model import SiteModel
 from schemas.enums import Transition
 from schemas.messages import Alarm
 
-_PAGE = 1000
+FIRST_NS, LAST_NS = -(1 << 63), (1 << 63) - 1
 MOST_EVENTS = 10_000
 """of one call; the client goes on from where it ended"""
 
@@ -41,28 +42,26 @@ class AlarmHistory(HistoryStorageInterface):
         since, until = (None if each in unset else each for each in (start, end))
         is_backwards = since is None or (until is not None and until < since)
         low, high = (until, since) if is_backwards and since is not None else (since, until)
-        found = await asyncio.to_thread(self._transitions, source_id, low, high)
-        if is_backwards:
-            found.reverse()
         most = min(nb_values or MOST_EVENTS, MOST_EVENTS)
+        stretch = (
+            FIRST_NS if low is None else max(FIRST_NS, min(LAST_NS, micros_of(low) * 1000)),
+            LAST_NS if high is None else max(FIRST_NS, min(LAST_NS, (micros_of(high) + 1) * 1000)),
+        )
+        found = await asyncio.to_thread(self._transitions, source_id, stretch, most + 1, is_backwards)
         rest = time_of(found[most].t_ns) if len(found) > most and not nb_values else None
-        return [self._event(alarm) for alarm in found[:most]], rest
+        return [self._event(alarm) for alarm in found[:most] if alarm.transition != Transition.REFUSED], rest
 
     def _event(self, alarm: Alarm) -> SiteEvent:
         return condition_event(past_condition(alarm), self._namespace)
 
-    def _transitions(self, source: ua.NodeId, low: datetime | None, high: datetime | None) -> list[Alarm]:
-        """Oldest first."""
+    def _transitions(
+        self, source: ua.NodeId, stretch: tuple[int, int], most: int, is_backwards: bool
+    ) -> Sequence[Alarm]:
         tray, number = "", -1
         if source.NamespaceIndex == self._namespace and isinstance(source.Identifier, str):
             fan = fan_of(source.Identifier)
             tray, number = fan[0] if fan else (source.Identifier, -1)
-        found: list[Alarm] = []
-        before = 0
-        while page := self._model.past_alarms(_PAGE, tray=tray, fan=number, before=before):
-            before = page[-1][0]
-            found += [alarm for _, alarm in page if _is_within(alarm, low, high)]
-        return sorted(found, key=lambda alarm: alarm.t_ns)
+        return self._model.alarms_between(*stretch, most, tray=tray, fan=number, is_backwards=is_backwards)
 
     async def init(self) -> None:
         """Nothing to do."""
@@ -89,12 +88,3 @@ class AlarmHistory(HistoryStorageInterface):
 
     async def save_event(self, event: Any) -> None:
         """The stage keeps them."""
-
-
-def _is_within(alarm: Alarm, low: datetime | None, high: datetime | None) -> bool:
-    if alarm.transition == Transition.REFUSED:
-        return False
-    at = time_of(alarm.t_ns)
-    if at is None:
-        return low is None
-    return (low is None or low <= at) and (high is None or at <= high)

@@ -16,9 +16,10 @@ from asyncua.crypto.permission_rules import User as LibraryUser
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
+from pipeline.presenting.event_log import EventLog
 from pipeline.presenting.login_failures import LoginFailures
+from pipeline.presenting.users import User, Users
 from pipeline.presenting.users import UserRole as SiteRole
-from pipeline.presenting.users import Users
 
 
 @dataclass
@@ -26,6 +27,8 @@ class SessionUser(LibraryUser):
     """may_act: whether he is an operator. name: empty for whoever is not logged in."""
 
     may_act: bool = False
+    password_hash: str = ""
+    """with which he has logged in"""
 
 
 class Permissions(PermissionRuleset):
@@ -38,7 +41,7 @@ class Permissions(PermissionRuleset):
 
     def check_validity(self, user: Any, action_type: ua.NodeId, body: Any) -> bool:
         """Whether a service is open to a user, who may have been removed since he logged in."""
-        return action_type in self._open and self._log_in.may_read(str(getattr(user, "name", "") or ""))
+        return action_type in self._open and self._log_in.may_read(user)
 
 
 class TrustedClients:
@@ -72,20 +75,28 @@ class LogIn:
         self._users = users
         self._is_open = is_open
         self._failures = LoginFailures()
+        self._log = EventLog()
 
     @property
     def problem(self) -> str:
         """What is wrong with the file of users; empty if nothing is."""
         return self._users.problem if self._users else ""
 
-    def is_operator(self, name: str) -> bool:
-        """Whether he is one now: the file may have changed since he logged in."""
-        user = self._users.of(name) if self._users and name else None
-        return user is not None and user.role == SiteRole.OPERATOR
+    def is_operator(self, who: object) -> bool:
+        """Whether he is one now: the file may have changed since he logged in. who: the user of a session."""
+        found = self._still(who)
+        return found is not None and found.role == SiteRole.OPERATOR
 
-    def may_read(self, name: str) -> bool:
-        """Whether he may still read. name: empty for whoever is not logged in."""
-        return self._is_open or (self._users is not None and self._users.of(name) is not None)
+    def may_read(self, who: object) -> bool:
+        """Whether he may still read; for whoever is not logged in: whether anybody may."""
+        return self._is_open or self._still(who) is not None
+
+    def _still(self, who: object) -> User | None:
+        """The user with whose password somebody has logged in; None: there is none, or he has another one now."""
+        if self._users is None or not isinstance(who, SessionUser) or not who.name:
+            return None
+        found = self._users.of(who.name)
+        return found if found is not None and found.password_hash == who.password_hash else None
 
     def user(self, name: str | None, password: str | None, address: str) -> SessionUser | None:
         """Who logs in; None: nobody does.
@@ -97,12 +108,13 @@ class LogIn:
             return SessionUser(UserRole.User, "") if self._is_open else None
         if self._users is None:
             return None
-        counted = (f"name {name}", f"address {address}")
-        if self._failures.wait_s(*counted):
+        if self._failures.begin(name, address):
+            self._log.add("login refused: too many wrong passwords", by="OPC UA", user=name, address=address)
             raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
         user = self._users.verified(name, password or "")
         if user is None:
-            self._failures.add(*counted)
+            self._log.add("login refused: wrong name or password", by="OPC UA", user=name, address=address)
             return None
-        self._failures.forget(*counted)
-        return SessionUser(UserRole.User, user.name, user.role == SiteRole.OPERATOR)
+        self._failures.succeed(name, address)
+        self._log.add("login", by="OPC UA", user=user.name, role=str(user.role), address=address)
+        return SessionUser(UserRole.User, user.name, user.role == SiteRole.OPERATOR, user.password_hash)

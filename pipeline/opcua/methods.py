@@ -32,7 +32,7 @@ from pipeline.opcua.sessions import CURRENT_SESSION
 from pipeline.opcua.site_nodes import SiteNodes
 from pipeline.opcua.templates import method_nodes
 from pipeline.presenting.request_desk import RequestDesk
-from pipeline.presenting.request_form import LONGEST_COMMENT, LONGEST_SHELVING_S
+from pipeline.presenting.request_form import LONGEST_COMMENT, LONGEST_SHELVING_S, one_line
 from pipeline.presenting.site_model import SiteModel
 from pipeline.viewing.fleet import Fan
 from schemas.enums import Action
@@ -151,7 +151,7 @@ def _refusal(method: ConditionMethod, arguments: tuple[ua.Variant, ...]) -> str:
 
 
 def _text(comment: ua.LocalizedText | None) -> str:
-    return (comment.Text or "") if comment is not None else ""
+    return one_line(comment.Text or "") if comment is not None else ""
 
 
 def _shelving_refusal(shelving_ms: Any) -> str:

@@ -43,7 +43,7 @@ DATA_QUEUE, EVENT_QUEUE = 5, 10_000
 """values of a variable, and events, that wait for a client"""
 MOST_UNACKNOWLEDGED = 10
 """messages that are kept for a client that wants them again"""
-LONGEST_SESSION_MS = 120_000.0
+LONGEST_SESSION_MS = 600_000.0
 """without a request; then it is over, with its subscriptions"""
 _METHODS_AT_ONCE = 32
 
@@ -141,8 +141,7 @@ class SiteSession(InternalSession):
     @property
     def operator_name(self) -> str:
         """Of the user if he is an operator; empty: he may not act."""
-        name = str(getattr(self.user, "name", "") or "")
-        return name if self.iserver.log_in.is_operator(name) else ""
+        return str(self.user.name) if self.iserver.log_in.is_operator(self.user) else ""
 
     def activate_session(
         self, params: ua.ActivateSessionParameters, peer_certificate: bytes | None

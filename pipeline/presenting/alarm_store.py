@@ -1,13 +1,16 @@
 """The history of alarms: each transition that was heard, in a file that survives a restart of the gateway.
 
-The bus keeps the last transitions too, and a gateway that starts asks for them: each is kept once.
+The bus keeps the last transitions too, and a gateway that starts asks for them: each is kept once. Those of before its
+first start may be in recordings: they get numbers below 0, so that the order by number is that of time.
 """
 
 from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from pipeline.errors import UserError
 from schemas.codec import CodecError, decode, encode
@@ -16,6 +19,8 @@ from schemas.messages import Alarm
 MOST_TRANSITIONS = 200_000
 """those that are older are deleted"""
 _DELETED_EVERY = 1000
+MOST_UNSAVED = 10_000
+"""that wait for room on the disk; of more, the oldest are not kept"""
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS transition (
@@ -29,7 +34,9 @@ CREATE TABLE IF NOT EXISTS transition (
     UNIQUE (producer, tray, sequence)
 );
 CREATE INDEX IF NOT EXISTS of_fan ON transition (tray, fan, number);
+CREATE INDEX IF NOT EXISTS of_time ON transition (t_ns, number);
 CREATE TABLE IF NOT EXISTS reader (name TEXT PRIMARY KEY, number INTEGER NOT NULL);
+CREATE TABLE IF NOT EXISTS beginning (t_ns INTEGER NOT NULL);
 """
 
 
@@ -44,8 +51,11 @@ class AlarmStore:
         """
         self._path = path
         self._added = 0
-        self.problem = ""
-        """why the last transition could not be kept; empty if it was"""
+        self._unsaved: dict[tuple[str, str, int], tuple[Any, ...]] = {}
+        """the rows for which there was no room, oldest first, by what each is known by"""
+        self.lost = 0
+        """transitions that were heard and are not kept"""
+        self._why_unsaved = self._why_unread = ""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
@@ -53,67 +63,192 @@ class AlarmStore:
         except (OSError, sqlite3.Error) as error:
             raise UserError(f"{path}: the history of alarms cannot be kept there: {error}") from error
 
+    @property
+    def problem(self) -> str:
+        """Why the file cannot be written or read; empty if it can."""
+        return "; ".join(filter(None, (self._why_unsaved, self._why_unread)))
+
     def add(self, alarm: Alarm) -> bool:
-        """Keep a transition; returns whether it is new. A full disk is a problem and no loss of what was kept."""
+        """Keep a transition; returns whether it is new. What a full disk has no room for is kept later."""
+        name = (alarm.header.producer, alarm.header.tray, alarm.header.sequence)
+        if name in self._unsaved:
+            return False
         row = (alarm.header.tray, alarm.fan, alarm.t_ns, alarm.header.producer, alarm.header.sequence, encode(alarm))
         try:
-            done = self._file.execute(
-                "INSERT OR IGNORE INTO transition (tray, fan, t_ns, producer, sequence, alarm)"
-                " VALUES (?, ?, ?, ?, ?, ?)",
-                row,
-            )
-            self._added += done.rowcount
-            if self._added >= _DELETED_EVERY:
-                self._added = 0
-                self._file.execute(
-                    "DELETE FROM transition WHERE number <= (SELECT MAX(number) FROM transition) - ?",
-                    (MOST_TRANSITIONS,),
-                )
+            self._save_waiting()
+            is_new = self._insert(row)
         except sqlite3.Error as error:
-            self.problem = f"{self._path}: {error}: this alarm is not kept in the history"
+            self._unsaved[name] = row
+            if len(self._unsaved) > MOST_UNSAVED:
+                self.lost += 1
+                del self._unsaved[next(iter(self._unsaved))]
+            self._why_unsaved = f"{self._path}: {error}: alarms are not kept in the history until there is room"
             return True
-        self.problem = ""
+        self._why_unsaved = ""
+        return is_new
+
+    def save_again(self) -> bool:
+        """Keep what waits, if there is room now; returns whether anything was kept."""
+        before = len(self._unsaved)
+        try:
+            self._save_waiting()
+        except sqlite3.Error:
+            return len(self._unsaved) < before
+        self._why_unsaved = self._why_unsaved if self._unsaved else ""
+        return before > 0
+
+    def _save_waiting(self) -> None:
+        while self._unsaved:
+            name = next(iter(self._unsaved))
+            self._insert(self._unsaved[name])
+            del self._unsaved[name]
+
+    def _insert(self, row: tuple[Any, ...]) -> bool:
+        done = self._file.execute(
+            "INSERT OR IGNORE INTO transition (tray, fan, t_ns, producer, sequence, alarm) VALUES (?, ?, ?, ?, ?, ?)",
+            row,
+        )
+        self._added += done.rowcount
+        if self._added >= _DELETED_EVERY:
+            self._added = 0
+            deleted = self._file.execute(
+                "DELETE FROM transition WHERE number <= (SELECT MAX(number) FROM transition) - ?", (MOST_TRANSITIONS,)
+            )
+            if deleted.rowcount > 0:
+                self._file.execute("UPDATE beginning SET t_ns = (SELECT MIN(t_ns) FROM transition)")
         return done.rowcount > 0
 
-    def newest(self, most: int, *, tray: str = "", fan: int = -1, before: int = 0) -> Sequence[tuple[int, Alarm]]:
+    def add_earlier(self, alarms: Sequence[Alarm]) -> int:
+        """Keep transitions of before all others, the last first, as far as there is room; returns how many had room.
+
+        Raises:
+            UserError: they cannot be kept.
+        """
+        try:
+            first, last = self._file.execute("SELECT MIN(number), MAX(number) FROM transition").fetchone()
+            number = min(first or 0, 0)
+            lowest = max(last or 0, 0) - MOST_TRANSITIONS + 1
+            room = alarms[: max(0, number - lowest)]
+            self._file.execute("BEGIN")
+            for alarm in room:
+                number -= 1
+                header = alarm.header
+                row = (number, header.tray, alarm.fan, alarm.t_ns, header.producer, header.sequence, encode(alarm))
+                self._file.execute("INSERT OR IGNORE INTO transition VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+            self._file.execute("COMMIT")
+        except sqlite3.Error as error:
+            raise UserError(f"{self._path}: {error}: alarms of recordings are not in the history") from error
+        return len(room)
+
+    def begins(self, t_ns: int) -> None:
+        """The history is complete from this time on, or from an earlier one that was given before. `problem` says it if
+        that cannot be kept."""
+        try:
+            kept = self.begins_t_ns()
+            if kept is None:
+                (first_t_ns,) = self._file.execute("SELECT MIN(t_ns) FROM transition").fetchone()
+                self._file.execute("INSERT INTO beginning VALUES (?)", (min(t_ns, first_t_ns or t_ns),))
+            elif t_ns < kept:
+                self._file.execute("UPDATE beginning SET t_ns = ?", (t_ns,))
+        except sqlite3.Error as error:
+            self._why_unsaved = f"{self._path}: {error}: how far back the history reaches is not kept"
+        except UserError:
+            return
+
+    def begins_t_ns(self) -> int | None:
+        """From when on the history is complete; None: nobody has said it.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        rows = self._read("SELECT t_ns FROM beginning")
+        return rows[0][0] if rows else None
+
+    def newest(
+        self, most: int, *, tray: str = "", fan: int = -1, before: int | None = None
+    ) -> Sequence[tuple[int, Alarm]]:
         """The last transitions, newest first, each with its number, by which the next page is asked for.
 
-        tray, fan: of these only. before: only those with a lower number; 0: all.
+        tray, fan: of these only. before: only those with a lower number; None: all.
+
+        Raises:
+            UserError: the file cannot be read.
         """
-        rows = self._file.execute(
+        rows = self._read(
             "SELECT number, alarm FROM transition WHERE (?1 = '' OR tray = ?1) AND (?2 < 0 OR fan = ?2)"
-            " AND (?3 = 0 OR number < ?3) ORDER BY number DESC LIMIT ?4",
+            " AND (?3 IS NULL OR number < ?3) ORDER BY number DESC LIMIT ?4",
             (tray, fan, before, most),
         )
         return [(number, alarm) for number, data in rows if (alarm := _decoded(data)) is not None]
 
+    def between(
+        self, begin_ns: int, end_ns: int, most: int, *, tray: str = "", fan: int = -1, is_backwards: bool = False
+    ) -> Sequence[Alarm]:
+        """The first transitions of a stretch of time, its end left out; is_backwards: the last ones, newest first.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        order = "DESC" if is_backwards else "ASC"
+        rows = self._read(
+            "SELECT alarm FROM transition WHERE t_ns >= ?1 AND t_ns < ?2 AND (?3 = '' OR tray = ?3)"
+            f" AND (?4 < 0 OR fan = ?4) ORDER BY t_ns {order}, number {order} LIMIT ?5",
+            (begin_ns, end_ns, tray, fan, most),
+        )
+        return [alarm for (data,) in rows if (alarm := _decoded(data)) is not None]
+
     def after(self, number: int, most: int) -> Sequence[tuple[int, Alarm]]:
-        """The transitions that came after one, oldest first, each with its number."""
-        rows = self._file.execute(
+        """The transitions that came after one, oldest first, each with its number.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        rows = self._read(
             "SELECT number, alarm FROM transition WHERE number > ? ORDER BY number LIMIT ?", (number, most)
         )
         return [(number, alarm) for number, data in rows if (alarm := _decoded(data)) is not None]
 
     def newest_number(self) -> int:
-        """The number of the last transition; 0: there is none."""
-        (number,) = self._file.execute("SELECT MAX(number) FROM transition").fetchone()
+        """The number of the last transition; 0: there is none.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        ((number,),) = self._read("SELECT MAX(number) FROM transition")
         return number or 0
 
     def position(self, reader: str) -> int:
-        """The number of the transition up to which a reader has come; 0: it has not begun."""
-        row = self._file.execute("SELECT number FROM reader WHERE name = ?", (reader,)).fetchone()
-        return row[0] if row else 0
+        """The number of the transition up to which a reader has come; 0: it has not begun.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        rows = self._read("SELECT number FROM reader WHERE name = ?", (reader,))
+        return rows[0][0] if rows else 0
 
     def set_position(self, reader: str, number: int) -> None:
         """A reader has come up to a transition."""
         try:
             self._file.execute("INSERT OR REPLACE INTO reader (name, number) VALUES (?, ?)", (reader, number))
         except sqlite3.Error as error:
-            self.problem = f"{self._path}: {error}: after a restart, transitions will be sent twice"
+            self._why_unsaved = f"{self._path}: {error}: after a restart, transitions will be sent twice"
 
     def close(self) -> None:
         """Leave a complete file."""
+        with suppress(sqlite3.Error):
+            self._save_waiting()
         self._file.close()
+
+    def _read(self, query: str, values: tuple[object, ...] = ()) -> list[Any]:
+        try:
+            rows = self._file.execute(query, values).fetchall()
+        except sqlite3.Error as error:
+            self._why_unread = (
+                f"{self._path}: the history of alarms cannot be read: {error}: move it away, and restart the stage"
+            )
+            raise UserError(self._why_unread) from error
+        self._why_unread = ""
+        return rows
 
 
 def _decoded(data: bytes) -> Alarm | None:

@@ -6,7 +6,7 @@ import asyncio
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 
@@ -28,8 +28,9 @@ class _UnderWay:
 class RequestDesk:
     """Thread-safe. The stage takes what is to be sent and adds the answers; pages wait for them."""
 
-    def __init__(self, producer: str) -> None:
-        """producer: of this process, by which answers name the request."""
+    def __init__(self, producer: str, now_s: Callable[[], float] = time.monotonic) -> None:
+        """producer: of this process, by which answers name the request. now_s: a clock that is never set."""
+        self._now_s = now_s
         self._producer = producer
         self._lock = threading.Lock()
         self._waiting: list[tuple[Request, _UnderWay]] = []
@@ -53,7 +54,7 @@ class RequestDesk:
         Raises:
             TimeoutError: too many requests are under way.
         """
-        under_way = _UnderWay(frozenset(fans), time.monotonic())
+        under_way = _UnderWay(frozenset(fans), self._now_s())
         with self._lock:
             if len(self._under_way) + len(self._waiting) >= MOST_UNDER_WAY:
                 raise TimeoutError(f"{MOST_UNDER_WAY} requests are waiting for their scorers")
@@ -62,7 +63,7 @@ class RequestDesk:
 
     def take(self) -> list[Request]:
         """The requests to be sent now."""
-        now_s = time.monotonic()
+        now_s = self._now_s()
         with self._lock:
             for name, each in list(self._under_way.items()):
                 if each.done.done() or now_s - each.sent_s > ANSWERED_WITHIN_S:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from schemas.enums import Action
 
@@ -23,6 +24,16 @@ OperatorAction = Literal[
     "in_service",
     "commission",
 ]
+_NOT_SHOWN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+"""characters that end a line, move the cursor of a terminal, or turn the direction of what follows"""
+
+
+def one_line(text: str) -> str:
+    """A text in which each character is one that is seen, or a space: it is shown on pages, terminals and in mails."""
+    return _NOT_SHOWN.sub(" ", text)
+
+
+Line = Annotated[str, AfterValidator(one_line)]
 
 
 class RequestForm(BaseModel):
@@ -38,7 +49,7 @@ class RequestForm(BaseModel):
 
     action: OperatorAction
     duration_s: Annotated[float, Field(ge=0, le=LONGEST_SHELVING_S, allow_inf_nan=False)] = 0.0
-    comment: Annotated[str, Field(max_length=LONGEST_COMMENT)] = ""
+    comment: Annotated[Line, Field(max_length=LONGEST_COMMENT)] = ""
 
     @property
     def message_action(self) -> Action:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,18 +19,25 @@ from schemas.twin_card import CardError, TwinCard
 from schemas.units import RAD_S_PER_UNIT
 from scoring.alarms.alarm_flags import is_listed
 from scoring.alarms.current_alarms import CurrentAlarm, words_of
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES
+from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, WHAT_TO_DO, short_name
 
 LEVELS, NO_LEVEL = 250, 255
 """a score of 1, at the limit, is level 100; what is not judged has none"""
-_ADVICE = ("move the command", "check ")
 _SPEEDS = 3
 """the first curves are speeds"""
 
 
-def site_json(model: SiteModel) -> dict[str, Any]:
+def site_json(model: SiteModel, viewer_urls: Mapping[str, str]) -> dict[str, Any]:
     """What does not change while the gateway runs: the trays in the order of the cells, and what their classes mean."""
-    trays = [{"name": tray.name, "fans": tray.fans, "speed_unit": tray.speed_unit} for tray in model.trays]
+    trays = [
+        {
+            "name": tray.name,
+            "fans": tray.fans,
+            "speed_unit": tray.speed_unit,
+            "viewer_url": viewer_urls.get(tray.name, ""),
+        }
+        for tray in model.trays
+    ]
     return {"site": model.site, "trays": trays, "classes": class_names(), "level_at_limit": 100}
 
 
@@ -65,7 +72,30 @@ def fan_in_full(model: SiteModel, fan: Fan) -> dict[str, Any]:
         "newest_t_ns": model.newest_t_ns(fan.tray),
         "alarm": alarm_json(alarm) if alarm else None,
         "twin": twin_json(twin, fan.number) if twin else None,
+        "wear": [_wear_json(row) for row in model.wear(fan)],
     }
+
+
+def _wear_json(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Change and limit are shares of the healthy value where the unit is `relative`, else commands."""
+    shown = (
+        "parameter",
+        "unit",
+        "command_unit",
+        "change",
+        "per_day",
+        "days",
+        "limit",
+        "reached_t_ns",
+        "unknown_reason",
+    )
+    return _without_nan({**{name: row[name] for name in shown}, "error": row["change_std_error"], "t_ns": row["t_ns"]})
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(each) for key, each in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def twin_json(card: ModelCard, fan: int) -> dict[str, Any]:
@@ -99,6 +129,13 @@ def alarm_json(current: CurrentAlarm) -> dict[str, Any]:
         "states": current.states(),
         "cause": CAUSES.get(first.cause, first.cause) if first else "",
         "probability": first.probability if first and first.cause != CANNOT_TELL else None,
+        "evidence": first.evidence if first else "",
+        "advice": WHAT_TO_DO.get(first.cause, "") if first else "",
+        "other_causes": [
+            {"cause": short_name(each.cause), "probability": each.probability}
+            for each in current.causes[1:]
+            if each.probability >= MIN_PROBABILITY
+        ],
     }
 
 
@@ -137,6 +174,7 @@ def _stage_json(state: StageState) -> dict[str, Any]:
         "latency_p50_ms": round(health.latency_p50_ms, 1) if health else 0.0,
         "latency_p99_ms": round(health.latency_p99_ms, 1) if health else 0.0,
         "uptime_s": round(health.uptime_s) if health else 0,
+        "notes": [f"{note.tray}: {note.text}" if note.tray else note.text for note in health.notes] if health else [],
     }
 
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +27,10 @@ from schemas.codec import CodecError, decode_columns, encode
 from schemas.enums import StageStatus, Transition
 from schemas.envelope import Envelope
 from schemas.health import Health
-from schemas.messages import Alarm, Array, ModelCard, Score
+from schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST
+from scoring.wear.recorded_wear import wear_in, wear_rows
 
 SILENT_AFTER_S = 5.0
 """a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus"""
@@ -80,8 +82,18 @@ class _Heard:
 class SiteModel:
     """Thread-safe."""
 
-    def __init__(self, site: str, trays: Sequence[TrayConfig], store: AlarmStore, *, keeps_curves: bool = True) -> None:
-        """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 72 MB."""
+    def __init__(
+        self,
+        site: str,
+        trays: Sequence[TrayConfig],
+        store: AlarmStore,
+        *,
+        keeps_curves: bool = True,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 72 MB. now_s: a clock
+        that is never set."""
+        self._now_s = now_s
         self.site = site
         self.trays = tuple(trays)
         self._by_name = {tray.name: tray for tray in trays}
@@ -98,6 +110,8 @@ class SiteModel:
         self._store = store
         self._stages: dict[tuple[str, str], _Heard] = {}
         self._twins: dict[str, ModelCard] = {}
+        self._wear: dict[str, tuple[int, Sequence[Mapping[str, Any]]]] = {}
+        """by tray: the time of the snapshot, and its rows"""
         self.refused_scores = 0
         """with another number of fans than the configuration says, or not to be decoded"""
 
@@ -113,7 +127,7 @@ class SiteModel:
             self.refused_scores += score.fans != tray.fans
             return None
         with self._lock:
-            self._heard_s[tray.name] = time.monotonic()
+            self._heard_s[tray.name] = self._now_s()
             self._newest[tray.name] = last_sample(score, COLUMNS)
             self._fleet.update(score)
             if self._history is not None:
@@ -136,7 +150,7 @@ class SiteModel:
         with self._lock:
             before = self._stages.get(name)
             previous = before.health if before and before.health.header.producer == health.header.producer else None
-            self._stages[name] = _Heard(health, previous, time.monotonic())
+            self._stages[name] = _Heard(health, previous, self._now_s())
 
     def add_twin(self, card: ModelCard) -> None:
         """A tray has another twin."""
@@ -145,7 +159,7 @@ class SiteModel:
 
     def notice_silence(self) -> None:
         """Trays that have sent no score for long are silent."""
-        before_s = time.monotonic() - SILENT_AFTER_S
+        before_s = self._now_s() - SILENT_AFTER_S
         with self._lock:
             for tray, heard_s in self._heard_s.items():
                 if heard_s < before_s:
@@ -189,7 +203,7 @@ class SiteModel:
 
     def newest_samples(self) -> list[NewestSample]:
         """Of every fan whose tray is heard now."""
-        after_s = time.monotonic() - SILENT_AFTER_S
+        after_s = self._now_s() - SILENT_AFTER_S
         with self._lock:
             heard = [(tray, score) for tray, score in self._newest.items() if self._heard_s[tray] >= after_s]
         found: list[NewestSample] = []
@@ -202,7 +216,7 @@ class SiteModel:
 
     def trays_now(self) -> list[TrayNow]:
         """The newest sample of each tray that was ever heard."""
-        after_s = time.monotonic() - SILENT_AFTER_S
+        after_s = self._now_s() - SILENT_AFTER_S
         with self._lock:
             newest = [(tray, score, self._heard_s[tray] >= after_s) for tray, score in self._newest.items()]
         return [
@@ -232,10 +246,59 @@ class SiteModel:
         with self._lock:
             return self._alarms.of(fan.tray, fan.number)
 
-    def past_alarms(self, most: int, *, tray: str = "", fan: int = -1, before: int = 0) -> Sequence[tuple[int, Alarm]]:
+    def past_alarms(
+        self, most: int, *, tray: str = "", fan: int = -1, before: int | None = None
+    ) -> Sequence[tuple[int, Alarm]]:
         """The last transitions: `AlarmStore.newest`."""
         with self._lock:
             return self._store.newest(most, tray=tray, fan=fan, before=before)
+
+    def alarms_between(
+        self, begin_ns: int, end_ns: int, most: int, *, tray: str = "", fan: int = -1, is_backwards: bool = False
+    ) -> Sequence[Alarm]:
+        """The transitions of a stretch of time: `AlarmStore.between`."""
+        with self._lock:
+            return self._store.between(begin_ns, end_ns, most, tray=tray, fan=fan, is_backwards=is_backwards)
+
+    def history_begins_t_ns(self) -> int | None:
+        """How far back the history of alarms reaches; None: nobody has said it."""
+        with self._lock:
+            return self._store.begins_t_ns()
+
+    def add_earlier_alarms(self, alarms: Sequence[Alarm]) -> int:
+        """Transitions of before all others: `AlarmStore.add_earlier`."""
+        with self._lock:
+            return self._store.add_earlier(alarms)
+
+    def has_read(self, reader: str) -> bool:
+        """Whether a reader of earlier alarms has finished, in this process or one before."""
+        with self._lock:
+            return self._store.position(reader) != 0
+
+    def finish_reading(self, reader: str, begins_t_ns: int | None) -> None:
+        """A reader of earlier alarms has finished. begins_t_ns: from when on they are complete; None: it is unknown."""
+        with self._lock:
+            self._store.set_position(reader, 1)
+            if begins_t_ns is not None:
+                self._store.begins(begins_t_ns)
+
+    def add_snapshot(self, snapshot: ScorerSnapshot) -> None:
+        """A scorer has sent its state, of which the wear is kept."""
+        tray = snapshot.header.tray
+        with self._lock:
+            kept = self._wear.get(tray)
+            if kept is not None and kept[0] > snapshot.t_ns:
+                return
+        wear = wear_in(snapshot)
+        if wear is not None and len(wear["fans"]) == self._by_name[tray].fans:
+            with self._lock:
+                self._wear[tray] = (snapshot.t_ns, wear_rows(tray, snapshot.t_ns, wear))
+
+    def wear(self, fan: Fan) -> Sequence[Mapping[str, Any]]:
+        """The wear of a fan, a row for each parameter, as of the last snapshot of its scorer; empty: none is known."""
+        with self._lock:
+            _, rows = self._wear.get(fan.tray, (0, ()))
+        return [row for row in rows if row["fan"] == fan.number]
 
     def twin(self, tray: str) -> ModelCard | None:
         """The twin in force; None: it has not been heard."""
@@ -243,7 +306,7 @@ class SiteModel:
 
     def stages(self) -> list[StageState]:
         """The stages that have been heard. One that is silent for long may have left the bus."""
-        now_s = time.monotonic()
+        now_s = self._now_s()
         with self._lock:
             views = [
                 StageView(each.health, each.previous, each.health.status != StageStatus.STOPPED, now_s - each.heard_s)

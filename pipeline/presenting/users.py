@@ -72,14 +72,18 @@ class Users:
 
     def verified(self, name: str, password: str) -> User | None:
         """The user with this name and password; None: there is none. It takes as long for a name that is not there."""
+        user = self.of(name)
+        return user if self.is_password(user, password) else None
+
+    def is_password(self, user: User | None, password: str) -> bool:
+        """Whether it is that of a user; for nobody it takes as long. In any thread."""
         from argon2.exceptions import Argon2Error, InvalidHashError  # noqa: PLC0415  an extra
 
-        user = self.of(name)
         try:
             self._hasher.verify(user.password_hash if user else self._nobody_hash, password[:LONGEST_PASSWORD])
         except (Argon2Error, InvalidHashError):
-            return None
-        return user
+            return False
+        return user is not None
 
     def _read(self) -> None:
         try:

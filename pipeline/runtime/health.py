@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import os
-import time
-from collections import deque
 from collections.abc import Iterable, Mapping
 
-import numpy as np
-
+from pipeline.runtime.latencies import Latencies
 from schemas.enums import StageStatus
 from schemas.health import AcceptedSamples, AwaitedInput, Counter, Health, Input, Note, Output
 from schemas.streams import stage_losses
 from schemas.units import NS_PER_S
 
-_MAX_LATENCIES = 2000
-LATENCY_WINDOW_S = 10.0
-"""latencies are those of the outputs of this long"""
 AWAITED_AFTER_NS = 2 * NS_PER_S
 """a stage waits for a main input when it has had nothing of it to process for this long"""
 
@@ -42,8 +36,7 @@ class HealthBuilder:
         self._trays = ",".join(trays)
         self.summary = "starting"
         """the status of the last health in one line"""
-        self._latencies_ms: deque[tuple[float, float]] = deque(maxlen=_MAX_LATENCIES)
-        """with the time at which each was measured, of a monotonic clock in s"""
+        self._latencies = Latencies()
         self._main_input_t_ns = dict.fromkeys(main_keys, started_t_ns)
         """by key: when its last message was processed, which a stage that is behind has had for a while"""
         self._newest_input_t_ns = self._newest_output_t_ns = 0
@@ -59,11 +52,11 @@ class HealthBuilder:
         `now_ns`, if the time is known."""
         self._newest_output_t_ns = sent_t_ns
         if t_ns and now_ns is not None:
-            self._latencies_ms.append((time.monotonic(), (now_ns - t_ns) / 1e6))
+            self._latencies.add((now_ns - t_ns) / NS_PER_S)
 
     def has_caught_up(self) -> None:
         """What was sent until now was made of messages from before the start: its age is no latency."""
-        self._latencies_ms.clear()
+        self._latencies.clear()
 
     def build(
         self,
@@ -81,9 +74,7 @@ class HealthBuilder:
         problem = "; ".join(filter(None, problems))
         if problem and status == StageStatus.OK:
             status = StageStatus.DEGRADED
-        since_s = time.monotonic() - LATENCY_WINDOW_S
-        latencies_ms = [latency_ms for at_s, latency_ms in self._latencies_ms if at_s >= since_s]
-        p50, p99 = np.percentile(latencies_ms, (50, 99)) if latencies_ms else (0.0, 0.0)
+        p50_ms, p99_ms = self._latencies.percentiles_ms()
         self.summary = f"{status.words}: {problem}" if problem else status.words
         return Health(
             stage=self._stage,
@@ -95,8 +86,10 @@ class HealthBuilder:
             inputs=inputs,
             outputs=tuple(outputs),
             counters=tuple(Counter(name=name, value=value) for name, value in sorted(counters.items())),
-            latency_p50_ms=float(p50),
-            latency_p99_ms=float(p99),
+            latency_p50_ms=p50_ms,
+            latency_p99_ms=p99_ms,
+            latencies=self._latencies.histogram(),
+            latency_sum_s=self._latencies.sum_s,
             lost=stage_losses(inputs, counters, may_drop=self._may_drop),
             process_id=os.getpid(),
             waiting_for=tuple(

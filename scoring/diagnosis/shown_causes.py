@@ -31,6 +31,22 @@ CAUSES = {
     CANNOT_TELL: "cannot tell yet",
 }
 """names for people, with what the fault may be"""
+WHAT_TO_DO = {
+    "drag_up": "see whether the airflow is free and the filter is clean",
+    "drag_down": "see whether a blade is missing, or a filter or cover was taken out",
+    "friction_up": "listen to the bearing, and plan to replace the fan",
+    "gain_down": "measure the supply, and look at the driver",
+    "external_torque": "see what touches the rotor",
+    "sensor_stuck": "look at the tacho and its cable",
+    "sensor_dropout": "look at the tacho and its cable",
+    "sensor_scaling": "compare the speed with another tachometer",
+    "blocked": "switch it off, then see what blocks the rotor",
+    "no_power": "look at its supply, fuse and plug",
+    "no_tacho": "see whether it turns; if it does, look at the tacho and its cable",
+    "still_driven": "see what still commands it, and look at the driver",
+    "windmilling": "it is off: see what blows air through it",
+}
+"""by cause; what is to be done where the cause is unclear is part of the evidence"""
 FALLING = "falling speed"
 """parameter of these causes while the fan still turns"""
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import http.client
 import json
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,17 +17,21 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from pipeline.gateway.config import GatewayConfig
 from pipeline.presenting.users import User, UserRole, hasher, write_users
+from pipeline.recordings.writing import RecordingWriter
 from schemas.enums import Action, FanState, InvalidReason, Severity, Transition
 from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis, Request, Score
+from schemas.messages import Alarm, Diagnosis, Request, Score, ScorerSnapshot
+from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT
 from tests.support.running_chain import eventually
-from tests.support.running_gateway import FANS, SITE, TRAY, Client, RunningGateway
+from tests.support.running_core import FANS, SITE, TRAY
+from tests.support.running_gateway import Client, RunningGateway
 
 NOW_NS = 1_790_000_000_000_000_000
 STEP_NS = 10_000_000
 PASSWORD = "correct horse battery"
 SCRIPT = "<script>alert(1)</script>"
+CONFIGURATION = f'site = "{SITE}"\nrun_folder = "."\n[[tray]]\nname = "{TRAY}"\nfans = {FANS}\nport = "p"\n[gateway]\n'
 
 
 def score(seconds: float = 0.0, *, state: FanState = FanState.NORMAL, samples: int = 5) -> Score:
@@ -160,7 +168,14 @@ def test_metrics_are_those_of_prometheus_and_an_unjudged_fan_has_no_score(gatewa
     assert samples["fantwin_fan_scored", "3", None] == 0.0
     assert samples["fantwin_fan_alarm_active", "2", "alarm"] == 1.0
     assert samples["fantwin_fan_alarm_active", "2", "warning"] == 0.0
-    assert samples["fantwin_alarms_total", "2", "alarm"] == 1.0
+    assert samples["fantwin_fan_alarm_unacknowledged", "2", "alarm"] == 1.0
+    assert samples["fantwin_alarms_total", None, "alarm"] == 1.0
+    assert samples["fantwin_alarms_total", None, "warning"] == 0.0, "counted from zero, so that the first one is seen"
+    gateway.feed(alarm(Transition.ACKNOWLEDGED, 1, acknowledged=True))
+    assert (
+        'fantwin_fan_alarm_unacknowledged{fan="2",severity="alarm",site="hall",tray="tray1"} 0.0'
+        in (Client(gateway).ask("GET", "/metrics")[1])
+    )
 
 
 def test_an_operator_acts_under_his_own_name_and_nobody_else_acts(gateway):
@@ -245,6 +260,27 @@ def test_openapi_names_every_path_and_the_forms(gateway):
     assert "shelve" in form["properties"]["action"]["enum"]
 
 
+def test_prometheus_sends_the_password_of_a_user_and_gets_nothing_else_with_it(tmp_path, users, monkeypatch):
+    gateway = RunningGateway(tmp_path, granted, users=users)
+    monkeypatch.setattr(GatewayConfig, "is_loopback", False)  # from here on, as if others could reach it
+
+    def basic(words: str) -> dict[str, str]:
+        return {"Authorization": f"Basic {base64.b64encode(words.encode()).decode()}"}
+
+    try:
+        client, right = Client(gateway), basic(f"vic:{PASSWORD}")
+        status, _, headers = client.ask("GET", "/metrics")
+        assert (status, headers["www-authenticate"]) == (401, 'Basic realm="fantwin"')
+        status, text, _ = client.ask("GET", "/metrics", None, right)
+        assert (status, "fantwin_gateway_pages" in text) == (200, True)
+        assert client.ask("GET", "/api/v1/fans", None, right)[0] == 401, "a browser sends it to every path"
+        assert client.ask("GET", "/metrics", None, {"Authorization": "Basic ÿÿ"})[0] == 401
+        wrong = [client.ask("GET", "/metrics", None, basic("vic:wrong wrong wrong"))[0] for _ in range(6)]
+        assert wrong == [401] * 5 + [429], "who guesses must wait"
+    finally:
+        gateway.close()
+
+
 def test_a_proxy_names_the_user_and_others_cannot(tmp_path):
     gateway = RunningGateway(tmp_path, granted, user_header="X-User", operators=("ann",))
     try:
@@ -282,4 +318,73 @@ def test_nothing_of_a_fan_is_shown_as_now_once_its_tray_is_silent(gateway, monke
     gateway.feed(score())
     client = Client(gateway)
     eventually(lambda: client.ask("GET", "/api/v1/fans")[1]["fans"][0]["state"] == "silent", "the tray is silent")
-    assert "fantwin_fan_speed_rpm{" not in client.ask("GET", "/metrics")[1]
+    metrics = client.ask("GET", "/metrics")[1]
+    assert "fantwin_fan_speed_rpm{" not in metrics
+    assert 'fantwin_fan_scored{fan="0",site="hall",tray="tray1"} 0.0' in metrics
+
+
+def test_alarms_of_before_the_first_start_are_read_from_the_recordings_once(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    for number, began_s in ((1, 0), (2, 10)):
+        with RecordingWriter(run / ("recording.mcap" if number == 1 else "recording-2.mcap"), {}) as writer:
+            for sequence in range(3):
+                each = alarm(
+                    sequence=sequence, t_ns=NOW_NS + round((began_s + sequence) * 1e9), message=f"{number}.{sequence}"
+                )
+                each = replace(each, header=Header(f"scorer-{number}", sequence, TRAY))
+                writer.add_message(tray_key(SITE, TRAY, "alarm"), each, each.t_ns)
+                writer.add_message(tray_key("elsewhere", TRAY, "alarm"), each, each.t_ns)
+    began_t_ns = NOW_NS + 60 * 10**9
+
+    def history(gateway: RunningGateway, query: str = "") -> dict[str, Any]:
+        client = Client(gateway)
+        return eventually(
+            lambda: (
+                (h := client.ask("GET", f"/api/v1/alarms/history?{query}")[1]) and not h["is_reading_recordings"] and h
+            ),
+            "the recordings are read",
+        )
+
+    gateway = RunningGateway(run, configuration=CONFIGURATION, started_t_ns=began_t_ns)
+    try:
+        gateway.feed(alarm(t_ns=began_t_ns, message="live"))
+        found = history(gateway)
+        assert [each["message"] for each in found["transitions"]] == ["live", "2.2", "2.1", "2.0", "1.2", "1.1", "1.0"]
+        assert found["begins_t_ns"] == NOW_NS
+        older = history(gateway, f"limit=2&before={found['transitions'][3]['number']}")["transitions"]
+        assert [each["message"] for each in older] == ["1.2", "1.1"]
+    finally:
+        gateway.close()
+    for path in run.glob("*.mcap"):
+        path.unlink()
+    gateway = RunningGateway(run, configuration=CONFIGURATION, started_t_ns=began_t_ns + 1)
+    try:
+        assert len(history(gateway)["transitions"]) == 7
+        assert history(gateway)["begins_t_ns"] == NOW_NS
+    finally:
+        gateway.close()
+
+
+def test_a_fan_shows_its_wear_its_advice_and_where_rerun_is(tmp_path):
+    gateway = RunningGateway(tmp_path, configuration=CONFIGURATION)
+    values = {"unit": "relative", "change": 0.2, "per_day": None, "days": None, "limit": math.nan, "reached_t_ns": None}
+    parameter = {**values, "unknown_reason": "too few points so far", "series": {"std_error": [0.01]}}
+    fans = [{"t_ns": NOW_NS, "parameters": {"drag": parameter if fan == 2 else {}}} for fan in range(FANS)]
+    state = json.dumps({"wear": {"command_unit": "", "fans": fans}})
+    try:
+        snapshot = ScorerSnapshot(header=Header("scorer-all-1", 0, TRAY), t_ns=NOW_NS, twin_sha256="", state_json=state)
+        gateway.feed(
+            score(), alarm(causes=(Diagnosis(cause="drag_up", probability=0.8, evidence="drag +20 %"),)), snapshot
+        )
+        gateway.feed(replace(snapshot, state_json="{"), replace(snapshot, t_ns=NOW_NS - 1, state_json='{"wear": {}}'))
+        client = Client(gateway)
+        worn = client.ask("GET", f"/api/v1/fans/{TRAY}/2")[1]
+        (row,) = worn["wear"]
+        assert (row["parameter"], row["change"], row["error"], row["limit"]) == ("drag", 0.2, 0.01, None)
+        assert "filter" in worn["alarm"]["advice"]
+        assert client.ask("GET", f"/api/v1/fans/{TRAY}/1")[1]["wear"] == []
+        (tray,) = client.ask("GET", "/api/v1/site")[1]["trays"]
+        assert tray["viewer_url"] == "http://127.0.0.1:9090/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9876%2Fproxy"
+    finally:
+        gateway.close()

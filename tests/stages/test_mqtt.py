@@ -27,7 +27,8 @@ from tests.stages.test_gateway import alarm, granted, score
 from tests.support.mosquitto import Listener, Mosquitto, needs_mosquitto, retained_by
 from tests.support.mqtt_broker import free_port
 from tests.support.running_chain import RunningCommand, eventually
-from tests.support.running_mqtt import ROOT, SITE, TRAY, RunningMqtt
+from tests.support.running_core import SITE, TRAY
+from tests.support.running_mqtt import ROOT, RunningMqtt
 
 pytestmark = needs_mosquitto
 FAN = f"{ROOT}/{TRAY}/2"

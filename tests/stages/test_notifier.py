@@ -18,6 +18,7 @@ import pytest
 
 from pipeline.notification import sending
 from pipeline.notification.config import NotifierConfig
+from pipeline.notification.outbox import Outbox
 from pipeline.notification.sending import MAY_BE_REPEATED
 from pipeline.runtime.stage import StageError
 from schemas.enums import Severity, Transition
@@ -282,6 +283,43 @@ def test_a_full_disk_is_said_and_nothing_is_forgotten(tmp_path, mail, started, m
         assert "disk is full" in notifier.core.problem()
     notifier.wait(5)
     eventually(lambda: mail.mails and not notifier.core.problem(), "it is sent once the disk has room")
+
+
+def test_what_has_arrived_is_not_sent_again_where_a_full_disk_cannot_forget_it(tmp_path, mail, started, monkeypatch):
+    notifier = started(tmp_path, [mail_target(tmp_path, mail)])
+    forget, is_full = Outbox.delivered, [True]
+
+    def delivered(*values: Any) -> None:
+        if is_full:
+            raise sqlite3.OperationalError("database or disk is full")
+        forget(*values)
+
+    monkeypatch.setattr(Outbox, "delivered", delivered)
+    notifier.hear(alarm(fan=0))
+    eventually(lambda: "disk is full" in notifier.core.problem(), "it is said")
+    notifier.hear(alarm(fan=1))
+    is_full.clear()
+    eventually(lambda: len(mail.mails) >= 2 and not notifier.core.problem(), "the next one arrives")
+    assert mail.subjects() == ["WARNING, fan 0 of tray1 (hall)", "WARNING, fan 1 of tray1 (hall)"]
+
+
+def test_a_fan_that_is_taken_out_of_the_configuration_is_not_spoken_of_any_more(tmp_path, mail, started):
+    receiver = HttpReceiver()
+    alerts = {"name": "alerts", "kind": "alertmanager", "url": f"http://127.0.0.1:{receiver.port}"}
+    targets = [mail_target(tmp_path, mail) | {"repeat_s": 60}, alerts]
+    before = started(tmp_path, targets)
+    before.hear(alarm(fan=6), alarm(fan=1))
+    eventually(lambda: len(mail.mails) == 2 and len(receiver.received) > 0, "both are said")
+    before.core.close()
+    receiver.received.clear()
+    after = started(tmp_path, targets, fans=4)
+    after.wait(120)
+    eventually(lambda: len(mail.mails) >= 3, "the one that is there is sent again")
+    assert mail.subjects()[2:] == ["Still: WARNING, fan 1 of tray1 (hall)"]
+    eventually(lambda: receiver.received, "the alerts are sent")
+    ended = {each["labels"]["fan"]: each["endsAt"] for each in receiver.received[0]}
+    assert ended["6"] < ended["1"], "that of the other fan is over"
+    receiver.stop()
 
 
 @pytest.mark.skipif(ALERTMANAGER is None, reason="needs Debian's prometheus-alertmanager")

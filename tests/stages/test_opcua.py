@@ -31,13 +31,16 @@ from cryptography import x509
 
 from pipeline.opcua.certificate import make_certificate
 from pipeline.opcua.config import OpcuaConfig
+from pipeline.opcua.sessions import LONGEST_LIFETIME_S
+from pipeline.presenting.users import User, UserRole, hasher, write_users
 from pipeline.runtime.stage import Context, StageError
 from schemas.enums import Transition
 from schemas.messages import Alarm, Request
 from stages.opcua import STAGE, check
 from tests.stages.test_gateway import alarm, score
 from tests.support.running_chain import eventually
-from tests.support.running_opcua import OPERATOR, PASSWORD, SITE, TRAY, VIEWER, RunningOpcua
+from tests.support.running_core import SITE, TRAY
+from tests.support.running_opcua import OPERATOR, PASSWORD, VIEWER, RunningOpcua
 
 ALARM = f"ns=2;s={TRAY}/2/Alarm"
 SUPPRESS = ua.NodeId(ua.ObjectIds.AlarmConditionType_Suppress)
@@ -83,6 +86,22 @@ def test_an_operator_acts_under_the_name_he_has_logged_in_with(opcua, tmp_path):
     assert asyncio.run(acts()) == "Good"
     (sent,) = opcua.sent
     assert (sent.operator_name, sent.fan) == (OPERATOR, 2)
+
+
+def test_a_session_ends_with_the_password_that_began_it_and_lasts_as_long_as_what_waits_for_it(opcua, tmp_path):
+    opcua.feed(score(), alarm())
+
+    async def session() -> None:
+        client = await encrypted(opcua, tmp_path, OPERATOR)
+        assert client.session_timeout >= LONGEST_LIFETIME_S * 1e3
+        assert await status_of_suppress(client) == "Good"
+        hashed = hasher().hash("another horse battery")
+        write_users(opcua.users, {OPERATOR: User(OPERATOR, UserRole.OPERATOR, hashed)})
+        assert await status_of_suppress(client) == "BadUserAccessDenied"
+        await client.disconnect()
+
+    asyncio.run(session())
+    assert len(opcua.sent) == 1
 
 
 def test_a_scorer_that_does_not_answer_is_a_timeout_and_others_are_served_meanwhile(tmp_path, monkeypatch):

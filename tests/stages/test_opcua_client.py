@@ -15,7 +15,8 @@ from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, alarm, score
 from tests.support.node_opcua import NodeOpcua, node_modules
 from tests.support.running_chain import eventually
-from tests.support.running_opcua import OPERATOR, PASSWORD, SITE, TRAY, VIEWER, RunningOpcua
+from tests.support.running_core import SITE, TRAY
+from tests.support.running_opcua import OPERATOR, PASSWORD, VIEWER, RunningOpcua
 
 FAN = f"ns=2;s={TRAY}/2"
 ALARM = f"{FAN}/Alarm"

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as st_numpy
 
 from schemas.fields import LARGEST_ENUM_VALUE, Column, OpenEnum, columns, other_fields
 from schemas.header import Header, InputPosition
-from schemas.health import AcceptedSamples, AwaitedInput, Counter, Input, Note, Output
+from schemas.health import AcceptedSamples, AwaitedInput, Counter, Input, LatencyBucket, Note, Output
 from schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Diagnosis, Message, StatedTacho
 
 TIME_NS = st.integers(1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
@@ -56,7 +56,7 @@ def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
         return SCALARS[name]
     if isinstance(hint, type) and issubclass(hint, OpenEnum):
         return st.integers(0, LARGEST_ENUM_VALUE).map(hint)
-    for record in (Counter, Input, Output, Diagnosis, AwaitedInput, Note, AcceptedSamples, StatedTacho):
+    for record in (Counter, Input, Output, Diagnosis, AwaitedInput, Note, AcceptedSamples, StatedTacho, LatencyBucket):
         if hint == tuple[record, ...]:
             values = {name: scalar(name, hint) for name, hint in other_fields(record).items()}
             return st.lists(st.builds(record, **values), max_size=3).map(tuple)

@@ -5,24 +5,12 @@ from __future__ import annotations
 import http.client
 import json
 import socket
-import threading
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.config.models import TrayConfig
 from pipeline.gateway.config import GatewayConfig
-from pipeline.runtime.stage import Context
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Alarm, Message, Request, Score
-from schemas.topics import tray_key
-from stages.gateway import GatewayCore, build
-
-SITE, TRAY, FANS = "hall", "tray1", 4
-PRODUCER = "gateway-all-0123"
-TICK_S = 0.02
+from stages.gateway import STAGE, GatewayCore
+from tests.support.running_core import FANS, Answer, RunningCore
 
 
 def free_port() -> int:
@@ -32,49 +20,24 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-class RunningGateway:
-    """answer: what the scorer says to a request; the answers are passed back as the bus would."""
+class RunningGateway(RunningCore[GatewayCore]):
+    """It listens at `port`."""
 
-    def __init__(self, folder: Path, answer: Callable[[Request], list[Alarm]] | None = None, **settings: Any) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        answer: Answer | None = None,
+        fans: int = FANS,
+        *,
+        configuration: str = "",
+        started_t_ns: int = 0,
+        **settings: Any,
+    ) -> None:
+        """configuration: the text of a configuration file in the folder; empty: there is none."""
         self.port = free_port()
-        config = GatewayConfig(port=self.port, **settings)
-        trays = (TrayConfig(name=TRAY, fans=FANS, speed_unit="rpm"),)
-        built = build(Context(SITE, trays, config, folder, folder, 0, producer=PRODUCER))
-        assert isinstance(built.core, GatewayCore)
-        self.core = built.core
-        self.sent: list[Request] = []
-        self._answer = answer or (lambda _request: [])
-        self._lock = threading.Lock()
-        self._ended = threading.Event()
-        self._now_ns = 0
-        self._thread = threading.Thread(target=self._tick, daemon=True)
-        self._thread.start()
-
-    def feed(self, *messages: Message) -> None:
-        """Pass messages to the core as the runner does: scores as envelopes."""
-        with self._lock:
-            for message in messages:
-                is_score = isinstance(message, Score)
-                item = Envelope.of(tray_key(SITE, TRAY, "score"), message, 0) if is_score else message
-                self.core.step(item)
-
-    def close(self) -> None:
-        self._ended.set()
-        self._thread.join()
-        self.core.close()
-
-    def _tick(self) -> None:
-        while not self._ended.wait(TICK_S):
-            with self._lock:
-                self._now_ns += 1_000_000_000
-                for message in self.core.tick(self._now_ns):
-                    assert isinstance(message, Request)
-                    name = f"{PRODUCER}/{len(self.sent)}"
-                    self.sent.append(message)
-                    for alarm in self._answer(message):
-                        self.core.step(
-                            replace(alarm, request=name, header=Header("scorer-all-1", 900 + len(self.sent), TRAY))
-                        )
+        path = folder / "fantwin.toml" if configuration else None
+        context = {"configuration_path": path, "configuration_text": configuration, "started_t_ns": started_t_ns}
+        super().__init__(STAGE, GatewayConfig(port=self.port, **settings), folder, answer, fans, **context)
 
 
 class Client:

@@ -22,11 +22,14 @@ from rich.table import Table
 
 from pipeline.bus.session import Bus, join_bus
 from pipeline.cli.options import JsonOption
+from pipeline.cli.watch.demo_page import PICTURE, DemoPage
 from pipeline.cli.watch.demo_report import Summary, summarise
 from pipeline.cli.watch.demo_screen import DemoScreen
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.errors import UserError
+from pipeline.gateway.config import NEEDED
+from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.runtime.signals import stop_on_signals
 from pipeline.runtime.snapshot_store import FORMER_SUFFIX
 from pipeline.selftest.scratch_site import FANTWIN, free_port
@@ -39,9 +42,11 @@ FAULTS = (
     ("inlet", "fan=2,start=8,stop=14,size=1.8"),
     ("rotor", "fan=5,start=18,stop=24,size=0.8"),
 )
+SHOWN_FAN = 5
+"""in the picture of the page, while it is in alarm"""
 OUTPUTS = (
-    *("recording*.mcap*", "view*.rrd", "bands.png", "summary.json", "truth.json", "up.log", "tray"),
-    *("*.snapshot", f"*{FORMER_SUFFIX}"),
+    *("recording*.mcap*", "view*.rrd", "bands.png", PICTURE, "summary.json", "truth.json", "up.log", "tray"),
+    *("*.snapshot", f"*{FORMER_SUFFIX}", "alarms.sqlite*"),
 )
 _START_TIMEOUT_S = 60.0
 _STOP_TIMEOUT_S = 60.0
@@ -67,6 +72,10 @@ def demo(
         f"tray.0.port={json.dumps(str(out / 'tray'))}",
         f"bus.endpoint='tcp/127.0.0.1:{free_port()}'",
     ]
+    if all(map(is_installed, NEEDED)):
+        overrides.append(f"gateway.port={free_port()}")
+    else:
+        console.print(f"without the operators' page: it needs the extra gateway; {how_to_install('gateway')}")
     config = load_config(DEMO_FOLDER / "demo.toml", overrides)
     started_s = time.monotonic()
     lost = _run(config, overrides, out, seed, console)
@@ -102,6 +111,7 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
     stop = threading.Event()
     stop_on_signals(stop)
     tray = config.trays[0]
+    page = DemoPage(config, out, SHOWN_FAN)
     simulate = [
         *("simulate", "--fans", str(tray.fans), "--profile", "manual", "--seed", str(seed)),
         *("--duration", str(DURATION_S), "--speed-unit", tray.speed_unit, "--link", str(out / "tray")),
@@ -116,8 +126,13 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
         _child(up, stdout=subprocess.PIPE, stderr=log) as pipeline,
         join_bus(config, listens=False) as bus,
     ):
-        console.print(f"simulated tray of {tray.fans} fans; starting six stages, each as a process of its own")
-        _watch(config, bus, device, pipeline, stop, console)
+        count = len(config.stages)
+        console.print(f"simulated tray of {tray.fans} fans; starting {count} stages, each as a process of its own")
+        if page.address:
+            console.print(f"operators' page, while the demo runs: {page.address}", soft_wrap=True)
+        _watch(config, bus, device, pipeline, page, stop, console)
+        if why_not := page.finish():
+            console.print(f"no picture of the page: {why_not}", soft_wrap=True)
         if pipeline.poll() is None:
             pipeline.send_signal(signal.SIGINT)
         try:
@@ -160,6 +175,7 @@ def _watch(
     bus: Bus,
     device: subprocess.Popen[str],
     pipeline: subprocess.Popen[str],
+    page: DemoPage,
     stop: threading.Event,
     console: Console,
 ) -> None:
@@ -173,6 +189,7 @@ def _watch(
         live.start()
     try:
         while device.poll() is None and pipeline.poll() is None and not stop.wait(0.25):
+            page.look(screen.fans_in_alarm)
             if live:
                 live.update(screen.render())
             elif time.monotonic() >= next_line_s:
@@ -220,9 +237,10 @@ def _print_report(summary: Summary, out: Path, took_s: float, console: Console) 
         soft_wrap=True,
     )
     shown, programs = (Path(os.path.relpath(path)) for path in (out, Path(sys.executable).parent))
+    page = f" and {shown / PICTURE} (operators' page)" if (out / PICTURE).exists() else ""
     for line in (
         f"results: {shown / 'summary.json'} and {shown / 'recording.mcap'}",
-        f"picture: {shown / 'bands.png'}; interactive: {programs / 'rerun'} {shown / 'view.rrd'}",
+        f"pictures: {shown / 'bands.png'}{page}; interactive: {programs / 'rerun'} {shown / 'view.rrd'}",
     ):
         console.print(line, markup=False, soft_wrap=True)  # to be copied
     for problem in summary.problems:

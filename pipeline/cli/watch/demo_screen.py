@@ -44,6 +44,12 @@ class DemoScreen:
         """Whether a score has arrived."""
         return self._score is not None
 
+    @property
+    def fans_in_alarm(self) -> list[int]:
+        """Those that the newest score says are in alarm."""
+        states = self._score.state[-1] if self._score else ()
+        return [fan for fan, state in enumerate(states) if state == FanState.ALARM]
+
     def render(self) -> Group:
         """Stages, alarms and fans, for a terminal."""
         starting = Text("starting the stages", style="dim")

@@ -21,7 +21,8 @@ from pipeline.bus.access_rules import SiteRoles
 from pipeline.bus.certificates import of_role
 from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
 from pipeline.bus.errors import BusError, NoAnswerError
-from pipeline.bus.session import credentials_of, join_bus
+from pipeline.bus.opening import credentials_of
+from pipeline.bus.session import join_bus
 from pipeline.cli.exposure import exposure_problem, is_exposed
 from pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from pipeline.cli.watch.line_check import check_line

@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 
 from pipeline.bus.access_rules import SiteRoles
+from pipeline.bus.opening import credentials_of
 from pipeline.bus.router import open_router
-from pipeline.bus.session import credentials_of
 from pipeline.cli.exposure import InsecureOption, checked_exposure
 from pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from pipeline.config.loading import load_config

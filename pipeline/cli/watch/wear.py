@@ -30,11 +30,10 @@ from schemas.codec import CodecError, decode
 from schemas.messages import ScorerSnapshot
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
-from scoring.former_snapshot_keys import FORMER_PARAMETER_KEYS, current_keys
+from scoring.wear.recorded_wear import wear_in, wear_rows
 from scoring.wear.trend import NS_PER_DAY
 
 _NEEDED = "a fan has its first point some time after commissioning (score below 0.5, no alarm, not too slow)"
-_SHOWN = ("unit", "change", "per_day", "days", "limit", "reached_t_ns", "unknown_reason")
 
 
 def wear(
@@ -75,16 +74,18 @@ def wear(
             ]
         nothing = "no scorer has recorded wear so far: it does so regularly; try again later"
     found = [
-        (tray, snapshot.t_ns, wear) for tray, snapshot in _latest(snapshots).items() for wear in _wear_in(snapshot)
+        (tray, snapshot.t_ns, wear)
+        for tray, snapshot in _latest(snapshots).items()
+        if (wear := wear_in(snapshot)) is not None
     ]
     if not found:
         raise UserError(nothing)
-    if not any(_rows(*each) for each in found):
+    if not any(wear_rows(*each) for each in found):
         raise UserError(
             f"no data yet for any fan of {', '.join(tray for tray, *_ in found)}: {_NEEDED}; try again later"
         )
     if json_output:
-        rows = [row for tray, t_ns, state in found for row in _rows(tray, t_ns, state)]
+        rows = [row for tray, t_ns, state in found for row in wear_rows(tray, t_ns, state)]
         typer.echo(json.dumps({"wear": rows}))
     else:
         console = Console(soft_wrap=True, highlight=False)
@@ -114,19 +115,6 @@ def _latest(snapshots: Iterable[ScorerSnapshot]) -> dict[str, ScorerSnapshot]:
     return dict(sorted(latest.items()))
 
 
-def _wear_in(snapshot: ScorerSnapshot) -> list[dict[str, Any]]:
-    """The wear in a snapshot; none in one of a scorer that did not monitor wear yet."""
-    try:
-        wear = json.loads(snapshot.state_json)["wear"]
-        for fan in wear["fans"]:
-            for name, parameter in fan["parameters"].items():
-                fan["parameters"][name] = current_keys(parameter, FORMER_PARAMETER_KEYS)
-        _rows("", 0, wear)
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return []
-    return [wear]
-
-
 def _decoded(payload: bytes) -> list[ScorerSnapshot]:
     """Unreadable messages are skipped here; the stages count them."""
     try:
@@ -134,25 +122,6 @@ def _decoded(payload: bytes) -> list[ScorerSnapshot]:
     except CodecError:
         return []
     return [message] if isinstance(message, ScorerSnapshot) else []
-
-
-def _rows(tray: str, t_ns: int, state: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows for machines: one for each fan and parameter that has a value."""
-    return [
-        {
-            "tray": tray,
-            "fan": number,
-            "parameter": parameter,
-            **{name: values[name] for name in _SHOWN},
-            "change_std_error": None if values["per_day"] else values["series"]["std_error"][-1],
-            "command_unit": state["command_unit"],
-            "seen_t_ns": fan["t_ns"],
-            "t_ns": t_ns,
-        }
-        for number, fan in enumerate(state["fans"])
-        for parameter, values in fan["parameters"].items()
-        if "change" in values
-    ]
 
 
 def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
@@ -177,7 +146,7 @@ def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("limit reached")
     before = None
-    for row in _rows(tray, t_ns, state):
+    for row in wear_rows(tray, t_ns, state):
         name, before = "" if row["fan"] == before else str(row["fan"]), row["fan"]
         per_day = row["per_day"]
         significant = per_day and not per_day["low"] <= 0.0 <= per_day["high"]

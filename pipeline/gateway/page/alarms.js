@@ -1,45 +1,65 @@
 // The list of alarms, and the history of their transitions.
 
 import { buttons } from "./actions.js";
-import { age, clock, element, percent } from "./dom.js";
+import { age, clock, element, facts, keepFocus, percent } from "./dom.js";
 import { ask } from "./server.js";
 
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
 const PAGE = 100;
+const SHOWN = 100;
 
 const name = (alarm) => `${alarm.tray}/${alarm.fan}`;
 const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.tray)}/${alarm.fan}` }, `${alarm.tray} fan ${alarm.fan}`);
+const share = (cause) => `${cause.cause}${cause.probability === null ? "" : `, ${percent(cause.probability)}`}`;
 
 export function badge(severity, text) {
   return element("span", { class: `badge ${severity}` }, `${MARKS[severity] ?? ""} ${text}`);
 }
 
-export function card(alarm) {
+// Rerun's viewer follows the newest sample; its address takes no time, so the text says where to look.
+export function rerunLink(url, t_ns) {
+  return url ? element("a", { href: url, target: "_blank", rel: "noopener" }, `Open Rerun${t_ns ? ` (${clock(t_ns)})` : ""} ↗`) : null;
+}
+
+// One alarm. viewerUrl: of Rerun's viewer; empty: none.
+export function card(alarm, viewerUrl) {
   const kind = alarm.presented ? alarm.severity : "silenced";
-  const cause = alarm.cause ? `${alarm.cause}${alarm.probability === null ? "" : `, ${percent(alarm.probability)}`}` : "";
-  const evidence = alarm.causes[0]?.evidence ?? "";
-  return element("article", { class: `card ${kind}`, "data-fan": name(alarm) },
+  const states = alarm.states.join(", ") + (alarm.acknowledged_by ? ` by ${alarm.acknowledged_by}` : "");
+  return element("article", { class: `card ${kind}`, "data-fan": name(alarm), "aria-label": `Alarm of ${alarm.tray} fan ${alarm.fan}` },
     element("p", {}, badge(alarm.active ? alarm.severity : "none", alarm.active ? alarm.severity : "over"), " ",
-      element("strong", {}, link(alarm)), ` since ${clock(alarm.onset_t_ns)} (${age(alarm.onset_t_ns)})`),
-    element("p", { class: "muted" }, alarm.states.join(", ") + (alarm.acknowledged_by ? ` by ${alarm.acknowledged_by}` : "")),
-    cause ? element("p", {}, element("strong", {}, cause), evidence ? `: ${evidence}` : "") : null,
-    evidence && alarm.message.includes(evidence) ? null : element("p", {}, alarm.message),
-    buttons(alarm.tray, alarm.fan, alarm));
+      element("strong", {}, link(alarm)), ` since ${clock(alarm.onset_t_ns)} (`, age(alarm.onset_t_ns), ")"),
+    facts({
+      "Cause": [alarm, ...alarm.other_causes].filter((each) => each.cause).map(share).join("; or "),
+      "Evidence": alarm.evidence,
+      "What to do": alarm.advice,
+      "Deviation": alarm.evidence && alarm.message.includes(alarm.evidence) ? "" : alarm.message.replace(`fan ${alarm.fan}: `, ""),
+      "State": states,
+    }),
+    rerunLink(viewerUrl, alarm.onset_t_ns), buttons(alarm.tray, alarm.fan, alarm));
 }
 
 export class AlarmsView {
-  constructor(alarms) {
-    this.alarms = alarms;
+  constructor(alarms, viewerUrl) {
+    Object.assign(this, { alarms, viewerUrl, most: SHOWN, due: 0 });
     this.root = element("div");
-    this.update();
+    this.draw();
   }
 
+  // When many come at once, they are drawn together.
   update() {
+    this.due ||= requestAnimationFrame(() => this.draw());
+  }
+
+  draw() {
+    this.due = 0;
     const rank = (alarm) => (alarm.presented ? 0 : 4) + (alarm.active ? 0 : 2) + (alarm.severity === "alarm" ? 0 : 1);
     const listed = [...this.alarms.values()].filter((alarm) => alarm.listed);
     listed.sort((one, other) => rank(one) - rank(other) || other.onset_t_ns - one.onset_t_ns);
-    this.root.replaceChildren(element("h2", {}, `Alarms (${listed.length})`),
-      ...(listed.length ? listed.map(card) : [element("p", { class: "muted" }, "No alarms.")]));
+    const more = listed.length - this.most;
+    keepFocus(this.root, () => this.root.replaceChildren(element("h2", {}, `Alarms (${listed.length})`),
+      ...(listed.length ? listed.slice(0, this.most).map((alarm) => card(alarm, this.viewerUrl(alarm.tray)))
+        : [element("p", { class: "muted" }, "No alarms.")]),
+      more > 0 ? element("button", { type: "button", onclick: () => { this.most += SHOWN; this.draw(); } }, `${more} more`) : ""));
   }
 }
 
@@ -47,27 +67,52 @@ export class HistoryView {
   constructor(fan = null) {
     this.fan = fan;
     this.body = element("tbody");
-    this.more = element("button", { type: "button", onclick: () => this.load() }, "Older");
-    const heads = ["Time", "Fan", "What happened", "By", "Message"].map((text) => element("th", { scope: "col" }, text));
-    this.root = element("div", {}, element("h2", {}, "History of alarms"), element("div", { class: "scroll" },
-      element("table", { class: "folding" }, element("thead", {}, element("tr", {}, ...heads)), this.body)), this.more);
-    this.before = 0;
+    this.more = element("button", { type: "button", onclick: () => this.load(this.oldest), hidden: true }, "Older");
+    this.reach = element("p", { class: "muted" });
+    const heads = ["Time", ...(fan ? [] : ["Fan"]), "What happened", "By", "Message"].map((text) => element("th", { scope: "col" }, text));
+    this.root = element("div", {}, element("h2", {}, fan ? "History of its alarms" : "History of alarms"), this.reach,
+      element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "History of alarms" },
+        element("table", { class: "folding" }, element("thead", {}, element("tr", {}, ...heads)), this.body)), this.more);
+    this.begin();
+  }
+
+  // The newest page, or the one before a transition.
+  async load(before = null) {
+    const of = this.fan ? `&tray=${encodeURIComponent(this.fan.tray)}&fan=${this.fan.fan}` : "";
+    const found = await ask(`/alarms/history?limit=${PAGE}${before === null ? "" : `&before=${before}`}${of}`);
+    const { transitions } = found;
+    const isNew = (each) => this.newest === null || each.number > this.newest;
+    if (before === null) this.body.prepend(...transitions.filter(isNew).map((each) => this.row(each)));
+    else this.body.append(...transitions.map((each) => this.row(each)));
+    if (this.oldest === null || before !== null) {
+      this.more.hidden = transitions.length < PAGE;
+      this.oldest = transitions.at(-1)?.number ?? this.oldest;
+    }
+    if (before === null) this.newest = transitions[0]?.number ?? this.newest;
+    const begins = found.begins_t_ns ? `Reaches back to ${clock(found.begins_t_ns)}.` : "";
+    this.reach.textContent = [begins, this.oldest === null ? "No alarm so far." : "",
+      found.is_reading_recordings ? "Earlier alarms are being read from the recordings." : ""].filter(Boolean).join(" ");
+    if (found.is_reading_recordings) {
+      clearTimeout(this.timer);
+      this.timer = setTimeout(() => this.root.isConnected && this.begin(), 1000);
+    }
+  }
+
+  begin() {
+    this.body.replaceChildren();
+    this.newest = this.oldest = null;
     this.load();
   }
 
-  async load() {
-    const of = this.fan ? `&tray=${encodeURIComponent(this.fan.tray)}&fan=${this.fan.fan}` : "";
-    const { transitions } = await ask(`/alarms/history?limit=${PAGE}&before=${this.before}${of}`);
-    this.body.append(...transitions.map((each) => this.row(each)));
-    this.before = transitions.at(-1)?.number ?? 0;
-    this.more.hidden = transitions.length < PAGE;
-    if (!this.body.childElementCount) this.body.append(element("tr", {}, element("td", { colspan: 5, class: "muted" }, "No alarm so far.")));
+  // A transition has come.
+  update() {
+    this.due ||= setTimeout(() => { this.due = 0; if (this.root.isConnected) this.load(); }, 200);
   }
 
   row(each) {
     const cell = (label, ...content) => element("td", { "data-label": label }, ...content);
     const what = each.transition.replaceAll("_", " ");
-    return element("tr", {}, cell("Time", clock(each.t_ns)), cell("Fan", link(each)),
+    return element("tr", {}, cell("Time", clock(each.t_ns)), this.fan ? "" : cell("Fan", link(each)),
       cell("What happened", badge(each.active ? each.severity : "none", what)), cell("By", each.operator_name),
       cell("Message", each.message, each.comment ? ` “${each.comment}”` : ""));
   }

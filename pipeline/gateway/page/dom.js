@@ -13,20 +13,52 @@ export function element(tag, attributes = {}, ...children) {
 
 const ms = (t_ns) => t_ns / 1e6;
 
+const two = (number) => String(number).padStart(2, "0");
+export const day = (at) => `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())}`;
+export const time = (at) => `${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
+
+// Local time, with the date unless it is today.
 export function clock(t_ns) {
   if (!t_ns) return "";
   const at = new Date(ms(t_ns));
-  const isToday = at.toDateString() === new Date().toDateString();
-  const time = at.toLocaleTimeString([], { hour12: false });
-  return isToday ? time : `${at.toLocaleDateString()} ${time}`;
+  return at.toDateString() === new Date().toDateString() ? time(at) : `${day(at)} ${time(at)}`;
 }
 
-export function age(t_ns, now_ms = Date.now()) {
-  const seconds = Math.max(0, Math.round((now_ms - ms(t_ns)) / 1000));
+function ageText(t_ns) {
+  const seconds = Math.max(0, Math.round((Date.now() - ms(t_ns)) / 1000));
   for (const [unit, size] of [["d", 86400], ["h", 3600], ["min", 60]]) {
     if (seconds >= 2 * size) return `${Math.floor(seconds / size)} ${unit}`;
   }
   return `${seconds} s`;
+}
+
+// How long ago, kept up to date as long as it is shown.
+export function age(t_ns) {
+  return element("time", { "data-since": t_ns }, ageText(t_ns));
+}
+
+setInterval(() => {
+  for (const shown of document.querySelectorAll("time[data-since]")) {
+    const text = ageText(Number(shown.dataset.since));
+    if (shown.textContent !== text) shown.textContent = text;
+  }
+}, 1000);
+
+// Names and values; what has no value is left out.
+export function facts(values) {
+  const shown = Object.entries(values).filter(([, value]) => value !== "" && value !== null && value !== undefined);
+  return element("dl", { class: "facts" }, ...shown.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
+}
+
+// Draw a part of the page again; what had the focus has it afterwards, if it is still there.
+export function keepFocus(root, draw) {
+  const had = root.contains(document.activeElement) ? document.activeElement : null;
+  const fan = had?.closest("[data-fan]")?.dataset.fan, action = had?.dataset.action;
+  draw();
+  if (!had || root.contains(document.activeElement)) return;
+  const of = [...root.querySelectorAll("[data-fan]")].find((each) => each.dataset.fan === fan) ?? root;
+  const next = [...of.querySelectorAll("[data-action]")].find((each) => each.dataset.action === action);
+  (next ?? of.querySelector("a, button") ?? root.closest("[tabindex]"))?.focus();
 }
 
 export function percent(share) {

@@ -1,57 +1,85 @@
-// One fan: its state and alarm, speed with its twin and band, torque balance and score, and its twin's parameters.
+// One fan: its state and alarm, speed with its twin and band, torque balance and score, its twin, its wear, its history.
 
-import { HistoryView, card } from "./alarms.js";
+import { HistoryView, card, rerunLink } from "./alarms.js";
 import { buttons } from "./actions.js";
-import { clock, element } from "./dom.js";
+import { bytes, HIGHEST_LEVEL, NO_LEVEL } from "./fans.js";
+import { Plot } from "./plot.js";
+import { clock, element, facts, keepFocus } from "./dom.js";
 import { ask } from "./server.js";
+import { wearTable } from "./wear.js";
 
 const KEPT_S = 3600;
 const COLUMNS = ["t_s", "measured", "predicted", "half_width", "torque_balance_command", "score"];
-const color = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 const WINDOWS = [["1 min", 60], ["10 min", 600], ["1 hour", KEPT_S]];
+const POINTS = 1200;
+const MEANINGS = {
+  J: "J, inertia, command s²/rad", alpha: "α, viscous friction, command s/rad", C_D: "C_D, drag, command s²/rad²",
+  lag_s: "lag of the torque behind the command, s", lowest_command: "lowest command that has an effect",
+  friction: "friction, of the command", kick_command: "command with which the drive starts the rotor",
+};
 
 export class FanView {
-  constructor(tray, fan, alarm, viewerUrl) {
-    Object.assign(this, { tray, fan, viewerUrl, window_s: 600, plots: [] });
+  constructor(site, index, tray, fan, alarm, viewerUrl) {
+    Object.assign(this, { site, index, tray, fan, viewerUrl, window_s: 600, plots: [], class: -1 });
     this.path = `/fans/${encodeURIComponent(tray)}/${fan}`;
     this.columns = Object.fromEntries(COLUMNS.map((name) => [name, []]));
-    this.facts = element("dl", { class: "facts" });
-    this.state = element("p", {});
+    this.state = element("span");
+    this.score = element("span");
     this.alarm = element("div");
     this.charts = element("div");
-    const windows = element("div", { class: "actions", role: "group", "aria-label": "Time shown" }, ...WINDOWS.map(([text, s]) =>
-      element("button", { type: "button", "aria-pressed": s === this.window_s, onclick: (event) => this.show(s, event.target) }, text)));
-    this.windows = windows;
-    this.root = element("div", {}, element("h2", {}, `${tray} fan ${fan}`), this.state, this.alarm, windows, this.charts,
-      element("h2", {}, "Twin"), this.facts, new HistoryView({ tray, fan }).root);
+    this.twin = element("div");
+    this.wear = element("div");
+    this.history = new HistoryView({ tray, fan });
+    this.windows = element("div", { class: "actions", role: "group", "aria-label": "Time shown" }, ...WINDOWS.map(([text, s]) =>
+      element("button", { type: "button", "aria-pressed": String(s === this.window_s), onclick: (event) => this.show(s, event.target) }, text)));
+    this.root = element("div", {}, element("div", { class: "title" }, element("h2", {}, `${tray} fan ${fan}`),
+      element("a", { href: "#/fans" }, "← all fans (Esc)")), element("p", {}, this.state, this.score, " ", rerunLink(viewerUrl, 0)),
+      this.alarm, this.windows, this.charts, element("h2", {}, "Wear"), this.wear, element("h2", {}, "Twin"), this.twin,
+      this.history.root);
     this.updateAlarm(alarm);
-    this.resized = () => this.plots.forEach((plot) => plot.setSize(this.size()));
+    this.resized = () => this.plots.forEach((plot) => plot.resize());
+    this.recolored = () => this.draw();
+    this.scheme = matchMedia("(prefers-color-scheme: dark)");
+    this.scheme.addEventListener("change", this.recolored);
     window.addEventListener("resize", this.resized);
     this.start();
   }
 
   async start() {
-    const [now, past] = await Promise.all([ask(this.path), ask(`${this.path}/curves?seconds=${KEPT_S}`)]);
+    const past = await ask(`${this.path}/curves?seconds=${KEPT_S}`);
+    await this.learn();
     this.speedUnit = past.speed_unit;
-    this.showFan(now);
     const live = this.columns;
     this.columns = Object.fromEntries(COLUMNS.map((name) => [name, past[name]]));
     this.draw();
     this.add(live);
   }
 
-  showFan(now) {
-    const score = now.score === null ? "not judged" : `${Math.round(now.score * 100)} % of the limit`;
-    this.state.replaceChildren(`${now.state} since ${clock(now.since_t_ns)}; score ${score}. `,
-      this.viewerUrl ? element("a", { href: this.viewerUrl, target: "_blank", rel: "noopener" }, "Open in Rerun") : "");
-    const facts = now.twin ? { "name": now.twin.name, "kind": now.twin.kind, "in force since": clock(now.twin.since_t_ns) || "the start",
-      ...Object.fromEntries(Object.entries(now.twin.parameters).map(([name, value]) =>
-        [name, typeof value === "number" ? value.toPrecision(4) : String(value)])) } : { "twin": "not heard yet" };
-    this.facts.replaceChildren(...Object.entries(facts).flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
+  // What does not come by itself: since when, the twin and the wear.
+  async learn() {
+    const now = await ask(this.path);
+    this.state.textContent = `${now.state} since ${clock(now.since_t_ns)}; `;
+    const twin = now.twin;
+    this.twin.replaceChildren(twin ? facts({ "name": twin.name, "kind": twin.kind, "in force since": clock(twin.since_t_ns) || "the start",
+      ...Object.fromEntries(Object.entries(twin.parameters).map(([name, value]) =>
+        [MEANINGS[name] ?? name, typeof value === "number" ? value.toPrecision(4) : String(value)])) })
+      : element("p", { class: "muted" }, "Its twin is not known yet."));
+    this.wear.replaceChildren(wearTable(now.wear));
+  }
+
+  // All fans at a glance have come: class and score of this one are among them.
+  update(fleet) {
+    const level = bytes(fleet.levels)[this.index], was = this.class;
+    this.class = bytes(fleet.classes)[this.index];
+    this.score.textContent = level === NO_LEVEL ? "not judged." : `score ${level} %${level >= HIGHEST_LEVEL ? " or more" : ""} of the limit.`;
+    if (was !== this.class && was >= 0 && this.site.classes[was] !== this.site.classes[this.class]) this.learn();
   }
 
   updateAlarm(alarm) {
-    this.alarm.replaceChildren(alarm && alarm.listed ? card(alarm) : buttons(this.tray, this.fan, alarm && null));
+    keepFocus(this.alarm, () => this.alarm.replaceChildren(
+      alarm?.listed ? card(alarm, this.viewerUrl) : buttons(this.tray, this.fan, null)));
+    if (this.known && alarm) this.history.update();
+    this.known = true;
   }
 
   // Samples that have just come.
@@ -67,23 +95,15 @@ export class FanView {
   }
 
   draw() {
-    const axis = (label) => ({ label, stroke: color("text"), grid: { stroke: color("line") }, ticks: { stroke: color("line") }, size: 64 });
-    const time = { ...axis(""), size: 40 };
-    const line = (label, stroke, more = {}) => ({ label, stroke: color(stroke), width: 1.5, points: { show: false }, ...more });
-    const chart = (title, series, label, more = {}) => {
-      const parent = element("div", { class: "plot" }, element("h3", {}, title));
-      this.charts.append(parent);
-      const plot = new uPlot({ ...this.size(), series: [{}, ...series], axes: [time, axis(label)], cursor: { sync: { key: "fan" } },
-        scales: { x: { time: true } }, ...more }, series.map(() => []).concat([[]]), parent);
-      this.plots.push(plot);
-      return plot;
-    };
-    this.speed = chart("Speed, its twin and the band", [line("band, low", "band"), line("band, high", "band"),
-      line("twin", "twin", { dash: [6, 4] }), line("measured", "measured")], this.speedUnit,
-      { bands: [{ series: [2, 1], fill: color("band") }] });
-    this.balance = chart("Torque balance", [line("torque balance", "measured")], "command");
-    this.score = chart("Score and its limit", [line("limit", "limit", { dash: [6, 4] }), line("score", "measured")], "of the limit",
-      { scales: { x: { time: true }, y: { range: (_plot, low, high) => [Math.min(0, low ?? 0), Math.max(1.2, high ?? 0)] } } });
+    this.plots.forEach((plot) => plot.destroy());
+    this.charts.replaceChildren();
+    const add = (...settings) => { const plot = new Plot(this.charts, ...settings); this.plots.push(plot); return plot; };
+    this.plots = [];
+    this.speedPlot = add("Speed", this.speedUnit, [{ label: "measured", color: "measured" },
+      { label: "twin", color: "twin", dash: [6, 4] }, { label: "band of a healthy fan, twin ± 2σ", color: "band", isBand: true }]);
+    this.balancePlot = add("Torque balance: command beyond that of a healthy fan", "command", [{ label: "torque balance", color: "measured" }]);
+    this.scorePlot = add("Score: an alarm is raised at 1", "of the limit", [{ label: "score", color: "measured" },
+      { label: "limit", color: "limit", dash: [2, 4] }], [0, 1.2]);
     this.refresh();
   }
 
@@ -91,27 +111,36 @@ export class FanView {
     if (!this.plots.length || this.due) return;
     this.due = requestAnimationFrame(() => {
       this.due = 0;
-      const all = this.columns, since_s = (all.t_s.at(-1) ?? 0) - this.window_s;
-      const first = Math.max(0, all.t_s.findIndex((t_s) => t_s >= since_s));
-      const c = Object.fromEntries(COLUMNS.map((name) => [name, all[name].slice(first)]));
-      const side = (sign) => c.predicted.map((value, i) => (value === null || c.half_width[i] === null ? null : value + sign * c.half_width[i]));
-      this.speed.setData([c.t_s, side(-1), side(1), c.predicted, c.measured]);
-      this.balance.setData([c.t_s, c.torque_balance_command]);
-      this.score.setData([c.t_s, c.t_s.map(() => 1), c.score]);
+      const shown = this.shown();
+      const side = (sign) => shown.predicted.map((value, i) => (value === null || shown.half_width[i] === null ? null : value + sign * shown.half_width[i]));
+      this.speedPlot.set(shown.t_s, [shown.measured, shown.predicted, side(-1), side(1)]);
+      this.balancePlot.set(shown.t_s, [shown.torque_balance_command]);
+      this.scorePlot.set(shown.t_s, [shown.score, shown.t_s.map(() => 1)]);
     });
+  }
+
+  // Of the time shown, not much more samples than a screen has pixels.
+  shown() {
+    const all = this.columns, { t_s } = all, since_s = (t_s.at(-1) ?? 0) - this.window_s;
+    const step_s = this.window_s > 60 ? this.window_s / POINTS : 0;
+    const indexes = [];
+    let next_s = since_s;
+    for (let i = Math.max(0, t_s.findIndex((each) => each >= since_s)); i < t_s.length; i++) {
+      if (t_s[i] < next_s) continue;
+      indexes.push(i);
+      next_s = t_s[i] + step_s;
+    }
+    return Object.fromEntries(COLUMNS.map((name) => [name, indexes.map((i) => all[name][i])]));
   }
 
   show(window_s, button) {
     this.window_s = window_s;
-    for (const each of this.windows.children) each.setAttribute("aria-pressed", each === button);
+    for (const each of this.windows.children) each.setAttribute("aria-pressed", String(each === button));
     this.refresh();
   }
 
-  size() {
-    return { width: Math.max(280, Math.min(1300, this.charts.clientWidth - 12)), height: window.innerWidth < 640 ? 190 : 240 };
-  }
-
   close() {
+    this.scheme.removeEventListener("change", this.recolored);
     window.removeEventListener("resize", this.resized);
     this.plots.forEach((plot) => plot.destroy());
   }

@@ -11,7 +11,9 @@ const GROUPS = [
   { name: "normal", title: "Normal", mark: "●" },
 ];
 const LARGE_UP_TO = 64;
-const NO_LEVEL = 255;
+const LARGE_GROUPS = 2;
+export const HIGHEST_LEVEL = 250;
+export const NO_LEVEL = 255;
 const REST = ["stopped", "starting"];
 
 function groupOf(words) {
@@ -22,7 +24,7 @@ function groupOf(words) {
   return 2;
 }
 
-const bytes = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+export const bytes = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
 
 export class FansView {
   constructor(site) {
@@ -34,24 +36,25 @@ export class FansView {
   }
 
   build() {
-    const large = this.fans.length <= LARGE_UP_TO ? " large" : "";
     this.tray = element("select", { id: "tray", onchange: () => this.filter() }, element("option", { value: "" }, "all trays"),
       ...this.site.trays.map((tray) => element("option", { value: tray.name }, tray.name)));
     this.state = element("select", { id: "state", onchange: () => this.filter() }, element("option", { value: "" }, "all states"),
       ...GROUPS.map((group) => element("option", { value: group.name }, group.title.toLowerCase())));
     this.sections = GROUPS.map((group, number) => {
       const count = element("span");
-      const cells = element("div", { class: `cells${large}`, role: "group", "aria-label": group.title,
+      const cells = element("div", { class: "cells", role: "group", "aria-label": group.title,
         onclick: (event) => this.chosen(event), onkeydown: (event) => this.moved(event) });
       const root = element("section", { hidden: true }, element("h2", {}, `${group.mark} ${group.title} `, count), cells);
-      return { root, cells, count, number };
+      return { root, cells, count, number, isLarge: false };
     });
     this.cells = this.fans.map((fan, index) => this.cell(fan, index));
     const legend = element("ul", { class: "legend" }, ...GROUPS.map((group) => element("li", {}, `${group.mark} ${group.title.toLowerCase()}`)),
-      element("li", {}, "bar: score relative to its limit"));
+      element("li", {}, "bar: score as a share of its limit"));
+    const keys = element("p", { class: "muted keys" }, "Arrow keys move from fan to fan, Enter opens one, Esc comes back.");
     const form = element("form", { class: "filters", onsubmit: (event) => event.preventDefault() },
       element("label", { for: "tray" }, "Tray"), this.tray, element("label", { for: "state" }, "State"), this.state);
-    return element("div", {}, form, legend, ...this.sections.map((section) => section.root));
+    this.nothing = element("p", { class: "muted", hidden: true }, "No fan is so.");
+    return element("div", {}, form, legend, keys, this.nothing, ...this.sections.map((section) => section.root));
   }
 
   cell(fan, index) {
@@ -59,9 +62,9 @@ export class FansView {
     const words = element("span", { class: "words" });
     const level = element("span", { class: "level", "aria-hidden": "true" });
     const root = element("button", { class: "cell", type: "button", tabindex: "-1" }, mark,
-      element("span", { class: "name" }, `${fan.tray} ${fan.fan}`), words, level);
-    root.dataset.index = index;
-    return { root, mark, words, level, group: -1, class: -1, percent: -1 };
+      element("span", { class: "name" }, `${fan.tray} fan ${fan.fan}`), words, level);
+    root.index = index;
+    return { root, mark, words, level, text: "", group: -1, class: -1, percent: -1 };
   }
 
   update(fleet) {
@@ -79,7 +82,7 @@ export class FansView {
           came.get(group).push(index);
         }
       }
-      const percent = levels[index] === NO_LEVEL ? 0 : Math.min(100, 5 * Math.round(levels[index] / 5));
+      const percent = levels[index] === NO_LEVEL ? 0 : 5 * Math.round(levels[index] / 5);
       if (isOther || percent !== cell.percent) this.label(cell, index, percent);
     }
     for (const [group, indexes] of came) this.place(group, indexes);
@@ -91,46 +94,87 @@ export class FansView {
     const words = cell.group === 4 ? "normal" : this.site.classes[cell.class];
     if (percent !== cell.percent) {
       cell.percent = percent;
-      cell.level.style.width = `${percent}%`;
+      cell.level.style.transform = `scaleX(${Math.min(1, percent / 100)})`;
     }
-    const text = `${fan.tray} fan ${fan.fan}: ${words}${percent ? `, ${percent} % of the limit` : ""}`;
-    if (cell.root.title !== text) {
+    const share = percent ? `, ${percent} %${percent >= HIGHEST_LEVEL ? " or more" : ""}` : "";
+    const text = `${fan.tray} fan ${fan.fan} ${words}${share}${share && " of the limit"}`;
+    if (cell.text !== text) {
+      cell.text = text;
       cell.root.title = text;
       cell.root.setAttribute("aria-label", text);
-      cell.mark.textContent = group.mark;
-      cell.words.textContent = percent ? `${words}, ${percent} % of limit` : words;
-      cell.root.className = `cell ${group.name}`;
+      if (cell.mark.textContent !== group.mark) cell.mark.textContent = group.mark;
+      if (this.sections[cell.group].isLarge) cell.words.textContent = `${words}${share}`;
+      const kind = `cell ${group.name}`;
+      if (cell.root.className !== kind) cell.root.className = kind;
     }
   }
 
   place(group, indexes) {
-    const parent = this.sections[group].cells;
-    if (parent.childElementCount === 0 || indexes.length > 200) {
-      const all = this.cells.map((cell, index) => [cell, index]).filter(([cell]) => cell.group === group);
-      parent.append(...all.map(([cell]) => cell.root));
-      return;
+    const parent = this.sections[group].cells, had = document.activeElement;
+    if (parent.childElementCount === 0 || indexes.length > 20) {
+      parent.append(...this.cells.filter((cell) => cell.group === group).map((cell) => cell.root));
+    } else {
+      for (const index of indexes) parent.insertBefore(this.cells[index].root, firstAfter(parent.children, index));
     }
-    for (const index of indexes) {
-      const next = [...parent.children].find((child) => Number(child.dataset.index) > index);
-      parent.insertBefore(this.cells[index].root, next ?? null);
-    }
+    if (had !== document.activeElement && this.root.contains(had)) had.focus();
   }
 
   count() {
-    const counts = GROUPS.map(() => 0);
-    for (const cell of this.cells) if (cell.group >= 0) counts[cell.group] += 1;
+    const counts = GROUPS.map(() => 0), shown = GROUPS.map(() => 0);
+    for (const cell of this.cells) {
+      if (cell.group < 0) continue;
+      counts[cell.group] += 1;
+      if (!cell.root.hidden) shown[cell.group] += 1;
+    }
     const wanted = this.state.value;
     this.sections.forEach((section, number) => {
-      section.count.textContent = `(${counts[number]})`;
-      section.root.hidden = counts[number] === 0 || (wanted !== "" && wanted !== GROUPS[number].name);
+      section.count.textContent = shown[number] === counts[number] ? `(${counts[number]})` : `(${shown[number]} of ${counts[number]})`;
+      this.enlarge(section, counts[number] <= LARGE_UP_TO && (number < LARGE_GROUPS || this.fans.length <= LARGE_UP_TO));
+      section.root.hidden = shown[number] === 0 || (wanted !== "" && wanted !== GROUPS[number].name);
     });
-    const first = this.root.querySelector("section:not([hidden]) .cell:not([hidden])");
-    if (first && !this.root.querySelector('.cell[tabindex="0"]')) first.tabIndex = 0;
+    this.nothing.hidden = this.sections.some((section) => !section.root.hidden);
+    this.offer(this.root.querySelector("section:not([hidden]) .cell:not([hidden])"));
+  }
+
+  // Cells with names and words, where they are few.
+  enlarge(section, isLarge) {
+    if (section.isLarge === isLarge) return;
+    section.isLarge = isLarge;
+    section.cells.classList.toggle("large", isLarge);
+    this.cells.forEach((cell, index) => {
+      if (cell.group === section.number) this.label(Object.assign(cell, { text: "" }), index, cell.percent);
+    });
+  }
+
+  // One cell is reached by Tab: the one that had the focus last, as long as it is shown.
+  offer(cell) {
+    const now = this.offered;
+    if (!cell || (now && !now.hidden && now.closest("section:not([hidden])"))) return;
+    if (now) now.tabIndex = -1;
+    cell.tabIndex = 0;
+    this.offered = cell;
+  }
+
+  // Focus a fan by its name; returns whether it is there.
+  focus(name) {
+    const index = this.fans.findIndex((fan) => `${fan.tray}/${fan.fan}` === name);
+    const cell = this.cells[index]?.root;
+    if (!cell?.isConnected || cell.hidden) return false;
+    this.moveTo(cell);
+    return true;
+  }
+
+  moveTo(cell) {
+    if (this.offered) this.offered.tabIndex = -1;
+    cell.tabIndex = 0;
+    this.offered = cell;
+    cell.focus();
   }
 
   filter() {
     this.cells.forEach((cell, index) => {
-      cell.root.hidden = this.tray.value !== "" && this.fans[index].tray !== this.tray.value;
+      const isHidden = this.tray.value !== "" && this.fans[index].tray !== this.tray.value;
+      if (cell.root.hidden !== isHidden) cell.root.hidden = isHidden;
     });
     this.count();
   }
@@ -138,7 +182,7 @@ export class FansView {
   chosen(event) {
     const cell = event.target.closest(".cell");
     if (!cell) return;
-    const fan = this.fans[Number(cell.dataset.index)];
+    const fan = this.fans[cell.index];
     location.hash = `#/fan/${encodeURIComponent(fan.tray)}/${fan.fan}`;
   }
 
@@ -155,8 +199,17 @@ export class FansView {
     const next = all[Math.max(0, Math.min(all.length - 1, to))];
     if (at < 0 || !next) return;
     event.preventDefault();
-    all[at].tabIndex = -1;
-    next.tabIndex = 0;
-    next.focus();
+    this.moveTo(next);
   }
+}
+
+// The first of the cells, which are in order, that comes after an index; null: none.
+function firstAfter(cells, index) {
+  let low = 0, high = cells.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (cells[middle].index > index) high = middle;
+    else low = middle + 1;
+  }
+  return cells[low] ?? null;
 }

@@ -10,12 +10,12 @@ import { ask, Events, learnWhoIAm, me, Refused } from "./server.js";
 
 const content = document.getElementById("content");
 const alarms = new Map();
-let site = null, view = null, fleet = null, stages = [], shownHash = null;
+let site = null, view = null, fleet = null, stages = [], shownHash = null, alarmsDue = 0, lastFan = "";
 
 const events = new Events({
   connected: (isThere) => showConnection(isThere),
-  fleet: (data) => { fleet = data; showSummary(); if (view instanceof FansView) view.update(fleet); },
-  alarm: (alarm) => { alarms.set(`${alarm.tray}/${alarm.fan}`, alarm); showAlarms(alarm); },
+  fleet: (data) => { fleet = data; showSummary(); if (view instanceof FansView || view instanceof FanView) view.update(fleet); },
+  alarm: (alarm) => { alarms.set(`${alarm.tray}/${alarm.fan}`, alarm); showAlarms(alarm); showCount(); },
   stages: (data) => { stages = data.stages; if (view instanceof StagesView) view.update(stages); },
   samples: (data) => { if (view instanceof FanView) view.add(data); },
   missed: () => learnState(),
@@ -39,6 +39,7 @@ async function learnState() {
     stages = now.stages;
     showUser();
     showAlarms(null);
+    showCount();
     if (view instanceof StagesView) view.update(stages);
   } catch (failure) {
     if (failure instanceof Refused && failure.status === 401) start();
@@ -52,13 +53,23 @@ function showSummary() {
 }
 
 function showAlarms(changed) {
-  const presented = [...alarms.values()].filter((alarm) => alarm.presented).length;
-  document.getElementById("alarm-count").textContent = presented ? `(${presented})` : "";
   if (view instanceof AlarmsView) view.update();
+  if (view instanceof HistoryView) view.update();
   if (view instanceof FanView && (!changed || (changed.tray === view.tray && changed.fan === view.fan))) {
     view.updateAlarm(alarms.get(`${view.tray}/${view.fan}`));
   }
 }
+
+// When many alarms come at once, they are counted together.
+function showCount() {
+  alarmsDue ||= requestAnimationFrame(() => {
+    alarmsDue = 0;
+    const presented = [...alarms.values()].filter((alarm) => alarm.presented).length;
+    document.getElementById("alarm-count").textContent = presented ? `(${presented})` : "";
+  });
+}
+
+const viewerUrl = (tray) => site.trays.find((each) => each.name === tray)?.viewer_url ?? "";
 
 function showUser() {
   const button = (text, onclick) => element("button", { type: "button", onclick }, text);
@@ -75,19 +86,30 @@ function showView() {
   const isFan = kind === "fan" && site.trays.some((each) => each.name === tray && Number(fan) < each.fans);
   const wanted = isFan ? `${tray}/${fan}` : "";
   if (events.fan !== wanted || !events.source) events.open(wanted);
-  if (isFan) view = new FanView(tray, Number(fan), alarms.get(wanted), site.viewer_url);
-  else if (kind === "alarms") view = new AlarmsView(alarms);
+  if (isFan) lastFan = wanted;
+  if (isFan) view = new FanView(site, indexOf(tray, Number(fan)), tray, Number(fan), alarms.get(wanted), viewerUrl(tray));
+  else if (kind === "alarms") view = new AlarmsView(alarms, viewerUrl);
   else if (kind === "history") view = new HistoryView();
   else if (kind === "stages") view = new StagesView();
   else view = new FansView(site);
   content.replaceChildren(view.root);
-  if (view instanceof FansView && fleet) view.update(fleet);
+  if ((view instanceof FansView || view instanceof FanView) && fleet) view.update(fleet);
   if (view instanceof StagesView) view.update(stages);
   const current = isFan || !["alarms", "history", "stages"].includes(kind) ? "fans" : kind;
   for (const link of document.querySelectorAll("nav a")) {
     if (link.getAttribute("href") === `#/${current}`) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
+}
+
+// The index of a fan among all of the site.
+function indexOf(tray, fan) {
+  let before = 0;
+  for (const each of site.trays) {
+    if (each.name === tray) return before + fan;
+    before += each.fans;
+  }
+  return -1;
 }
 
 async function start() {
@@ -112,5 +134,12 @@ async function start() {
   }
 }
 
-window.addEventListener("hashchange", () => { showView(); content.focus(); });
+window.addEventListener("hashchange", () => {
+  showView();
+  if (!(view instanceof FansView && view.focus(lastFan))) content.focus();
+});
+window.addEventListener("keydown", (event) => {
+  const isElsewhere = document.getElementById("dialog").open || event.target.matches("input, select");
+  if (event.key === "Escape" && !isElsewhere && view instanceof FanView) location.hash = "#/fans";
+});
 start();

@@ -4,21 +4,30 @@ import { element } from "./dom.js";
 import { badge } from "./alarms.js";
 
 const WELL = ["ok", "stopped"];
-const HEADS = ["Stage", "State", "In, Hz", "Out, Hz", "Latency p50, p99", "Lost", "Problem"];
+const HEADS = [["Stage"], ["State"], ["In, messages/s", "number"], ["Out, messages/s", "number"], ["Latency, ms: p50", "number"], ["p99", "number"],
+  ["Lost", "number"], ["Problem; notes"]];
 
 export class StagesView {
   constructor() {
     this.body = element("tbody");
-    this.root = element("div", {}, element("h2", {}, "Stages"), element("div", { class: "scroll" }, element("table", { class: "folding" },
-      element("thead", {}, element("tr", {}, ...HEADS.map((text) => element("th", { scope: "col" }, text)))), this.body)));
+    this.shown = "";
+    this.root = element("div", {}, element("h2", {}, "Stages"), element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Stages" },
+      element("table", { class: "folding" }, element("thead", {}, element("tr", {}, ...HEADS.map(([text, kind]) =>
+        element("th", { scope: "col", class: kind }, text)))), this.body)));
   }
 
   update(stages) {
+    const shown = JSON.stringify(stages);
+    if (shown === this.shown) return;
+    this.shown = shown;
     const cell = (label, content, kind = "") => element("td", { "data-label": label, class: kind }, content);
+    const latency = (each, ms) => (each.latency_p99_ms ? ms.toFixed(1) : "");
+    const about = (each) => element("div", {}, each.detail ? element("p", { class: "problem" }, `▲ ${each.detail}`) : "",
+      ...each.notes.map((note) => element("p", { class: "muted" }, note)));
     this.body.replaceChildren(...stages.map((each) => element("tr", {}, cell("Stage", each.name),
       cell("State", WELL.includes(each.state) ? element("span", { class: "badge good" }, `● ${each.state}`) : badge("warning", each.state)),
-      cell("In, Hz", each.in_hz.toFixed(1), "number"), cell("Out, Hz", each.out_hz.toFixed(1), "number"),
-      cell("Latency", `${each.latency_p50_ms} ms, ${each.latency_p99_ms} ms`, "number"),
-      cell("Lost", String(each.lost), each.lost ? "number lost" : "number"), cell("Problem", each.detail))));
+      cell("In, messages/s", each.in_hz.toFixed(1), "number"), cell("Out, messages/s", each.out_hz.toFixed(1), "number"),
+      cell("Latency p50, ms", latency(each, each.latency_p50_ms), "number"), cell("Latency p99, ms", latency(each, each.latency_p99_ms), "number"),
+      cell("Lost", each.lost ? `▲ ${each.lost}` : "0", each.lost ? "number lost" : "number"), cell("Problem; notes", about(each)))));
   }
 }

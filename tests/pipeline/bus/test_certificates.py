@@ -12,7 +12,8 @@ import pytest
 from pipeline.bus.authority import CLOCK_SKEW, Authority
 from pipeline.bus.certificates import Credentials, checked_credentials, read_certificate
 from pipeline.bus.errors import BusError
-from pipeline.bus.session import Bus, _zenoh_config
+from pipeline.bus.opening import zenoh_config
+from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from tests.support.site_certificates import DAY, SiteCertificates
 
@@ -153,5 +154,5 @@ def test_settings_of_zenoh_that_cannot_be_passed_through_are_one_line(endpoint, 
 
 
 def test_settings_of_zenoh_are_passed_through(endpoint):
-    config = _zenoh_config(BusConfig(zenoh={"transport/unicast/max_sessions": 7}), listens=False)
+    config = zenoh_config(BusConfig(zenoh={"transport/unicast/max_sessions": 7}), listens=False)
     assert config.get_json("transport/unicast/max_sessions") == "7"

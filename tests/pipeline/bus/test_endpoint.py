@@ -52,7 +52,7 @@ def test_row_15_other_endpoints_are_left_to_zenoh(endpoint):
 @pytest.mark.parametrize("mode", ["peer", "client"])
 @pytest.mark.parametrize("stop", [None, threading.Event()])
 def test_row_15_a_foreign_program_at_the_endpoint_is_one_line(foreign, monkeypatch, mode, stop):
-    monkeypatch.setattr("pipeline.bus.session.MEETING_LIMIT_S", 0.0)
+    monkeypatch.setattr("pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
     with pytest.raises(BusError) as refused:
         Bus(BusConfig(mode=mode, endpoint=foreign), stop)
     assert str(refused.value) == (
@@ -63,7 +63,7 @@ def test_row_15_a_foreign_program_at_the_endpoint_is_one_line(foreign, monkeypat
 
 @pytest.mark.parametrize("mode", ["peer", "client"])
 def test_row_15_without_certificates_at_a_port_with_tls_is_one_line_that_says_so(tmp_path, monkeypatch, mode):
-    monkeypatch.setattr("pipeline.bus.session.MEETING_LIMIT_S", 0.0)
+    monkeypatch.setattr("pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
     with SecuredSite(tmp_path, free_endpoint()).running() as site, pytest.raises(BusError) as refused:
         Bus(BusConfig(mode=mode, endpoint=site.endpoint.replace("tls/", "tcp/")))
     assert "the program that listens there takes TLS only: give this configuration" in str(refused.value)
@@ -84,7 +84,7 @@ def test_row_15_a_command_tries_again_where_a_router_is_just_starting(endpoint, 
             relay.heal()
             return accepts_connections(asked)
 
-        monkeypatch.setattr("pipeline.bus.session.accepts_connections", is_asked)
+        monkeypatch.setattr("pipeline.bus.opening.accepts_connections", is_asked)
         with Bus(BusConfig(mode="client", endpoint=relay.endpoint)) as bus:
             assert bus.alive("fantwin/**") == set()
 

@@ -15,8 +15,9 @@ import pytest
 
 from pipeline.bus.errors import BusError
 from pipeline.bus.link import LEASE_MS
+from pipeline.bus.opening import zenoh_config
 from pipeline.bus.router import open_router
-from pipeline.bus.session import Bus, _zenoh_config, join_bus
+from pipeline.bus.session import Bus, join_bus
 from pipeline.config.loading import load_config
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, tray_key
@@ -188,9 +189,9 @@ def test_a_router_takes_settings_of_zenoh(endpoint):
 
 def test_row_16_a_client_and_its_router_notice_a_dead_connection_after_four_seconds():
     """A connection that is cut and never answers again: resumed after 4.0 s instead of 10.0 s (measured)."""
-    client = _zenoh_config(BusConfig(mode="client"), listens=False)
+    client = zenoh_config(BusConfig(mode="client"), listens=False)
     assert client.get_json("transport/link/tx/lease") == LEASE_MS == "4000"
-    peer = _zenoh_config(BusConfig(), listens=True)
+    peer = zenoh_config(BusConfig(), listens=True)
     assert peer.get_json("transport/link/tx/lease") == "10000"
 
 

@@ -17,6 +17,8 @@ from PIL import Image
 from rich.console import Console
 
 from pipeline.cli.watch.demo import DEMO_FOLDER, _clear, _run, demo
+from pipeline.cli.watch.demo_page import SIZE
+from pipeline.cli.watch.page_picture import installed_browser, take_picture
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.devices.serial_config import SerialConfig
@@ -31,6 +33,12 @@ def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
     done = fantwin("demo", "-o", out, timeout_s=200)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Traceback" not in done.stdout + done.stderr
+    assert "operators' page, while the demo runs: http://127.0.0.1:" in done.stdout
+    if installed_browser():
+        with Image.open(out / "page.png") as picture:
+            assert picture.size == SIZE
+    else:
+        assert "no picture of the page: it needs a browser" in done.stdout
 
     summary = json.loads((out / "summary.json").read_text())
     assert [(fault["fan"], fault["kind"]) for fault in summary["faults"]] == [(2, "inlet"), (5, "rotor")]
@@ -119,6 +127,16 @@ def test_a_pipeline_that_does_not_stop_is_one_line_and_is_killed(tmp_path, endpo
     with pytest.raises(UserError, match=r"did not stop within 0\.2 s.*up\.log"):
         _run(config, overrides, tmp_path, 7, Console(file=io.StringIO()))
     assert not is_running(int((tmp_path / "up").read_text()))
+
+
+@pytest.mark.parametrize("program", ["false", "cat", "no-such-program"])
+def test_a_browser_that_takes_no_picture_is_one_line_and_ends(program, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.cli.watch.page_picture.LIMIT_S", 1.0)
+    path = shutil.which(program) or f"/{program}"
+    why_not = take_picture(path, "http://127.0.0.1:1/", "true", (100, 100), tmp_path / "page.png")
+    assert why_not.startswith(f"{program} has taken none: ")
+    assert "\n" not in why_not
+    assert not (tmp_path / "page.png").exists()
 
 
 def test_a_folder_that_cannot_be_used_is_one_line(tmp_path):

@@ -116,7 +116,7 @@ def test_only_the_lines_of_the_named_trays_are_checked(tmp_path, port):
 
 
 def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(capsys, tmp_path, port, monkeypatch):
-    monkeypatch.setattr("pipeline.bus.session.MEETING_LIMIT_S", 0.0)
+    monkeypatch.setattr("pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
         settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]

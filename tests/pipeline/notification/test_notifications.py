@@ -296,3 +296,18 @@ def test_two_targets_of_one_name_and_unknown_time_zones_are_refused():
         NotifierConfig.model_validate({"target": [TARGET, TARGET]})
     with pytest.raises(ValidationError, match="time zone"):
         NotifierConfig(timezone="Moon/Sea")
+
+
+def test_a_clock_that_is_set_back_holds_nothing_up():
+    desk = Desk(escalation_after_s=900, repeat_s=1800)
+    desk.hear(alarm())
+    desk.wait(60)
+    desk.now_ns -= 86_400 * NS_PER_S
+    assert titles(desk.wait(960)) == ["Nobody has acknowledged: WARNING, fan 2 of tray1"]
+    desk.now_ns -= 86_400 * NS_PER_S
+    assert titles(desk.wait(1860))[0] == "Still: WARNING, fan 2 of tray1"
+    first = Desk(is_first=True)
+    first.hear(alarm())
+    assert first.wait(2) == []
+    first.now_ns -= 86_400 * NS_PER_S
+    assert titles(first.wait(20)) == ["WARNING, fan 2 of tray1"], "the first look takes as long as ever"

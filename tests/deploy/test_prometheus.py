@@ -1,0 +1,199 @@
+"""Prometheus and Grafana: the rules and queries of `deploy/`, on what a real Prometheus scrapes of a gateway."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import subprocess
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from prometheus_client.parser import text_string_to_metric_families
+
+from schemas.enums import FanState, StageStatus
+from schemas.fields import columns
+from schemas.header import Header
+from schemas.health import Health, Input, LatencyBucket, Output
+from schemas.messages import Score
+from tests.stages.test_gateway import alarm, score
+from tests.support.grafana_schema import problems_of
+from tests.support.running_chain import eventually
+from tests.support.running_core import FANS, SITE, TRAY
+from tests.support.running_gateway import Client, RunningGateway
+from tests.support.running_prometheus import DEPLOY, RunningPrometheus, needs_prometheus
+
+RULES = DEPLOY / "prometheus" / "fantwin.rules.yml"
+RULE_TESTS = RULES.with_name("fantwin.rules.test.yml")
+BOARD = DEPLOY / "grafana" / "fantwin.json"
+DOCUMENT = DEPLOY.parent / "docs" / "how-to" / "metrics.md"
+VARIABLES = {"$site": SITE, "$tray": TRAY, "$fan": "2", "$__rate_interval": "5m"}
+ALL_FANS = 2 * FANS
+EMPTY_WHILE_HEALTHY = ["Fans in alarm"]
+"""a table"""
+BAD_NUMBERS = {"Number of fans in alarm": [1], "Fans not judged": [1], "Stages not at work": [1]}
+NOT_WITHIN_A_TEST = {"FantwinStageMissing"}
+"""it looks an hour back; `promtool test rules` has that hour"""
+
+
+def alerts() -> set[str]:
+    groups = yaml.safe_load(RULES.read_text())["groups"]
+    return {rule["alert"] for group in groups for rule in group["rules"] if "alert" in rule}
+
+
+def board_queries() -> list[tuple[str, str]]:
+    """Title of the panel (and which of its queries), and query, with the values of the board's variables."""
+    panels = json.loads(BOARD.read_text())["panels"]
+    found = [
+        (panel["title"] if target["refId"] == "A" else f"{panel['title']} {target['refId']}", target["expr"])
+        for panel in panels
+        for target in panel.get("targets", ())
+    ]
+    for name, value in VARIABLES.items():
+        found = [(title, query.replace(name, value)) for title, query in found]
+    assert all("$" not in query for _, query in found)
+    return found
+
+
+def judged(second: float, *unknown: int) -> Score:
+    """Of ALL_FANS, all but these normal."""
+    made = score(second)
+    wide = {name: np.tile(getattr(made, name), ALL_FANS // made.fans) for name in columns(Score) if name != "t_ns"}
+    state = np.full((len(made.t_ns), ALL_FANS), FanState.NORMAL, np.uint8)
+    state[:, unknown] = FanState.UNKNOWN
+    return replace(made, fans=ALL_FANS, **wide | {"state": state, "valid": state != FanState.UNKNOWN})
+
+
+def health(stage: str, messages: int, uptime_s: float, latency_s: float = 0.05, **more: Any) -> Health:
+    """Of a stage whose outputs are all of one age."""
+    latencies = tuple(
+        LatencyBucket(upper_s=upper_s, count=messages * (latency_s <= upper_s))
+        for upper_s in (0.1, 1.0, 10.0, math.inf)
+    )
+    key = f"fantwin/{SITE}/{TRAY}/"
+    values = {
+        "status": StageStatus.OK,
+        "inputs": (
+            Input(key=f"{key}in", producer="p-1", received=messages, missing=0, duplicated=0, next_sequence=messages),
+        ),
+        "outputs": (Output(key=f"{key}out", published=messages),),
+        "latencies": latencies,
+        "latency_sum_s": messages * latency_s,
+        "t_ns": messages * 10**9,
+        "newest_input_t_ns": messages * 10**9,
+        **more,
+    }
+    header = Header(f"{stage}-all-1", messages)
+    return Health(header=header, stage=stage, instance="all", uptime_s=uptime_s, **values)
+
+
+@pytest.fixture
+def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningGateway]:
+    """What it was last fed with does not grow old, however long Prometheus takes."""
+    for module in ("pipeline.presenting.site_model", "pipeline.launch.site_state"):
+        monkeypatch.setattr(f"{module}.SILENT_AFTER_S", math.inf)
+    running = RunningGateway(tmp_path, fans=ALL_FANS)
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+@pytest.fixture
+def prometheus(tmp_path: Path, gateway: RunningGateway) -> Iterator[RunningPrometheus]:
+    running = RunningPrometheus(tmp_path, gateway.port)
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+def promtool(*words: str | Path, text: str | None = None) -> str:
+    done = subprocess.run(["promtool", *words], input=text, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@needs_prometheus
+def test_every_query_of_the_board_and_every_rule_works_on_what_a_site_sends(gateway, prometheus):
+    def feed_and_wait(number: int, uptime_s: float, *fans: int, **more: Any) -> None:
+        """Feed scores and healths, and wait until Prometheus has them."""
+        gateway.feed(judged(number, *fans))
+        gateway.feed(health("scorer", 100 * number, uptime_s, **more), health("recorder", 100 * number, 100.0 * number))
+        received = f'fantwin_stage_received_messages_total{{site="{SITE}",stage="scorer"}}'
+        eventually(lambda: prometheus.value(received) == 100 * number, "Prometheus has scraped what was fed")
+
+    feed_and_wait(1, 100.0)
+    feed_and_wait(2, 200.0)
+    eventually(lambda: prometheus.alert_states().keys() == alerts(), "all rules have been evaluated")
+    latencies = f'fantwin_stage_latency_seconds_count{{site="{SITE}",stage="scorer"}}'
+    eventually(lambda: prometheus.value(latencies) == 200, "the histogram has every output")
+    shown: dict[str, list[tuple[dict[str, str], float]]] = {}
+
+    def is_shown() -> bool:
+        """Of one moment: where a scrape comes late on a busy machine, nothing is there until the next."""
+        shown.update({title: prometheus.query(query) for title, query in board_queries()})
+        return [title for title, found in shown.items() if not found] == EMPTY_WHILE_HEALTHY
+
+    eventually(is_shown, "every other panel shows something")
+    values = {title: [value for _, value in found] for title, found in shown.items()}
+    assert values["Fans"] == [ALL_FANS]
+    assert values["Fans not judged"] == values["Stages not at work"] == values["Lost in the last hour"] == [0.0]
+    assert set(values["Score against its limit"]) == {0.5}
+    eventually(lambda: set(prometheus.alert_states().values()) == {"inactive"}, "no alert")
+
+    gateway.feed(alarm(), health("viewer", 1, 1.0, status=StageStatus.STOPPED))
+    for number in range(3, 7):  # the scorer starts again and again, loses data, and is late
+        feed_and_wait(number, 10.0 - number, 1, lost=5, latency_s=5.0, status=StageStatus.DEGRADED)
+    eventually(lambda: not is_shown() and all(shown.values()), "every panel shows something")
+    assert [labels for labels, _ in shown["Fans in alarm"]] == [{"tray": TRAY, "fan": "2", "severity": "alarm"}]
+    assert len(shown["Worst fans"]) == ALL_FANS - 1, "what is not judged has no score"
+    assert {title: [value for _, value in shown[title]] for title in BAD_NUMBERS} == BAD_NUMBERS
+
+    def have_gone_off(*but: str) -> bool:
+        states = prometheus.alert_states()
+        return {name for name, state in states.items() if state != "inactive"} == alerts() - NOT_WITHIN_A_TEST - {*but}
+
+    eventually(lambda: have_gone_off("FantwinManyFansNotScored", "FantwinGatewayAbsent"), "the rules go off")
+    feed_and_wait(7, 1.0, 1, 3, 4, lost=5, latency_s=5.0, status=StageStatus.DEGRADED)
+    eventually(lambda: have_gone_off("FantwinFansNotScored", "FantwinGatewayAbsent"), "many fans are one alert")
+    gateway.core.close()
+    eventually(lambda: prometheus.alert_states()["FantwinGatewayAbsent"] != "inactive", "nothing is scraped any more")
+
+
+@needs_prometheus
+def test_the_rules_say_what_their_own_tests_expect(tmp_path):
+    promtool("check", "config", RULES.with_name("prometheus.yml"))
+    promtool("test", "rules", RULE_TESTS)
+    tested = yaml.safe_load(RULE_TESTS.read_text())["tests"]
+    fired = {each["alertname"] for test in tested for each in test["alert_rule_test"] if each["exp_alerts"]}
+    assert fired == alerts()
+
+
+@needs_prometheus
+def test_prometheus_finds_nothing_to_say_against_the_metrics(gateway):
+    gateway.feed(judged(1.0), alarm(), health("scorer", 100, 10.0))
+    assert not promtool("check", "metrics", text=Client(gateway).ask("GET", "/metrics")[1])
+
+
+def test_the_board_is_one_of_grafanas_schema():
+    assert problems_of(json.loads(BOARD.read_text())) == []
+
+
+def test_the_document_has_every_metric_with_its_labels(gateway):
+    gateway.feed(judged(1.0), alarm(), health("scorer", 100, 10.0))
+    families = [*text_string_to_metric_families(Client(gateway).ask("GET", "/metrics")[1])]
+    labels = {
+        (f"{family.name}_total" if family.type == "counter" else family.name): sorted(
+            family.samples[0].labels.keys() - {"le"}
+        )
+        for family in families
+        if family.name.startswith("fantwin_")
+    }
+    rows = re.findall(r"^\| `(fantwin_\w+)` \| ([^|]*) \|", DOCUMENT.read_text(), re.MULTILINE)
+    assert {name: sorted(words.split(", ")) for name, words in rows} == labels

@@ -1,0 +1,368 @@
+"""The gateway under attack: guesses, sessions that should be over, connections that are held, headers that lie."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import socket
+import sqlite3
+import ssl
+import threading
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from argon2 import PasswordHasher
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    PrivateFormat,
+    load_pem_private_key,
+)
+
+from pipeline.gateway import server
+from pipeline.gateway.config import GatewayConfig
+from pipeline.presenting import login_failures
+from pipeline.presenting.users import User, UserRole, write_users
+from pipeline.runtime.stage import StageError
+from stages import gateway as stage
+from tests.stages.test_gateway import PASSWORD, SCRIPT, alarm, granted, score
+from tests.support.running_chain import eventually
+from tests.support.running_core import TRAY
+from tests.support.running_gateway import Client, RunningGateway
+from tests.support.site_certificates import SiteCertificates
+
+ACT, ASKED = f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"}
+OTHER_PASSWORD = "another horse battery"
+
+
+def put_users(path: Path, password: str = PASSWORD, **roles: UserRole) -> Path:
+    hashed = quick_hasher().hash(password)
+    write_users(path, {name: User(name, role, hashed) for name, role in roles.items()})
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _quickly_hashed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.presenting.users.hasher", quick_hasher)
+
+
+def quick_hasher() -> PasswordHasher:
+    return PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+
+
+@pytest.fixture
+def users(tmp_path: Path) -> Path:
+    return put_users(tmp_path / "users.toml", ann=UserRole.OPERATOR, vic=UserRole.VIEWER)
+
+
+@pytest.fixture
+def gateway(tmp_path: Path, users: Path) -> Iterator[RunningGateway]:
+    running = RunningGateway(tmp_path, granted, users=users)
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+def logged_in(gateway: RunningGateway, name: str = "ann") -> Client:
+    client = Client(gateway)
+    assert client.log_in(name, PASSWORD) == 200
+    return client
+
+
+def events(gateway: RunningGateway, **headers: str) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=30)
+    connection.request("GET", "/api/v1/events", headers=headers)
+    return connection.getresponse()
+
+
+def said(capfd: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
+    lines = [line.partition("event: ") for line in capfd.readouterr().err.splitlines()]
+    return [json.loads(text) for before, sign, text in lines if sign and not before]
+
+
+def test_a_login_holds_nobody_up(gateway, monkeypatch):
+    goes_on, is_checking = threading.Event(), threading.Event()
+
+    def slowly(*_rest: object) -> bool:
+        is_checking.set()
+        assert goes_on.wait(30)
+        return False
+
+    monkeypatch.setattr("pipeline.presenting.users.Users.is_password", slowly)
+    answers: list[int] = []
+    guess = threading.Thread(target=lambda: answers.append(Client(gateway).log_in("ann", PASSWORD)))
+    guess.start()
+    assert is_checking.wait(30)
+    assert Client(gateway).ask("GET", "/api/v1/site")[0] == 200, "while a password is being checked"
+    goes_on.set()
+    guess.join()
+    assert answers == [401]
+
+
+def test_guesses_side_by_side_are_as_few_as_one_after_the_other(gateway):
+    answers: list[int] = []
+    guesses = [
+        threading.Thread(target=lambda: answers.append(Client(gateway).log_in("ann", "wrong wrong wrong")))
+        for _ in range(12)
+    ]
+    for each in guesses:
+        each.start()
+    for each in guesses:
+        each.join()
+    assert sorted(answers) == [401] * login_failures.FAILURES + [429] * (12 - login_failures.FAILURES)
+
+
+def test_an_own_account_buys_no_more_guesses_and_an_ipv6_network_counts_as_one_address():
+    now_s = 0.0
+    failures = login_failures.LoginFailures(lambda: now_s)
+    for number in range(login_failures.FAILURES):
+        assert failures.begin(f"user{number}", f"2001:db8::{number}") == 0
+        failures.begin("vic", "192.0.2.1")
+        failures.succeed("vic", "192.0.2.1")
+    assert failures.begin("ann", "2001:db8::ffff") > 0
+    assert failures.begin("ann", "2001:db8:0:1::1") == 0
+    assert failures.begin("ann", "::ffff:192.0.2.7") == 0
+    guesses = 0
+    while now_s < 3600:
+        guesses += failures.begin("bob", "192.0.2.9") == 0
+        now_s += 1
+    assert guesses <= 100, "in an hour"
+
+
+def test_a_new_password_and_another_login_end_the_session_of_before(gateway, users):
+    first = logged_in(gateway)
+    again = Client(gateway)
+    again.cookie = first.cookie
+    assert again.log_in("ann", PASSWORD) == 200
+    assert first.ask("POST", ACT, ASKED)[0] == 401, "this browser has logged in again"
+    assert again.ask("POST", ACT, ASKED)[0] == 200
+    put_users(users, OTHER_PASSWORD, ann=UserRole.OPERATOR)
+    assert again.ask("POST", ACT, ASKED)[0] == 401
+    assert len(gateway.sent) == 1
+
+
+def test_a_user_who_logs_in_again_and_again_ends_his_own_sessions_only(gateway, monkeypatch):
+    monkeypatch.setattr("pipeline.gateway.sessions.MOST_OF_A_USER", 2)
+    operator, viewers = logged_in(gateway), [logged_in(gateway, "vic") for _ in range(3)]
+    assert [each.ask("GET", "/api/v1/me")[1]["name"] for each in viewers] == ["", "vic", "vic"]
+    assert operator.ask("GET", "/api/v1/me")[1]["name"] == "ann"
+
+
+def test_live_events_end_for_who_may_not_read_any_more(gateway, users, monkeypatch):
+    monkeypatch.setattr("pipeline.gateway.api.CHECKED_EVERY_S", 0.0)
+    monkeypatch.setattr("pipeline.gateway.config.GatewayConfig.is_loopback", False)
+    gateway.feed(score())
+    assert events(gateway).status == 401
+    stream = events(gateway, Cookie=logged_in(gateway, "vic").cookie)
+    assert stream.readline() == b"event: fleet\n"
+    put_users(users, ann=UserRole.OPERATOR)
+    while stream.readline():
+        pass
+    assert stream.isclosed()
+
+
+def test_through_a_proxy_that_knows_no_users_nobody_reads_without_a_login(tmp_path, users, gateway):
+    assert Client(gateway).ask("GET", "/api/v1/site")[0] == 200
+    assert Client(gateway).ask("GET", "/api/v1/site", None, {"X-Forwarded-For": "192.0.2.1"})[0] == 401
+    named = RunningGateway(tmp_path / "named", users=users, hosts=("fans.plant.example",))
+    try:
+        client, host = Client(named), {"Host": "fans.plant.example"}
+        assert client.ask("GET", "/api/v1/site", None, host)[0] == 401
+        assert client.ask("GET", "/metrics", None, host)[0] == 401
+        assert logged_in(gateway).ask("GET", "/api/v1/site")[0] == 200
+    finally:
+        named.close()
+
+
+def test_a_header_of_the_proxy_that_comes_twice_names_nobody(tmp_path):
+    gateway = RunningGateway(tmp_path, granted, user_header="X-User", operators=("ann",))
+    try:
+        connection = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=20)
+        connection.putrequest("GET", "/api/v1/site")
+        connection.putheader("X-User", "ann")
+        connection.putheader("X-User", "vic")
+        connection.endheaders()
+        assert connection.getresponse().status == 401
+        connection.close()
+    finally:
+        gateway.close()
+    with pytest.raises(ValueError, match="address of the proxy, not its name"):
+        GatewayConfig(user_header="X-User", proxies=("proxy.plant.example",))
+
+
+def test_connections_that_ask_nothing_are_ended_and_those_that_are_answered_are_not(gateway, monkeypatch):
+    monkeypatch.setattr(server, "REQUEST_WITHIN_S", 0.3)
+    gateway.feed(score())
+    stream = events(gateway)
+    silent, slow = (socket.create_connection(("127.0.0.1", gateway.port), timeout=30) for _ in range(2))
+    slow.sendall(b"GET / HTTP/1.1\r\nHost: loc")
+    again = socket.create_connection(("127.0.0.1", gateway.port), timeout=30)
+    again.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\nGET / HTTP")
+    assert b"200 OK" in again.recv(4096)
+    for each in (silent, slow, again):
+        assert is_ended(each)
+    fleets = 0
+    while fleets < 3:
+        fleets += stream.readline() == b"event: fleet\n"
+    stream.close()
+
+
+def is_ended(connection: socket.socket) -> bool:
+    """Waits for the end of a connection."""
+    try:
+        while connection.recv(4096):
+            pass
+    except ConnectionResetError:
+        pass
+    connection.close()
+    return True
+
+
+def test_one_address_elsewhere_cannot_take_all_connections_and_all_are_never_too_many(tmp_path, monkeypatch):
+    monkeypatch.setattr(server, "MOST_OF_AN_ADDRESS", 2)
+    connections = server.Connections(frozenset({"127.0.0.1"}), most=7)
+    assert [connections.begin("192.0.2.1") for _ in range(3)] == [False, False, True]
+    connections.end("192.0.2.1")
+    assert [connections.begin("127.0.0.1") for _ in range(4)] == [False] * 4
+    assert not connections.begin("192.0.2.2")
+    assert connections.begin("192.0.2.3"), "more than there may be"
+    for address in ("192.0.2.1", "192.0.2.1", "192.0.2.3"):
+        connections.end(address)
+    assert not connections.begin("192.0.2.1")
+    monkeypatch.setattr(server, "most_connections", lambda: 3)
+    gateway = RunningGateway(tmp_path)
+    try:
+        held = [socket.create_connection(("127.0.0.1", gateway.port), timeout=30) for _ in range(5)]
+        assert is_ended(held[3])
+        assert is_ended(held[4])
+        held[0].close()
+        eventually(lambda: answers(gateway), "there is room again")
+    finally:
+        gateway.close()
+
+
+def answers(gateway: RunningGateway) -> bool:
+    try:
+        return Client(gateway).ask("GET", "/healthz")[0] == 200
+    except (OSError, http.client.HTTPException):
+        return False
+
+
+def test_a_body_that_comes_little_by_little_is_given_up(gateway, monkeypatch):
+    monkeypatch.setattr("pipeline.gateway.api.BODY_WITHIN_S", 0.3)
+    slow = socket.create_connection(("127.0.0.1", gateway.port), timeout=30)
+    head = ("POST /api/v1/login HTTP/1.1", "Host: localhost", "Content-Type: application/json", "Content-Length: 9")
+    slow.sendall("\r\n".join((*head, "", "{")).encode())
+    assert slow.recv(4096).startswith(b"HTTP/1.1 408")
+    slow.close()
+
+
+def test_what_fails_in_the_gateway_is_logged_and_says_nothing_to_whoever_asks(gateway, capfd, monkeypatch):
+    assert Client(gateway).ask("POST", "/api/v1/login", {}, {"Origin": "http://["})[0] == 403
+    said(capfd)
+
+    def fail(*_rest: object) -> None:
+        raise RuntimeError("the secret")
+
+    monkeypatch.setattr(gateway.core._model, "stages", fail)
+    status, body, headers = Client(gateway).ask("GET", "/api/v1/stages")
+    assert (status, "secret" in json.dumps(body)) == (500, False)
+    assert "default-src 'none'" in headers["content-security-policy"]
+    (event,) = said(capfd)
+    assert (event["what"], event["path"], event["address"]) == ("gateway failed", "/api/v1/stages", "127.0.0.1")
+    assert event["why"] == "RuntimeError: the secret"
+
+
+def test_logins_refusals_and_requests_are_logged_a_line_each(gateway, capfd):
+    gateway.feed(score(), alarm())
+    Client(gateway).log_in('ann"}\nevent: {', "wrong wrong wrong")
+    viewer, operator = logged_in(gateway, "vic"), logged_in(gateway)
+    viewer.ask("POST", ACT, ASKED)
+    operator.ask("POST", ACT, ASKED, {"X-CSRF-Token": "another"})
+    operator.ask("POST", ACT, ASKED)
+    operator.ask("POST", "/api/v1/logout", {})
+    found = said(capfd)
+    assert [(each["what"], each["user"]) for each in found] == [
+        ("login refused: wrong name or password", 'ann"}\nevent: {'),
+        ("login", "vic"),
+        ("login", "ann"),
+        ("request refused", "vic"),
+        ("request refused", "ann"),
+        ("request", "ann"),
+        ("logout", "ann"),
+    ]
+    assert (found[5]["action"], found[5]["fan"], found[5]["address"]) == ("acknowledge", f"{TRAY} 2", "127.0.0.1")
+    assert PASSWORD not in json.dumps(found)
+
+
+def test_a_comment_is_one_line_that_shows_what_it_says(gateway):
+    gateway.feed(score(), alarm())
+    operator = logged_in(gateway)
+    comment = f"é 扇 \U0001f600 {SCRIPT}\x1b[2J\r\nfan 3: \u202etxet\x00\x9b"
+    assert operator.ask("POST", ACT, ASKED | {"comment": comment})[0] == 200
+    assert gateway.sent[0].comment == f"é 扇 \U0001f600 {SCRIPT} [2J  fan 3:  txet  "
+
+
+def test_a_history_that_is_damaged_is_a_problem_and_the_page_goes_on(tmp_path, users):
+    first = RunningGateway(tmp_path)
+    first.feed(*(alarm(sequence=number) for number in range(300)))
+    first.close()
+    path = tmp_path / stage.HISTORY
+    sqlite3.connect(path).execute("PRAGMA wal_checkpoint(TRUNCATE)").connection.close()
+    with path.open("r+b") as file:
+        file.seek(4096)
+        file.write(os.urandom(path.stat().st_size - 4096))
+    second = RunningGateway(tmp_path)
+    try:
+        client = Client(second)
+        assert client.ask("GET", "/api/v1/alarms/history")[0] == 503
+        second.feed(score(), alarm(sequence=1000))
+        assert client.ask("GET", "/api/v1/alarms")[1]["alarms"], "what is now needs no history"
+        eventually(lambda: "move it away" in second.problem(), "the problem is named")
+    finally:
+        second.close()
+
+
+def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_named(tmp_path, users):
+    certificates = SiteCertificates(tmp_path)
+    certificates.issue("page", lifetime=timedelta(seconds=-1))
+    files = {"certificate": tmp_path / "page.pem", "key": tmp_path / "page.key"}
+    gateway = RunningGateway(tmp_path, users=users, **files)
+    try:
+        gateway.feed(score())
+        unchecked = ssl.create_default_context()
+        unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
+        connection = http.client.HTTPSConnection("127.0.0.1", gateway.port, timeout=30, context=unchecked)
+        form = json.dumps({"name": "ann", "password": PASSWORD})
+        connection.request("POST", "/api/v1/login", form, {"Content-Type": "application/json"})
+        answer = connection.getresponse()
+        token, cookie = json.loads(answer.read())["csrf_token"], answer.getheader("set-cookie", "")
+        assert cookie.startswith("__Host-fantwin=")
+        assert "; Secure" in cookie
+        headers = {"Cookie": cookie.partition(";")[0], "X-CSRF-Token": token}
+        connection.request("POST", "/api/v1/logout", headers=headers)
+        answer = connection.getresponse()
+        gone = answer.getheader("set-cookie", "")
+        assert "Max-Age=0" in gone
+        assert "; Secure" in gone, "browsers refuse a cookie of this name without it"
+        connection.close()
+        assert "the certificate is over since" in gateway.problem()
+    finally:
+        gateway.close()
+    with pytest.raises(StageError, match="it is over since"):
+        server.check_expiry(files["certificate"])
+
+
+def test_a_key_with_a_password_is_refused_and_not_asked_for(tmp_path):
+    certificates = SiteCertificates(tmp_path)
+    certificates.issue("page")
+    key = load_pem_private_key((tmp_path / "page.key").read_bytes(), None)
+    encrypted = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))
+    (tmp_path / "page.key").write_bytes(encrypted)
+    with pytest.raises(StageError, match="the key has no password"):
+        server.check_certificate(tmp_path / "page.pem", tmp_path / "page.key")
