@@ -42,6 +42,8 @@ PATHS: Mapping[str, tuple[str, Callable[..., object]]] = {
     "/fans/{tray}/{fan}/requests": ("POST", Api.act),
     "/alarms": ("GET", Api.alarms),
     "/alarms/history": ("GET", Api.alarm_history),
+    "/clips": ("GET", Api.clips),
+    "/clips/{name}": ("GET", Api.clip),
     "/stages": ("GET", Api.stages),
     "/events": ("GET", Api.events),
     "/me": ("GET", Api.me),

@@ -13,6 +13,7 @@ from pipeline.config.models import TrayConfig
 from pipeline.launch.site_state import StageState
 from pipeline.presenting.fan_history import Curves
 from pipeline.presenting.site_model import SiteModel
+from pipeline.recordings.clips.clip import Clip
 from pipeline.viewing.fleet import Fan, FanNow, class_names
 from schemas.messages import Alarm, Array, ModelCard
 from schemas.twin_card import CardError, TwinCard
@@ -136,6 +137,20 @@ def alarm_json(current: CurrentAlarm) -> dict[str, Any]:
             for each in current.causes[1:]
             if each.probability >= MIN_PROBABILITY
         ],
+    }
+
+
+def clip_json(clip: Clip) -> dict[str, Any]:
+    """A clip of alarms, for machines."""
+    return {
+        "name": clip.name,
+        "tray": clip.tray,
+        "since_t_ns": clip.since_ns,
+        "until_t_ns": clip.until_ns,
+        "bytes": clip.size_bytes,
+        "acknowledged": clip.is_acknowledged,
+        "problem": clip.problem,
+        "alarms": [{"fan": each.fan, "onset_t_ns": each.onset_t_ns, "t_ns": each.t_ns} for each in clip.alarms],
     }
 
 

@@ -2,6 +2,7 @@
 
 import { buttons } from "./actions.js";
 import { age, clock, element, facts, keepFocus, percent } from "./dom.js";
+import { clipLink } from "./clips.js";
 import { ask } from "./server.js";
 
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
@@ -35,7 +36,7 @@ export function card(alarm, viewerUrl) {
       "Deviation": alarm.evidence && alarm.message.includes(alarm.evidence) ? "" : alarm.message.replace(`fan ${alarm.fan}: `, ""),
       "State": states,
     }),
-    rerunLink(viewerUrl, alarm.onset_t_ns), buttons(alarm.tray, alarm.fan, alarm));
+    rerunLink(viewerUrl, alarm.onset_t_ns), " ", clipLink(alarm), buttons(alarm.tray, alarm.fan, alarm));
 }
 
 export class AlarmsView {
@@ -114,6 +115,7 @@ export class HistoryView {
     const what = each.transition.replaceAll("_", " ");
     return element("tr", {}, cell("Time", clock(each.t_ns)), this.fan ? "" : cell("Fan", link(each)),
       cell("What happened", badge(each.active ? each.severity : "none", what)), cell("By", each.operator_name),
-      cell("Message", each.message, each.comment ? ` “${each.comment}”` : ""));
+      cell("Message", each.message, each.comment ? ` “${each.comment}”` : "", " ",
+        each.transition === "raised" ? clipLink(each) : null));
   }
 }

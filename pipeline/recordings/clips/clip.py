@@ -117,7 +117,8 @@ def kept_clips(folder: Path) -> list[Clip]:
             clips = clips_in(path)
         except NOT_A_LIST:
             continue
-        found += [clip for clip in clips if clip.size_bytes and (folder / clip.name).is_file()]
+        named = [clip for clip in clips if clip.size_bytes and Path(clip.name).name == clip.name]
+        found += [clip for clip in named if (folder / clip.name).is_file()]
     return sorted(found, key=lambda clip: clip.since_ns, reverse=True)
 
 
