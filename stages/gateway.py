@@ -27,6 +27,7 @@ from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stages_json
 from pipeline.presenting.site_core import SiteCore
 from pipeline.presenting.site_model import SiteModel
+from pipeline.recordings.clips.clip import clip_folder
 from pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
 from pipeline.viewing.fleet import Fan
 from schemas.envelope import Envelope
@@ -133,7 +134,13 @@ class Server:
 
 class _Running(Server):
     def __init__(
-        self, context: Context, model: SiteModel, feed: LiveFeed, desk: RequestDesk, recorded: RecordedAlarms
+        self,
+        context: Context,
+        model: SiteModel,
+        feed: LiveFeed,
+        desk: RequestDesk,
+        recorded: RecordedAlarms,
+        clip_folders: Sequence[Path],
     ) -> None:
         from pipeline.gateway.access import Access  # noqa: PLC0415  the extra may not be installed
         from pipeline.gateway.api import Api  # noqa: PLC0415
@@ -149,7 +156,9 @@ class _Running(Server):
         self._access = Access(config, Users(context.resolve(config.users)) if config.users else None)
         listening = listen(config.host, config.port + context.shard_number - 1)
         site = configured(context, VIEWER)
-        app = application(Api(model, self._access, feed, desk, recorded, viewer_urls(site) if site else {}), config)
+        app = application(
+            Api(model, self._access, feed, desk, recorded, viewer_urls(site) if site else {}, clip_folders), config
+        )
         self._server = WebServer(app, listening, tls, feed.end, frozenset({"127.0.0.1", "::1", *config.proxies}))
 
     def stop(self) -> None:
@@ -174,8 +183,10 @@ def build(context: Context) -> BuiltStage:
     model = SiteModel(context.site, context.trays, store, rates=AlarmRates(path))
     feed, desk = LiveFeed(), RequestDesk(context.producer)
     site = configured(context, RECORDER)
-    recorded = RecordedAlarms(model, recordings_of(site) if site else ())
-    core = GatewayCore(model, feed, desk, _Running(context, model, feed, desk, recorded), recorded)
+    recordings = recordings_of(site) if site else ()
+    recorded = RecordedAlarms(model, recordings)
+    clip_folders = tuple(dict.fromkeys(map(clip_folder, recordings)))
+    core = GatewayCore(model, feed, desk, _Running(context, model, feed, desk, recorded, clip_folders), recorded)
     recorded.start()
     return BuiltStage(core)
 

@@ -44,6 +44,8 @@ PATHS: Mapping[str, tuple[str, Callable[..., object]]] = {
     "/alarms": ("GET", Api.alarms),
     "/alarms/history": ("GET", Api.alarm_history),
     "/alarm-rate": ("GET", Api.alarm_rate),
+    "/clips": ("GET", Api.clips),
+    "/clips/{name}": ("GET", Api.clip),
     "/stages": ("GET", Api.stages),
     "/events": ("GET", Api.events),
     "/me": ("GET", Api.me),

@@ -18,8 +18,10 @@ _QUERY = {
     "/fans/{tray}/{fan}/curves": {"seconds": "integer"},
     "/alarms": {"all": "integer"},
     "/alarms/history": {"tray": "string", "fan": "integer", "limit": "integer", "before": "integer"},
+    "/clips": {"tray": "string"},
     "/events": {"fan": "string"},
 }
+_KINDS = {"/events": "text/event-stream", "/clips/{name}": "application/octet-stream"}
 _ERRORS = {"401": "nobody is logged in", "403": "the user may not do this", "404": "no such tray or fan"}
 _OF_REQUEST = {"409": "the scorer has refused it", "422": "the form is wrong", "504": "no scorer has answered"}
 
@@ -55,7 +57,7 @@ def _operation(path: str, method: str, handler: Callable[..., object]) -> dict[s
         {"name": name, "in": "query", "required": False, "schema": {"type": kind}}
         for name, kind in _QUERY.get(path, {}).items()
     ]
-    kind = "text/event-stream" if path == "/events" else "application/json"
+    kind = _KINDS.get(path, "application/json")
     errors = _ERRORS | (_OF_REQUEST if method == "POST" else {})
     operation: dict[str, Any] = {
         "operationId": getattr(handler, "__name__", ""),

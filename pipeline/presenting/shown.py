@@ -13,6 +13,7 @@ from pipeline.config.models import TrayConfig
 from pipeline.launch.site_state import StageState
 from pipeline.presenting.fan_history import Curves
 from pipeline.presenting.site_model import SiteModel
+from pipeline.recordings.clips.clip import Clip
 from pipeline.viewing.fleet import Fan, FanNow, class_names
 from schemas.enums import Feedback
 from schemas.messages import Alarm, Array, ModelCard
@@ -145,6 +146,20 @@ def alarms_json(model: SiteModel, *, everything: bool) -> dict[str, Any]:
     """All current alarms. everything: also those that are over."""
     found = [each for each in model.current_alarms() if everything or is_listed(each.newest)]
     return {"alarms": [alarm_json(each) for each in found]}
+
+
+def clip_json(clip: Clip) -> dict[str, Any]:
+    """A clip of alarms, for machines."""
+    return {
+        "name": clip.name,
+        "tray": clip.tray,
+        "since_t_ns": clip.since_ns,
+        "until_t_ns": clip.until_ns,
+        "bytes": clip.size_bytes,
+        "acknowledged": clip.is_acknowledged,
+        "problem": clip.problem,
+        "alarms": [{"fan": each.fan, "onset_t_ns": each.onset_t_ns, "t_ns": each.t_ns} for each in clip.alarms],
+    }
 
 
 def transition_json(number: int, alarm: Alarm, feedback: Feedback = Feedback.NONE) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from pipeline.gateway.config import GatewayConfig
 from pipeline.presenting.users import User, UserRole, hasher, write_users
+from pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
 from pipeline.recordings.rare_messages import rare_messages
 from pipeline.recordings.writing import RecordingWriter
 from schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Transition
@@ -441,3 +442,38 @@ def test_feedback_names_its_alarm_and_a_false_alarm_needs_a_reason(gateway):
     (sent,) = gateway.sent
     assert (sent.action, sent.onset_t_ns, sent.comment) == (Action.FALSE_ALARM, NOW_NS, "the door was open")
     assert sent.operator_name == "ann"
+
+
+RAISED_NS = 1_800_000_000_000_000_000
+
+
+def test_clips_of_alarms_are_listed_and_downloaded_and_nothing_else_of_the_disk_is(tmp_path):
+    folder = tmp_path / "runs" / "clips"
+    folder.mkdir(parents=True)
+    content = "a recording " * 1000
+    alarms = (ClipAlarm(3, RAISED_NS, RAISED_NS, acknowledged=True),)
+    size, window = len(content), (RAISED_NS, RAISED_NS + 9, RAISED_NS)
+    kept = Clip("tray1-3-x.mcap", TRAY, *window, alarms, is_due=False, size_bytes=size)
+    others = [replace(kept, name="../secret.json"), replace(kept, name="gone.mcap"), replace(kept, tray="tray9")]
+    (folder / "recording.json").write_text(clips_as_text([kept, *others]))
+    (folder / kept.name).write_text(content)
+    (tmp_path / "runs" / "secret.json").write_text("secret")
+    text = f'[[tray]]\nname = "{TRAY}"\nfans = 4\n[recorder]\n[gateway]\n'
+    running = RunningGateway(tmp_path, configuration=text, user_header="X-User")
+    try:
+        client, viewer = Client(running), {"X-User": "vic"}
+        assert client.ask("GET", "/api/v1/clips")[0] == 401
+        assert client.ask("GET", f"/api/v1/clips/{kept.name}")[0] == 401
+        (listed, *more) = client.ask("GET", "/api/v1/clips", headers=viewer)[1]["clips"]
+        assert (listed["name"], listed["bytes"], listed["acknowledged"]) == (kept.name, size, True)
+        assert listed["alarms"] == [{"fan": 3, "onset_t_ns": RAISED_NS, "t_ns": RAISED_NS}]
+        assert more == []
+        status, body, headers = client.ask("GET", f"/api/v1/clips/{kept.name}", headers=viewer)
+        assert (status, body) == (200, content)
+        assert headers["content-type"] == "application/octet-stream"
+        assert headers["content-disposition"] == f'attachment; filename="{kept.name}"'
+        assert headers["content-length"] == str(size)
+        for name in ("gone.mcap", "recording.json", "..%2Fsecret.json", "../secret.json", "%2Fetc%2Fpasswd", "x%00"):
+            assert client.ask("GET", f"/api/v1/clips/{name}", headers=viewer)[0] == 404
+    finally:
+        running.close()

@@ -2,6 +2,7 @@
 
 import { ACTIONS, askFor, buttons, feedbackOn } from "./actions.js";
 import { age, clock, element, facts, keepFocus, percent } from "./dom.js";
+import { clipLink } from "./clips.js";
 import { ask, learn, me } from "./server.js";
 
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
@@ -37,7 +38,7 @@ export function card(alarm, viewerUrl) {
       "Deviation": alarm.evidence && alarm.message.includes(alarm.evidence) ? "" : alarm.message.replace(`fan ${alarm.fan}: `, ""),
       "State": states,
     }),
-    rerunLink(viewerUrl, alarm.onset_t_ns), buttons(alarm.tray, alarm.fan, alarm));
+    rerunLink(viewerUrl, alarm.onset_t_ns), " ", clipLink(alarm), buttons(alarm.tray, alarm.fan, alarm));
 }
 
 export class AlarmsView {
@@ -131,7 +132,8 @@ export class HistoryView {
     const what = each.transition.replaceAll("_", " ");
     return element("tr", {}, cell("Time", clock(each.t_ns)), this.fan ? "" : cell("Fan", link(each)),
       cell("What happened", badge(each.active ? each.severity : "none", what)), cell("By", each.operator_name),
-      cell("Message", each.message, each.comment ? ` “${each.comment}”` : "", each.transition === "raised" ? this.feedback(each) : ""));
+      cell("Message", each.message, each.comment ? ` “${each.comment}”` : "",
+        ...(each.transition === "raised" ? [" ", clipLink(each), this.feedback(each)] : [])));
   }
 
   // What was said of an alarm, and the buttons to say it.

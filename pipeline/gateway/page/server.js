@@ -1,6 +1,6 @@
 // The server: questions, requests and live events. The page comes back by itself when the server does.
 
-const PREFIX = "/api/v1";
+export const PREFIX = "/api/v1";
 const RETRY_MS = 1000;
 
 export let me = { name: "", may_read: false, may_act: false, has_login: false, csrf_token: "" };
