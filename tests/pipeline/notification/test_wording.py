@@ -13,6 +13,7 @@ from pipeline.notification.gathering import ranges
 from pipeline.notification.services import Service
 from pipeline.notification.wording import WHAT_TO_DO, Level, Place, Text, cause_line, to_do
 from schemas.units import NS_PER_S
+from scoring.diagnosis.advice import KNOWN_SOON
 from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES
 from tests.support.message_receivers import HttpReceiver, free_port
 
@@ -26,6 +27,8 @@ def test_there_is_an_advice_for_every_cause():
 def test_where_the_cause_is_unclear_its_evidence_says_what_to_do():
     unclear = (NamedCause(CANNOT_TELL, 1.0, "cannot tell yet: move the command to 0.6 for ten seconds, and back"),)
     assert cause_line(unclear) == "Cause: cannot tell yet: move the command to 0.6 for ten seconds, and back"
+    soon = (NamedCause(CANNOT_TELL, 1.0, f"cannot tell yet: {KNOWN_SOON}"),)
+    assert cause_line(soon) == "Cause: cannot tell yet: the page, or `fantwin alarms`, may know it by now"
     assert to_do(unclear) == ""
     assert cause_line(()) == "Cause: unknown"
 
