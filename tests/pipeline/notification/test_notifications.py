@@ -305,7 +305,10 @@ def test_targets_that_cannot_be_are_refused(target):
     ("section", "words"),
     [
         ({"target": {"name": "a", "url_file": "x"}}, "write \\[\\[notifier.target\\]\\], with two brackets"),
-        ({"target": [{**TARGET, "quiet_hours": {"begin": "22", "end": "06:00"}}]}, 'hours and minutes, such as "22:00"'),
+        (
+            {"target": [{**TARGET, "quiet_hours": {"begin": "22", "end": "06:00"}}]},
+            'hours and minutes, such as "22:00"',
+        ),
         ({"target": [{**TARGET, "quiet_hours": {"begin": "22:00", "end": "06:00\n"}}]}, "hours and minutes"),
     ],
 )
