@@ -44,7 +44,7 @@ from pipeline.presenting.shown import (
 )
 from pipeline.presenting.site_model import SiteModel
 from pipeline.recordings.clips.clip import Clip, kept_clips
-from pipeline.viewing.fleet import Fan
+from pipeline.viewing.fleet import Fan, state_words
 from schemas.enums import Transition
 from schemas.messages import Request as OperatorRequest
 from schemas.units import NS_PER_S
@@ -97,8 +97,12 @@ class Api:
         """All fans, the worst first; ?tray=NAME, ?state=WORD and ?limit=N choose."""
         tray, state = request.query_params.get("tray", ""), request.query_params.get("state", "")
         most = _number(request, "limit", 10_000_000)
+        if tray:
+            self._tray(tray)
+        if state and state not in (known := state_words()):
+            raise HTTPException(422, f"state: one of {', '.join(known)}, please")
         found = [each for each in self.model.every_fan() if not tray or each.fan.tray == tray]
-        return JSONResponse({"fans": [fan_json(each) for each in found if state in each.state][:most]})
+        return JSONResponse({"fans": [fan_json(each) for each in found if each.state.startswith(state)][:most]})
 
     @reads
     async def fan(self, request: Request) -> Response:

@@ -77,11 +77,10 @@ def application(api: Api, config: GatewayConfig) -> ASGIApp:
         Route("/healthz", health),
         Route("/", page),
     ]
-    hosts = list(config.hosts) if config.is_loopback else ["*"]
     app = Starlette(
         routes=[*routes, Mount("/page", StaticFiles(directory=PAGE))],
         middleware=[
-            Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False),
+            Middleware(TrustedHostMiddleware, allowed_hosts=sorted(config.known_hosts), www_redirect=False),
             Middleware(GZipMiddleware, minimum_size=1000, compresslevel=COMPRESSION),
         ],
         exception_handlers={HTTPException: failed, Exception: partial(broken, api)},

@@ -65,7 +65,9 @@ class SiteMetrics(Collector):
             "fantwin_alarms_presented", "Alarms that need attention: neither silenced nor dealt with.", labels=["site"]
         )
         total = CounterMetricFamily(
-            "fantwin_alarms", "Alarms that were raised since the gateway began.", labels=[*_TRAY, "severity"]
+            "fantwin_alarms",
+            "Alarms that have reached this severity since the gateway began.",
+            labels=[*_TRAY, "severity"],
         )
         alarms = self._model.current_alarms()
         for each in alarms:

@@ -97,6 +97,8 @@ class SiteModel:
         """by tray, its last sample alone"""
         self._raised: Counter[tuple[str, int, str]] = Counter()
         """by tray, fan and severity"""
+        self._counted: dict[tuple[str, int], tuple[int, int]] = {}
+        """by tray and fan: the onset of the alarm that was counted last, and its worst severity"""
         fans = sum(tray.fans for tray in trays)
         self._alarms = WatchedAlarms(lambda _producer: True, most_fans=fans)
         self._store = store
@@ -140,9 +142,17 @@ class SiteModel:
             self._alarms.add(alarm, len(encode(alarm)))
             self._fleet.add_alarm(alarm)
             is_new = self._store.add(alarm)
-            if is_new and alarm.transition == Transition.RAISED:
-                self._raised[alarm.header.tray, alarm.fan, alarm.severity.name.lower()] += 1
+            if is_new and alarm.transition in (Transition.RAISED, Transition.SEVERITY):
+                self._count(alarm)
             return is_new
+
+    def _count(self, alarm: Alarm) -> None:
+        """Once for each severity that it reaches."""
+        name = (alarm.header.tray, alarm.fan)
+        onset_t_ns, worst = self._counted.get(name, (0, 0))
+        if alarm.onset_t_ns != onset_t_ns or alarm.severity > worst:
+            self._counted[name] = (alarm.onset_t_ns, int(alarm.severity))
+            self._raised[*name, alarm.severity.name.lower()] += 1
 
     def add_health(self, health: Health) -> None:
         """A stage has reported."""
@@ -222,7 +232,7 @@ class SiteModel:
         ]
 
     def raised(self) -> dict[tuple[str, int, str], int]:
-        """How many alarms were raised since the gateway began, by tray, fan and severity."""
+        """How many alarms have reached a severity since the gateway began, by tray, fan and severity."""
         with self._lock:
             return dict(self._raised)
 

@@ -206,6 +206,11 @@ class Fleet:
         return SILENT if code < 0 else state_name(*divmod(code, LARGEST_ENUM_VALUE + 1))
 
 
+def state_words() -> list[str]:
+    """The words with which states of fans begin; after `unknown` comes the reason."""
+    return [*(state.words for state in FanState), SILENT]
+
+
 def class_names() -> list[str]:
     """What the classes of cells mean: normal by its score, then the states, a state of a newer version, and silent."""
     step = 1 / NORMAL_LEVELS

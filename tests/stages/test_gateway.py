@@ -124,6 +124,13 @@ def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(g
     ]
     assert fans[1]["score"] == 0.5
     assert client.ask("GET", "/api/v1/fans?state=alarm")[1]["fans"] == fans[:1]
+    assert client.ask("GET", "/api/v1/fans?state=unknown")[1]["fans"] == fans[3:]
+    status, answer, _ = client.ask("GET", "/api/v1/fans?state=alarms")
+    assert (status, answer["error"].partition(" please")[0]) == (
+        422,
+        "state: one of unknown, normal, suspect, alarm, returning, commissioning, stopped, starting, silent,",
+    )
+    assert client.ask("GET", "/api/v1/fans?tray=nowhere")[0] == 404
     (found,) = client.ask("GET", "/api/v1/alarms")[1]["alarms"]
     assert (found["fan"], found["presented"], found["probability"]) == (2, True, 0.8)
     assert found["causes"][0]["evidence"] == "drag +20 %"
@@ -179,6 +186,23 @@ def test_metrics_are_those_of_prometheus_and_an_unjudged_fan_has_no_score(gatewa
         'fantwin_fan_alarm_unacknowledged{fan="2",severity="alarm",site="hall",tray="tray1"} 0.0'
         in (Client(gateway).ask("GET", "/metrics")[1])
     )
+
+
+def test_an_alarm_counts_once_in_each_severity_that_it_reaches(gateway):
+    warned, worse, worst = Transition.RAISED, Transition.SEVERITY, Severity.ALARM
+    gateway.feed(
+        alarm(warned, 0, severity=Severity.WARNING),
+        alarm(worse, 1, severity=worst),
+        alarm(worse, 2, severity=Severity.WARNING),
+        alarm(worse, 3, severity=worst),
+        alarm(warned, 4, severity=Severity.WARNING, onset_t_ns=NOW_NS + 1),
+    )
+    text = Client(gateway).ask("GET", "/metrics")[1]
+    counted = [line for line in text.splitlines() if line.startswith("fantwin_alarms_total{")]
+    assert [(line.partition("severity=")[2].partition(",")[0], line[-3:]) for line in counted] == [
+        ('"warning"', "2.0"),
+        ('"alarm"', "1.0"),
+    ]
 
 
 def test_an_operator_acts_under_his_own_name_and_nobody_else_acts(gateway):
@@ -261,6 +285,9 @@ def test_openapi_names_every_path_and_the_forms(gateway):
     assert "/api/v1/fans/{tray}/{fan}/requests" in document["paths"]
     form = document["components"]["schemas"]["RequestForm"]
     assert "shelve" in form["properties"]["action"]["enum"]
+    asked = {each["name"]: each["schema"] for each in document["paths"]["/api/v1/fans"]["get"]["parameters"]}
+    assert "alarm" in asked["state"]["enum"]
+    assert asked["limit"] == {"type": "integer"}
 
 
 def test_prometheus_sends_the_password_of_a_user_and_gets_nothing_else_with_it(tmp_path, users, monkeypatch):
@@ -290,6 +317,8 @@ def test_a_proxy_names_the_user_and_others_cannot(tmp_path):
         client, path, asked = Client(gateway), f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"}
         assert client.ask("GET", "/api/v1/site")[0] == 401
         assert client.ask("GET", "/api/v1/site", None, {"X-User": "vic"})[1]["site"] == SITE
+        status, answer, _ = client.ask("POST", path, asked)
+        assert (status, answer["error"][:31]) == (401, "the proxy has sent no X-User wi")
         assert client.ask("POST", path, asked, {"X-User": "vic"})[0] == 403
         assert client.ask("POST", path, asked, {"X-User": "ann"})[0] == 200
         assert gateway.sent[0].operator_name == "ann"
@@ -298,6 +327,8 @@ def test_a_proxy_names_the_user_and_others_cannot(tmp_path):
     other = RunningGateway(tmp_path / "other", user_header="X-User", operators=("ann",), proxies=("192.0.2.1",))
     try:
         assert Client(other).ask("GET", "/api/v1/site", None, {"X-User": "ann"})[0] == 401
+        status, answer, _ = Client(other).ask("POST", path, asked, {"X-User": "ann"})
+        assert (status, answer["error"]) == (401, "users come through the proxy of this page: ask there")
     finally:
         other.close()
 

@@ -159,6 +159,29 @@ def test_a_new_password_and_another_login_end_the_session_of_before(gateway, use
     assert len(gateway.sent) == 1
 
 
+@pytest.mark.parametrize(
+    ("break_it", "why"),
+    [
+        (Path.unlink, "there is no such file: `fantwin users add NAME` makes it"),
+        (lambda path: path.chmod(0o644), "others may read it: chmod 600"),
+        (lambda path: path.write_text("[ann", encoding="utf-8"), "the users cannot be read"),
+    ],
+)
+def test_while_the_file_of_users_cannot_be_used_nobody_acts_or_logs_in(gateway, users, break_it, why):
+    operator, text = logged_in(gateway), users.read_text(encoding="utf-8")
+    break_it(users)
+    assert operator.ask("POST", ACT, ASKED)[0] == 401
+    status, answer, _ = Client(gateway).ask("POST", "/api/v1/login", {"name": "ann", "password": PASSWORD})
+    assert (status, "the file of users cannot be read" in answer["error"]) == (503, True)
+    assert why in gateway.problem()
+    assert Client(gateway).ask("GET", "/api/v1/site")[0] == 200, "on this host whoever looks needs no login"
+    users.write_text(text, encoding="utf-8")
+    users.chmod(0o600)
+    assert operator.ask("POST", ACT, ASKED)[0] == 401, "the session is over"
+    assert logged_in(gateway).ask("POST", ACT, ASKED)[0] == 200
+    assert gateway.problem() == ""
+
+
 def test_a_user_who_logs_in_again_and_again_ends_his_own_sessions_only(gateway, monkeypatch):
     monkeypatch.setattr("pipeline.gateway.sessions.MOST_OF_A_USER", 2)
     operator, viewers = logged_in(gateway), [logged_in(gateway, "vic") for _ in range(3)]
@@ -187,6 +210,9 @@ def test_through_a_proxy_that_knows_no_users_nobody_reads_without_a_login(tmp_pa
         client, host = Client(named), {"Host": "fans.plant.example"}
         assert client.ask("GET", "/api/v1/site", None, host)[0] == 401
         assert client.ask("GET", "/metrics", None, host)[0] == 401
+        own = {"Host": f"localhost:{named.port}"}, {"Host": f"[::1]:{named.port}"}
+        assert [client.ask("GET", "/healthz", None, each)[0] for each in ({}, *own)] == [200, 200, 200]
+        assert client.ask("GET", "/healthz", None, {"Host": "evil.example"})[0] == 400
         assert logged_in(gateway).ask("GET", "/api/v1/site")[0] == 200
     finally:
         named.close()
@@ -371,7 +397,7 @@ def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_na
         server.check_files(**files)
 
 
-def test_a_key_that_everybody_reads_is_named_and_one_with_a_password_is_refused_and_not_asked_for(tmp_path):
+def test_a_key_that_everybody_reads_is_named(tmp_path):
     certificates = SiteCertificates(tmp_path)
     certificates.issue("page")
     (tmp_path / "page.key").chmod(0o640)
@@ -379,11 +405,33 @@ def test_a_key_that_everybody_reads_is_named_and_one_with_a_password_is_refused_
     (tmp_path / "page.key").chmod(0o644)
     with pytest.raises(StageError, match="everybody may read it"):
         server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
-    key = load_pem_private_key((tmp_path / "page.key").read_bytes(), None)
-    encrypted = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))
-    (tmp_path / "page.key").write_bytes(encrypted)
-    with pytest.raises(StageError, match="the key has no password"):
-        server.check_certificate(tmp_path / "page.pem", tmp_path / "page.key")
+
+
+def encrypted(key: Path) -> None:
+    private = load_pem_private_key(key.read_bytes(), None)
+    key.write_bytes(private.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret")))
+
+
+@pytest.mark.parametrize(
+    ("file", "break_it", "why"),
+    [
+        ("key", encrypted, "the key has a password, which nobody is asked for"),
+        ("key", lambda path: path.write_bytes((path.parent / "other.key").read_bytes()), "not the key of the certific"),
+        ("key", lambda path: path.write_text("key", encoding="utf-8"), "this is no private key in PEM"),
+        ("key", Path.unlink, "No such file"),
+        ("certificate", lambda path: path.write_text("c", encoding="utf-8"), "this is no certificate in PEM"),
+        ("certificate", Path.unlink, "No such file"),
+    ],
+)
+def test_what_is_wrong_with_the_files_of_tls_is_said_and_no_password_is_asked_for(tmp_path, file, break_it, why):
+    certificates = SiteCertificates(tmp_path)
+    for name in ("page", "other"):
+        certificates.issue(name)
+    files = {"certificate": tmp_path / "page.pem", "key": tmp_path / "page.key"}
+    server.check_certificate(**files)
+    break_it(files[file])
+    with pytest.raises(StageError, match=rf"gateway\.{file} = .*: .*{why}"):
+        server.check_certificate(**files)
 
 
 def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question(

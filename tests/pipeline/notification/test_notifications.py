@@ -70,7 +70,7 @@ def test_an_alarm_is_raised_worse_and_cleared_and_each_is_said_once_with_cause_a
     assert raised.level == Level.WARNING
     assert raised.body.splitlines() == [
         "fan 2 of tray1 at hall: WARNING since 2026-09-21 14:13:20 UTC",
-        "90 rpm below the twin (limit 50)",
+        "90 rpm below the twin (limit 50) at 2026-09-21 14:13:20 UTC",
         "Cause: more drag (airflow blocked, filter clogged), 80 % (drag +20 %), or more friction (bearing), 20 %",
         "What to do: see whether the airflow is free and the filter is clean",
         "Not acknowledged.",
@@ -82,7 +82,7 @@ def test_an_alarm_is_raised_worse_and_cleared_and_each_is_said_once_with_cause_a
     desk.hear(cleared(severity=Severity.ALARM))
     (over,) = desk.wait(10)
     assert (over.title, over.level) == ("Cleared: alarm, fan 2 of tray1 (hall)", Level.GOOD)
-    assert "It was: 90 rpm below the twin (limit 50)" in over.body
+    assert "It was: 90 rpm below the twin (limit 50) at 2026-09-21 14:13:20 UTC" in over.body
     assert desk.wait(20_000) == [], "what is over is not sent again"
 
 
@@ -287,6 +287,16 @@ def test_the_first_notifier_of_a_site_says_what_is_presented_and_not_what_was():
     assert titles(desk.wait(10)) == ["WARNING, fan 3 of tray1"]
 
 
+def test_a_message_about_many_that_are_over_says_so_first():
+    desk = Desk()
+    desk.hear(*(alarm(fan=fan) for fan in range(5)))
+    assert titles(desk.wait(60)) == ["5 alarms in 1 tray (hall): 5 WARNING"]
+    desk.hear(*(cleared(fan) for fan in range(5)))
+    (over,) = desk.wait(60)
+    assert (over.title, over.level) == ("5 alarms cleared in 1 tray (hall)", Level.GOOD)
+    assert over.body.startswith("5 alarms cleared in 1 tray at hall\ntray1: cleared: 5 fans: 0-4\n")
+
+
 @pytest.mark.parametrize(
     "target",
     [
@@ -302,6 +312,22 @@ def test_the_first_notifier_of_a_site_says_what_is_presented_and_not_what_was():
 def test_targets_that_cannot_be_are_refused(target):
     with pytest.raises(ValidationError):
         NotifierConfig.model_validate({"target": [target]})
+
+
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        ({"target": {"name": "a", "url_file": "x"}}, "write \\[\\[notifier.target\\]\\], with two brackets"),
+        (
+            {"target": [{**TARGET, "quiet_hours": {"begin": "22", "end": "06:00"}}]},
+            'hours and minutes, such as "22:00"',
+        ),
+        ({"target": [{**TARGET, "quiet_hours": {"begin": "22:00", "end": "06:00\n"}}]}, "hours and minutes"),
+    ],
+)
+def test_what_is_easily_written_wrong_is_said_in_plain_words(section, words):
+    with pytest.raises(ValidationError, match=words):
+        NotifierConfig.model_validate(section)
 
 
 def test_two_targets_of_one_name_and_unknown_time_zones_are_refused():
