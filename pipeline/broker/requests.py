@@ -15,7 +15,7 @@ from pipeline.broker.json_text import json_text
 from pipeline.broker.topics import ALL_FANS, ANSWER, REQUEST, Topics
 from pipeline.config.models import TrayConfig
 from pipeline.presenting.request_desk import ANSWERED_WITHIN_S, RequestDesk
-from pipeline.presenting.request_form import LONGEST_COMMENT, Line, RequestForm
+from pipeline.presenting.request_form import LONGEST_COMMENT, OneLine, RequestForm
 from schemas.enums import Transition
 from schemas.messages import Alarm, Request
 
@@ -31,7 +31,7 @@ class MqttRequestForm(RequestForm):
     """
 
     id: Annotated[str, Field(max_length=64)] = ""
-    name: Annotated[Line, Field(max_length=64)] = ""
+    name: Annotated[OneLine, Field(max_length=64)] = ""
 
     @property
     def full_comment(self) -> str:

@@ -20,8 +20,8 @@ from starlette.requests import Request
 
 from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.sessions import LoginSessions, Session
-from pipeline.presenting.event_log import EventLog
 from pipeline.presenting.login_failures import LoginFailures
+from pipeline.presenting.security_log import SecurityLog
 from pipeline.presenting.users import NAME, User, UserRole, Users
 
 COOKIE, SECURE_COOKIE = "fantwin", "__Host-fantwin"
@@ -46,12 +46,12 @@ class Visitor:
 class Access:
     """The rules of one gateway."""
 
-    def __init__(self, config: GatewayConfig, users: Users | None, log: EventLog | None = None) -> None:
+    def __init__(self, config: GatewayConfig, users: Users | None, log: SecurityLog | None = None) -> None:
         """users: None where a proxy knows them, or nobody may act."""
         self._config = config
         self._users = users
         self.sessions = LoginSessions()
-        self.log = log or EventLog()
+        self.log = log or SecurityLog()
         self._failures = LoginFailures()
         self._logins = 0
         self._one_at_a_time = asyncio.Lock()

@@ -8,8 +8,8 @@ import re
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import aclosing
-from dataclasses import dataclass
-from functools import wraps
+from dataclasses import dataclass, field
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,12 +25,13 @@ from pipeline.gateway.access import Access, Visitor, address_of, require_own_pag
 from pipeline.gateway.forms import LoginForm
 from pipeline.gateway.live_feed import LiveFeed, encoded
 from pipeline.gateway.metrics import metrics_text
+from pipeline.gateway.shared_answer import SharedAnswer
 from pipeline.presenting.fan_history import HISTORY_S
 from pipeline.presenting.recorded_alarms import RecordedAlarms
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.request_form import RequestForm
 from pipeline.presenting.shown import (
-    alarm_json,
+    alarms_json,
     clip_json,
     curves_json,
     fan_in_full,
@@ -83,6 +84,7 @@ class Api:
     """by tray, of Rerun's viewer for browsers; none where it is not served"""
     clip_folders: Sequence[Path] = ()
     """of the alarm clips of recorders on this host"""
+    _alarms: dict[bool, SharedAnswer] = field(default_factory=dict[bool, SharedAnswer], init=False)
 
     @reads
     async def site(self, request: Request) -> Response:
@@ -113,9 +115,10 @@ class Api:
     @reads
     async def alarms(self, request: Request) -> Response:
         """The current alarms; ?all=1 also those that are over."""
-        found = [alarm_json(each) for each in self.model.current_alarms()]
         everything = request.query_params.get("all", "") == "1"
-        return JSONResponse({"alarms": [each for each in found if everything or each["listed"]]})
+        if everything not in self._alarms:
+            self._alarms[everything] = SharedAnswer(partial(alarms_json, self.model, everything=everything))
+        return await self._alarms[everything].to(request)
 
     @reads
     async def alarm_history(self, request: Request) -> Response:
@@ -172,7 +175,7 @@ class Api:
         return StreamingResponse(events, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 
     async def metrics(self, request: Request) -> Response:
-        """For Prometheus. Of 5,000 fans they take a tenth of a second, in which live events must not wait."""
+        """For Prometheus. Meanwhile live events go on."""
         await self.access.require_scraper(request)
         text = await run_in_threadpool(metrics_text, self.model, self.feed.readers)
         return Response(text, media_type=METRICS_TYPE)

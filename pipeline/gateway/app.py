@@ -20,6 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from pipeline.gateway.api import Api, broken, failed
 from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.openapi import description
+from pipeline.gateway.shared_answer import COMPRESSION
 
 PAGE = Path(__file__).parent / "page"
 PREFIX = "/api/v1"
@@ -80,7 +81,7 @@ def application(api: Api, config: GatewayConfig) -> ASGIApp:
         routes=[*routes, Mount("/page", StaticFiles(directory=PAGE))],
         middleware=[
             Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False),
-            Middleware(GZipMiddleware, minimum_size=1000, compresslevel=5),
+            Middleware(GZipMiddleware, minimum_size=1000, compresslevel=COMPRESSION),
         ],
         exception_handlers={HTTPException: failed, Exception: partial(broken, api)},
     )

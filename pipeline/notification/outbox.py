@@ -114,14 +114,15 @@ class Outbox:
             ) from error
 
     def was_sent(self, target: str, event: Event) -> bool:
-        """Whether an event was decided before for a target."""
-        with self._lock:
+        """Whether an event was decided before for a target; of a damaged file, where nothing is saved either: no."""
+        with self._lock, suppress(sqlite3.Error):
             found = self._file.execute(
                 "SELECT 1 FROM event WHERE target = ? AND tray = ? AND fan = ? AND onset_t_ns = ? AND kind = ?"
                 " AND number = ?",
                 (target, *astuple(event)),
             )
             return found.fetchone() is not None
+        return False
 
     def save(self, saved: Saved, changes: Changes, *, most_messages: int, kept_s: float, now_ns: int) -> None:
         """Save what has changed, all or nothing. Messages that are too old or too many are lost.

@@ -16,8 +16,8 @@ from asyncua.crypto.permission_rules import User as LibraryUser
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from pipeline.presenting.event_log import EventLog
 from pipeline.presenting.login_failures import LoginFailures
+from pipeline.presenting.security_log import SecurityLog
 from pipeline.presenting.users import User, Users
 from pipeline.presenting.users import UserRole as SiteRole
 
@@ -75,7 +75,7 @@ class LogIn:
         self._users = users
         self._is_open = is_open
         self._failures = LoginFailures()
-        self._log = EventLog()
+        self._log = SecurityLog()
 
     @property
     def problem(self) -> str:

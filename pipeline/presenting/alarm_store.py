@@ -19,6 +19,8 @@ from schemas.messages import Alarm
 MOST_TRANSITIONS = 200_000
 """those that are older are deleted"""
 _DELETED_EVERY = 1000
+WAIT_S = 0.2
+"""for another program that writes into the file; what it holds up is kept later"""
 MOST_UNSAVED = 10_000
 """that wait for room on the disk; of more, the oldest are not kept"""
 
@@ -58,7 +60,7 @@ class AlarmStore:
         self._why_unsaved = self._why_unread = ""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+            self._file = sqlite3.connect(path, WAIT_S, check_same_thread=False, isolation_level=None)
             self._file.executescript(f"PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; {_SCHEMA}")
         except (OSError, sqlite3.Error) as error:
             raise UserError(f"{path}: the history of alarms cannot be kept there: {error}") from error
@@ -137,6 +139,8 @@ class AlarmStore:
                 self._file.execute("INSERT OR IGNORE INTO transition VALUES (?, ?, ?, ?, ?, ?, ?)", row)
             self._file.execute("COMMIT")
         except sqlite3.Error as error:
+            with suppress(sqlite3.Error):
+                self._file.rollback()
             raise UserError(f"{self._path}: {error}: alarms of recordings are not in the history") from error
         return len(room)
 

@@ -33,7 +33,7 @@ def one_line(text: str) -> str:
     return _NOT_SHOWN.sub(" ", text)
 
 
-Line = Annotated[str, AfterValidator(one_line)]
+OneLine = Annotated[str, AfterValidator(one_line)]
 
 
 class RequestForm(BaseModel):
@@ -49,7 +49,7 @@ class RequestForm(BaseModel):
 
     action: OperatorAction
     duration_s: Annotated[float, Field(ge=0, le=LONGEST_SHELVING_S, allow_inf_nan=False)] = 0.0
-    comment: Annotated[Line, Field(max_length=LONGEST_COMMENT)] = ""
+    comment: Annotated[OneLine, Field(max_length=LONGEST_COMMENT)] = ""
 
     @property
     def message_action(self) -> Action:

@@ -45,18 +45,6 @@ class FleetNow:
     score: Array
 
 
-@dataclass(frozen=True, slots=True)
-class NewestSample:
-    """Of one fan; speeds in rad/s. The twin's speed and the score are NaN where the sample is not judged."""
-
-    tray: str
-    fan: int
-    measured_rad_s: float
-    predicted_rad_s: float
-    score: float
-    is_judged: bool
-
-
 @dataclass(frozen=True, eq=False)
 class TrayNow:
     """The newest sample of a tray: values (fans, len(CURVES)) and whether each fan is judged (fans,).
@@ -200,19 +188,6 @@ class SiteModel:
         with self._lock:
             newest = self._newest.get(tray)
         return int(newest.t_ns[-1]) if newest else 0
-
-    def newest_samples(self) -> list[NewestSample]:
-        """Of every fan whose tray is heard now."""
-        after_s = self._now_s() - SILENT_AFTER_S
-        with self._lock:
-            heard = [(tray, score) for tray, score in self._newest.items() if self._heard_s[tray] >= after_s]
-        found: list[NewestSample] = []
-        for tray, score in heard:
-            values = values_of(score)[-1].tolist()
-            judged = (score.valid[-1] | np.isin(score.invalid_reason[-1], JUDGED_AT_REST)).tolist()
-            for fan, (measured, predicted, _, _, ratio) in enumerate(values):
-                found.append(NewestSample(tray, fan, measured, predicted, ratio, judged[fan]))
-        return found
 
     def trays_now(self) -> list[TrayNow]:
         """The newest sample of each tray that was ever heard."""

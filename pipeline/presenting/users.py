@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 SHORTEST_PASSWORD, LONGEST_PASSWORD = 12, 128
-"""characters (ASVS 2.1.1, 2.1.2)"""
+"""characters"""
+GUESSED_WORDS = ("fantwin", "password", "operator", "viewer", "ventilator", "admin")
+"""with the name of the user, these do not count in a password"""
+FEWEST_OTHERS = 5
 _OTHERS = 0o077
 _ENTRIES = {"role", "password_hash"}
 
@@ -80,7 +83,8 @@ class Users:
         from argon2.exceptions import Argon2Error, InvalidHashError  # noqa: PLC0415  an extra
 
         try:
-            self._hasher.verify(user.password_hash if user else self._nobody_hash, password[:LONGEST_PASSWORD])
+            given = password if len(password) <= LONGEST_PASSWORD else ""
+            self._hasher.verify(user.password_hash if user else self._nobody_hash, given)
         except (Argon2Error, InvalidHashError):
             return False
         return user is not None
@@ -141,15 +145,23 @@ def write_users(path: Path, users: Mapping[str, User]) -> None:
         raise UserError(f"{path}: the users cannot be written: {error.strerror}") from error
 
 
-def checked_password(password: str) -> str:
-    """The password, if it is one.
+def checked_password(password: str, name: str) -> str:
+    """The password, if it is one for this user.
 
     Raises:
-        UserError: it is too short or too long.
+        UserError: it is too short or too long, or easy to guess.
     """
     if not SHORTEST_PASSWORD <= len(password) <= LONGEST_PASSWORD:
         raise UserError(
             f"the password has {len(password)} characters: {SHORTEST_PASSWORD} to {LONGEST_PASSWORD}, please"
+        )
+    rest = password.casefold()
+    for word in (name.casefold(), *GUESSED_WORDS):
+        rest = rest.replace(word, "")
+    if len(set(rest)) < FEWEST_OTHERS:
+        raise UserError(
+            f"the password is easy to guess: it needs {FEWEST_OTHERS} different characters beside the name and "
+            f"{', '.join(GUESSED_WORDS)}"
         )
     return password
 

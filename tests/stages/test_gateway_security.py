@@ -134,6 +134,19 @@ def test_an_own_account_buys_no_more_guesses_and_an_ipv6_network_counts_as_one_a
     assert guesses <= 100, "in an hour"
 
 
+def test_guesses_from_elsewhere_do_not_lock_out_who_has_logged_in_where_he_is():
+    failures = login_failures.LoginFailures(lambda: 0.0)
+    assert failures.begin("ann", "192.0.2.1") == 0
+    failures.succeed("ann", "192.0.2.1")
+    for number in range(login_failures.FAILURES):
+        assert failures.begin("ann", f"198.51.100.{number}") == 0
+    assert failures.begin("ann", "198.51.100.77") > 0
+    assert failures.begin("ann", "192.0.2.1") == 0
+    failures.succeed("ann", "192.0.2.1")
+    guesses = sum(failures.begin("ann", "192.0.2.1") == 0 for _ in range(20))
+    assert guesses == login_failures.FAILURES, "there he has no more guesses than others"
+
+
 def test_a_new_password_and_another_login_end_the_session_of_before(gateway, users):
     first = logged_in(gateway)
     again = Client(gateway)
@@ -355,14 +368,58 @@ def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_na
     finally:
         gateway.close()
     with pytest.raises(StageError, match="it is over since"):
-        server.check_expiry(files["certificate"])
+        server.check_files(**files)
 
 
-def test_a_key_with_a_password_is_refused_and_not_asked_for(tmp_path):
+def test_a_key_that_everybody_reads_is_named_and_one_with_a_password_is_refused_and_not_asked_for(tmp_path):
     certificates = SiteCertificates(tmp_path)
     certificates.issue("page")
+    (tmp_path / "page.key").chmod(0o640)
+    server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
+    (tmp_path / "page.key").chmod(0o644)
+    with pytest.raises(StageError, match="everybody may read it"):
+        server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
     key = load_pem_private_key((tmp_path / "page.key").read_bytes(), None)
     encrypted = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))
     (tmp_path / "page.key").write_bytes(encrypted)
     with pytest.raises(StageError, match="the key has no password"):
         server.check_certificate(tmp_path / "page.pem", tmp_path / "page.key")
+
+
+def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question(
+    gateway, monkeypatch
+):
+    goes_on, is_making, made = threading.Event(), threading.Event(), []
+    make = gateway.core._model.current_alarms
+
+    def slowly() -> list[Any]:
+        made.append(make())
+        is_making.set()
+        assert goes_on.wait(30)
+        return made[-1]
+
+    monkeypatch.setattr(gateway.core._model, "current_alarms", slowly)
+    answers: list[int] = []
+    pages = [
+        threading.Thread(target=lambda: answers.append(len(Client(gateway).ask("GET", "/api/v1/alarms")[1]["alarms"])))
+        for _ in range(9)
+    ]
+    pages[0].start()
+    assert is_making.wait(30)
+    gateway.feed(alarm())
+    for page in pages[1:]:
+        page.start()
+    assert Client(gateway).ask("GET", "/healthz")[0] == 200, "whoever asks for something else does not wait"
+    eventually(lambda: open_connections(gateway) >= len(pages), "all have asked")
+    goes_on.set()
+    for page in pages:
+        page.join()
+    assert sorted(answers) == [0] + [1] * 8
+    assert len(made) == 2
+    headers = Client(gateway).ask("GET", "/api/v1/alarms?all=1", None, {"Accept-Encoding": "identity"})[2]
+    assert headers["content-type"] == "application/json"
+
+
+def open_connections(gateway: RunningGateway) -> int:
+    web_server: Any = gateway.core._server
+    return len(web_server._server._server.server_state.tasks)

@@ -13,7 +13,8 @@ from schemas.enums import Action, FanState, Transition
 from schemas.messages import Alarm, Request
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, alarm, score
-from tests.support.node_opcua import NodeOpcua, node_modules
+from tests.support.node_opcua import PACKAGE, VERSION, WHAT, NodeOpcua
+from tests.support.node_packages import node_modules
 from tests.support.running_chain import eventually
 from tests.support.running_core import SITE, TRAY
 from tests.support.running_opcua import OPERATOR, PASSWORD, VIEWER, RunningOpcua
@@ -60,7 +61,7 @@ class Scorer:
 
 @pytest.fixture(scope="module")
 def _installed() -> Path:
-    return node_modules()
+    return node_modules(PACKAGE, VERSION, WHAT)
 
 
 @pytest.fixture

@@ -9,12 +9,12 @@ from pipeline.cli.main import COMMANDS
 from pipeline.errors import UsageError, UserError
 
 
-def fantwin(name: str, *arguments: object) -> Result:
-    """Run a command; the result has its exit code, standard output and exception."""
+def fantwin(name: str, *arguments: object, typed: str | None = None) -> Result:
+    """Run a command; the result has its exit code, standard output and exception. typed: what it reads."""
     module = COMMANDS[name]
     app = typer.Typer(pretty_exceptions_enable=False)
     app.command(name)(getattr(import_module(f"pipeline.cli.{module}"), module.rpartition(".")[2]))
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], input=typed)
 
 
 def error_of(name: str, *arguments: object) -> str:

@@ -4,36 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 from pathlib import Path
 from typing import Any
 
-import pytest
+from tests.support.node_packages import node_modules
 
-NODE = Path(__file__).parents[2] / "build" / "node"
-"""where `npm install --prefix build/node node-opcua-client@2` has put it"""
-PACKAGE = "node-opcua-client"
-VERSION = "2.182.2"
-_INSTALL_LIMIT_S = 240
-
-
-def node_modules() -> Path:
-    """The folder of the client, installed if it is not; skips the test where that cannot be done."""
-    modules = NODE / "node_modules"
-    if shutil.which("node") is None or shutil.which("npm") is None:
-        pytest.skip("no OPC UA client of another make: needs node and npm")
-    if not (modules / PACKAGE / "package.json").exists():
-        NODE.mkdir(parents=True, exist_ok=True)
-        command = ["npm", "install", "--no-audit", "--no-fund", "--prefix", str(NODE), f"{PACKAGE}@{VERSION}"]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=_INSTALL_LIMIT_S, check=False)
-        except subprocess.TimeoutExpired:
-            pytest.skip(f"no OPC UA client of another make: npm install {PACKAGE} takes too long")
-        if done.returncode:
-            pytest.skip(f"no OPC UA client of another make: npm install {PACKAGE}: {done.stderr[-200:]}")
-    return modules
+PACKAGE, VERSION, WHAT = "node-opcua-client", "2.182.2", "OPC UA client of another make"
 
 
 class NodeOpcua:
@@ -42,7 +20,10 @@ class NodeOpcua:
     def __init__(self, folder: Path) -> None:
         """folder: for its certificate."""
         self._folder = folder
-        environment = os.environ | {"NODE_PATH": str(node_modules()), "HOME": str(folder)}
+        environment = os.environ | {
+            "NODE_PATH": str(node_modules(PACKAGE, VERSION, WHAT)),
+            "HOME": str(folder),
+        }
         folder.mkdir(parents=True, exist_ok=True)
         self._process = subprocess.Popen(
             ["node", str(Path(__file__).with_name("opcua_client.cjs"))],

@@ -6,32 +6,34 @@ Two browsers look at the same site, one of an operator and one of a viewer; the 
 from __future__ import annotations
 
 import json
-import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, expect
 
-from pipeline.presenting.users import User, UserRole, hasher, write_users
-from tests.support.browser import browser as browser_path
-from tests.support.running_chain import DEADLINE_S, SITE, TRAY, Chain, eventually, view_of
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from schemas.topics import tray_key
+from tests.support.page_browser import make_users, opened, running_browser
+from tests.support.running_chain import SITE, TRAY, Chain, eventually, view_of
 from tests.support.running_gateway import free_port
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
-FAULTY, PASSWORD = 5, "correct horse battery"
+FAULTY = 5
 FAULT = f"rotor:fan={FAULTY},start=25,stop=75,size=1.0"
 SCRIPT = '<img src=x onerror="document.title=1">'
-DEADLINE_MS = DEADLINE_S * 1000
+SEEN = """() => new MutationObserver(() => {
+    if (document.querySelector(".cell.alarm")) window.seen_ms ??= Date.now();
+}).observe(document.body, {subtree: true, childList: true, attributes: true})"""
 STAGES = ["acquisition", "resampler", "twin_integrator", "scorer", "recorder", "gateway"]
 
 
 @pytest.fixture
 def chain(tmp_path: Path, endpoint: str) -> Iterator[tuple[Chain, str]]:
-    hashed = hasher().hash(PASSWORD)
-    users = {n: User(n, r, hashed) for n, r in (("ann", UserRole.OPERATOR), ("vic", UserRole.VIEWER))}
-    write_users(tmp_path / "users.toml", users)
+    make_users(tmp_path / "users.toml")
     port = free_port()
     settings = (f"gateway.port={port}", f"gateway.users='{tmp_path / 'users.toml'}'", "scorer.baseline_s=2")
     running = Chain(tmp_path, endpoint, *settings, f"launcher.stages={json.dumps(STAGES)}", viewer=False)
@@ -43,41 +45,27 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[tuple[Chain, str]]:
 
 @pytest.fixture
 def browser() -> Iterator[Browser]:
-    arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
-    with sync_playwright() as playwright:
-        running = playwright.chromium.launch(executable_path=browser_path(), args=arguments)
-        try:
-            yield running
-        finally:
-            running.close()
-
-
-def opened(browser: Browser, url: str, name: str, errors: list[str]) -> Page:
-    """The page in a browser of its own, logged in."""
-    page = browser.new_context(viewport={"width": 1280, "height": 900}).new_page()
-    page.set_default_timeout(DEADLINE_MS)
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.goto(url)
-    page.get_by_role("button", name="Log in").click()
-    page.get_by_label("Name").fill(name)
-    page.get_by_label("Password").fill(PASSWORD)
-    page.get_by_role("dialog").get_by_role("button", name="Log in").click()
-    expect(page.get_by_role("button", name="Log out")).to_be_visible()
-    return page
+    with running_browser() as running:
+        yield running
 
 
 def test_an_alarm_is_seen_acknowledged_shelved_and_cleared_in_two_browsers(chain, browser):
     site, url = chain
-    expect.set_options(timeout=DEADLINE_MS)
     errors: list[str] = []
-    with site.watcher() as watcher:
+    presented_s: list[float] = []
+    with site.watcher() as watcher, Bus(BusConfig(endpoint=site.endpoint), listens=False) as bus:
+        bus.subscribe(tray_key(SITE, TRAY, "alarm"), lambda _key, _payload: presented_s.append(time.time()))
         site.start_up()
         eventually(lambda: (v := view_of(watcher, "gateway")) and v.alive, "the gateway is at work")
-        ann, vic = (opened(browser, url, name, errors) for name in ("ann", "vic"))
+        ann, vic = (opened(browser, url, errors, name) for name in ("ann", "vic"))
+        vic.evaluate(SEEN)
         site.start_tray("--fault", FAULT)
-        cell = ann.get_by_role("button", name=f"{TRAY} fan {FAULTY}: alarm")
+        cell = ann.get_by_role("button", name=f"{TRAY} fan {FAULTY} alarm")
         expect(cell).to_be_visible()
-        expect(vic.get_by_role("button", name=f"{TRAY} fan {FAULTY}: alarm")).to_be_visible()
+        expect(vic.get_by_role("button", name=f"{TRAY} fan {FAULTY} alarm")).to_be_visible()
+
+        seen_s = vic.evaluate("window.seen_ms") / 1000
+        print(f"from the bus to the page: {1000 * (seen_s - presented_s[0]):.0f} ms")
 
         cell.click()
         card = ann.locator(f'article[data-fan="{TRAY}/{FAULTY}"]')
@@ -109,7 +97,7 @@ def test_an_alarm_is_seen_acknowledged_shelved_and_cleared_in_two_browsers(chain
             expect(page.locator("#connection")).to_contain_text("live")
         expect(shown).to_contain_text("acknowledged by ann")
 
-        opened_again = opened(browser, url, "ann", errors)
+        opened_again = opened(browser, url, errors, "ann")
         opened_again.get_by_role("link", name="Alarms").click()
         again = opened_again.locator(f'article[data-fan="{TRAY}/{FAULTY}"]')
         again.get_by_role("button", name="Shelve").click()

@@ -94,4 +94,4 @@ def _asked_for(name: str, role: str) -> User:
         password = typer.prompt("Password", hide_input=True, confirmation_prompt=True)
     else:
         password = sys.stdin.readline().rstrip("\n")
-    return User(name, UserRole(role), hasher().hash(checked_password(password)))
+    return User(name, UserRole(role), hasher().hash(checked_password(password, name)))

@@ -74,6 +74,13 @@ export async function logOut(onDone) {
   onDone();
 }
 
+// What opened a dialog may have been drawn again meanwhile: then the next thing to do has the focus.
+function focusAgain(event) {
+  const has = document.activeElement;
+  if (has && has !== document.body && !event.target.contains(has)) return;
+  (document.querySelector("main article .actions button") ?? document.getElementById("content")).focus();
+}
+
 function dialog(title, content, button, onDone) {
   const root = document.getElementById("dialog");
   const error = element("p", { class: "error", role: "alert" });
@@ -90,5 +97,6 @@ function dialog(title, content, button, onDone) {
     element("button", { type: "button", onclick: () => root.close() }, "Cancel"),
     element("button", { type: "submit", class: "primary" }, button)));
   root.replaceChildren(form);
+  root.onclose = focusAgain;
   root.showModal();
 }

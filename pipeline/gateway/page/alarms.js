@@ -3,7 +3,7 @@
 import { buttons } from "./actions.js";
 import { age, clock, element, facts, keepFocus, percent } from "./dom.js";
 import { clipLink } from "./clips.js";
-import { ask } from "./server.js";
+import { ask, learn } from "./server.js";
 
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
 const PAGE = 100;
@@ -25,7 +25,8 @@ export function rerunLink(url, t_ns) {
 // One alarm. viewerUrl: of Rerun's viewer; empty: none.
 export function card(alarm, viewerUrl) {
   const kind = alarm.presented ? alarm.severity : "silenced";
-  const states = alarm.states.join(", ") + (alarm.acknowledged_by ? ` by ${alarm.acknowledged_by}` : "");
+  const by = alarm.acknowledged_by ? ` by ${alarm.acknowledged_by}` : "";
+  const states = alarm.states.map((state) => (state === "acknowledged" ? state + by : state)).join(", ");
   return element("article", { class: `card ${kind}`, "data-fan": name(alarm), "aria-label": `Alarm of ${alarm.tray} fan ${alarm.fan}` },
     element("p", {}, badge(alarm.active ? alarm.severity : "none", alarm.active ? alarm.severity : "over"), " ",
       element("strong", {}, link(alarm)), ` since ${clock(alarm.onset_t_ns)} (`, age(alarm.onset_t_ns), ")"),
@@ -68,7 +69,7 @@ export class HistoryView {
   constructor(fan = null) {
     this.fan = fan;
     this.body = element("tbody");
-    this.more = element("button", { type: "button", onclick: () => this.load(this.oldest), hidden: true }, "Older");
+    this.more = element("button", { type: "button", onclick: () => learn(() => this.load(this.oldest)), hidden: true }, "Older");
     this.reach = element("p", { class: "muted" });
     const heads = ["Time", ...(fan ? [] : ["Fan"]), "What happened", "By", "Message"].map((text) => element("th", { scope: "col" }, text));
     this.root = element("div", {}, element("h2", {}, fan ? "History of its alarms" : "History of alarms"), this.reach,
@@ -102,12 +103,12 @@ export class HistoryView {
   begin() {
     this.body.replaceChildren();
     this.newest = this.oldest = null;
-    this.load();
+    learn(() => this.load());
   }
 
   // A transition has come.
   update() {
-    this.due ||= setTimeout(() => { this.due = 0; if (this.root.isConnected) this.load(); }, 200);
+    this.due ||= setTimeout(() => { this.due = 0; if (this.root.isConnected) learn(() => this.load()); }, 200);
   }
 
   row(each) {

@@ -5,10 +5,11 @@ import { buttons } from "./actions.js";
 import { bytes, HIGHEST_LEVEL, NO_LEVEL } from "./fans.js";
 import { Plot } from "./plot.js";
 import { clock, element, facts, keepFocus } from "./dom.js";
-import { ask } from "./server.js";
+import { ask, learn } from "./server.js";
 import { wearTable } from "./wear.js";
 
 const KEPT_S = 3600;
+const HOLE_S = 12;  // without samples for longer, there is a hole in the plots
 const COLUMNS = ["t_s", "measured", "predicted", "half_width", "torque_balance_command", "score"];
 const WINDOWS = [["1 min", 60], ["10 min", 600], ["1 hour", KEPT_S]];
 const POINTS = 1200;
@@ -42,13 +43,22 @@ export class FanView {
     this.scheme = matchMedia("(prefers-color-scheme: dark)");
     this.scheme.addEventListener("change", this.recolored);
     window.addEventListener("resize", this.resized);
-    this.start();
+    this.begin();
+  }
+
+  // Also after the server was away.
+  begin() {
+    learn(() => this.start());
   }
 
   async start() {
     const past = await ask(`${this.path}/curves?seconds=${KEPT_S}`);
     await this.learn();
     this.speedUnit = past.speed_unit;
+    if (this.plots.length) {  // the page has more than a server that has just begun
+      this.add(past);
+      return;
+    }
     const live = this.columns;
     this.columns = Object.fromEntries(COLUMNS.map((name) => [name, past[name]]));
     this.draw();
@@ -71,8 +81,8 @@ export class FanView {
   update(fleet) {
     const level = bytes(fleet.levels)[this.index], was = this.class;
     this.class = bytes(fleet.classes)[this.index];
-    this.score.textContent = level === NO_LEVEL ? "not judged." : `score ${level} %${level >= HIGHEST_LEVEL ? " or more" : ""} of the limit.`;
-    if (was !== this.class && was >= 0 && this.site.classes[was] !== this.site.classes[this.class]) this.learn();
+    this.score.textContent = level === NO_LEVEL ? "not judged." : `score ${level >= HIGHEST_LEVEL ? "≥ " : ""}${level} % of the limit.`;
+    if (was !== this.class && was >= 0 && this.site.classes[was] !== this.site.classes[this.class]) learn(() => this.learn());
   }
 
   updateAlarm(alarm) {
@@ -87,8 +97,10 @@ export class FanView {
     const mine = this.columns, newest = mine.t_s.at(-1) ?? -Infinity;
     const first = samples.t_s.findIndex((t_s) => t_s > newest);
     if (samples.t_s.length && samples.t_s.at(-1) < newest - 10) COLUMNS.forEach((name) => { mine[name] = samples[name]; });
-    else if (first >= 0) COLUMNS.forEach((name) => mine[name].push(...samples[name].slice(first)));
-    else return;
+    else if (first >= 0) {
+      if (newest > 0 && samples.t_s[first] - newest > HOLE_S) COLUMNS.forEach((name) => mine[name].push(name === "t_s" ? newest + HOLE_S / 2 : null));
+      COLUMNS.forEach((name) => mine[name].push(...samples[name].slice(first)));
+    } else return;
     const old = mine.t_s.findIndex((t_s) => t_s > mine.t_s.at(-1) - KEPT_S);
     if (old > 2000) COLUMNS.forEach((name) => mine[name].splice(0, old));
     this.refresh();

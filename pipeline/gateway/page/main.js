@@ -16,19 +16,28 @@ let site = null, view = null, fleet = null, stages = [], shownHash = null, alarm
 
 const events = new Events({
   connected: (isThere) => showConnection(isThere),
+  refused: () => start(),
   fleet: (data) => { fleet = data; showSummary(); if (view instanceof FansView || view instanceof FanView) view.update(fleet); },
-  alarm: (alarm) => { alarms.set(`${alarm.tray}/${alarm.fan}`, alarm); showAlarms(alarm); showCount(); },
+  alarm: (alarm) => {
+    const name = `${alarm.tray}/${alarm.fan}`;
+    if (view instanceof FansView && alarm.active && !alarms.get(name)?.active) view.raise(indexOf(alarm.tray, alarm.fan));
+    alarms.set(name, alarm);
+    showAlarms(alarm);
+    showCount();
+  },
   stages: (data) => { stages = data.stages; if (view instanceof StagesView) view.update(stages); },
   samples: (data) => { if (view instanceof FanView) view.add(data); },
   missed: () => learnState(),
 });
-let wasConnected = false;
+let wasConnected = false, wasLost = false;
 
 function showConnection(isThere) {
   const shown = document.getElementById("connection");
   shown.textContent = isThere ? "● live" : "✖ no connection: what is shown is old";
   shown.className = isThere ? "muted" : "lost";
   if (isThere && !wasConnected) learnState();
+  if (isThere && wasLost) view?.begin?.();
+  wasLost = !isThere && view !== null;
   wasConnected = isThere;
 }
 

@@ -110,3 +110,11 @@ def test_a_file_that_cannot_be_understood_is_named(outbox, tmp_path):
     (tmp_path / "text").write_text("this is no database, and long enough to be seen as such\n" * 20)
     with pytest.raises(UserError, match="messages cannot be kept there"):
         Outbox(tmp_path / "text", ["mail"])
+
+
+def test_a_file_that_is_damaged_while_it_is_used_ends_nothing(outbox):
+    outbox._file.execute("DROP TABLE event")
+    assert not outbox.was_sent("mail", EVENT)
+    with pytest.raises(sqlite3.Error):
+        save(outbox, Saved(), texts("mail"))
+    assert outbox.next_for("mail") is None, "what cannot be decided for good is not sent"

@@ -16,7 +16,7 @@ MOST_LINES, WITHIN_S = 60, 60.0
 LONGEST_VALUE = 200
 
 
-class EventLog:
+class SecurityLog:
     """Thread-safe."""
 
     def __init__(self, write: Callable[[str], None] | None = None, now_s: Callable[[], float] = time.monotonic) -> None:

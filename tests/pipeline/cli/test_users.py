@@ -1,0 +1,60 @@
+"""`fantwin users`: what the file of users holds then."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from argon2 import PasswordHasher
+
+from pipeline.errors import UserError
+from pipeline.presenting.users import Users
+from tests.support.fantwin_command import error_of, fantwin, usage_error_of
+
+PASSWORD, OTHER_PASSWORD = "correct horse battery", "another horse battery"
+
+
+@pytest.fixture
+def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    quick = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+    for place in ("pipeline.presenting.users", "pipeline.cli.watch.users"):
+        monkeypatch.setattr(f"{place}.hasher", lambda: quick)
+    path = tmp_path / "fantwin.toml"
+    path.write_text('[[tray]]\nname = "tray1"\nfans = 1\n[gateway]\nusers = "users.toml"\n')
+    return path
+
+
+def add(config: Path, name: str, password: str, *words: str) -> None:
+    done = fantwin("users", "add", name, "-c", config, *words, typed=f"{password}\n")
+    assert done.exit_code == 0, done.output
+    assert password not in done.output
+
+
+def test_users_are_added_changed_listed_and_removed_and_only_the_owner_reads_the_file(config):
+    add(config, "ann", PASSWORD, "--role", "operator")
+    add(config, "vic", PASSWORD)
+    add(config, "ann", OTHER_PASSWORD)
+    path = config.parent / "users.toml"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert PASSWORD not in path.read_text()
+    listed = json.loads(fantwin("users", "-c", config, "--json").stdout)
+    assert listed == [{"name": "ann", "role": "viewer"}, {"name": "vic", "role": "viewer"}]
+    users = Users(path)
+    assert users.verified("ann", PASSWORD) is None
+    assert users.verified("ann", OTHER_PASSWORD) is not None
+    assert fantwin("users", "remove", "ann", "-c", config).exit_code == 0
+    assert users.verified("ann", OTHER_PASSWORD) is None, "from the next request on"
+    path.chmod(0o644)
+    with pytest.raises(UserError, match="others may read it"):
+        Users(path)
+
+
+def test_what_is_no_user_is_refused_and_changes_nothing(config):
+    assert "12 to 128" in str(fantwin("users", "add", "ann", "-c", config, typed="short\n").exception)
+    assert "is no name" in usage_error_of("users", "add", "../ann", "-c", config)
+    assert "viewer or operator" in usage_error_of("users", "add", "ann", "--role", "root", "-c", config)
+    assert "no user 'ann'" in error_of("users", "remove", "ann", "-c", config)
+    assert not (config.parent / "users.toml").exists()
+    config.write_text('[[tray]]\nname = "tray1"\nfans = 1\n')
+    assert "neither [gateway] nor [opcua]" in error_of("users", "-c", config)

@@ -1,0 +1,216 @@
+"""The operators' page in a real browser, on a gateway that is fed with messages: keyboard, accessibility, attacks."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from schemas.enums import Action, FanState, Transition
+from schemas.messages import Alarm, Request
+from tests.stages.test_gateway import alarm, score
+from tests.support.page_browser import PASSWORD, inaccessible, make_users, opened, running_browser
+from tests.support.running_chain import eventually
+from tests.support.running_core import TRAY
+from tests.support.running_gateway import RunningGateway
+
+pytestmark = pytest.mark.slow
+FAULTY = 2
+CELL = f"{TRAY} fan {FAULTY} alarm"
+FOCUSED = "(document.activeElement.ariaLabel ?? document.activeElement.innerText).replace(/\\s+/g, ' ').trim()"
+SCRIPT = '<img src=x onerror="document.title=1"><script>document.title=1</script>'
+
+
+class Scorer:
+    """Grants what is asked."""
+
+    def __init__(self) -> None:
+        self._state = {"acknowledged": False, "confirmed": False, "shelved_until_t_ns": 0}
+
+    def __call__(self, request: Request) -> list[Alarm]:
+        transition, change = {
+            Action.ACKNOWLEDGE: (Transition.ACKNOWLEDGED, {"acknowledged": True}),
+            Action.CONFIRM: (Transition.CONFIRMED, {"confirmed": True}),
+            Action.SHELVE: (Transition.SHELVED, {"shelved_until_t_ns": alarm().t_ns + round(request.duration_s * 1e9)}),
+        }[request.action]
+        self._state |= change
+        name, comment = request.operator_name, request.comment
+        return [alarm(transition, operator_name=name, comment=comment, message=f"{name} asks", **self._state)]
+
+
+@pytest.fixture
+def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningGateway]:
+    monkeypatch.setattr("pipeline.presenting.site_model.SILENT_AFTER_S", 1e9)
+    running = RunningGateway(tmp_path, Scorer(), users=make_users(tmp_path / "users.toml"))
+    running.feed(score(), score(1.0, state=FanState.ALARM), alarm())
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+@pytest.fixture
+def browser() -> Iterator[Browser]:
+    with running_browser() as running:
+        yield running
+
+
+def test_everything_is_done_by_keyboard(gateway, browser):
+    errors: list[str] = []
+    page = opened(browser, f"http://127.0.0.1:{gateway.port}/", errors, "ann")
+    keyboard = page.keyboard
+
+    def tab_to(name: str) -> None:
+        for _ in range(40):
+            keyboard.press("Tab")
+            if page.evaluate(FOCUSED).endswith(name):
+                assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+                return
+        raise AssertionError(f"Tab does not come to {name!r}")
+
+    expect(page.get_by_role("button", name=CELL)).to_be_visible()
+    page.get_by_label("State").focus()
+    tab_to(f"{CELL}, 50 %")
+    keyboard.press("ArrowRight")
+    assert f"{TRAY} fan 3" in page.evaluate(FOCUSED)
+    keyboard.press("ArrowLeft")
+    keyboard.press("Enter")
+    card = page.locator(f'article[data-fan="{TRAY}/{FAULTY}"]')
+    for button, done in (("Acknowledge", "by ann, unconfirmed"), ("Confirm", "by ann"), ("Shelve", "shelved until")):
+        tab_to(button)
+        keyboard.press("Enter")
+        page.get_by_label("Why").focus()
+        keyboard.type(f"{button} by key")
+        keyboard.press("Enter")
+        expect(page.get_by_role("dialog")).to_be_hidden()
+        expect(card).to_contain_text(done)
+        expect(card.get_by_role("button", name=button, exact=True)).to_have_count(0)
+        assert page.evaluate("document.activeElement !== document.body"), "the focus is lost"
+        page.locator("#content").focus()
+    asked = [(each.action, each.operator_name, each.comment) for each in gateway.sent]
+    assert asked == [
+        (Action.ACKNOWLEDGE, "ann", "Acknowledge by key"),
+        (Action.CONFIRM, "ann", "Confirm by key"),
+        (Action.SHELVE, "ann", "Shelve by key"),
+    ]
+    keyboard.press("Escape")
+    expect(page.get_by_label("State")).to_be_visible()
+    assert f"{TRAY} fan {FAULTY}" in page.evaluate(FOCUSED)
+    assert errors == []
+
+
+def test_whoever_must_log_in_is_asked_again_after_a_restart_and_sees_the_page_again(tmp_path, browser):
+    settings = {"users": make_users(tmp_path / "users.toml"), "hosts": ("127.0.0.1", "fans.example")}
+    running = RunningGateway(tmp_path, **settings)
+    page = browser.new_page()
+
+    def log_in() -> None:
+        page.get_by_label("Name").fill("vic")
+        page.get_by_label("Password").fill(PASSWORD)
+        page.get_by_role("dialog").get_by_role("button", name="Log in").click()
+        expect(page.locator("#connection")).to_contain_text("live")
+
+    try:
+        page.goto(f"http://127.0.0.1:{running.port}/")
+        log_in()
+        running.close()
+        expect(page.locator("#connection")).to_contain_text("no connection")
+        running = RunningGateway(tmp_path, port=running.port, **settings)
+        log_in()
+        running.feed(score())
+        expect(page.get_by_role("button", name=f"{TRAY} fan 0")).to_be_visible()
+    finally:
+        running.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_is_accessible_and_fits_a_phone(scheme, gateway, browser):
+    errors: list[str] = []
+    url = f"http://127.0.0.1:{gateway.port}/"
+    phone = opened(browser, url, errors, "ann", size=(390, 844), scheme=scheme)
+    found: dict[str, list[str]] = {}
+    views = {
+        "fans": CELL,
+        f"fan/{TRAY}/{FAULTY}": "measured",
+        "alarms": "drag +20 %",
+        "stages": "Stages",
+        "history": "raised",
+    }
+    for view, shown in views.items():
+        phone.goto(f"{url}#/{view}")
+        expect(phone.locator("main")).to_contain_text(shown.replace(f"{TRAY} fan {FAULTY} ", ""))
+        found[view] = inaccessible(phone)
+        assert phone.evaluate("document.documentElement.scrollWidth") <= 390, f"{view} scrolls sideways"
+    phone.goto(f"{url}#/alarms")
+    phone.get_by_role("button", name="Shelve").click()
+    found["dialog"] = inaccessible(phone)
+    assert {view: problems for view, problems in found.items() if problems} == {}
+    assert errors == []
+
+
+def test_forged_sessions_other_sites_and_scripts_in_comments_get_nowhere(gateway, browser):
+    errors: list[str] = []
+    url, path = f"http://127.0.0.1:{gateway.port}/", f"/api/v1/fans/{TRAY}/{FAULTY}/requests"
+    forged = opened(browser, url, errors)
+    forged.context.add_cookies([{"name": "fantwin", "value": "A" * 43, "url": url}])
+    post = """async (path) => (await fetch(path, {method: "POST", body: '{"action": "acknowledge"}',
+        headers: {"Content-Type": "application/json", "X-CSRF-Token": "A"}})).status"""
+    assert forged.evaluate(post, path) == 401
+
+    ann = opened(browser, url, errors, "ann")
+    assert ann.evaluate(post, path) == 403, "without the token of the session"
+    other = ann.context.new_page()
+    asked: list[str] = []
+    statuses: list[int] = []
+    other.on("request", lambda request: asked.append(request.resource_type) if path in request.url else None)
+    other.on("response", lambda response: statuses.append(response.status) if path in response.url else None)
+    with other_site(f"{url.rstrip('/')}{path}") as evil:
+        other.goto(evil)
+        eventually(lambda: statuses or other.wait_for_timeout(50), "the form is answered")
+    assert (asked, statuses) == (["fetch", "document"], [403]), "the browser keeps the answer to the script from it"
+    assert gateway.sent == []
+
+    gateway.feed(
+        alarm(Transition.ACKNOWLEDGED, 1, acknowledged=True, operator_name="ann", comment=SCRIPT, message=SCRIPT)
+    )
+    ann.get_by_role("link", name="History").click()
+    expect(ann.locator("tbody")).to_contain_text(SCRIPT)
+    assert ann.locator("tbody img").count() == 0
+    assert ann.title() != "1"
+    assert errors == []
+
+
+class other_site:  # noqa: N801  a context manager
+    """A page of another site, which posts to an address by a script and by a form."""
+
+    def __init__(self, target: str) -> None:
+        page = f"""<form method="post" enctype="text/plain" action="{target}">
+            <input name='{{"action":"acknowledge","a":"' value='"}}'></form>
+            <script>fetch("{target}", {{method: "POST", mode: "no-cors", credentials: "include",
+            body: '{{"action": "acknowledge"}}'}}).finally(() => document.forms[0].submit())</script>""".encode()
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", "text/html")
+                self.end_headers()
+                self.wfile.write(page)
+
+            def log_message(self, format: str, *args: object) -> None:
+                pass
+
+        self._server = HTTPServer(("127.0.0.1", 0), Handler)
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+
+    def __enter__(self) -> str:
+        self._thread.start()
+        return f"http://localhost:{self._server.server_port}/"
+
+    def __exit__(self, *_: object) -> None:
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
