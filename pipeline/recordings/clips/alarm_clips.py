@@ -62,7 +62,6 @@ class AlarmClips:
         self._save()  # before it is cut: a clip that is due survives a crash
         if due := self._tracker.due(now_ns):
             self._maker.cut(due, open_part())
-        self._save()
 
     def oldest_acknowledged_until_ns(self) -> int | None:
         """The end of the first clip that may be deleted; None: there is none."""
