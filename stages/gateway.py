@@ -183,14 +183,14 @@ def check(context: Context) -> list[str]:
     """Report a missing extra, a port that another program has taken, and files that cannot be read."""
     if not all(map(is_installed, NEEDED)):
         return [NOT_INSTALLED]
-    from pipeline.gateway.server import check_certificate, check_expiry, listen  # noqa: PLC0415  the extra may not be installed
+    from pipeline.gateway.server import check_certificate, check_files, listen  # noqa: PLC0415  the extra may not be installed
     from pipeline.presenting.users import read_users  # noqa: PLC0415
 
     config: GatewayConfig = context.config
     attempts: list[Callable[[], object]] = []
     if config.certificate and config.key:
         attempts.append(partial(check_certificate, context.resolve(config.certificate), context.resolve(config.key)))
-        attempts.append(partial(check_expiry, context.resolve(config.certificate)))
+        attempts.append(partial(check_files, context.resolve(config.certificate), context.resolve(config.key)))
     if config.users:
         attempts.append(partial(read_users, context.resolve(config.users)))
     if not context.is_running:

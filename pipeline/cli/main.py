@@ -40,6 +40,7 @@ COMMANDS = {
     "recover": "recordings.recover",
     "import": "recordings.import_table",
     "export": "recordings.export",
+    "view": "recordings.view",
     "plot": "recordings.plot",
     "picture": "recordings.picture",
     "identify": "twins.identify",

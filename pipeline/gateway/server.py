@@ -10,6 +10,7 @@ import ssl
 import threading
 from collections import Counter
 from collections.abc import Callable, Set
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -30,6 +31,7 @@ MOST_OF_AN_ADDRESS = 100
 """connections from elsewhere; on this host, and from a proxy, are many people"""
 REQUEST_WITHIN_S = 10.0
 """whoever has connected, or begun another request, sends its head within this time"""
+_EVERYBODY = 0o007
 _OTHER_FILES = 200
 """that the process may have open beside its connections"""
 
@@ -216,13 +218,16 @@ def _why(error: OSError | ValueError, otherwise: str) -> str:
     return (error.strerror or str(error)) if isinstance(error, OSError) else otherwise
 
 
-def check_expiry(certificate: Path) -> None:
+def check_files(certificate: Path, key: Path) -> None:
     """Raises:
-    StageError: the certificate is over.
+    StageError: the certificate is over, or everybody may read its key.
     """
     expires = expiry_of(certificate)
     if expires is not None and expires < datetime.now(UTC):
         raise StageError(f"gateway.certificate = {str(certificate)!r}: it is over since {expires:%Y-%m-%d}")
+    with suppress(OSError):  # that it cannot be read is said elsewhere
+        if key.stat().st_mode & _EVERYBODY:
+            raise StageError(f"gateway.key = {str(key)!r}: everybody may read it: chmod o= {key}")
 
 
 def expiry_of(certificate: Path) -> datetime | None:

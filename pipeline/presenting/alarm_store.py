@@ -139,6 +139,8 @@ class AlarmStore:
                 self._file.execute("INSERT OR IGNORE INTO transition VALUES (?, ?, ?, ?, ?, ?, ?)", row)
             self._file.execute("COMMIT")
         except sqlite3.Error as error:
+            with suppress(sqlite3.Error):
+                self._file.rollback()
             raise UserError(f"{self._path}: {error}: alarms of recordings are not in the history") from error
         return len(room)
 

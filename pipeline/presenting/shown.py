@@ -177,11 +177,16 @@ def _stage_json(state: StageState) -> dict[str, Any]:
         "in_hz": round(view.rate_in_hz, 1) if view else 0.0,
         "out_hz": round(view.rate_out_hz, 1) if view else 0.0,
         "lost": health.lost if health else 0,
-        "latency_p50_ms": round(health.latency_p50_ms, 1) if health else 0.0,
-        "latency_p99_ms": round(health.latency_p99_ms, 1) if health else 0.0,
-        "uptime_s": round(health.uptime_s) if health else 0,
+        "latency_p50_ms": _rounded(health.latency_p50_ms, 1) if health else 0.0,
+        "latency_p99_ms": _rounded(health.latency_p99_ms, 1) if health else 0.0,
+        "uptime_s": _rounded(health.uptime_s, 0) if health else 0.0,
         "notes": [f"{note.tray}: {note.text}" if note.tray else note.text for note in health.notes] if health else [],
     }
+
+
+def _rounded(value: float, digits: int) -> float:
+    """0 for what is no number: health is what its sender makes it."""
+    return round(value, digits) if math.isfinite(value) else 0.0
 
 
 def _or_null(values: Array) -> Sequence[float | None]:

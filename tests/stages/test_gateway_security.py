@@ -134,6 +134,19 @@ def test_an_own_account_buys_no_more_guesses_and_an_ipv6_network_counts_as_one_a
     assert guesses <= 100, "in an hour"
 
 
+def test_guesses_from_elsewhere_do_not_lock_out_who_has_logged_in_where_he_is():
+    failures = login_failures.LoginFailures(lambda: 0.0)
+    assert failures.begin("ann", "192.0.2.1") == 0
+    failures.succeed("ann", "192.0.2.1")
+    for number in range(login_failures.FAILURES):
+        assert failures.begin("ann", f"198.51.100.{number}") == 0
+    assert failures.begin("ann", "198.51.100.77") > 0
+    assert failures.begin("ann", "192.0.2.1") == 0
+    failures.succeed("ann", "192.0.2.1")
+    guesses = sum(failures.begin("ann", "192.0.2.1") == 0 for _ in range(20))
+    assert guesses == login_failures.FAILURES, "there he has no more guesses than others"
+
+
 def test_a_new_password_and_another_login_end_the_session_of_before(gateway, users):
     first = logged_in(gateway)
     again = Client(gateway)
@@ -381,7 +394,7 @@ def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_na
     finally:
         gateway.close()
     with pytest.raises(StageError, match="it is over since"):
-        server.check_expiry(files["certificate"])
+        server.check_files(**files)
 
 
 def encrypted(key: Path) -> None:
@@ -409,6 +422,16 @@ def test_what_is_wrong_with_the_files_of_tls_is_said_and_no_password_is_asked_fo
     break_it(files[file])
     with pytest.raises(StageError, match=rf"gateway\.{file} = .*: .*{why}"):
         server.check_certificate(**files)
+
+
+def test_a_key_that_everybody_reads_is_named(tmp_path):
+    certificates = SiteCertificates(tmp_path)
+    certificates.issue("page")
+    (tmp_path / "page.key").chmod(0o640)
+    server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
+    (tmp_path / "page.key").chmod(0o644)
+    with pytest.raises(StageError, match="everybody may read it"):
+        server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
 
 
 def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question(

@@ -81,7 +81,7 @@ export class FanView {
   update(fleet) {
     const level = bytes(fleet.levels)[this.index], was = this.class;
     this.class = bytes(fleet.classes)[this.index];
-    this.score.textContent = level === NO_LEVEL ? "not judged." : `score ${level} %${level >= HIGHEST_LEVEL ? " or more" : ""} of the limit.`;
+    this.score.textContent = level === NO_LEVEL ? "not judged." : `score ${level >= HIGHEST_LEVEL ? "≥ " : ""}${level} % of the limit.`;
     if (was !== this.class && was >= 0 && this.site.classes[was] !== this.site.classes[this.class]) learn(() => this.learn());
   }
 

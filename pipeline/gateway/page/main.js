@@ -14,6 +14,7 @@ let site = null, view = null, fleet = null, stages = [], shownHash = null, alarm
 
 const events = new Events({
   connected: (isThere) => showConnection(isThere),
+  refused: () => start(),
   fleet: (data) => { fleet = data; showSummary(); if (view instanceof FansView || view instanceof FanView) view.update(fleet); },
   alarm: (alarm) => {
     const name = `${alarm.tray}/${alarm.fan}`;
