@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -62,6 +63,11 @@ def test_no_reason_of_a_failure_shows_a_secret(url, capfd):
     receiver.stop()
     said = capfd.readouterr()
     assert "123" not in said.out + said.err
+
+
+def test_the_urls_of_the_how_to_can_be_used():
+    urls = re.findall(r"`((?:mailtos?|json)://[^`]+)`", PAGE.read_text(encoding="utf-8"))
+    assert [Service(url) and url.partition(":")[0] for url in urls] == ["mailtos", "mailto", "json"]
 
 
 @pytest.mark.parametrize(
