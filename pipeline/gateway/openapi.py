@@ -10,15 +10,17 @@ from pydantic.json_schema import models_json_schema
 
 from pipeline.gateway.access import CSRF_HEADER
 from pipeline.gateway.forms import LoginForm
+from pipeline.presenting.fan_groups import FanGroup
 from pipeline.presenting.request_form import RequestForm
 
 _FORMS = {"/login": LoginForm, "/fans/{tray}/{fan}/requests": RequestForm}
-_QUERY = {
-    "/fans": {"tray": "string", "state": "string", "limit": "integer"},
-    "/fans/{tray}/{fan}/curves": {"seconds": "integer"},
-    "/alarms": {"all": "integer"},
-    "/alarms/history": {"tray": "string", "fan": "integer", "limit": "integer", "before": "integer"},
-    "/events": {"fan": "string"},
+_TEXT, _WHOLE = {"type": "string"}, {"type": "integer"}
+_QUERY: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
+    "/fans": {"tray": _TEXT, "state": {"type": "string", "enum": list(FanGroup)}, "limit": _WHOLE},
+    "/fans/{tray}/{fan}/curves": {"seconds": _WHOLE},
+    "/alarms": {"all": _WHOLE},
+    "/alarms/history": {"tray": _TEXT, "fan": _WHOLE, "limit": _WHOLE, "before": _WHOLE},
+    "/events": {"fan": _TEXT},
 }
 _ERRORS = {"401": "nobody is logged in", "403": "the user may not do this", "404": "no such tray or fan"}
 _OF_REQUEST = {"409": "the scorer has refused it", "422": "the form is wrong", "504": "no scorer has answered"}
@@ -52,8 +54,8 @@ def _operation(path: str, method: str, handler: Callable[..., object]) -> dict[s
         for name in re.findall(r"{(\w+)}", path)
     ]
     asked = [
-        {"name": name, "in": "query", "required": False, "schema": {"type": kind}}
-        for name, kind in _QUERY.get(path, {}).items()
+        {"name": name, "in": "query", "required": False, "schema": schema}
+        for name, schema in _QUERY.get(path, {}).items()
     ]
     kind = "text/event-stream" if path == "/events" else "application/json"
     errors = _ERRORS | (_OF_REQUEST if method == "POST" else {})

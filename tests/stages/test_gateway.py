@@ -147,7 +147,7 @@ def test_live_events_bring_an_alarm_and_the_samples_of_the_fan_that_is_looked_at
             if line == f"event: {wanted}\n":
                 return json.loads(stream.readline().decode().removeprefix("data: "))
 
-    assert event("fleet")["counts"] == {"in_alarm": 0, "suspect": 0, "not_judged": 1}
+    assert event("fleet")["counts"] == {"in_alarm": 0, "suspect": 0, "not_judged": 1, "silenced": 0}
     gateway.feed(score(1.0), alarm())
     assert event("samples")["measured"] == [1000.0] * 5
     assert event("alarm")["fan"] == 2

@@ -10,7 +10,7 @@ const SHOWN = 100;
 
 const name = (alarm) => `${alarm.tray}/${alarm.fan}`;
 const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.tray)}/${alarm.fan}` }, `${alarm.tray} fan ${alarm.fan}`);
-const share = (cause) => `${cause.cause}${cause.probability === null ? "" : `, ${percent(cause.probability)}`}`;
+const share = (cause) => `${cause.cause}, ${percent(cause.probability)}`;
 
 export function badge(severity, text) {
   return element("span", { class: `badge ${severity}` }, `${MARKS[severity] ?? ""} ${text}`);
@@ -25,12 +25,13 @@ export function rerunLink(url, t_ns) {
 export function card(alarm, viewerUrl) {
   const kind = alarm.presented ? alarm.severity : "silenced";
   const by = alarm.acknowledged_by ? ` by ${alarm.acknowledged_by}` : "";
-  const states = alarm.states.map((state) => (state === "acknowledged" ? state + by : state)).join(", ");
+  const states = alarm.states.map((state) => (state === "acknowledged" ? state + by : state))
+    .concat(alarm.now ? `now ${alarm.now}` : []).join(", ");
   return element("article", { class: `card ${kind}`, "data-fan": name(alarm), "aria-label": `Alarm of ${alarm.tray} fan ${alarm.fan}` },
     element("p", {}, badge(alarm.active ? alarm.severity : "none", alarm.active ? alarm.severity : "over"), " ",
       element("strong", {}, link(alarm)), ` since ${clock(alarm.onset_t_ns)} (`, age(alarm.onset_t_ns), ")"),
     facts({
-      "Cause": [alarm, ...alarm.other_causes].filter((each) => each.cause).map(share).join("; or "),
+      "Cause": [alarm.cause_with_share, ...alarm.other_causes.map(share)].filter(Boolean).join("; or "),
       "Evidence": alarm.evidence,
       "What to do": alarm.advice,
       "Deviation": alarm.evidence && alarm.message.includes(alarm.evidence) ? "" : alarm.message.replace(`fan ${alarm.fan}: `, ""),

@@ -2,7 +2,7 @@
 
 import { HistoryView, card, rerunLink } from "./alarms.js";
 import { buttons } from "./actions.js";
-import { bytes, HIGHEST_LEVEL, NO_LEVEL } from "./fans.js";
+import { address, bytes, levelText, NO_LEVEL } from "./fans.js";
 import { Plot } from "./plot.js";
 import { clock, element, facts, keepFocus } from "./dom.js";
 import { ask, learn } from "./server.js";
@@ -34,7 +34,7 @@ export class FanView {
     this.windows = element("div", { class: "actions", role: "group", "aria-label": "Time shown" }, ...WINDOWS.map(([text, s]) =>
       element("button", { type: "button", "aria-pressed": String(s === this.window_s), onclick: (event) => this.show(s, event.target) }, text)));
     this.root = element("div", {}, element("div", { class: "title" }, element("h2", {}, `${tray} fan ${fan}`),
-      element("a", { href: "#/fans" }, "← all fans (Esc)")), element("p", {}, this.state, this.score, " ", rerunLink(viewerUrl, 0)),
+      element("a", { href: address }, "← all fans (Esc)")), element("p", {}, this.state, this.score, " ", rerunLink(viewerUrl, 0)),
       this.alarm, this.windows, this.charts, element("h2", {}, "Wear"), this.wear, element("h2", {}, "Twin"), this.twin,
       this.history.root);
     this.updateAlarm(alarm);
@@ -81,14 +81,15 @@ export class FanView {
   update(fleet) {
     const level = bytes(fleet.levels)[this.index], was = this.class;
     this.class = bytes(fleet.classes)[this.index];
-    this.score.textContent = level === NO_LEVEL ? "not judged." : `score ${level} %${level >= HIGHEST_LEVEL ? " or more" : ""} of the limit.`;
+    this.score.textContent = level === NO_LEVEL ? "not judged." : `score ${levelText(level)} of the limit.`;
     if (was !== this.class && was >= 0 && this.site.classes[was] !== this.site.classes[this.class]) learn(() => this.learn());
   }
 
-  updateAlarm(alarm) {
+  // isNew: a transition has come.
+  updateAlarm(alarm, isNew = true) {
     keepFocus(this.alarm, () => this.alarm.replaceChildren(
       alarm?.listed ? card(alarm, this.viewerUrl) : buttons(this.tray, this.fan, null)));
-    if (this.known && alarm) this.history.update();
+    if (this.known && isNew && alarm) this.history.update();
     this.known = true;
   }
 
