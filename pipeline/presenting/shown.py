@@ -133,7 +133,7 @@ def curves_json(curves: Curves, tray: TrayConfig) -> dict[str, Any]:
     """Columns by name; speeds in the unit of the tray, null where nothing was measured or judged."""
     values = curves.values.astype(np.float64)
     values[:, :_SPEEDS] /= RAD_S_PER_UNIT[tray.speed_unit]
-    names = ("measured", "predicted", "half_width", "torque_balance_command", "score")
+    names = ("measured", "predicted", "half_width", "torque_balance_command", "score", "command")
     columns = {name: _or_null(values[:, number]) for number, name in enumerate(names)}
     return {"speed_unit": tray.speed_unit, "t_s": (curves.t_ns / 1e9).round(3).tolist(), **columns}
 

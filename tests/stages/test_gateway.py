@@ -129,6 +129,7 @@ def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(g
     assert curves["t_s"] == [(NOW_NS + 4 * STEP_NS) / 1e9, (NOW_NS + 10**9 + 4 * STEP_NS) / 1e9]
     assert curves["measured"] == [1000.0, 1000.0]
     assert curves["half_width"] == [20.0, 20.0]
+    assert curves["command"] == [0.5, 0.5]
     unjudged = client.ask("GET", f"/api/v1/fans/{TRAY}/3/curves")[1]
     assert unjudged["predicted"] == [None, None], "where nothing is judged, there is no twin to see"
     assert client.ask("GET", f"/api/v1/fans/{TRAY}/{FANS}")[0] == 404

@@ -1,9 +1,10 @@
 // The list of alarms, and the history of their transitions.
 
-import { buttons } from "./actions.js";
-import { age, clock, element, facts, keepFocus, percent } from "./dom.js";
+import { buttons, buttonsForAll } from "./actions.js";
+import { age, clock, element, facts, keepFocus, percent, stamp } from "./dom.js";
 import { ask, learn } from "./server.js";
 
+const OF_FAN = ["raised", "severity", "diagnosed"];  // these have the colour of the severity: nothing else is bad
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
 const PAGE = 100;
 const SHOWN = 100;
@@ -13,7 +14,7 @@ const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.t
 const share = (cause) => `${cause.cause}, ${percent(cause.probability)}`;
 
 export function badge(severity, text) {
-  return element("span", { class: `badge ${severity}` }, `${MARKS[severity] ?? ""} ${text}`);
+  return element("span", { class: `badge ${severity}` }, `${MARKS[severity] ?? ""} ${text}`.trim());
 }
 
 // Rerun's viewer follows the newest sample; its address takes no time, so the text says where to look.
@@ -40,6 +41,14 @@ export function card(alarm, viewerUrl) {
     rerunLink(viewerUrl, alarm.onset_t_ns), buttons(alarm.tray, alarm.fan, alarm));
 }
 
+// As many need attention as the header says.
+function title(listed) {
+  const open = listed.filter((alarm) => alarm.presented);
+  const active = open.filter((alarm) => alarm.active).length, over = open.length - active, silenced = listed.length - open.length;
+  const parts = [[active, "active"], [over, "over but not dealt with"], [silenced, "silenced"]].filter(([count]) => count);
+  return `Alarms (${open.length})${parts.length ? `: ${parts.map(([count, words]) => `${count} ${words}`).join(", ")}` : ""}`;
+}
+
 export class AlarmsView {
   constructor(alarms, viewerUrl) {
     Object.assign(this, { alarms, viewerUrl, most: SHOWN, due: 0 });
@@ -58,7 +67,7 @@ export class AlarmsView {
     const listed = [...this.alarms.values()].filter((alarm) => alarm.listed);
     listed.sort((one, other) => rank(one) - rank(other) || other.onset_t_ns - one.onset_t_ns);
     const more = listed.length - this.most;
-    keepFocus(this.root, () => this.root.replaceChildren(element("h2", {}, `Alarms (${listed.length})`),
+    keepFocus(this.root, () => this.root.replaceChildren(element("h2", {}, title(listed)), buttonsForAll(listed),
       ...(listed.length ? listed.slice(0, this.most).map((alarm) => card(alarm, this.viewerUrl(alarm.tray)))
         : [element("p", { class: "muted" }, "No alarms.")]),
       more > 0 ? element("button", { type: "button", onclick: () => { this.most += SHOWN; this.draw(); } }, `${more} more`) : ""));
@@ -114,8 +123,8 @@ export class HistoryView {
   row(each) {
     const cell = (label, ...content) => element("td", { "data-label": label }, ...content);
     const what = each.transition.replaceAll("_", " ");
-    return element("tr", {}, cell("Time", clock(each.t_ns)), this.fan ? "" : cell("Fan", link(each)),
-      cell("What happened", badge(each.active ? each.severity : "none", what)), cell("By", each.operator_name),
+    return element("tr", {}, cell("Time", stamp(each.t_ns)), this.fan ? "" : cell("Fan", link(each)),
+      cell("What happened", badge(OF_FAN.includes(each.transition) ? each.severity : "plain", what)), cell("By", each.operator_name),
       cell("Message", each.message, each.comment ? ` “${each.comment}”` : ""));
   }
 }

@@ -163,7 +163,10 @@ async function start() {
 
 window.addEventListener("hashchange", () => {
   showView();
-  if (!(view instanceof FansView && view.focus(lastFan))) content.focus();
+  if (!(view instanceof FansView && view.focus(lastFan))) {
+    content.focus({ preventScroll: true });  // it would scroll the first line behind the header
+    scrollTo(0, 0);
+  }
 });
 window.addEventListener("keydown", (event) => {
   const isElsewhere = document.getElementById("dialog").open || event.target.matches("input, select");
