@@ -8,6 +8,7 @@
 # make configuration  write docs/reference/configuration.md again
 # make twin   train the demo's twin again
 # make lock   pin the dependencies again
+# make rerun-bump VERSION=0.42  pin Rerun to this release, and run all tests that draw with it
 # make clean  remove what was built (and nothing that was recorded)
 
 PYTHON ?= python3
@@ -21,7 +22,7 @@ BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_t
 	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed stage_memory)
 SOURCES := fantwin_client schemas scoring pipeline simulation stages twin tests bench
 
-.PHONY: demo test check selftest compose-test bench schema configuration twin lock clean
+.PHONY: demo test check selftest compose-test bench schema configuration twin lock rerun-bump clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.runtime
@@ -64,6 +65,18 @@ lock: $(VENV)/.development
 	@echo "torch; sys_platform == 'none'" > $(VENV)/without-torch.txt
 	$(COMPILE) --extra bench --constraint requirements-dev.lock --override $(VENV)/without-torch.txt \
 		--output-file requirements-bench.lock
+
+# what depends on a release of Rerun: its calls, its files, and the viewer itself, which must report nothing
+RERUN_TESTS := tests/pipeline/viewing tests/stages/test_viewer.py tests/stages/test_viewer_fleet.py \
+	tests/pipeline/recordings/test_other_readers.py tests/bench/test_viewer_cost.py
+
+rerun-bump:
+	@echo "$(VERSION)" | grep -Eqx '[0-9]+\.[0-9]+' || { echo "name a release: make rerun-bump VERSION=0.42"; exit 1; }
+	sed -i 's/"rerun-sdk==[^"]*"/"rerun-sdk==$(VERSION).*"/' pyproject.toml
+	$(MAKE) lock
+	$(MAKE) $(VENV)/.development
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(RERUN_TESTS)
+	@echo "Rerun $(VERSION) passes; look at the pictures: fantwin picture runs/demo/view.rrd"
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache

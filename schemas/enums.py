@@ -71,6 +71,8 @@ class Transition(OpenEnum):
     REFUSED = 16
     DATA_LOST = 17
     DATA_RESTORED = 18
+    MARKED_TRUE = 19
+    MARKED_FALSE = 20
 
 
 class Action(OpenEnum):
@@ -87,6 +89,16 @@ class Action(OpenEnum):
     OUT_OF_SERVICE = 8
     IN_SERVICE = 9
     COMMISSION = 10
+    TRUE_ALARM = 11
+    FALSE_ALARM = 12
+
+
+class Feedback(OpenEnum):
+    """What operators have said of an alarm."""
+
+    NONE = 0
+    TRUE_ALARM = 1
+    FALSE_ALARM = 2
 
 
 class Severity(OpenEnum):

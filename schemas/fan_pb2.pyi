@@ -66,6 +66,8 @@ class Transition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     TRANSITION_REFUSED: _ClassVar[Transition]
     TRANSITION_DATA_LOST: _ClassVar[Transition]
     TRANSITION_DATA_RESTORED: _ClassVar[Transition]
+    TRANSITION_MARKED_TRUE: _ClassVar[Transition]
+    TRANSITION_MARKED_FALSE: _ClassVar[Transition]
 
 class Action(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -80,6 +82,14 @@ class Action(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ACTION_OUT_OF_SERVICE: _ClassVar[Action]
     ACTION_IN_SERVICE: _ClassVar[Action]
     ACTION_COMMISSION: _ClassVar[Action]
+    ACTION_TRUE_ALARM: _ClassVar[Action]
+    ACTION_FALSE_ALARM: _ClassVar[Action]
+
+class Feedback(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    FEEDBACK_NONE: _ClassVar[Feedback]
+    FEEDBACK_TRUE_ALARM: _ClassVar[Feedback]
+    FEEDBACK_FALSE_ALARM: _ClassVar[Feedback]
 
 class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -148,6 +158,8 @@ TRANSITION_REPUBLISHED: Transition
 TRANSITION_REFUSED: Transition
 TRANSITION_DATA_LOST: Transition
 TRANSITION_DATA_RESTORED: Transition
+TRANSITION_MARKED_TRUE: Transition
+TRANSITION_MARKED_FALSE: Transition
 ACTION_NONE: Action
 ACTION_ACKNOWLEDGE: Action
 ACTION_CONFIRM: Action
@@ -159,6 +171,11 @@ ACTION_UNSUPPRESS: Action
 ACTION_OUT_OF_SERVICE: Action
 ACTION_IN_SERVICE: Action
 ACTION_COMMISSION: Action
+ACTION_TRUE_ALARM: Action
+ACTION_FALSE_ALARM: Action
+FEEDBACK_NONE: Feedback
+FEEDBACK_TRUE_ALARM: Feedback
+FEEDBACK_FALSE_ALARM: Feedback
 SEVERITY_NONE: Severity
 SEVERITY_WARNING: Severity
 SEVERITY_ALARM: Severity
@@ -420,7 +437,7 @@ class Diagnosis(_message.Message):
     def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., parameter: _Optional[str] = ..., change: _Optional[float] = ..., change_low: _Optional[float] = ..., change_high: _Optional[float] = ..., unit: _Optional[str] = ..., evidence: _Optional[str] = ...) -> None: ...
 
 class Alarm(_message.Message):
-    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "limit_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_limit_command", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed", "out_of_service", "causes", "request", "operator_name", "comment", "stale")
+    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "limit_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_limit_command", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed", "out_of_service", "causes", "request", "operator_name", "comment", "stale", "feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FAN_FIELD_NUMBER: _ClassVar[int]
     ACTIVE_FIELD_NUMBER: _ClassVar[int]
@@ -446,6 +463,10 @@ class Alarm(_message.Message):
     OPERATOR_NAME_FIELD_NUMBER: _ClassVar[int]
     COMMENT_FIELD_NUMBER: _ClassVar[int]
     STALE_FIELD_NUMBER: _ClassVar[int]
+    FEEDBACK_FIELD_NUMBER: _ClassVar[int]
+    FEEDBACK_BY_FIELD_NUMBER: _ClassVar[int]
+    FEEDBACK_REASON_FIELD_NUMBER: _ClassVar[int]
+    MARKED_ONSET_T_NS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fan: int
     active: bool
@@ -471,10 +492,14 @@ class Alarm(_message.Message):
     operator_name: str
     comment: str
     stale: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., limit_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_limit_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., confirmed: _Optional[bool] = ..., latched: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., suppressed: _Optional[bool] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., stale: _Optional[bool] = ...) -> None: ...
+    feedback: Feedback
+    feedback_by: str
+    feedback_reason: str
+    marked_onset_t_ns: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., limit_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_limit_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., confirmed: _Optional[bool] = ..., latched: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., suppressed: _Optional[bool] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., stale: _Optional[bool] = ..., feedback: _Optional[_Union[Feedback, str]] = ..., feedback_by: _Optional[str] = ..., feedback_reason: _Optional[str] = ..., marked_onset_t_ns: _Optional[int] = ...) -> None: ...
 
 class Request(_message.Message):
-    __slots__ = ("header", "t_ns", "action", "fan", "duration_s", "operator_name", "comment")
+    __slots__ = ("header", "t_ns", "action", "fan", "duration_s", "operator_name", "comment", "onset_t_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     T_NS_FIELD_NUMBER: _ClassVar[int]
     ACTION_FIELD_NUMBER: _ClassVar[int]
@@ -482,6 +507,7 @@ class Request(_message.Message):
     DURATION_S_FIELD_NUMBER: _ClassVar[int]
     OPERATOR_NAME_FIELD_NUMBER: _ClassVar[int]
     COMMENT_FIELD_NUMBER: _ClassVar[int]
+    ONSET_T_NS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     t_ns: int
     action: Action
@@ -489,7 +515,8 @@ class Request(_message.Message):
     duration_s: float
     operator_name: str
     comment: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., action: _Optional[_Union[Action, str]] = ..., fan: _Optional[int] = ..., duration_s: _Optional[float] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ...) -> None: ...
+    onset_t_ns: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., action: _Optional[_Union[Action, str]] = ..., fan: _Optional[int] = ..., duration_s: _Optional[float] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., onset_t_ns: _Optional[int] = ...) -> None: ...
 
 class ScorerSnapshot(_message.Message):
     __slots__ = ("header", "t_ns", "twin_sha256", "restored", "state_json")

@@ -12,7 +12,7 @@ from typing import TypeAlias, get_args
 
 import numpy as np
 
-from schemas.enums import Action, FanState, InvalidReason, Severity, Statistic, TachoKind, Transition
+from schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Statistic, TachoKind, Transition
 from schemas.fields import Array, column, derived, time_column
 from schemas.header import Header
 from schemas.health import Health
@@ -231,11 +231,18 @@ class Alarm:
     operator_name: str = ""
     comment: str = ""
     stale: bool = False
+    feedback: Feedback = Feedback.NONE
+    feedback_by: str = ""
+    feedback_reason: str = ""
+    marked_onset_t_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Request:
-    """An operator's request about the alarms of a tray; fan -1 means all fans."""
+    """An operator's request about the alarms of a tray; fan -1 means all fans.
+
+    onset_t_ns: for feedback, of the alarm that is meant, to within a second; 0: the last one.
+    """
 
     header: Header = Header()
     t_ns: int
@@ -244,6 +251,7 @@ class Request:
     duration_s: float = 0.0
     operator_name: str = ""
     comment: str = ""
+    onset_t_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

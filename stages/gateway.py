@@ -18,7 +18,8 @@ from pipeline.errors import refusals
 from pipeline.gateway.config import NEEDED, GatewayConfig
 from pipeline.gateway.live_feed import LiveFeed
 from pipeline.optional_dependencies import how_to_install, is_installed
-from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.alarm_rates import AlarmRates
+from pipeline.presenting.alarm_store import HISTORY, AlarmStore
 from pipeline.presenting.fan_history import curves_of
 from pipeline.presenting.other_stages import VIEWER, configured, recordings_of, viewer_urls
 from pipeline.presenting.recorded_alarms import RecordedAlarms
@@ -26,6 +27,7 @@ from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stages_json
 from pipeline.presenting.site_core import SiteCore
 from pipeline.presenting.site_model import SiteModel
+from pipeline.recordings.clips.clip import clip_folder
 from pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
 from pipeline.viewing.fleet import Fan
 from schemas.envelope import Envelope
@@ -39,7 +41,6 @@ ALL_FOLLOWED = 64
 """with no more fans than this, all samples of all trays arrive"""
 MOST_FOLLOWED = 32
 """trays that somebody looks at; of more, the samples come once a second"""
-HISTORY = "alarms.sqlite"
 
 
 class GatewayCore(SiteCore):
@@ -134,7 +135,13 @@ class Server:
 
 class _Running(Server):
     def __init__(
-        self, context: Context, model: SiteModel, feed: LiveFeed, desk: RequestDesk, recorded: RecordedAlarms
+        self,
+        context: Context,
+        model: SiteModel,
+        feed: LiveFeed,
+        desk: RequestDesk,
+        recorded: RecordedAlarms,
+        clip_folders: Sequence[Path],
     ) -> None:
         from pipeline.gateway.access import Access  # noqa: PLC0415  the extra may not be installed
         from pipeline.gateway.api import Api  # noqa: PLC0415
@@ -150,7 +157,9 @@ class _Running(Server):
         self._access = Access(config, Users(context.resolve(config.users)) if config.users else None)
         listening = listen(config.host, config.port + context.shard_number - 1)
         site = configured(context, VIEWER)
-        app = application(Api(model, self._access, feed, desk, recorded, viewer_urls(site) if site else {}), config)
+        app = application(
+            Api(model, self._access, feed, desk, recorded, viewer_urls(site) if site else {}, clip_folders), config
+        )
         self._server = WebServer(app, listening, tls, feed.end, frozenset({"127.0.0.1", "::1", *config.proxies}))
 
     def stop(self) -> None:
@@ -168,14 +177,17 @@ def build(context: Context) -> BuiltStage:
     """
     if not all(map(is_installed, NEEDED)):
         raise StageError(NOT_INSTALLED)
-    store = AlarmStore(context.own_file(Path(HISTORY)))
+    path = context.own_file(Path(HISTORY))
+    store = AlarmStore(path)
     if context.started_t_ns:
         store.begins(context.started_t_ns)
-    model = SiteModel(context.site, context.trays, store)
+    model = SiteModel(context.site, context.trays, store, rates=AlarmRates(path))
     feed, desk = LiveFeed(), RequestDesk(context.producer)
     site = configured(context, RECORDER)
-    recorded = RecordedAlarms(model, recordings_of(site) if site else ())
-    core = GatewayCore(model, feed, desk, _Running(context, model, feed, desk, recorded), recorded)
+    recordings = recordings_of(site) if site else ()
+    recorded = RecordedAlarms(model, recordings)
+    clip_folders = tuple(dict.fromkeys(map(clip_folder, recordings)))
+    core = GatewayCore(model, feed, desk, _Running(context, model, feed, desk, recorded, clip_folders), recorded)
     recorded.start()
     return BuiltStage(core)
 
@@ -184,14 +196,14 @@ def check(context: Context) -> list[str]:
     """Report a missing extra, a port that another program has taken, and files that cannot be read."""
     if not all(map(is_installed, NEEDED)):
         return [NOT_INSTALLED]
-    from pipeline.gateway.server import check_certificate, check_expiry, listen  # noqa: PLC0415  the extra may not be installed
+    from pipeline.gateway.server import check_certificate, check_files, listen  # noqa: PLC0415  the extra may not be installed
     from pipeline.presenting.users import read_users  # noqa: PLC0415
 
     config: GatewayConfig = context.config
     attempts: list[Callable[[], object]] = []
     if config.certificate and config.key:
         attempts.append(partial(check_certificate, context.resolve(config.certificate), context.resolve(config.key)))
-        attempts.append(partial(check_expiry, context.resolve(config.certificate)))
+        attempts.append(partial(check_files, context.resolve(config.certificate), context.resolve(config.key)))
     if config.users:
         attempts.append(partial(read_users, context.resolve(config.users)))
     if not context.is_running:

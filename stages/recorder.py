@@ -18,8 +18,12 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 
 from pipeline.config.registry import RECORDER, STAGES
+from pipeline.recordings.clips.alarm_clips import AlarmClips, tracker_of
+from pipeline.recordings.clips.worker import ClipWorker
 from pipeline.recordings.disk import DiskError
+from pipeline.recordings.disk_room import DiskRoom
 from pipeline.recordings.held_messages import HeldMessages
+from pipeline.recordings.index import PartIndex
 from pipeline.recordings.interference import Interference
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.recordings.open_part import OpenPart, PartsFolder
@@ -62,9 +66,10 @@ class Recorder(Core):
         now_ns: int,
         left_out: Collection[str] = (),
         flush_s: float = FLUSH_S,
+        clips: AlarmClips | None = None,
     ) -> None:
         """Begin the first part, at `now_ns`. If the disk is full or gone, wait for it. left_out: topics that are not
-        recorded on purpose. flush_s: how often it flushes.
+        recorded on purpose. flush_s: how often it flushes. clips: of alarms; None: no clips are kept.
 
         Raises:
             RecordingError: nothing can be recorded there.
@@ -72,6 +77,8 @@ class Recorder(Core):
         self._parts = parts
         self._config = config
         self._flush_ns = round(flush_s * NS_PER_S)
+        self._clips = clips
+        self._room = DiskRoom(parts, config, clips)
         self._part: OpenPart | None = None
         self._ledger = SequenceLedger(parts.before, left_out)
         self._before = parts.before
@@ -89,7 +96,7 @@ class Recorder(Core):
         self._unflushed_ns: int | None = None
         """time of receipt of the oldest message that may not be on the disk yet"""
         try:
-            shortage = self._shortage(0)
+            shortage = self._room.shortage(0)
             if not shortage:
                 self._begin({})
         except DiskError as error:
@@ -109,6 +116,8 @@ class Recorder(Core):
         if isinstance(item.message, Health):
             self._count_duplicated(item.message)
         self._record(item)
+        if self._clips and item.topic == "alarm":
+            self._clips.add(item)
         return ()
 
     def tick(self, now_ns: int) -> Sequence[Message]:
@@ -133,6 +142,8 @@ class Recorder(Core):
             self._attempt(self._end_part)
             if not self._problem:
                 self._attempt(lambda: self._begin({}))
+        if self._clips:
+            self._clips.tick(now_ns, self._index)
         return ()
 
     def close(self) -> Sequence[Message]:
@@ -142,6 +153,8 @@ class Recorder(Core):
             self._resume()
             self._attempt(lambda: self._end_part(has_ended=True))
         self._counts["lost_unwritten"] += len(self._held.take_all())
+        if self._clips:
+            self._clips.close(self._index)
         return ()
 
     def abort(self) -> None:
@@ -158,7 +171,8 @@ class Recorder(Core):
         file was deleted, parts, and files that were restored."""
         recorded = self._recorded + (self._part.written if self._part else Counter())
         written = {f"recorded_{topic}": count for topic, count in recorded.items()}
-        return written | self._counts | self._interference.counts
+        of_clips = self._clips.counters() if self._clips else {}
+        return {**written, **self._counts, **self._room.counts, **self._interference.counts, **of_clips}
 
     def notes(self) -> Sequence[str]:
         """Which topics are left out on purpose."""
@@ -171,7 +185,11 @@ class Recorder(Core):
 
     def problem(self) -> str:
         """Why nothing is recorded now, or what another program did to the file; empty if all is well."""
-        return self._problem or self._interference.problem(self._now_ns)
+        of_clips = self._clips.problem() if self._clips else ""
+        return self._problem or "; ".join(filter(None, (self._interference.problem(self._now_ns), of_clips)))
+
+    def _index(self) -> PartIndex | None:
+        return self._part.index() if self._part else None
 
     def _record(self, envelope: Envelope) -> None:
         if self._part is None:
@@ -239,28 +257,9 @@ class Recorder(Core):
             self._counts["lost_unwritten"] += 1
             self._lost_in_pause += 1
 
-    def _shortage(self, more_bytes: int) -> str:
-        """Why the free space is not enough for `more_bytes`; empty if it is. Deletes the oldest part if allowed.
-
-        One part at a time: the space may become free a little later. Raises RecordingError if the disk is gone.
-        """
-        wanted = self._config.min_free_bytes + more_bytes
-        free = self._parts.free_bytes()
-        if free >= wanted:
-            return ""
-        deleted = self._parts.delete_oldest() if self._config.delete_oldest else None
-        if deleted is None:
-            return (
-                f"{free / 1e6:,.1f} MB are free on the disk, but {wanted / 1e6:,.1f} MB are required "
-                "(recorder.min_free_bytes): make room, or set recorder.delete_oldest"
-            )
-        self._counts["parts_deleted"] += 1
-        _LOG.warning("%s: the oldest part was deleted to make room (recorder.delete_oldest)", deleted)
-        return ""
-
     def _check_disk(self) -> None:
         try:
-            shortage = self._shortage(0)
+            shortage = self._room.shortage(0)
         except RecordingError as error:
             shortage = str(error)
         if shortage:
@@ -287,7 +286,7 @@ class Recorder(Core):
             "lost_in_pause": str(self._lost_in_pause),
         }
         try:
-            shortage = self._shortage(ROOM_TO_RESUME + self._held.size_bytes)
+            shortage = self._room.shortage(ROOM_TO_RESUME + self._held.size_bytes)
             if not shortage:
                 self._begin(about)
         except RecordingError as error:
@@ -349,9 +348,18 @@ def build(context: Context) -> BuiltStage:
             )
         own = {tray_key(context.site, tray.name, topic) for tray in context.trays for topic in KEEPS}
         kept = {key: last for topic in KEEPS for key, last in parts.last_messages(topic).items() if key in own}
-        return BuiltStage(Recorder(parts, config, context.started_t_ns, left_out, flush_s), kept=kept)
+        clips = _clips_of(parts, config, flush_s) if config.clips else None
+        return BuiltStage(Recorder(parts, config, context.started_t_ns, left_out, flush_s, clips), kept=kept)
     except RecordingError as error:
         raise StageError(f"{error} (recorder.file)") from error
+
+
+def _clips_of(parts: RecordingParts, config: RecorderConfig, flush_s: float) -> AlarmClips:
+    tracker = tracker_of(parts.path, config.clip_before_s, config.clip_after_s, config.clip_bytes, flush_s + 1.0)
+    clips = AlarmClips(tracker, ClipWorker(parts.path, config.min_free_bytes, parts.free_bytes))
+    if parts.last_part:
+        clips.continue_after(parts.last_part)
+    return clips
 
 
 def check(context: Context) -> list[str]:

@@ -151,7 +151,7 @@ def _leave_the_band(excursion: Excursion, t_s: Array, measured: Array, state: Ar
 def _alarm(excursion: Excursion, at_s: float, active: bool) -> Alarm:
     number = excursion.fan.number
     return Alarm(
-        header=Header("scorer-all-0123abcd", 0, excursion.fan.tray),
+        header=Header("scorer-all-0123abcd", round(at_s * 1000), excursion.fan.tray),  # rises with time
         fan=number,
         active=active,
         severity=Severity.ALARM,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import math
 import multiprocessing
 import os
 import selectors
@@ -22,6 +23,7 @@ import threading
 import time
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
+from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Annotated, Any
@@ -48,6 +50,8 @@ READY_S = 300.0
 WARM_UP_S = 5.0
 SCRAPED_EVERY_S = 15.0
 ALARMS_HZ = 2.0
+LATEST_S = 30.0
+"""an alarm that has not arrived so long after the last one is lost"""
 PRODUCER = "scorer-all-0123abcd"
 _ALARM = b"event: alarm\ndata: "
 _END = b"\n\n"
@@ -84,8 +88,11 @@ def main(
         progress(f"{count} pages")
         with tempfile.TemporaryDirectory() as folder:
             rows.append(load_of(count, fans, seconds, rate_hz, block_s, Path(folder)))
+    for row in rows:
+        row["relative"] = row["% of a core"] / rows[0]["% of a core"]
     notes = [
-        "latency: from the publication of an alarm to its arrival at a page; missed: times that a page did not keep up",
+        "relative: to the first row; missed: times that a page did not keep up",
+        "latency: from the publication of an alarm to its arrival at a page",
         f"load: of the machine while it was measured, with {os.cpu_count()} cores; all processes of the bench included",
     ]
     show({f"the gateway, {fans} fans at {rate_hz:g} Hz": rows}, notes, as_json=json_output)
@@ -110,9 +117,12 @@ def load_of(pages: int, fans: int, seconds: int, rate_hz: float, block_s: float,
         _wait_for(port)
         arrived, arrived_by = spawned.Pipe(duplex=False)
         are_open, have_ended = spawned.Event(), spawned.Event()
+        expected = spawned.Value("l", -1)
         names = [f"{tray.name}/{fan}" for tray in fleet.trays for fan in range(tray.fans)]
         looked_at = [names[len(names) * page // pages] if page % 2 else "" for page in range(pages)]
-        browsers = spawned.Process(target=browse, args=(port, looked_at, are_open, have_ended, arrived_by), daemon=True)
+        browsers = spawned.Process(
+            target=browse, args=(port, looked_at, are_open, have_ended, expected, arrived_by), daemon=True
+        )
         browsers.start()
         assert are_open.wait(READY_S), "the pages do not open"
         may_begin.set()
@@ -121,7 +131,7 @@ def load_of(pages: int, fans: int, seconds: int, rate_hz: float, block_s: float,
         alarms = sent.recv()  # the last has been sent
         took_s, cpu_s = time.monotonic() - began_s, _cpu_s(gateway.pid) - cpu_s
         peak_mb, load = _peak_mb(gateway.pid), os.getloadavg()[0]
-        time.sleep(2.0)
+        expected.value = alarms * pages
         have_ended.set()
         arrivals: Arrivals = arrived.recv()
         may_end.set()
@@ -183,8 +193,18 @@ def publish(
         may_end.wait()
 
 
-def browse(port: int, looked_at: list[str], are_open: Event, have_ended: Event, arrived: Connection) -> None:
-    """Hold a page open for each of `looked_at`, the name of its fan or nothing; in a process of its own."""
+def browse(
+    port: int,
+    looked_at: list[str],
+    are_open: Event,
+    have_ended: Event,
+    expected: Synchronized[int],
+    arrived: Connection,
+) -> None:
+    """Hold a page open for each of `looked_at`, the name of its fan or nothing; in a process of its own.
+
+    expected: arrivals of alarms at all pages, known at the end.
+    """
     waiting, arrivals = selectors.DefaultSelector(), Arrivals()
     for fan in looked_at:
         page = socket.create_connection(("127.0.0.1", port))
@@ -193,7 +213,10 @@ def browse(port: int, looked_at: list[str], are_open: Event, have_ended: Event, 
     opened: set[int] = set()
     scraping = threading.Thread(target=_scrape_now_and_then, args=(port, have_ended, arrivals.scrapes_s))
     scraping.start()
-    while not have_ended.is_set():
+    until_s = math.inf
+    while not (have_ended.is_set() and len(arrivals.latencies_s) >= expected.value) and time.monotonic() < until_s:
+        if have_ended.is_set():
+            until_s = min(until_s, time.monotonic() + LATEST_S)
         for key, _ in waiting.select(0.2):
             data = key.fileobj.recv(1 << 20)  # type: ignore[union-attr]
             assert data, "the gateway has closed a page"

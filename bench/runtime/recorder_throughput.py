@@ -93,7 +93,12 @@ def _packets(first: int, block: int) -> list[Envelope]:
         ),
         "grid": lambda header: Grid(header=header, **common, speed_rad_s=noise, valid=ones, invalid_reason=zeros),
         "prediction": lambda header: Prediction(
-            header=header, **judged, predicted_speed_rad_s=noise + 1.0, sigma_rad_s=np.full(FANS, 3.0), twin="hybrid"
+            header=header,
+            **judged,
+            predicted_speed_rad_s=noise + 1.0,
+            sigma_rad_s=np.full(FANS, 3.0),
+            torque_balance_command=noise * 1e-4,
+            torque_balance_sigma_command=np.full(FANS, 0.01),
         ),
         "score": lambda header: Score(
             header=header,
@@ -102,6 +107,11 @@ def _packets(first: int, block: int) -> list[Envelope]:
             band_variance=np.full((block, FANS), 36.0),
             smoothed_residual_rad_s=noise - 100.0,
             state=zeros + 1,
+            torque_balance_command=noise * 1e-4,
+            speed_baseline_rad_s=noise * 0.0,
+            balance_baseline_command=noise * 0.0,
+            score=noise * 1e-3,
+            statistic=zeros + 1,
         ),
     }
     prepared = {topic: make(Header(f"{topic}-tray1-0a1b2c3d", sequence, "tray1")) for topic, make in messages.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from pipeline.presenting.request_form import LONGEST_COMMENT, OneLine, RequestFo
 from schemas.enums import Transition
 from schemas.messages import Alarm, Request
 
-LARGEST_REQUEST_BYTES = 4096
+LARGEST_REQUEST_BYTES, LONGEST_ID = 4096, 64
 
 
 class MqttRequestForm(RequestForm):
@@ -30,7 +31,7 @@ class MqttRequestForm(RequestForm):
         name: who says that he asks; nothing proves it, and it goes into the comment.
     """
 
-    id: Annotated[str, Field(max_length=64)] = ""
+    id: Annotated[str, Field(max_length=LONGEST_ID)] = ""
     name: Annotated[OneLine, Field(max_length=64)] = ""
 
     @property
@@ -81,7 +82,7 @@ class Requests:
             form = MqttRequestForm.model_validate_json(payload)
         except ValueError as error:
             self.counts["malformed_requests"] += 1
-            return _answer(topic, "", {"error": _why(error)})
+            return _answer(topic, _id_of(payload), {"error": _why(error)})
         fans = self._fans_of(*parts[:2])
         error = ""
         if fans is None:
@@ -98,6 +99,7 @@ class Requests:
             duration_s=form.duration_s,
             operator_name=self._operator_name,
             comment=form.full_comment,
+            onset_t_ns=form.onset_t_ns,
         )
         try:
             answers = self._desk.begin(parts[0], asked, fans)
@@ -144,6 +146,16 @@ def _granted(answers: Sequence[Alarm]) -> dict[str, Any]:
 
 def _answer(topic: str, name: str, body: dict[str, Any]) -> tuple[str, str]:
     return f"{topic}/{ANSWER}", json_text(({"id": name} if name else {}) | {"ok": "error" not in body} | body)
+
+
+def _id_of(payload: bytes) -> str:
+    """Of a request that is none; empty if it has none that could be repeated."""
+    try:
+        found = json.loads(payload) if len(payload) <= LARGEST_REQUEST_BYTES else None
+    except (ValueError, RecursionError):
+        return ""
+    name = found.get("id") if isinstance(found, dict) else None
+    return name if isinstance(name, str) and len(name) <= LONGEST_ID else ""
 
 
 def _why(error: ValueError) -> str:

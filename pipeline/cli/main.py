@@ -40,6 +40,7 @@ COMMANDS = {
     "recover": "recordings.recover",
     "import": "recordings.import_table",
     "export": "recordings.export",
+    "view": "recordings.view",
     "plot": "recordings.plot",
     "picture": "recordings.picture",
     "identify": "twins.identify",
@@ -58,7 +59,8 @@ VARIADIC: dict[str, tuple[str, ...]] = {
     "train": ("--validate",),
     "place": ("--validate",),
     "compare": ("--validate", "--test"),
-    "calibrate": ("--verify",),
+    "calibrate": ("--verify", "--feedback"),
+    "alarms": ("--recordings",),
 }
 """command -> options that take all words up to the next option"""
 

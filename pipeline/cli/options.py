@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
@@ -30,6 +31,14 @@ TemperatureOption: TypeAlias = Annotated[
 ]
 
 DEFAULT_CONFIG = Path("fantwin.toml")
+
+
+class ViewLayout(StrEnum):
+    """The layouts of a view, which `pipeline.viewing.rerun_layout` draws; that needs the extra `view`."""
+
+    ALL = "all"
+    ALARMS = "alarms"
+    WEAR = "wear"
 
 
 def auxiliary_options(

@@ -15,6 +15,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from pipeline.config.models import (
     BusConfig,
@@ -36,6 +37,8 @@ LONGEST_OVERRIDE = 1000
 """characters of one `--set`"""
 LONGEST_SHOWN = 100
 """characters of a key or value in an error"""
+MOST_SHOWN = 5
+"""problems of a section"""
 
 
 class _File(Section):
@@ -195,25 +198,32 @@ def _check(model: type[_Model], values: Any, path: Path, section: str) -> _Model
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {_first_problem(error, model, section)}") from error
+        raise ConfigError(f"{path}: {_problems(error, model, section)}") from error
 
 
-def _first_problem(error: ValidationError, model: type[BaseModel], section: str) -> str:
+def _problems(error: ValidationError, model: type[BaseModel], section: str) -> str:
+    """What is wrong in a section, in one line."""
     # a list whose only entry is wrong counts as too short, too: what is wrong within it says what to correct
     found = error.errors()
     found = [each for each in found if not any(_is_within(other["loc"], each["loc"]) for other in found)]
     # a misspelt key is both unknown and missing: the unknown one says what to correct
-    first = min(found, key=lambda problem: problem["type"] != "extra_forbidden")
-    where = ".".join(str(part) for part in ((section,) if section else ()) + first["loc"])
-    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-    if first["type"] == "extra_forbidden":
-        known = _keys_at(model, first["loc"][:-1])
-        return f"unknown key {_shown(where)}{nearest(str(first['loc'][-1]), known)}{more}"
-    if first["type"] == "missing":
-        return f"{where!r} is missing{more}"
-    message = first["msg"].removeprefix("Value error, ")
-    given = "" if isinstance(first["input"], dict) else f" = {_shown(first['input'])}"
-    return f"{where}{given}: {message[0].lower()}{message[1:]}{more}"
+    misspelt = [each["loc"][:-1] for each in found if each["type"] == "extra_forbidden"]
+    found = [each for each in found if each["type"] != "missing" or each["loc"][:-1] not in misspelt]
+    found.sort(key=lambda each: each["type"] != "extra_forbidden")
+    more = f" (and {len(found) - MOST_SHOWN} more)" if len(found) > MOST_SHOWN else ""
+    return "; ".join(_problem(each, model, section) for each in found[:MOST_SHOWN]) + more
+
+
+def _problem(found: ErrorDetails, model: type[BaseModel], section: str) -> str:
+    where = ".".join(str(part) for part in ((section,) if section else ()) + found["loc"])
+    if found["type"] == "extra_forbidden":
+        known = _keys_at(model, found["loc"][:-1])
+        return f"unknown key {_shown(where)}{nearest(str(found['loc'][-1]), known)}"
+    if found["type"] == "missing":
+        return f"{where!r} is missing"
+    message = found["msg"].removeprefix("Value error, ")
+    given = "" if isinstance(found["input"], dict) else f" = {_shown(found['input'])}"
+    return f"{where}{given}: {message[0].lower()}{message[1:]}"
 
 
 def _is_within(location: tuple[int | str, ...], outer: tuple[int | str, ...]) -> bool:

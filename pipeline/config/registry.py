@@ -108,7 +108,7 @@ STAGES: dict[str, StageRow] = {
             enabled_by="default",
             has_common_shards=False,
             may_drop=True,
-            reads=("score", "alarm", "twin", "health"),
+            reads=("score", "alarm", "twin", "health", "snapshot"),
             writes=(),
         ),
         StageRow(

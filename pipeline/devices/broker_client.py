@@ -67,8 +67,19 @@ def new_client(
         try:
             client.tls_set(ca, certificate, key)
         except (OSError, ssl.SSLError, ValueError) as error:
-            raise UserError(f"a certificate of {what} cannot be used: {error}") from error
+            named = ", ".join(
+                f"{name} = {str(path)!r}"
+                for name, path in (("ca", settings.ca), ("certificate", settings.certificate), ("key", settings.key))
+                if path is not None
+            )
+            raise UserError(f"a certificate of {what} cannot be used: {named}: {error}") from error
     return client
+
+
+def _of_tls(error: ssl.SSLError) -> str:
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"{error.verify_message}: check ca, and that host is a name in the certificate of the broker"
+    return "check port, and whether the broker has TLS there: if not, tls = false"
 
 
 def connection_problems(client: Client, settings: BrokerSettings, name: str) -> list[str]:
@@ -87,7 +98,9 @@ def connection_problems(client: Client, settings: BrokerSettings, name: str) -> 
     client.on_connect = on_connect
     try:
         client.connect(settings.host, settings.port, keepalive=settings.keepalive_s)
-    except OSError as error:  # errors of TLS are such, too
+    except ssl.SSLError as error:
+        return [f"{name}: no connection by TLS: {error.strerror or error}; {_of_tls(error)}"]
+    except OSError as error:
         return [f"{name}: cannot be reached: {error.strerror or error}; check host and port"]
     client.loop_start()
     if not has_answered.wait(ANSWER_S):

@@ -112,9 +112,7 @@ class Access:
             visitor = self.visitor(request)
             name = visitor.name
             if not name:
-                raise HTTPException(
-                    401, "log in first" if self.has_login else "nobody can act here: [gateway] has no users"
-                )
+                raise HTTPException(401, self._who_acts(request))
             if visitor.session is not None:
                 require_token(request, visitor.session)
             if not visitor.may_act:
@@ -164,10 +162,12 @@ class Access:
         where = address_of(request)
         if self._logins >= MOST_LOGINS:
             raise HTTPException(503, "too many log in at once: try again")
+        user = users.of(name)
+        if users.problem:
+            raise HTTPException(503, "nobody can log in: the file of users cannot be read; health says why")
         if wait_s := self._failures.begin(name, where["address"]):
             self.log.add("login refused: too many wrong passwords", user=name, **where)
             raise HTTPException(429, "too many wrong passwords: try again later", {"Retry-After": f"{wait_s:.0f}"})
-        user = users.of(name)
         self._logins += 1
         try:
             async with self._one_at_a_time:  # each takes 64 MB and much of a processor
@@ -179,6 +179,17 @@ class Access:
             raise HTTPException(401, "no such user, or another password")
         self._failures.succeed(name, where["address"])
         return user
+
+    def _who_acts(self, request: Request) -> str:
+        """What somebody without a name must do to act."""
+        if self.has_login:
+            return "log in first"
+        header = self._config.user_header
+        if not header:
+            return "nobody can act here: [gateway] has no users"
+        if plain_address(address_of(request)["address"]) not in self._config.proxies:
+            return "users come through the proxy of this page: ask there"
+        return f"the proxy has sent no {header} with the name of a user, or no valid one"
 
     def _is_free(self, request: Request) -> bool:
         """Whether whoever asks may read without a login: only on this host, and not through a proxy that has its users

@@ -6,17 +6,18 @@ import asyncio
 import json
 import re
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass, field
 from functools import partial, wraps
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 
 from pipeline.config.models import TrayConfig
 from pipeline.errors import UserError
@@ -32,15 +33,18 @@ from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.request_form import RequestForm
 from pipeline.presenting.shown import (
     alarms_json,
+    clip_json,
     curves_json,
     fan_in_full,
     fan_json,
     fleet_json,
+    rates_json,
     site_json,
     stages_json,
     transition_json,
 )
 from pipeline.presenting.site_model import SiteModel
+from pipeline.recordings.clips.clip import Clip, kept_clips
 from pipeline.viewing.fleet import Fan
 from schemas.enums import Transition
 from schemas.messages import Request as OperatorRequest
@@ -50,6 +54,7 @@ MOST_LISTED = 500
 LARGEST_BODY_BYTES, BODY_WITHIN_S = 16_384, 10.0
 CHECKED_EVERY_S = 5.0
 """so often it is looked whether a reader of live events may still read"""
+CLIP_TYPE = "application/octet-stream"
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 ALL_FANS = "all"
 
@@ -79,6 +84,8 @@ class Api:
     recorded: RecordedAlarms
     viewer_urls: Mapping[str, str]
     """by tray, of Rerun's viewer for browsers; none where it is not served"""
+    clip_folders: Sequence[Path] = ()
+    """of the alarm clips of recorders on this host"""
     _alarms: dict[bool, SharedAnswer] = field(default_factory=dict[bool, SharedAnswer], init=False)
 
     @reads
@@ -134,15 +141,43 @@ class Api:
                 before=_whole(request, "before"),
             )
             begins_t_ns = self.model.history_begins_t_ns()
+            feedback = self.model.feedback_on([alarm for _, alarm in found])
         except UserError as error:
             raise HTTPException(503, "the history cannot be read: see the problem of the gateway") from error
         return JSONResponse(
             {
-                "transitions": [transition_json(number, alarm) for number, alarm in found],
+                "transitions": [
+                    transition_json(number, alarm, said) for (number, alarm), said in zip(found, feedback, strict=True)
+                ],
                 "begins_t_ns": begins_t_ns,
                 "is_reading_recordings": self.recorded.is_reading,
             }
         )
+
+    @reads
+    async def alarm_rate(self, request: Request) -> Response:
+        """The rate of false alarms that really was beside the declared one, of each tray and of the site."""
+        try:
+            return JSONResponse(await asyncio.to_thread(rates_json, self.model))
+        except UserError as error:
+            raise HTTPException(503, "the rate cannot be read: see the problem of the gateway") from error
+
+    @reads
+    async def clips(self, request: Request) -> Response:
+        """The recordings around alarms that can be downloaded, the newest first; ?tray=NAME chooses."""
+        tray = request.query_params.get("tray", "")
+        found = await run_in_threadpool(self._kept_clips)
+        return JSONResponse({"clips": [clip_json(clip) for _, clip in found if tray in ("", clip.tray)]})
+
+    @reads
+    async def clip(self, request: Request) -> Response:
+        """Download an alarm clip, an MCAP file."""
+        found = await run_in_threadpool(self._kept_clips)
+        for folder, clip in found:
+            if clip.name == request.path_params["name"]:
+                headers = {"Content-Encoding": "identity"}  # it is compressed already
+                return FileResponse(folder / clip.name, 200, headers, CLIP_TYPE, filename=clip.name)
+        raise HTTPException(404, "no such clip")
 
     @reads
     async def stages(self, request: Request) -> Response:
@@ -209,6 +244,7 @@ class Api:
             duration_s=form.duration_s,
             operator_name=visitor.name,
             comment=form.comment,
+            onset_t_ns=form.onset_t_ns,
         )
         where = f"{name} {'all' if is_all else fan}"
         self.access.log.add("request", user=visitor.name, action=form.action, fan=where, **address_of(request))
@@ -246,6 +282,10 @@ class Api:
             "has_login": self.access.has_login,
             "csrf_token": visitor.session.csrf_token if visitor.session else "",
         }
+
+    def _kept_clips(self) -> list[tuple[Path, Clip]]:
+        listed = [(folder, clip) for folder in self.clip_folders for clip in kept_clips(folder)]
+        return [(folder, clip) for folder, clip in listed if self.model.tray(clip.tray)]
 
     def _fan(self, request: Request) -> Fan:
         return Fan(*self._named(request.path_params["tray"], request.path_params["fan"]))

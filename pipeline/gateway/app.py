@@ -43,6 +43,9 @@ PATHS: Mapping[str, tuple[str, Callable[..., object]]] = {
     "/fans/{tray}/{fan}/requests": ("POST", Api.act),
     "/alarms": ("GET", Api.alarms),
     "/alarms/history": ("GET", Api.alarm_history),
+    "/alarm-rate": ("GET", Api.alarm_rate),
+    "/clips": ("GET", Api.clips),
+    "/clips/{name}": ("GET", Api.clip),
     "/stages": ("GET", Api.stages),
     "/events": ("GET", Api.events),
     "/me": ("GET", Api.me),
@@ -74,11 +77,10 @@ def application(api: Api, config: GatewayConfig) -> ASGIApp:
         Route("/healthz", health),
         Route("/", page),
     ]
-    hosts = list(config.hosts) if config.is_loopback else ["*"]
     app = Starlette(
         routes=[*routes, Mount("/page", StaticFiles(directory=PAGE))],
         middleware=[
-            Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False),
+            Middleware(TrustedHostMiddleware, allowed_hosts=sorted(config.known_hosts), www_redirect=False),
             Middleware(GZipMiddleware, minimum_size=1000, compresslevel=COMPRESSION),
         ],
         exception_handlers={HTTPException: failed, Exception: partial(broken, api)},

@@ -40,14 +40,20 @@ class GatewayConfig(StageConfig):
         default=(), description="users of the proxy who may act; all others may only look"
     )
     hosts: tuple[str, ...] = Field(
-        default=_OWN_HOSTS,
-        description='names under which browsers may ask for the page on loopback; add that of a proxy, "*": any',
+        default=(),
+        description="names under which browsers may ask for the page on loopback, beside localhost and its addresses: "
+        'such as that of a proxy; "*": any',
     )
 
     @property
     def is_loopback(self) -> bool:
         """Whether only this host reaches it."""
         return is_of_this_host_only(self.host)
+
+    @property
+    def known_hosts(self) -> frozenset[str]:
+        """All names under which browsers may ask for the page; with "*", under any."""
+        return frozenset((*_OWN_HOSTS, *self.hosts)) if self.is_loopback else frozenset("*")
 
     @property
     def has_other_hosts(self) -> bool:

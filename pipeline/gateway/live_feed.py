@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,19 +24,25 @@ FanName = tuple[str, int]
 
 @dataclass(eq=False)
 class _Reader:
-    loop: asyncio.AbstractEventLoop
     fan: FanName | None
     waiting: asyncio.Queue[bytes] = field(default_factory=lambda: asyncio.Queue(MOST_WAITING))
     has_missed: bool = False
 
     def put(self, event: bytes) -> None:
-        """From the loop."""
+        """An event of this reader."""
         if self.has_missed:
             return
         try:
             self.waiting.put_nowait(event)
         except asyncio.QueueFull:
             self.has_missed = True
+
+    def taken(self, event: bytes) -> bytes:
+        """An event that has just come out of the queue, and all that wait behind it: they are sent at once."""
+        events = [event]
+        while not self.waiting.empty():
+            events.append(self.waiting.get_nowait())
+        return b"".join(events)
 
 
 class LiveFeed:
@@ -45,17 +51,16 @@ class LiveFeed:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._readers: list[_Reader] = []
+        self._loop: asyncio.AbstractEventLoop | None = None
+        """of the server, in which all readers are"""
         self._ended = False
 
     def publish(self, name: str, data: Any, about: FanName | None = None) -> None:
         """Send an event to all readers, or to those that look at one fan."""
         with self._lock:
             readers = [each for each in self._readers if about is None or each.fan == about]
-        if not readers:
-            return
-        event = encoded(name, data)
-        for each in readers:
-            each.loop.call_soon_threadsafe(each.put, event)
+        if readers:
+            self._put(readers, encoded(name, data))
 
     @property
     def readers(self) -> int:
@@ -72,8 +77,7 @@ class LiveFeed:
         with self._lock:
             self._ended = True
             readers = list(self._readers)
-        for each in readers:
-            each.loop.call_soon_threadsafe(each.put, b"")
+        self._put(readers, b"")
 
     async def events(self, first: bytes, fan: FanName | None) -> AsyncIterator[bytes]:
         """The events of one reader as they are sent, `first` at once. fan: the one that it looks at."""
@@ -85,16 +89,27 @@ class LiveFeed:
                 except TimeoutError:
                     yield b": alive\n\n"
                     continue
-                if event:
-                    yield event
+                if events := reader.taken(event):
+                    yield events
                 if reader.has_missed and reader.waiting.empty():
                     reader.has_missed = False
                     yield encoded("missed", {})
 
+    def _put(self, readers: Sequence[_Reader], event: bytes) -> None:
+        """To all of them in one go: waking the loop for each takes longer than what it does then."""
+
+        def put() -> None:
+            for each in readers:
+                each.put(event)
+
+        if readers and self._loop:
+            self._loop.call_soon_threadsafe(put)
+
     @contextmanager
     def _joined(self, fan: FanName | None) -> Iterator[_Reader]:
-        reader = _Reader(asyncio.get_running_loop(), fan)
+        reader = _Reader(fan)
         with self._lock:
+            self._loop = asyncio.get_running_loop()
             self._readers.append(reader)
         try:
             yield reader

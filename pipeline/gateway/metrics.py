@@ -69,7 +69,9 @@ class SiteMetrics(Collector):
         )
         fans_in_alarm.add_metric([self._model.site], self._model.counts()["in_alarm"])
         total = CounterMetricFamily(
-            "fantwin_alarms", "Alarms that were raised since the gateway began.", labels=[*_TRAY, "severity"]
+            "fantwin_alarms",
+            "Alarms that have reached this severity since the gateway began.",
+            labels=[*_TRAY, "severity"],
         )
         alarms = self._model.current_alarms()
         for each in alarms:

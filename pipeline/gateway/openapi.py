@@ -14,15 +14,18 @@ from pipeline.presenting.fan_groups import FanGroup
 from pipeline.presenting.request_form import RequestForm
 
 _FORMS = {"/login": LoginForm, "/fans/{tray}/{fan}/requests": RequestForm}
-_TEXT, _WHOLE = {"type": "string"}, {"type": "integer"}
-_QUERY: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
-    "/fans": {"tray": _TEXT, "state": {"type": "string", "enum": list(FanGroup)}, "limit": _WHOLE},
-    "/fans/{tray}/{fan}/curves": {"seconds": _WHOLE},
-    "/alarms": {"all": _WHOLE},
-    "/alarms/history": {"tray": _TEXT, "fan": _WHOLE, "limit": _WHOLE, "before": _WHOLE},
-    "/events": {"fan": _TEXT},
+_QUERY: Mapping[str, Mapping[str, str | list[str]]] = {
+    "/fans": {"tray": "string", "state": list(FanGroup), "limit": "integer"},
+    "/fans/{tray}/{fan}/curves": {"seconds": "integer"},
+    "/alarms": {"all": "integer"},
+    "/alarms/history": {"tray": "string", "fan": "integer", "limit": "integer", "before": "integer"},
+    "/clips": {"tray": "string"},
+    "/events": {"fan": "string"},
 }
+"""by path, the parameters with their type, or the words that they may be"""
+_KINDS = {"/events": "text/event-stream", "/clips/{name}": "application/octet-stream"}
 _ERRORS = {"401": "nobody is logged in", "403": "the user may not do this", "404": "no such tray or fan"}
+_OF_LIST = {"422": "a parameter is wrong"}
 _OF_REQUEST = {"409": "the scorer has refused it", "422": "the form is wrong", "504": "no scorer has answered"}
 
 
@@ -48,17 +51,21 @@ def description(prefix: str, paths: Mapping[str, tuple[str, Callable[..., object
     }
 
 
+def _schema(kind: str | list[str]) -> dict[str, Any]:
+    return {"type": kind} if isinstance(kind, str) else {"type": "string", "enum": kind}
+
+
 def _operation(path: str, method: str, handler: Callable[..., object]) -> dict[str, Any]:
     named = [
         {"name": name, "in": "path", "required": True, "schema": {"type": "string"}}
         for name in re.findall(r"{(\w+)}", path)
     ]
     asked = [
-        {"name": name, "in": "query", "required": False, "schema": schema}
-        for name, schema in _QUERY.get(path, {}).items()
+        {"name": name, "in": "query", "required": False, "schema": _schema(kind)}
+        for name, kind in _QUERY.get(path, {}).items()
     ]
-    kind = "text/event-stream" if path == "/events" else "application/json"
-    errors = _ERRORS | (_OF_REQUEST if method == "POST" else {})
+    kind = _KINDS.get(path, "application/json")
+    errors = _ERRORS | (_OF_REQUEST if method == "POST" else _OF_LIST if path in _QUERY else {})
     operation: dict[str, Any] = {
         "operationId": getattr(handler, "__name__", ""),
         "summary": " ".join((handler.__doc__ or "").split()),

@@ -10,6 +10,7 @@ import ssl
 import threading
 from collections import Counter
 from collections.abc import Callable, Set
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 
 import uvicorn
 from cryptography import x509
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -29,6 +31,7 @@ MOST_OF_AN_ADDRESS = 100
 """connections from elsewhere; on this host, and from a proxy, are many people"""
 REQUEST_WITHIN_S = 10.0
 """whoever has connected, or begun another request, sends its head within this time"""
+_EVERYBODY = 0o007
 _OTHER_FILES = 200
 """that the process may have open beside its connections"""
 
@@ -190,22 +193,41 @@ def check_certificate(certificate: Path, key: Path) -> None:
     """Raises:
     StageError: these are no certificate and its key.
     """
+    of_certificate, of_key = f"gateway.certificate = {str(certificate)!r}", f"gateway.key = {str(key)!r}"
     try:
-        # without a password, a key that is encrypted would be asked for on the terminal
+        public = x509.load_pem_x509_certificate(certificate.read_bytes()).public_key()
+    except (OSError, ValueError) as error:
+        raise StageError(f"{of_certificate}: {_why(error, 'this is no certificate in PEM')}") from error
+    try:
+        private = load_pem_private_key(key.read_bytes(), None)
+    except TypeError as error:
+        raise StageError(
+            f"{of_key}: the key has a password, which nobody is asked for: `openssl pkey -in KEY -out NEW` takes it out"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise StageError(f"{of_key}: {_why(error, 'this is no private key in PEM')}") from error
+    if private.public_key() != public:
+        raise StageError(f"{of_key}: this is not the key of the certificate {str(certificate)!r}")
+    try:  # without a password, nobody is asked for it on the terminal
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password=lambda: "")
     except OSError as error:
-        what = f"gateway.certificate = {str(certificate)!r}, gateway.key = {str(key)!r}"
-        why = error.strerror if error.filename is None and error.strerror else str(error)
-        raise StageError(f"{what}: {why}; both are PEM files, and the key has no password") from error
+        raise StageError(f"{of_certificate}, {of_key}: {error.strerror or error}") from error
 
 
-def check_expiry(certificate: Path) -> None:
+def _why(error: OSError | ValueError, otherwise: str) -> str:
+    return (error.strerror or str(error)) if isinstance(error, OSError) else otherwise
+
+
+def check_files(certificate: Path, key: Path) -> None:
     """Raises:
-    StageError: the certificate is over.
+    StageError: the certificate is over, or everybody may read its key.
     """
     expires = expiry_of(certificate)
     if expires is not None and expires < datetime.now(UTC):
         raise StageError(f"gateway.certificate = {str(certificate)!r}: it is over since {expires:%Y-%m-%d}")
+    with suppress(OSError):  # that it cannot be read is said elsewhere
+        if key.stat().st_mode & _EVERYBODY:
+            raise StageError(f"gateway.key = {str(key)!r}: everybody may read it: chmod o= {key}")
 
 
 def expiry_of(certificate: Path) -> datetime | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from datetime import time
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 from urllib.parse import urlsplit
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -13,18 +14,25 @@ from pydantic import Field, field_validator, model_validator
 from pipeline.config.models import Name, Section
 from pipeline.runtime.stage import StageConfig
 
-_TIME = r"^([01]\d|2[0-3]):[0-5]\d$"
+_TIME = re.compile(r"([01][0-9]|2[0-3]):[0-5][0-9]")
 
 
 class QuietHours(Section):
     """A time of each day in which messages are held; at its end one message says what was held."""
 
-    begin: str = Field(pattern=_TIME, description='time of day, such as "22:00"')
-    end: str = Field(pattern=_TIME, description='time of day, such as "06:30"; if it is earlier, of the next day')
+    begin: str = Field(description='time of day, such as "22:00"')
+    end: str = Field(description='time of day, such as "06:30"; if it is earlier, of the next day')
     sent_from: Literal["alarm", "none"] = Field(
         default="alarm",
         description="messages about alarms at least as severe are sent all the same; none: all are held",
     )
+
+    @field_validator("begin", "end")
+    @classmethod
+    def _is_time(cls, value: str) -> str:
+        if not _TIME.fullmatch(value):
+            raise ValueError('hours and minutes, such as "22:00"')
+        return value
 
     @property
     def times(self) -> tuple[time, time]:
@@ -115,6 +123,13 @@ class NotifierConfig(StageConfig):
         default=10_000, ge=1, description="messages that wait for their targets; beyond, the oldest are lost"
     )
     kept_s: float = Field(default=3 * 86_400.0, gt=0, description="a message that has waited for so long is lost")
+
+    @field_validator("target", mode="before")
+    @classmethod
+    def _are_tables(cls, value: Any) -> Any:
+        if isinstance(value, dict):
+            raise ValueError("write [[notifier.target]], with two brackets on each side: there may be several")
+        return value
 
     @field_validator("timezone")
     @classmethod

@@ -47,6 +47,8 @@ class FanAlarm:
     deviation: str
     """how far the fan is from its twin, as the last message of this occurrence that said so has it; may be empty"""
     causes: tuple[NamedCause, ...]
+    deviation_t_ns: int = 0
+    """when that was, by the clock of the device; 0: unknown"""
     former_producers: tuple[str, ...] = ()
     """the last ones before `producer`: what comes from them now is old"""
 
@@ -92,8 +94,9 @@ def after(before: FanAlarm | None, message: Alarm, now_ns: int) -> FanAlarm | No
     acknowledged_by = of_same.acknowledged_by if of_same else ""
     if message.transition in _NAMES_WHO_ACKNOWLEDGED and message.operator_name:
         acknowledged_by = message.operator_name
-    deviation = of_same.deviation if of_same else ""
+    deviation, deviation_t_ns = (of_same.deviation, of_same.deviation_t_ns) if of_same else ("", 0)
     if message.transition in _WITH_DEVIATION:
+        deviation_t_ns = message.t_ns
         deviation = message.message.removeprefix(f"fan {message.fan}: ").partition("; ")[0]
     return FanAlarm(
         tray=header.tray,
@@ -111,6 +114,7 @@ def after(before: FanAlarm | None, message: Alarm, now_ns: int) -> FanAlarm | No
         stale=message.stale,
         deviation=deviation,
         causes=tuple(NamedCause(each.cause, each.probability, each.evidence) for each in message.causes),
+        deviation_t_ns=deviation_t_ns,
         former_producers=former,
     )
 

@@ -20,8 +20,17 @@ MAIL_PAUSE_S = 1.0
 _KNOWN_REASONS = re.compile(
     r"\[Errno -?\d+\] [A-Za-z ]+|timed out|\[SSL: [A-Z_]+\]|Connection (?:unexpectedly closed|reset by peer)"
     r"|Remote end closed connection without response|\(\d{3}, b'[^']*'|error=\d{3}"
+    r"|STARTTLS extension not supported by server|SMTP AUTH extension not supported by server"
 )
 """in what apprise logs at level DEBUG, which may hold parts of the URL"""
+_WHAT_TO_DO = {
+    "STARTTLS extension": "the mail server has no TLS: mailto:// sends without, for all on the way to read",
+    "SMTP AUTH extension": "the mail server takes no password without TLS, or none at all: leave user and password out "
+    "of the URL, or use mailtos://",
+    "[SSL: WRONG_VERSION_NUMBER]": "what listens there has no TLS at this port: check scheme and port",
+    "[SSL: CERTIFICATE_VERIFY_FAILED]": "this host does not know the authority of the server's certificate",
+}
+_MAIL_NEEDS = "; a mail needs ?to=ADDRESS, and a user or from=ADDRESS"
 _OF_FAILURES = ("WARNING", "ERROR", "CRITICAL")
 _REFUSAL = re.compile(r"(?<!\d)5\d\d, b'|error=4(?!01|03|04|08|29)\d\d")
 """the answer of a server that does not want this message; not those that it gives to any"""
@@ -53,7 +62,7 @@ class Service:
         if service is None:
             raise UserError(
                 f"apprise cannot use this URL ({scheme}://...): it is unknown, or a part is missing; "
-                "https://appriseit.com/services lists them"
+                f"https://appriseit.com/services lists them{_MAIL_NEEDS if scheme in ('mailto', 'mailtos') else ''}"
             )
         if (recipients := _recipients(service)) > 1:
             raise UserError(
@@ -98,7 +107,8 @@ def _failure(said: list[tuple[str, str]]) -> Failure:
     known = [match for _, words in said for match in _KNOWN_REASONS.findall(words)]
     warnings = [words.strip() for level, words in said if level in _OF_FAILURES]
     reason = "; ".join(dict.fromkeys(each.lstrip("(") for each in known)) or (warnings[-1] if warnings else "refused")
-    return Failure(reason[:200], is_uncertain=bool(_UNCERTAIN.search(reason)), is_refusal=bool(_REFUSAL.search(reason)))
+    reason = "; ".join((reason[:200], *(advice for sign, advice in _WHAT_TO_DO.items() if sign in reason)))
+    return Failure(reason, is_uncertain=bool(_UNCERTAIN.search(reason)), is_refusal=bool(_REFUSAL.search(reason)))
 
 
 def _asset() -> AppriseAsset:

@@ -14,6 +14,7 @@ from pipeline.notification.fan_alarm import FanAlarm, NamedCause
 from pipeline.notification.gathering import Happened, ranges
 from schemas.enums import Severity
 from schemas.units import NS_PER_S
+from scoring.diagnosis.advice import KNOWN_SOON
 from scoring.diagnosis.shown_causes import (
     CANNOT_TELL,
     CAUSES,
@@ -34,6 +35,7 @@ _BEGINNING = {
     Kind.ESCALATED: "Nobody has acknowledged: ",
     Kind.NOT_CONFIRMED: "Not confirmed by data: ",
 }
+_WHERE_IT_IS_KNOWN = "the page, or `fantwin alarms`, may know it by now"
 _BY_IMPORTANCE = (Kind.ESCALATED, Kind.RAISED, Kind.WORSE, Kind.NOT_CONFIRMED, Kind.AGAIN, Kind.CLEARED)
 
 
@@ -83,7 +85,8 @@ def cause_line(causes: Sequence[NamedCause]) -> str:
         return "Cause: unknown"
     first = causes[0]
     if first.cause == CANNOT_TELL:
-        return f"Cause: {first.evidence or CAUSES[CANNOT_TELL]}"
+        # a message does not change: what is known later is elsewhere
+        return f"Cause: {first.evidence or CAUSES[CANNOT_TELL]}".replace(KNOWN_SOON, _WHERE_IT_IS_KNOWN)
     others = [_with_probability(each) for each in less_likely(causes)]
     evidence = f" ({found})" if (found := likely_evidence(causes)) else ""
     return f"Cause: {likely_with_share(causes)}{evidence}{''.join(f', or {each}' for each in others)}"
@@ -113,10 +116,10 @@ def describe(place: Place, alarm: FanAlarm) -> list[str]:
         return [f"{fan}: no alarm"]
     if not alarm.active:
         lines = [f"{fan}: back to normal; the alarm began {place.clock(alarm.onset_t_ns)}"]
-        lines += [f"It was: {alarm.deviation}"] if alarm.deviation else []
+        lines += [f"It was: {_deviation(place, alarm)}"] if alarm.deviation else []
     else:
         lines = [f"{fan}: {alarm.severity_name} since {place.clock(alarm.onset_t_ns)}"]
-        lines += [alarm.deviation or "away from its twin", cause_line(alarm.causes)]
+        lines += [_deviation(place, alarm) or "away from its twin", cause_line(alarm.causes)]
         if to_do := advice(alarm.causes):
             lines.append(f"What to do: {to_do}")
     if alarm.acknowledged:
@@ -128,19 +131,25 @@ def describe(place: Place, alarm: FanAlarm) -> list[str]:
     return lines
 
 
+def _deviation(place: Place, alarm: FanAlarm) -> str:
+    """With its time: it is not as new as the message."""
+    at = f" at {place.clock(alarm.deviation_t_ns)}" if alarm.deviation and alarm.deviation_t_ns else ""
+    return f"{alarm.deviation}{at}"
+
+
 def about_many(
     place: Place, fans: Sequence[tuple[FanAlarm, Happened]], now_ns: int, *, were_held: bool = False
 ) -> Text:
     """One message about many fans, or about those of quiet hours."""
     alarms = [alarm for alarm, _ in fans]
     trays = sorted({alarm.tray for alarm in alarms})
-    subject = f"{_count(len(fans), 'alarm')} in {_count(len(trays), 'tray')}"
-    counted = ", ".join(_how_many(fans))
-    lines = [f"{subject} at {place.site}: {counted}"]
+    active = [alarm for alarm in alarms if alarm.active]
+    subject = f"{_count(len(fans), 'alarm')}{'' if active else ' cleared'} in {_count(len(trays), 'tray')}"
+    counted = f": {', '.join(_how_many(fans))}" if active else ""
+    lines = [f"{subject} at {place.site}{counted}"]
     if were_held:
         lines.insert(0, "Held during quiet hours:")
     lines += _of_each_tray(alarms)
-    active = [alarm for alarm in alarms if alarm.active]
     if active:
         causes = Counter(likely_causes(each.causes) or "unknown" for each in active)
         named = [f"{words} {count}" for words, count in causes.most_common(MOST_NAMED_CAUSES)]
@@ -151,7 +160,7 @@ def about_many(
     lines.append(f"As of {place.clock(now_ns)}")
     if place.page:
         lines.append(place.page)
-    return Text(f"{subject} ({place.site}): {counted}", "\n".join(lines), _level(alarms))
+    return Text(f"{subject} ({place.site}){counted}", "\n".join(lines), _level(alarms))
 
 
 def test_text(place: Place, target: str, now_ns: int) -> Text:

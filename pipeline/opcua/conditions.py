@@ -136,7 +136,8 @@ class ConditionBook:
         fan = Fan(alarm.header.tray, alarm.fan)
         with self._lock:
             before = self._conditions.get(fan, Condition(fan))
-            has_comment = bool(alarm.comment) and alarm.transition != Transition.REFUSED
+            is_of_earlier = alarm.marked_onset_t_ns not in (0, alarm.onset_t_ns)
+            has_comment = bool(alarm.comment) and alarm.transition != Transition.REFUSED and not is_of_earlier
             said = (alarm.comment, alarm.t_ns, alarm.operator_name) if has_comment else _said(before)
             self._conditions[fan] = Condition(fan, current, *said)
             return self._conditions[fan]

@@ -67,7 +67,11 @@ VARIABLES = (
     ),
     FanVariable("Score", "Double", "how near the fan is to its limit: 1 is at the limit", "score"),
     FanVariable("State", "String", "state of the fan, in words"),
-    FanVariable("Judged", "Boolean", "whether the newest sample is judged: if not, no alarm can be raised"),
+    FanVariable(
+        "Judged",
+        "Boolean",
+        "whether the newest sample is judged, or the fan stands or starts as commanded: if not, no alarm can be raised",
+    ),
 )
 VARIABLE = {each.name: each for each in VARIABLES}
 

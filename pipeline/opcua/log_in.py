@@ -98,6 +98,10 @@ class LogIn:
         found = self._users.of(who.name)
         return found if found is not None and found.password_hash == who.password_hash else None
 
+    def log_untrusted(self, address: str) -> None:
+        """A client has come whose certificate is not among the trusted ones."""
+        self._log.add("client refused: its certificate is not in the folder `trusted`", by="OPC UA", address=address)
+
     def user(self, name: str | None, password: str | None, address: str) -> SessionUser | None:
         """Who logs in; None: nobody does.
 
@@ -107,6 +111,10 @@ class LogIn:
         if name is None:
             return SessionUser(UserRole.User, "") if self._is_open else None
         if self._users is None:
+            return None
+        self._users.of(name)
+        if self._users.problem:
+            self._log.add("login refused: the file of users cannot be read", by="OPC UA", user=name, address=address)
             return None
         if self._failures.begin(name, address):
             self._log.add("login refused: too many wrong passwords", by="OPC UA", user=name, address=address)

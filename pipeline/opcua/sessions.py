@@ -152,13 +152,14 @@ class SiteSession(InternalSession):
             ServiceError: he may not.
         """
         certificate = self.iserver.certificate_of_caller()
+        address = self.name[0] if isinstance(self.name, tuple) else str(self.name)
         if certificate is None and isinstance(params.UserIdentityToken, ua.UserNameIdentityToken):
             raise ServiceError(ua.StatusCodes.BadSecurityModeInsufficient)
         if certificate is not None and not self.iserver.trusted.trusts(certificate):
+            self.iserver.log_in.log_untrusted(address)
             raise ServiceError(ua.StatusCodes.BadCertificateUntrusted)
         if self.is_activated() and certificate != self.certificate:
             raise ServiceError(ua.StatusCodes.BadSecurityChecksFailed)
-        address = self.name[0] if isinstance(self.name, tuple) else str(self.name)
         self.iserver.user_manager = _AtAddress(self.iserver.log_in, address)
         result = super().activate_session(params, peer_certificate)
         self.certificate = certificate

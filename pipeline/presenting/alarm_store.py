@@ -16,6 +16,8 @@ from pipeline.errors import UserError
 from schemas.codec import CodecError, decode, encode
 from schemas.messages import Alarm
 
+HISTORY = "alarms.sqlite"
+"""the file of the gateway, in the run folder"""
 MOST_TRANSITIONS = 200_000
 """those that are older are deleted"""
 _DELETED_EVERY = 1000
@@ -45,8 +47,8 @@ CREATE TABLE IF NOT EXISTS beginning (t_ns INTEGER NOT NULL);
 class AlarmStore:
     """Not thread-safe: whoever shares it locks it."""
 
-    def __init__(self, path: Path) -> None:
-        """Open the file, or make it.
+    def __init__(self, path: Path, *, read_only: bool = False) -> None:
+        """Open the file, or make it. read_only: of another process.
 
         Raises:
             UserError: it cannot be read or written.
@@ -59,11 +61,16 @@ class AlarmStore:
         """transitions that were heard and are not kept"""
         self._why_unsaved = self._why_unread = ""
         try:
+            if read_only:
+                self._file = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
+                self._file.execute("SELECT 1 FROM transition LIMIT 1")
+                return
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = sqlite3.connect(path, WAIT_S, check_same_thread=False, isolation_level=None)
             self._file.executescript(f"PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; {_SCHEMA}")
         except (OSError, sqlite3.Error) as error:
-            raise UserError(f"{path}: the history of alarms cannot be kept there: {error}") from error
+            what = "it has no history of alarms" if read_only else "the history of alarms cannot be kept there"
+            raise UserError(f"{path}: {what}: {error}") from error
 
     @property
     def problem(self) -> str:
@@ -139,6 +146,8 @@ class AlarmStore:
                 self._file.execute("INSERT OR IGNORE INTO transition VALUES (?, ?, ?, ?, ?, ?, ?)", row)
             self._file.execute("COMMIT")
         except sqlite3.Error as error:
+            with suppress(sqlite3.Error):
+                self._file.rollback()
             raise UserError(f"{self._path}: {error}: alarms of recordings are not in the history") from error
         return len(room)
 

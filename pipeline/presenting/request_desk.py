@@ -62,13 +62,14 @@ class RequestDesk:
         return under_way.done
 
     def take(self) -> list[Request]:
-        """The requests to be sent now."""
+        """The requests to be sent now, but for those that nobody waits for any more."""
         now_s = self._now_s()
         with self._lock:
             for name, each in list(self._under_way.items()):
                 if each.done.done() or now_s - each.sent_s > ANSWERED_WITHIN_S:
                     del self._under_way[name]
-            taken, self._waiting = self._waiting, []
+            waiting, self._waiting = self._waiting, []
+            taken = [each for each in waiting if not each[1].done.done()]
             for request, under_way in taken:
                 tray = request.header.tray
                 self._under_way[f"{self._producer}/{tray}/{self._sent[tray]}"] = under_way

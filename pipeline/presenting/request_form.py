@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from schemas.enums import Action
+from scoring.alarms.fan_condition import GIVES_FEEDBACK
 
 LONGEST_SHELVING_S = 30 * 86400.0
 LONGEST_COMMENT = 500
@@ -23,6 +24,8 @@ OperatorAction = Literal[
     "out_of_service",
     "in_service",
     "commission",
+    "true_alarm",
+    "false_alarm",
 ]
 _NOT_SHOWN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 """characters that end a line, move the cursor of a terminal, or turn the direction of what follows"""
@@ -42,7 +45,9 @@ class RequestForm(BaseModel):
     Attributes:
         action: what is asked.
         duration_s: how long to shelve, s; 0: until the alarm clears. Only for shelve.
-        comment: why, for the record.
+        comment: why, for the record; false_alarm needs it.
+        onset_t_ns: for true_alarm and false_alarm, onset of the alarm that is meant, to within a second; 0: the last
+            one of the fan.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -50,6 +55,15 @@ class RequestForm(BaseModel):
     action: OperatorAction
     duration_s: Annotated[float, Field(ge=0, le=LONGEST_SHELVING_S, allow_inf_nan=False)] = 0.0
     comment: Annotated[OneLine, Field(max_length=LONGEST_COMMENT)] = ""
+    onset_t_ns: Annotated[int, Field(ge=0, lt=2**63)] = 0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.action == "false_alarm" and not self.comment.strip():
+            raise ValueError("a false alarm needs a reason: give a comment")
+        if self.onset_t_ns and self.message_action not in GIVES_FEEDBACK:
+            raise ValueError("onset_t_ns is for true_alarm and false_alarm only")
+        return self
 
     @property
     def message_action(self) -> Action:

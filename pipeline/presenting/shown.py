@@ -14,12 +14,15 @@ from pipeline.launch.site_state import StageState
 from pipeline.presenting.fan_groups import SHOWN_CLASSES, FanGroup
 from pipeline.presenting.fan_history import Curves
 from pipeline.presenting.site_model import SiteModel
+from pipeline.recordings.clips.clip import Clip
 from pipeline.viewing.fleet import Fan, FanNow
+from schemas.enums import Feedback
 from schemas.messages import Alarm, Array, ModelCard
 from schemas.twin_card import CardError, TwinCard
 from schemas.units import RAD_S_PER_UNIT
 from scoring.alarms.alarm_flags import is_listed
 from scoring.alarms.current_alarms import CurrentAlarm, words_of
+from scoring.calibration.observed_rate import together
 from scoring.diagnosis.shown_causes import (
     CANNOT_TELL,
     advice,
@@ -163,8 +166,22 @@ def alarms_json(model: SiteModel, *, everything: bool) -> dict[str, Any]:
     return {"alarms": [alarm_json(each) | {"now": now} for each, now in zip(found, words, strict=True)]}
 
 
-def transition_json(number: int, alarm: Alarm) -> dict[str, Any]:
-    """A transition of the history."""
+def clip_json(clip: Clip) -> dict[str, Any]:
+    """A clip of alarms, for machines."""
+    return {
+        "name": clip.name,
+        "tray": clip.tray,
+        "since_t_ns": clip.since_ns,
+        "until_t_ns": clip.until_ns,
+        "bytes": clip.size_bytes,
+        "acknowledged": clip.is_acknowledged,
+        "problem": clip.problem,
+        "alarms": [{"fan": each.fan, "onset_t_ns": each.onset_t_ns, "t_ns": each.t_ns} for each in clip.alarms],
+    }
+
+
+def transition_json(number: int, alarm: Alarm, feedback: Feedback = Feedback.NONE) -> dict[str, Any]:
+    """A transition of the history. feedback: the last one on its alarm."""
     return {
         "number": number,
         "t_ns": alarm.t_ns,
@@ -177,7 +194,15 @@ def transition_json(number: int, alarm: Alarm) -> dict[str, Any]:
         "message": words_of(alarm),
         "operator_name": alarm.operator_name,
         "comment": alarm.comment,
+        "feedback": feedback.name.lower(),
     }
+
+
+def rates_json(model: SiteModel) -> dict[str, Any]:
+    """The rate of false alarms that really was beside the declared one, of each tray and of all."""
+    rates = model.observed_rates()
+    trays = {tray: rate.as_json() for tray, rate in rates.items()}
+    return {"trays": trays, "site": together(list(rates.values())).as_json()}
 
 
 def stages_json(states: Iterable[StageState]) -> list[dict[str, Any]]:
@@ -195,11 +220,16 @@ def _stage_json(state: StageState) -> dict[str, Any]:
         "in_hz": round(view.rate_in_hz, 1) if view else 0.0,
         "out_hz": round(view.rate_out_hz, 1) if view else 0.0,
         "lost": health.lost if health else 0,
-        "latency_p50_ms": round(health.latency_p50_ms, 1) if health else 0.0,
-        "latency_p99_ms": round(health.latency_p99_ms, 1) if health else 0.0,
-        "uptime_s": round(health.uptime_s) if health else 0,
+        "latency_p50_ms": _rounded(health.latency_p50_ms, 1) if health else 0.0,
+        "latency_p99_ms": _rounded(health.latency_p99_ms, 1) if health else 0.0,
+        "uptime_s": _rounded(health.uptime_s, 0) if health else 0.0,
         "notes": [f"{note.tray}: {note.text}" if note.tray else note.text for note in health.notes] if health else [],
     }
+
+
+def _rounded(value: float, digits: int) -> float:
+    """0 for what is no number: health is what its sender makes it."""
+    return round(value, digits) if math.isfinite(value) else 0.0
 
 
 def _or_null(values: Array) -> Sequence[float | None]:

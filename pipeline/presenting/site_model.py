@@ -19,18 +19,21 @@ from pipeline.config.registry import STAGES
 from pipeline.launch.site_state import StageState, stage_states
 from pipeline.launch.site_watcher import StageView
 from pipeline.launch.watched_alarms import WatchedAlarms
+from pipeline.presenting.alarm_rates import AlarmRates
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.fan_groups import SHOWN_CLASSES, FanGroup, classes_of, counts_of
 from pipeline.presenting.fan_history import COLUMNS, Curves, FanHistory, values_of
+from pipeline.presenting.judged_time import LEARNED, JudgedTime
 from pipeline.viewing.fleet import Fan, FanNow, Fleet
 from pipeline.viewing.fleet_view import last_sample
 from schemas.codec import CodecError, decode_columns, encode
-from schemas.enums import StageStatus, Transition
+from schemas.enums import Feedback, StageStatus, Transition
 from schemas.envelope import Envelope
 from schemas.health import Health
 from schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST
+from scoring.calibration.observed_rate import ObservedRate, declared_per_day
 from scoring.wear.recorded_wear import wear_in, wear_rows
 
 SILENT_AFTER_S = 5.0
@@ -78,10 +81,11 @@ class SiteModel:
         store: AlarmStore,
         *,
         keeps_curves: bool = True,
+        rates: AlarmRates | None = None,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 86 MB. now_s: a clock
-        that is never set."""
+        """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 86 MB.
+        rates: takes for how long fans are judged, for `observed_rates`. now_s: a clock that is never set."""
         self._now_s = now_s
         self.site = site
         self.trays = tuple(trays)
@@ -94,6 +98,8 @@ class SiteModel:
         """by tray, its last sample alone"""
         self._raised: Counter[tuple[str, int, str]] = Counter()
         """by tray, fan and severity"""
+        self._counted: dict[tuple[str, int], tuple[int, int]] = {}
+        """by tray and fan: the onset of the alarm that was counted last, and its worst severity"""
         fans = sum(tray.fans for tray in trays)
         self._alarms = WatchedAlarms(lambda _producer: True, most_fans=fans)
         self._store = store
@@ -101,6 +107,10 @@ class SiteModel:
         self._twins: dict[str, ModelCard] = {}
         self._wear: dict[str, tuple[int, Sequence[Mapping[str, Any]]]] = {}
         """by tray: the time of the snapshot, and its rows"""
+        self._rates = rates
+        self._judged = JudgedTime()
+        self._judging: dict[str, tuple[str, float | None]] = {}
+        """by tray, the name of its twin for the judged time, and the rate that it declares"""
         self.refused_scores = 0
         """with another number of fans than the configuration says, or not to be decoded"""
 
@@ -121,6 +131,10 @@ class SiteModel:
             self._fleet.update(score)
             if self._history is not None:
                 self._history.add(score)
+            if self._rates is not None and tray.name in self._judging:
+                stretches = self._judged.add(score, *self._judging[tray.name])
+                if stretches:
+                    self._rates.catch_up(self._store, stretches)
         return score
 
     def add_alarm(self, alarm: Alarm) -> bool:
@@ -130,9 +144,17 @@ class SiteModel:
             current = self._alarms.of(alarm.header.tray, alarm.fan)
             self._fleet.add_alarm(current.newest if current else alarm)  # this one may be late
             is_new = self._store.add(alarm)
-            if is_new and alarm.transition == Transition.RAISED:
-                self._raised[alarm.header.tray, alarm.fan, alarm.severity.name.lower()] += 1
+            if is_new and alarm.transition in (Transition.RAISED, Transition.SEVERITY):
+                self._count(alarm)
             return is_new
+
+    def _count(self, alarm: Alarm) -> None:
+        """Once for each severity that it reaches."""
+        name = (alarm.header.tray, alarm.fan)
+        onset_t_ns, worst = self._counted.get(name, (0, 0))
+        if alarm.onset_t_ns != onset_t_ns or alarm.severity > worst:
+            self._counted[name] = (alarm.onset_t_ns, int(alarm.severity))
+            self._raised[*name, alarm.severity.name.lower()] += 1
 
     def add_health(self, health: Health) -> None:
         """A stage has reported."""
@@ -144,8 +166,11 @@ class SiteModel:
 
     def add_twin(self, card: ModelCard) -> None:
         """A tray has another twin."""
+        tray = self._by_name.get(card.header.tray)
+        name = LEARNED if tray and tray.twin is None else card.sha256
         with self._lock:
             self._twins[card.header.tray] = card
+            self._judging[card.header.tray] = (name, declared_per_day(card.card_json))
 
     def notice_silence(self) -> None:
         """Trays that have sent no score for long are silent."""
@@ -227,7 +252,7 @@ class SiteModel:
         ]
 
     def raised(self) -> dict[tuple[str, int, str], int]:
-        """How many alarms were raised since the gateway began, by tray, fan and severity."""
+        """How many alarms have reached a severity since the gateway began, by tray, fan and severity."""
         with self._lock:
             return dict(self._raised)
 
@@ -295,6 +320,22 @@ class SiteModel:
             _, rows = self._wear.get(fan.tray, (0, ()))
         return [row for row in rows if row["fan"] == fan.number]
 
+    def feedback_on(self, alarms: Sequence[Alarm]) -> list[Feedback]:
+        """What operators said last of the alarm that each of these messages is about."""
+        if self._rates is None:
+            return [alarm.feedback for alarm in alarms]
+        with self._lock:
+            self._rates.catch_up(self._store, ())
+            return [self._rates.feedback(alarm.header.tray, alarm.fan, alarm.onset_t_ns) for alarm in alarms]
+
+    def observed_rates(self) -> dict[str, ObservedRate]:
+        """Of each tray, the rate of false alarms beside the declared one: `AlarmRates.observed`."""
+        if self._rates is None:
+            return {}
+        with self._lock:
+            self._rates.catch_up(self._store, self._judged.growing())
+            return self._rates.observed()
+
     def twin(self, tray: str) -> ModelCard | None:
         """The twin in force; None: it has not been heard."""
         return self._twins.get(tray)
@@ -313,9 +354,12 @@ class SiteModel:
 
     def problem(self) -> str:
         """What is wrong with the history of alarms; empty if nothing is."""
-        return self._store.problem
+        return "; ".join(filter(None, (self._store.problem, self._rates.problem if self._rates else "")))
 
     def close(self) -> None:
         """Leave complete files."""
         with self._lock:
+            if self._rates is not None:
+                self._rates.catch_up(self._store, self._judged.growing())
+                self._rates.close()
             self._store.close()

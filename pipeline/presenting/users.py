@@ -47,7 +47,7 @@ class User:
 
 
 class Users:
-    """The file, read again when it changes."""
+    """The file, read again when it changes. While it is missing, or others may read it, there are no users."""
 
     def __init__(self, path: Path) -> None:
         """Read it.
@@ -58,10 +58,10 @@ class Users:
         self._path = path
         self._hasher = hasher()
         self._nobody_hash = self._hasher.hash("nobody has this password")
-        self._stamp: tuple[int, int] = (0, 0)
+        self._stamp: tuple[int, ...] = ()
         self._users: Mapping[str, User] = {}
         self.problem = ""
-        """why the file could not be read again; empty if it was. The users are then those of before."""
+        """why the file cannot be read; empty if it can"""
         self._read()
 
     def of(self, name: str) -> User | None:
@@ -70,7 +70,8 @@ class Users:
             self._read()
             self.problem = ""
         except UserError as error:
-            self.problem = str(error)
+            self._stamp, self._users = (), {}
+            self.problem = f"nobody can log in or act: {error}"
         return self._users.get(name)
 
     def verified(self, name: str, password: str) -> User | None:
@@ -93,8 +94,8 @@ class Users:
         try:
             found = self._path.stat()
         except OSError as error:
-            raise UserError(f"{self._path}: {error.strerror}: make users with `fantwin users add NAME`") from error
-        stamp = (found.st_mtime_ns, found.st_ino)
+            raise _unreadable(self._path, error) from error
+        stamp = (found.st_mtime_ns, found.st_ctime_ns, found.st_ino)  # a change of its rights sets st_ctime_ns alone
         if stamp != self._stamp:
             self._users = read_users(self._path)
             self._stamp = stamp
@@ -119,7 +120,7 @@ def read_users(path: Path) -> dict[str, User]:
                 raise UserError(f"{path}: others may read it: chmod 600 {path}")
             tables = tomllib.load(file)
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: the users cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        raise _unreadable(path, error) from error
     return {name: _user(path, name, table) for name, table in tables.items()}
 
 
@@ -164,6 +165,12 @@ def checked_password(password: str, name: str) -> str:
             f"{', '.join(GUESSED_WORDS)}"
         )
     return password
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    if isinstance(error, FileNotFoundError):
+        return UserError(f"{path}: there is no such file: `fantwin users add NAME` makes it")
+    return UserError(f"{path}: the users cannot be read: {getattr(error, 'strerror', None) or error}")
 
 
 def _user(path: Path, name: str, table: Any) -> User:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from zlib import crc32
 
 from mcap.opcode import Opcode
@@ -38,6 +40,15 @@ _INDEX_HEAD = struct.Struct("<HI")
 _FOOTER = struct.Struct("<BQQQ")
 
 
+@dataclass(frozen=True)
+class PartIndex:
+    """Where the chunks of a file are."""
+
+    path: Path
+    channels: Mapping[int, Channel]
+    chunks: Sequence[ChunkIndex]
+
+
 class Index:
     """What a file holds, and where."""
 
@@ -48,7 +59,7 @@ class Index:
         """by channel"""
         self.first_ns: int | None = None
         self.last_ns = 0
-        self._chunks: list[McapRecord] = []
+        self.chunks: list[ChunkIndex] = []
         self._attachments: list[McapRecord] = []
         self._metadata: list[McapRecord] = []
 
@@ -76,7 +87,7 @@ class Index:
 
     def add_chunk(self, chunk: ChunkIndex, messages: Mapping[int, int]) -> None:
         """Add a chunk; messages: how many it has of each channel."""
-        self._chunks.append(chunk)
+        self.chunks.append(chunk)
         self.messages.update(messages)
         self._add_times(chunk.message_start_time, chunk.message_end_time)
 
@@ -93,7 +104,7 @@ class Index:
             (Opcode.SCHEMA, self.schemas.values()),
             (Opcode.CHANNEL, self.channels.values()),
             (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.CHUNK_INDEX, self.chunks),
             (Opcode.ATTACHMENT_INDEX, self._attachments),
             (Opcode.METADATA_INDEX, self._metadata),
         )
@@ -118,7 +129,7 @@ class Index:
             attachment_count=len(self._attachments),
             channel_count=len(self.channels),
             channel_message_counts=dict(self.messages),
-            chunk_count=len(self._chunks),
+            chunk_count=len(self.chunks),
             message_count=self.messages.total(),
             metadata_count=len(self._metadata),
             message_start_time=self.first_ns or 0,

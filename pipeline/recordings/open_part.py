@@ -5,11 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
+from pipeline.recordings.index import PartIndex
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from schemas.envelope import Envelope
 from schemas.streams import StreamId
+
+
+class OldPart(NamedTuple):
+    """A finished part."""
+
+    name: str
+    last_ns: int
+    """when its last message was received"""
 
 
 class OpenPart(Protocol):
@@ -25,6 +34,7 @@ class OpenPart(Protocol):
     def pending(self) -> Sequence[Envelope]: ...  # noqa: D102
     @property
     def size(self) -> int: ...  # noqa: D102
+    def index(self) -> PartIndex: ...  # noqa: D102
     def add(self, envelope: Envelope) -> None: ...  # noqa: D102
     def flush(self) -> None: ...  # noqa: D102
     def stay_in_place(self) -> None: ...  # noqa: D102
@@ -39,4 +49,5 @@ class PartsFolder(Protocol):
     def before(self) -> Mapping[StreamId, int]: ...  # noqa: D102
     def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> OpenPart: ...  # noqa: D102
     def free_bytes(self) -> int: ...  # noqa: D102
+    def oldest_part(self) -> OldPart | None: ...  # noqa: D102
     def delete_oldest(self) -> str | None: ...  # noqa: D102

@@ -7,7 +7,7 @@ is repaired, and the next part continues it.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import islice
@@ -15,7 +15,8 @@ from pathlib import Path
 
 from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
-from pipeline.recordings.rare_messages import last_messages
+from pipeline.recordings.open_part import OldPart
+from pipeline.recordings.rare_messages import last_message_ns, last_messages
 from pipeline.recordings.reading import RecordingError, read_metadata
 from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.repair import (
@@ -67,7 +68,7 @@ class RecordingParts:
         Raises:
             RecordingError: nothing can be recorded there, or another recorder does.
         """
-        self._path = path
+        self.path = path
         self._metadata = dict(metadata) | {"session": session, RECORDING_KEY: path.name}
         self._attachments = attachments
         self._part = 0
@@ -81,12 +82,12 @@ class RecordingParts:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._disk = Disk(path.parent)
             self._repair()
-            self._number = max((number for number, _ in part_files(self._path)), default=0)
+            self._number = max((number for number, _ in part_files(self.path)), default=0)
         except OSError as error:
             raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
         last = self._last_part()
-        self._last = last.path if last else None
-        """the part before the next one"""
+        self._last = self.last_part = last.path if last else None
+        """the part before the next one, and before the first one"""
         self._writer: RecordingWriter | None = None
         self.before = last.next if last else {}
         """the sequence number due of each stream after the last part"""
@@ -99,9 +100,9 @@ class RecordingParts:
         """
         self.free_bytes()  # raises if the disk is gone: do not write to its mount point
         try:
-            self._number = 1 + max([self._number, *(number for number, _ in part_files(self._path))])
+            self._number = 1 + max([self._number, *(number for number, _ in part_files(self.path))])
         except OSError as error:
-            raise refused(f"{self._path.parent}: cannot be read", error, "name another folder") from error
+            raise refused(f"{self.path.parent}: cannot be read", error, "name another folder") from error
         if self._writer:
             self._last = self._writer.path  # it may have been given another name since it began
         metadata = {
@@ -114,7 +115,7 @@ class RecordingParts:
         }
         try:
             writer = RecordingWriter(
-                part_path(self._path, self._number), metadata, self._attachments, t_ns=t_ns, ledger=ledger
+                part_path(self.path, self._number), metadata, self._attachments, t_ns=t_ns, ledger=ledger
             )
         except RecordingError:
             self._number -= 1
@@ -127,8 +128,8 @@ class RecordingParts:
         """The last message of a topic on each key in the last parts of this recording, as bytes."""
         found: dict[str, bytes] = {}
         with suppress(OSError, RecordingError):
-            files = sorted(part_files(self._path), reverse=True)
-            ours = (path for _, path in files if path.suffix == self._path.suffix and self._is_ours(path))
+            files = sorted(part_files(self.path), reverse=True)
+            ours = (path for _, path in files if path.suffix == self.path.suffix and self._is_ours(path))
             for path in islice(ours, PARTS_SEARCHED):
                 found = last_messages(path, topic) | found
         return found
@@ -141,23 +142,33 @@ class RecordingParts:
         """
         return self._disk.free_bytes()
 
+    def oldest_part(self) -> OldPart | None:
+        """The oldest finished part; None if there is none."""
+        path = next(self._finished(), None)
+        return None if path is None else OldPart(path.name, last_message_ns(path))
+
     def delete_oldest(self) -> str | None:
         """Delete the oldest finished part and give its name; None if there is none."""
-        for _, path in sorted(part_files(self._path)):
-            if path.suffix == self._path.suffix and self._is_ours(path):
-                with suppress(OSError):
-                    path.unlink()
-                    return path.name
+        for path in self._finished():
+            with suppress(OSError):
+                path.unlink()
+                return path.name
         return None
+
+    def _finished(self) -> Iterator[Path]:
+        """The finished parts of this recording, the oldest first."""
+        for _, path in sorted(part_files(self.path)):
+            if path.suffix == self.path.suffix and self._is_ours(path):
+                yield path
 
     def _is_ours(self, path: Path) -> bool:
         try:
-            return read_metadata(path).metadata.get(RECORDING_KEY) == self._path.name
+            return read_metadata(path).metadata.get(RECORDING_KEY) == self.path.name
         except RecordingError:
             return False
 
     def _repair(self) -> None:
-        for _, path in sorted(part_files(self._path)):
+        for _, path in sorted(part_files(self.path)):
             if not path.name.endswith(ACTIVE_SUFFIX):
                 continue
             try:
@@ -179,7 +190,7 @@ class RecordingParts:
 
     def _last_part(self) -> Contents | None:
         """The contents of the last part of this recording."""
-        for _, path in sorted(part_files(self._path), reverse=True):
-            if (path.suffix == self._path.suffix or path in self.unrepaired) and self._is_ours(path):
+        for _, path in sorted(part_files(self.path), reverse=True):
+            if (path.suffix == self.path.suffix or path in self.unrepaired) and self._is_ours(path):
                 return contents_of(path)
         return None

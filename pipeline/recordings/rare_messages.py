@@ -48,6 +48,16 @@ def last_messages(path: Path, topic: str) -> dict[str, bytes]:
     return found
 
 
+def last_message_ns(path: Path) -> int:
+    """When the last message of a finished recording was received; 0 if its index does not say it."""
+    try:
+        with path.open("rb") as file:
+            summary = indexed_reader(file).get_summary()
+    except (OSError, LookupError, *CORRUPT_DATA_ERRORS):
+        return 0
+    return summary.statistics.message_end_time if summary and summary.statistics else 0
+
+
 def _by_index(path: Path, topic: str) -> Iterator[Envelope]:
     reading = Reading(path, (topic,), None)
     channels: dict[int, tuple[str, str]] = {}

@@ -23,15 +23,15 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from pipeline.recordings.chunk import FillingChunk
 from pipeline.recordings.disk import AtomicAppendFile, Disk, refused, sync_folder
-from pipeline.recordings.index import SHORT_ENDING, Index, write_ending
+from pipeline.recordings.index import SHORT_ENDING, Index, PartIndex, write_ending
 from pipeline.recordings.reading import METADATA_NAME
 from pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, active_path, indexed_reader, record_bytes
 from pipeline.recordings.sequence_ledger import BEFORE_NAME, SequenceLedger, ledger_metadata
 from schemas.codec import proto_type, type_name
 from schemas.envelope import Envelope
 from schemas.health import Health
-from schemas.messages import Message, newest_t_ns
-from schemas.topics import topic_of
+from schemas.messages import Message
+from schemas.topics import HEALTH, topic_of
 
 CHUNK_BYTES = 256 * 1024
 """A crash loses what is not in a finished chunk; a reader holds one chunk in memory."""
@@ -129,16 +129,20 @@ class RecordingWriter:
         """The messages that are not flushed to the disk, in order."""
         return [*chain.from_iterable(chunk.messages for chunk in self._unsynced), *self._filling]
 
+    def index(self) -> PartIndex:
+        """What is flushed to the disk, and where."""
+        return PartIndex(self._active, dict(self._index.channels), list(self._index.chunks))
+
     def add(self, envelope: Envelope) -> None:
         """Add a message.
 
         Raises:
             RecordingError: the disk refuses; `pending` then has the messages that are not in the file.
         """
-        key, message = envelope.key, envelope.message
-        channel, _ = self._channels.get(key) or self._register_channel(key, type(message))
+        key = envelope.key
+        channel, _ = self._channels.get(key) or self._register_channel(key, topic_of(key).message)
         self._chunk.add(
-            channel, message.header.sequence, envelope.received_t_ns, newest_t_ns(message), envelope.payload
+            channel, envelope.header.sequence, envelope.received_t_ns, envelope.newest_t_ns, envelope.payload
         )
         self._filling.append(envelope)  # counted as recorded only if it is in the chunk
         self._added[key] += 1
@@ -275,11 +279,12 @@ class RecordingWriter:
     def _count(self, chunk: _WrittenChunk) -> None:
         self._index.add_chunk(chunk.chunk_index, chunk.counts)
         for envelope in chunk.messages:
-            key, message = envelope.key, envelope.message
-            header = message.header
-            self.ledger.add(key, header.producer, header.sequence, envelope.received_t_ns)
-            self.written[self._channels[key][1]] += 1
-            if isinstance(message, Health):
+            header, (_, topic) = envelope.header, self._channels[envelope.key]
+            self.ledger.add(envelope.key, header.producer, header.sequence, envelope.received_t_ns)
+            self.written[topic] += 1
+            if topic == HEALTH:
+                message = envelope.message
+                assert isinstance(message, Health)
                 self.ledger.add_health(message)
 
     def _take_back(self) -> None:

@@ -85,6 +85,9 @@ class DecisionRules(IntEnum):
     """On a grid that is slower than the training data, the twin takes several steps for each sample, each about as
     long as the sampling period of the training data. Before, it took one, which could be unstable, for example at 1 Hz.
     """
+    FEEDBACK = 23
+    """The onsets of the last 32 alarms of a fan are kept, so that operators may say of them whether they were true. No
+    alarm differs."""
 
 
 CURRENT_RULES = max(DecisionRules)

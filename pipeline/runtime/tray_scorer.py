@@ -37,6 +37,8 @@ from scoring.wear.reference import healthy_fans
 from scoring.wear.wear_monitor import WearInputs, WearMonitor
 
 DATA_LOST_AFTER_NS = 2 * NS_PER_S  # an active alarm is not confirmed by data after so long without a score
+EARLIER_ALARMS = 32
+"""of a fan, on which operators may still give feedback"""
 
 
 def fan_scorer_of(fans: int, twin: HealthyTwin, decision_rules: DecisionRules) -> FanScorer:
@@ -114,6 +116,7 @@ class TrayScorer:
             data_lost_after_ns=DATA_LOST_AFTER_NS if decision_rules >= DecisionRules.TIME_AND_GAPS else None,
             settling_ns=self.fan_scorer.longest_memory_ns,
             detectors=holding if self._holds else (),
+            earlier_alarms=EARLIER_ALARMS if decision_rules >= DecisionRules.FEEDBACK else 0,
         )
         self.alarms = AlarmManager(fans, settings, self._diagnoser, text)
 

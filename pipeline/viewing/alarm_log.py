@@ -1,12 +1,20 @@
-"""The lines of the alarm log."""
+"""The lines of the alarm log: short enough to be read in a third of a window."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from schemas.enums import Severity, Transition
+from pipeline.viewing.worst_page import clock_utc
+from schemas.enums import Severity, Statistic, Transition
 from schemas.messages import Alarm
-from scoring.alarms.current_alarms import words_of
+from scoring.alarms.alarm_text import TRANSITIONS
+from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from scoring.detectors.table import row_of
+from scoring.diagnosis.shown_causes import with_share
+
+LINE_LENGTH = 64
+"""a longer line is cut"""
+_SOURCES = {"speed": "speed", "balance": "torque balance", "tacho": "tacho"}
 
 
 class LogLine(NamedTuple):
@@ -20,9 +28,42 @@ class LogLine(NamedTuple):
 
 def log_line(alarm: Alarm) -> LogLine:
     """The line about an alarm's transition."""
-    level, happened = "INFO", alarm.transition.words
+    level = "INFO"
     is_bad = alarm.active or alarm.transition != Transition.REPUBLISHED
     if is_bad and alarm.transition in (Transition.RAISED, Transition.SEVERITY, Transition.REPUBLISHED):
         level = "ERROR" if alarm.severity == Severity.ALARM else "WARN"
-        happened = f"{alarm.severity.words} {happened}"
-    return LogLine(alarm.header.tray, alarm.t_ns, level, f"{happened}: {words_of(alarm)}")
+    text = f"fan {alarm.fan}: {_what_happened(alarm)}"
+    return LogLine(alarm.header.tray, alarm.t_ns, level, cut(text, LINE_LENGTH))
+
+
+def cut(text: str, length: int) -> str:
+    """The text on one line, at most so long."""
+    text = " ".join(text.split())
+    return text if len(text) <= length else f"{text[: length - 1].rstrip()}…"
+
+
+def _what_happened(alarm: Alarm) -> str:
+    transition, by = alarm.transition, f" by {alarm.operator_name}" if alarm.operator_name else ""
+    if transition in (Transition.RAISED, Transition.SEVERITY):
+        return f"{alarm.severity.words} {transition.words}, {exceeded(alarm)}"
+    if transition == Transition.DIAGNOSED and alarm.causes:
+        return f"probably {with_share(alarm.causes[0])}"
+    if transition == Transition.REPUBLISHED:
+        over = "no alarm" if alarm.severity == Severity.NONE else "back to normal"
+        return f"{f'{alarm.severity.words} goes on' if alarm.active else over}, after a restart"
+    if transition == Transition.SHELVED:
+        ends = alarm.shelved_until_t_ns
+        until = "it clears" if ends == UNTIL_IT_CLEARS_T_NS else clock_utc(ends, alarm.t_ns)
+        return f"shelved until {until}{by}"
+    if transition == Transition.REFUSED:
+        return f"request{by} refused: {alarm.message.partition('refused: ')[2] or alarm.message}"
+    return f"{TRANSITIONS.get(transition, transition.words)}{by}"
+
+
+def exceeded(alarm: Alarm) -> str:
+    """What is beyond its limit, and how far: `torque balance 1.7 x its limit`."""
+    if alarm.statistic == Statistic.STANDSTILL:
+        return "does not turn as commanded"
+    row = row_of(alarm.statistic)
+    name = _SOURCES[row.source] if row else "score"
+    return f"{name} {alarm.score:.2g} x its limit"

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.config.models import TrayConfig
-from pipeline.viewing.trace import state_codes, state_name
+from pipeline.viewing.trace import SILENT, state_codes, state_name
 from schemas.enums import FanState, Transition
 from schemas.fields import LARGEST_ENUM_VALUE
 from schemas.messages import Alarm, Array, Score
@@ -18,8 +18,6 @@ from scoring.alarms.words_now import words_now
 
 FLEET_COLUMNS = ("state", "invalid_reason", "score")
 """the columns of a score that a fleet is made of"""
-SILENT = "silent"
-"""the state of a fan without samples, in words"""
 NORMAL_LEVELS = 5
 """shades of a normal fan's cell, by its score"""
 _NEVER_NS = -(1 << 62)

@@ -1,7 +1,8 @@
 """The bands and states of fans in a recording.
 
-Each fan has one entity with its series side by side, and one `send_columns` per flush. Deviations in alarm, samples
-outside the band and samples without a score are sent only if there are any.
+Each fan has one entity with its series side by side, and one `send_columns` per flush; the torque balances of a page of
+fans are one entity, and so are their scores. Deviations in alarm, samples outside the band and samples without a score
+are sent only if there are any.
 """
 
 from __future__ import annotations
@@ -12,25 +13,29 @@ import numpy as np
 import rerun as rr
 
 from pipeline.viewing.fleet import Fan
-from pipeline.viewing.rerun_layout import (
-    LINE_WIDTH,
+from pipeline.viewing.rerun_paths import (
+    BALANCE,
+    SCORE,
     TIMELINE,
     auxiliary_path,
     fan_path,
-    log_fan_styles,
-    place_auxiliary,
+    judged_path,
+    pages_of,
+    place_beside,
     place_lane,
     place_root,
-    speed_style,
     state_path,
 )
-from pipeline.viewing.trace import Trace
+from pipeline.viewing.rerun_styles import LINE_WIDTH, balance_style, log_fan_styles, score_style, speed_style
+from pipeline.viewing.trace import NO_SAMPLES, Trace
 from schemas.auxiliary import AUXILIARY
 from schemas.messages import Array
 from schemas.units import SpeedUnit
 
 FREE = "free"
 """the state of a place without a fan"""
+ABOVE_LIMIT = 1.2
+"""times the limit of the score: an axis shows it up to here at least"""
 
 
 class RerunBands:
@@ -52,6 +57,9 @@ class RerunBands:
         log_fan_styles(self._recording, root, fan.number, speed_style(unit, LINE_WIDTH, str(fan)))
         fill = speed_style(unit, 0.0, str(fan))
         self._recording.log(fan_path(root, fan.number, "fill"), fill, static=True)
+        # The name is that of the newest fan in this place.
+        self._recording.log(place_beside(place, BALANCE), balance_style(1, name=str(fan)), static=True)
+        self._recording.log(place_beside(place, SCORE), score_style(1, name=str(fan)), static=True)
 
     def hide(self, fan: Fan, t_ns: int) -> None:
         """From `t_ns` on a fan has no place: its lines end."""
@@ -60,6 +68,8 @@ class RerunBands:
         self._send_measurements(speed, times, np.full((1, 4), np.nan), np.zeros((1, 4)))
         for column in AUXILIARY:
             self._send_where(self._auxiliary_path(fan, column.name), times, np.array([np.nan]))
+        for kind, series in ((BALANCE, 2), (SCORE, 3)):
+            self._send_rows(place_beside(self._places[fan], kind), times, np.full((1, series), np.nan))
         self.change_states(fan.tray, fan.number, times, [FREE])
         del self._places[fan]
 
@@ -67,6 +77,7 @@ class RerunBands:
         """Send the next stretch of a tray."""
         for column in range(trace.fans):
             self._draw_fan(trace, column)
+        self._draw_judged(trace)
         for name, values in trace.auxiliary.items():
             for number, of_fan in zip(trace.fan_numbers, values.T, strict=True):
                 self._send_where(self._auxiliary_path(Fan(trace.tray, number), name), trace.t_ns, of_fan)
@@ -77,13 +88,29 @@ class RerunBands:
         path = state_path(tray, fan) if place is None else place_lane(place)
         self._send(path, t_ns, rr.StateChange.columns(state=list(names)))
 
+    def _draw_judged(self, trace: Trace) -> None:
+        """Send torque balance and score: of a fan in a place alone, of others a page at a time."""
+        placed = [column for column, fan in enumerate(trace.fan_numbers) if Fan(trace.tray, fan) in self._places]
+        for column in placed:
+            place = self._places[Fan(trace.tray, trace.fan_numbers[column])]
+            self._send_judged(trace, [column], place_beside(place, BALANCE), place_beside(place, SCORE))
+        if not placed:
+            for page, columns in enumerate(pages_of(range(trace.fans))):
+                self._send_judged(trace, columns, *(judged_path(trace.tray, kind, page) for kind in (BALANCE, SCORE)))
+
+    def _send_judged(self, trace: Trace, columns: Sequence[int], balance_path: str, score_path: str) -> None:
+        balances = (trace.balance[:, columns], trace.expected_balance[:, columns])
+        self._send_rows(balance_path, trace.t_ns, np.concatenate(balances, axis=1))
+        limit = np.where((trace.state[:, columns] == NO_SAMPLES).all(axis=1), np.nan, 1.0)
+        self._send_rows(score_path, trace.t_ns, np.column_stack([trace.score[:, columns], limit, ABOVE_LIMIT * limit]))
+
     def _root(self, fan: Fan) -> str:
         place = self._places.get(fan)
         return fan.tray if place is None else place_root(place, fan.tray)
 
     def _auxiliary_path(self, fan: Fan, column: str) -> str:
         place = self._places.get(fan)
-        return auxiliary_path(fan.tray, column, fan.number) if place is None else place_auxiliary(place, column)
+        return auxiliary_path(fan.tray, column, fan.number) if place is None else place_beside(place, column)
 
     def _draw_fan(self, trace: Trace, column: int) -> None:
         fan = Fan(trace.tray, trace.fan_numbers[column])
@@ -129,6 +156,10 @@ class RerunBands:
 
     def _send_measurements(self, path: str, t_ns: Array, values: Array, variances: Array) -> None:
         columns = rr.Measurements.columns(values=values.reshape(-1), variances=variances.reshape(-1))
+        self._send(path, t_ns, columns.partition([values.shape[1]] * len(values)))
+
+    def _send_rows(self, path: str, t_ns: Array, values: Array) -> None:
+        columns = rr.Scalars.columns(scalars=values.reshape(-1))
         self._send(path, t_ns, columns.partition([values.shape[1]] * len(values)))
 
     def _send(self, path: str, t_ns: Array, columns: rr.ComponentColumnList) -> None:

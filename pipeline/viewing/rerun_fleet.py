@@ -14,27 +14,23 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from pipeline.config.models import TrayConfig
-from pipeline.viewing.fleet import NORMAL_LEVELS, SILENT, Fan, class_names
+from pipeline.viewing.fleet import NORMAL_LEVELS, Fan, class_names
 from pipeline.viewing.fleet_map import LABEL_HEIGHT_PX, fleet_map
 from pipeline.viewing.fleet_view import FANS_NAMED, Overview
 from pipeline.viewing.plot_places import FleetPlots
 from pipeline.viewing.rerun_bands import FREE
-from pipeline.viewing.rerun_layout import (
-    FANS_ON_A_PAGE,
+from pipeline.viewing.rerun_layout import LINKED, MARGIN_FOR_LEGEND, alarms_view, blueprint, judged_view, log_view
+from pipeline.viewing.rerun_paths import (
+    BALANCE,
     FLEET_LOG,
-    LINE_WIDTH,
-    RED,
+    SCORE,
     SHOWN,
-    STATE_COLORS,
     TIMELINE,
-    UNKNOWN_COLOR,
-    log_state_styles,
-    log_view,
-    place_auxiliary,
+    place_beside,
     place_lane,
-    rolling,
 )
-from pipeline.viewing.trace import state_names
+from pipeline.viewing.rerun_styles import LINE_WIDTH, RED, STATE_COLORS, UNKNOWN_COLOR, log_state_styles
+from pipeline.viewing.trace import SILENT, state_names
 from schemas.auxiliary import AuxiliaryColumn
 from schemas.messages import Array
 
@@ -44,13 +40,12 @@ LEGEND, LEGEND_TEXTS = f"{MAP}/legend", f"{MAP}/legend_texts"
 ALARMS, ALARM_NAMES = f"{MAP}/alarms", f"{MAP}/alarm_names"
 WORST, COUNTS = "fleet/worst", "fleet/counts"
 NEAR_THE_LIMIT = (222, 205, 60)
-SILENT_COLOR = (70, 70, 70)
 FRAME_COLOR = (128, 128, 128)
 COUNT_COLORS = {"in alarm": RED, "suspect": STATE_COLORS["suspect"]}
 """the counts that are plotted; a tray that is not judged would hide the few fans that these are about"""
 CELL_RADIUS = 0.44
 ALARM_RADIUS_PX = 6.0  # a fan in alarm is seen even where a cell is a few pixels
-MARGIN_FOR_LEGEND = 0.5  # share of the window kept free at the right of a plot, whose legend names the fan
+PLOTS_ON_A_PAGE = 4
 COLUMNS = 2  # of plots
 
 
@@ -60,7 +55,7 @@ def class_colors() -> list[tuple[int, int, int]]:
     shares = np.linspace(0.0, 1.0, NORMAL_LEVELS)
     normal = [tuple((green + (yellow - green) * share).astype(int).tolist()) for share in shares]
     others = [STATE_COLORS.get(name, UNKNOWN_COLOR) for name in class_names()[NORMAL_LEVELS:-1]]
-    return [*normal, *others, SILENT_COLOR]
+    return [*normal, *others, STATE_COLORS[SILENT]]
 
 
 class RerunFleet:
@@ -104,7 +99,7 @@ class RerunFleet:
             style = rr.SeriesLines(names=name, colors=color, widths=LINE_WIDTH)
             shown.log(count_path(name), style, static=True)
         for place in range(1, places + 1):
-            log_state_styles(shown, place_lane(place), [*state_names(), SILENT, FREE])
+            log_state_styles(shown, place_lane(place), [*state_names(), FREE])
 
     def draw(self, overview: Overview) -> None:
         """Send what has changed."""
@@ -164,68 +159,95 @@ def bounds_of(places: Array) -> rrb.VisualBounds2D:
     return rrb.VisualBounds2D(x_range=(left - margin, right + margin), y_range=(top - margin, bottom + 2 * margin))
 
 
-def overview_tab(bounds: rrb.VisualBounds2D, window_s: float) -> rrb.Container:
+def fleet_blueprint(
+    bounds: rrb.VisualBounds2D,
+    plots: FleetPlots,
+    window_s: float,
+    auxiliary: Sequence[AuxiliaryColumn] = (),
+    *,
+    for_picture: bool = False,
+) -> rrb.Blueprint:
+    """The layout `all` of a fleet. auxiliary: the columns beside command and speed that are drawn."""
+    tabs = [_overview_tab(bounds, window_s)]
+    tabs += [_plots_tab(plots, auxiliary)] if plots.count and not for_picture else []
+    return blueprint(tabs, window_s, MARGIN_FOR_LEGEND[COLUMNS], for_picture=for_picture)
+
+
+def fleet_alarms_blueprint(
+    plots: FleetPlots, window_s: float, auxiliary: Sequence[AuxiliaryColumn] = (), *, for_picture: bool = False
+) -> rrb.Blueprint:
+    """The layout `alarms` of a fleet: its plots, which the fans in alarm get."""
+    lists = rrb.Horizontal(alarms_view(), log_view([FLEET_LOG], "alarm log"), name="alarms")
+    tab = _plots_tab(plots, auxiliary) if plots.count else lists
+    return blueprint([tab], window_s, MARGIN_FOR_LEGEND[COLUMNS], for_picture=for_picture)
+
+
+def _overview_tab(bounds: rrb.VisualBounds2D, window_s: float) -> rrb.Container:
     """The tab with the map, the worst fans, the alarm log, and how many fans were in alarm in the last minutes."""
     cells = rrb.Spatial2DView(origin=f"/{MAP}", name="every fan", visual_bounds=bounds)
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    minutes = rr.TimeRange(start=cursor(seconds=-10 * window_s), end=cursor(seconds=4 * window_s))
     counts = rrb.TimeSeriesView(
         origin=f"/{COUNTS}",
         name="fans in alarm, suspect",
-        axis_x=rolling(10 * window_s, MARGIN_FOR_LEGEND),
+        axis_x=rrb.TimeAxis(view_range=minutes),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
     )
     worst = rrb.TextDocumentView(origin=f"/{WORST}", name="the worst fans")
     return rrb.Vertical(
         rrb.Horizontal(cells, worst, column_shares=[7, 3]),
-        rrb.Horizontal(log_view(FLEET_LOG, "alarm log"), counts, column_shares=[7, 3]),
+        rrb.Horizontal(alarms_view(), log_view([FLEET_LOG], "alarm log"), counts, column_shares=[4, 3, 3]),
         row_shares=[4, 1],
         name="fleet",
     )
 
 
-def plots_tab(plots: FleetPlots, window_s: float, auxiliary: Sequence[AuxiliaryColumn] = ()) -> rrb.Container:
-    """The tab with the plots. auxiliary: the columns beside command and speed that are drawn."""
-    starts = range(1, plots.count + 1, FANS_ON_A_PAGE)
+def _plots_tab(plots: FleetPlots, auxiliary: Sequence[AuxiliaryColumn]) -> rrb.Container:
+    """The tab with the plots."""
+    starts = range(1, plots.count + 1, PLOTS_ON_A_PAGE)
     pages = [
-        _plots_page(plots, range(start, min(start + FANS_ON_A_PAGE, plots.count + 1)), window_s, auxiliary)
-        for start in starts
+        _plots_page(plots, range(start, min(start + PLOTS_ON_A_PAGE, plots.count + 1)), auxiliary) for start in starts
     ]
     return rrb.Tabs(*pages, active_tab=0, name="plots") if len(pages) > 1 else pages[0]
 
 
-def _plots_page(
-    plots: FleetPlots, places: Sequence[int], window_s: float, auxiliary: Sequence[AuxiliaryColumn]
-) -> rrb.Container:
+def _plots_page(plots: FleetPlots, places: Sequence[int], auxiliary: Sequence[AuxiliaryColumn]) -> rrb.Container:
     lanes = rrb.StateTimelineView(
         origin=f"/{SHOWN}/state",
         contents=[f"/{place_lane(place)}" for place in places],
         name="state of the fan in each plot",
-        time_view=rolling(window_s, 0.0),
+        time_view=LINKED,
     )
-    views = [
-        rrb.TimeSeriesView(
-            origin=f"/{SHOWN}/plot_{place}",
-            name=plots.title(place),
-            axis_x=rolling(window_s, MARGIN_FOR_LEGEND),
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
-        )
-        for place in places
-    ]
     beside = [
         rrb.TimeSeriesView(
             origin=f"/{SHOWN}/{column.name}",
-            contents=[f"/{place_auxiliary(place, column.name)}" for place in places],
+            contents=[f"/{place_beside(place, column.name)}" for place in places],
             name=f"{column.title} of the fan in each plot ({column.unit})",
-            axis_x=rolling(window_s, MARGIN_FOR_LEGEND),
+            axis_x=LINKED,
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
         )
         for column in auxiliary
     ]
     return rrb.Horizontal(
-        rrb.Grid(*views, grid_columns=COLUMNS if len(views) > 1 else 1),
-        rrb.Vertical(lanes, *beside, log_view(FLEET_LOG, "alarm log")),
+        rrb.Grid(*(_plot_rows(plots, place) for place in places), grid_columns=COLUMNS if len(places) > 1 else 1),
+        rrb.Vertical(lanes, *beside, alarms_view(), log_view([FLEET_LOG], "alarm log")),
         column_shares=[7, 3],
-        name="plots" if len(places) == plots.count else f"plots from {places[0]} on",
+        name="plots" if len(places) == plots.count else f"plots {places[0]} to {places[-1]}",
     )
+
+
+def _plot_rows(plots: FleetPlots, place: int) -> rrb.Container:
+    speed = rrb.TimeSeriesView(
+        origin=f"/{SHOWN}/plot_{place}",
+        name=plots.title(place),
+        axis_x=LINKED,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+    )
+    kinds = [
+        judged_view([place_beside(place, kind)], f"plot {place}: {title}", None)
+        for kind, title in ((BALANCE, "torque balance"), (SCORE, "score"))
+    ]
+    return rrb.Vertical(speed, rrb.Horizontal(*kinds), row_shares=[5, 3])
 
 
 def _legend_classes() -> list[int]:

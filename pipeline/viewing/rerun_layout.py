@@ -1,71 +1,90 @@
-"""The layout of a view in Rerun: for each tray a tab with plots, state lanes and alarm log, and a tab for the stages.
+"""The layout of a view in Rerun. Live views, view files and pictures have the same: it comes from here alone.
 
-A fleet has other tabs, see `rerun_fleet`. Measured with Rerun 0.41; see docs/how-to/viewing.md. Only the modules whose
-names begin with `rerun_` import rerun.
+`all`: for each tray a tab with plots, state lanes, alarms and log, and a tab for the stages; of a fleet, see
+`rerun_fleet`. `alarms`: the fans that are in alarm or were, and nothing else. `wear`: how each fan's parameters have
+changed, on a timeline of days. All plots of a layout share one time axis. Only the modules whose names begin with
+`rerun_` import rerun. Measured with Rerun 0.41; see docs/how-to/viewing.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.archetypes import TextLogColumns
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
+from pipeline.viewing.rerun_paths import (
+    ALARMS_PATH,
+    BALANCE,
+    DAYS,
+    FAN_PARTS,
+    FANS_ON_A_PAGE,
+    FLEET_LOG,
+    SCORE,
+    STAGES_PATH,
+    TIMELINE,
+    auxiliary_path,
+    fan_path,
+    judged_path,
+    log_path,
+    pages_of,
+    place_beside,
+    place_lane,
+    place_root,
+    state_path,
+    wear_path,
+)
+from pipeline.viewing.rerun_styles import (
+    LINE_WIDTH,
+    balance_style,
+    log_fan_styles,
+    log_state_styles,
+    score_style,
+    speed_style,
+)
 from pipeline.viewing.trace import state_names
+from pipeline.viewing.wear_points import PARAMETERS
 from schemas.auxiliary import AuxiliaryColumn
 from schemas.units import SpeedUnit
 
-TIMELINE = "time"
-STAGES_PATH = "stages"
-FLEET_LOG = "fleet/log"
-SHOWN = "shown"
-FAN_PARTS = ("speed", "deviation", "outside", "not_scored")
-FANS_ON_A_PAGE = 8  # Rerun draws a page of a hundred plots only seven times a second
-MARGIN_FOR_LEGEND = {1: 0.12, 2: 0.25, 4: 0.45}  # columns of plots -> share of the window kept free at the right
-
-LINE_WIDTH = 1.2
-# Lines are legible on the dark and on the light background of Rerun.
-VIOLET = (160, 100, 250)
-GREEN = (25, 160, 75)
-RED = (240, 50, 50)
-GREY = (135, 135, 135)
-STATE_COLORS = {
-    "normal": (38, 150, 76),
-    "suspect": (250, 178, 0),
-    "alarm": (224, 36, 36),
-    "returning": (232, 120, 60),
-    "commissioning": (90, 140, 200),
-    "stopped": (70, 82, 104),
-    "starting": (40, 160, 170),
-}
-UNKNOWN_COLOR = (110, 110, 110)
+LayoutName = Literal["all", "alarms", "wear"]
+ALARMS_ON_A_PAGE = 4
+MARGIN_FOR_LEGEND = {1: 0.12, 2: 0.25, 4: 0.02}
+"""columns of plots -> share of the window kept free at the right; four columns leave no room for legends"""
+MIN_LANE_SHARE = 0.24
+"""of the height, for state lanes, alarms and log"""
+LINKED = rrb.TimeAxis(link="LinkToGlobal")
+_SHARED_VIEW = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc"
+"""where a blueprint keeps the range of all linked time axes (`GLOBAL_VIEW_ID` of Rerun, for which it has no call)"""
 
 
 @dataclass(frozen=True)
 class TrayLayout:
     """The fans of a tray that are shown, counted from 0, and their unit of speed.
 
-    places: in the view of a fleet, the numbers of the plots that have shown each fan. auxiliary: the columns beside
-    command and speed that are drawn.
+    all_fans: how many the tray has. places: in the view of a fleet, the numbers of the plots that have shown each fan.
+    auxiliary: the columns beside command and speed that are drawn. alarmed: the fans that have been in alarm.
     """
 
     name: str
     fans: Sequence[int]
     speed_unit: SpeedUnit
+    all_fans: int
     places: Mapping[int, Sequence[int]] = field(default_factory=dict[int, Sequence[int]])
     auxiliary: Sequence[AuxiliaryColumn] = ()
+    alarmed: Sequence[int] = ()
 
     def roots(self, fan: int) -> list[str]:
         """The entities below which the fan is drawn."""
         return [place_root(place, self.name) for place in self.places.get(fan, ())] or [self.name]
 
-    def lanes(self, fans: Sequence[int]) -> list[str]:
-        """The entities of the state lanes of some fans."""
-        places = sorted({place for fan in fans for place in self.places.get(fan, ())})
-        return [place_lane(place) for place in places] or [state_path(self.name, fan) for fan in fans]
+    def lanes(self, fan: int) -> list[str]:
+        """The entities of the state lane of a fan."""
+        return [place_lane(place) for place in self.places.get(fan, ())] or [state_path(self.name, fan)]
 
     @property
     def log(self) -> str:
@@ -73,63 +92,7 @@ class TrayLayout:
         return FLEET_LOG if self.places else log_path(self.name)
 
 
-def fan_path(root: str, fan: int, part: str) -> str:
-    """Entity of one fan below the root of its tray, which is the tray's name but in a fleet.
-
-    `part` is `speed` (measured, twin), `deviation`, `outside` or `not_scored`.
-    """
-    return f"{root}/fan_{fan}/{part}"
-
-
-def state_path(tray: str, fan: int) -> str:
-    """Entity of a fan's state lane."""
-    return f"{tray}/state/fan_{fan}"
-
-
-def auxiliary_path(tray: str, column: str, fan: int | None = None) -> str:
-    """Entity of what a fan's source measures beside command and speed; without a fan, that of all fans."""
-    return f"{tray}/{column}" if fan is None else f"{tray}/{column}/fan_{fan}"
-
-
-def log_path(tray: str) -> str:
-    """Entity of a tray's log."""
-    return f"{tray}/log"
-
-
-def place_root(place: int, tray: str) -> str:
-    """In a fleet, the root of a tray's fans in plot number `place`."""
-    return f"{SHOWN}/plot_{place}/{tray}"
-
-
-def place_in(root: str) -> int | None:
-    """The number of the plot whose root begins so; None: it is no root of a plot."""
-    shown, _, name = root.partition("/")
-    return int(name.removeprefix("plot_")) if shown == SHOWN and name.startswith("plot_") else None
-
-
-def place_lane(place: int) -> str:
-    """In a fleet, the entity of the state lane of plot number `place`."""
-    return f"{SHOWN}/state/plot_{place}"
-
-
-def place_auxiliary(place: int, column: str) -> str:
-    """In a fleet, the entity of a column beside command and speed, for the fan in plot number `place`."""
-    return f"{SHOWN}/{column}/plot_{place}"
-
-
-def speed_style(unit: SpeedUnit, width: float, name: str = "") -> rr.Measurements:
-    """Style of the series of a fan's `speed`: measured, twin with band, and the lowest and highest ends of the band,
-    which are not seen: an axis fits the lines, not the bands around them.
-
-    Width 0 shows the band only. `name` is that of the fan, where the plot has another title.
-    """
-    prefix = f"{name} " if name else ""
-    twin = f"{prefix}twin ± 2σ ({unit})"
-    return rr.Measurements.from_fields(
-        names=[f"{prefix}measured ({unit})", twin, twin, twin],
-        colors=[VIOLET, GREEN, GREEN, GREEN],
-        widths=[width, width, 0.0, 0.0],
-    )
+FanPlot = tuple[TrayLayout, int]
 
 
 def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
@@ -137,110 +100,203 @@ def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
     for fan in tray.fans:
         log_fan_styles(recording, tray.name, fan, speed_style(tray.speed_unit, LINE_WIDTH))
         log_state_styles(recording, state_path(tray.name, fan), state_names())
+    for page, fans in enumerate(pages_of(tray.fans)):
+        recording.log(judged_path(tray.name, BALANCE, page), balance_style(len(fans)), static=True)
+        recording.log(judged_path(tray.name, SCORE, page), score_style(len(fans)), static=True)
 
 
-def log_fan_styles(recording: rr.RecordingStream, root: str, fan: int, speed: rr.Measurements) -> None:
-    """Log the static names, colours and widths of the series of a fan; `speed`: see `speed_style`."""
-    deviation = rr.Measurements.from_fields(names="area in alarm", colors=RED, widths=0.0)
-    recording.log(fan_path(root, fan, "speed"), speed, static=True)
-    recording.log(fan_path(root, fan, "deviation"), deviation, static=True)
-    outside = rr.SeriesPoints(names="dots outside band", colors=RED, marker_sizes=2.0)
-    recording.log(fan_path(root, fan, "outside"), outside, static=True)
-    not_scored = rr.SeriesLines(names="not scored", colors=GREY, widths=LINE_WIDTH)
-    recording.log(fan_path(root, fan, "not_scored"), not_scored, static=True)
+class _Linked(rrb.Blueprint):
+    """A blueprint whose linked time axes all show one range."""
+
+    def __init__(self, *parts: Any, shown: rr.TimeRange, **options: bool) -> None:
+        super().__init__(*parts, **options)
+        self._axis = rrb.TimeAxis(view_range=shown)
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        super()._log_to_stream(stream)
+        stream.log(f"{_SHARED_VIEW}/TimeAxis", self._axis)
 
 
-def log_state_styles(recording: rr.RecordingStream, path: str, names: Sequence[str]) -> None:
-    """Log the static colours of a lane that shows these states."""
-    colors = [STATE_COLORS.get(name, UNKNOWN_COLOR) for name in names]
-    recording.log(path, rr.StateConfiguration(values=list(names), colors=colors), static=True)
+def blueprint(
+    tabs: Sequence[rrb.Container | rrb.View], window_s: float, margin: float, *, for_picture: bool = False
+) -> rrb.Blueprint:
+    """The whole layout of some tabs; it follows the newest data. A picture has no panels and no tab for the stages.
 
-
-def blueprint(tabs: Sequence[rrb.Container | rrb.View], *, for_picture: bool = False) -> rrb.Blueprint:
-    """The whole layout of some tabs; it follows the newest data. A picture has no panels and no tab for the stages."""
+    window_s: length of time shown. margin: the share of it that is kept free at the right.
+    """
     if not for_picture:
         tabs = [*tabs, rrb.TextDocumentView(origin=f"/{STAGES_PATH}", name="stages")]
-    return rrb.Blueprint(
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    window = rr.TimeRange(start=cursor(seconds=-window_s), end=cursor(seconds=margin * window_s))
+    return _tabbed(tabs, TIMELINE, window, for_picture=for_picture)
+
+
+def _tabbed(
+    tabs: Sequence[rrb.Container | rrb.View], timeline: str, shown: rr.TimeRange, *, for_picture: bool
+) -> rrb.Blueprint:
+    return _Linked(
         rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0],
         rrb.TopPanel(state="hidden" if for_picture else "expanded"),
-        rrb.TimePanel(timeline=TIMELINE, play_state="following", state="hidden" if for_picture else "collapsed"),
+        rrb.TimePanel(timeline=timeline, play_state="following", state="hidden" if for_picture else "collapsed"),
+        shown=shown,
         auto_views=False,
         collapse_panels=True,
     )
 
 
-def tray_tab(tray: TrayLayout, window_s: float) -> rrb.Container:
-    """The tab of a tray, with a window of `window_s` seconds."""
-    starts = range(0, len(tray.fans), FANS_ON_A_PAGE)
-    pages = [_page(tray, tray.fans[start : start + FANS_ON_A_PAGE], window_s) for start in starts]
+def trays_blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool = False) -> rrb.Blueprint:
+    """The layout `all` of some trays."""
+    margin = max(MARGIN_FOR_LEGEND[columns_of(len(page))] for tray in trays for page in pages_of(tray.fans))
+    return blueprint([_tray_tab(tray) for tray in trays], window_s, margin, for_picture=for_picture)
+
+
+def alarms_blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool = False) -> rrb.Blueprint:
+    """The layout `alarms` of some trays: the fans that are in alarm or were, four on a page."""
+    plots = [(tray, fan) for tray in trays for fan in tray.alarmed]
+    pages = [plots[start : start + ALARMS_ON_A_PAGE] for start in range(0, len(plots), ALARMS_ON_A_PAGE)]
+    tabs = [page_tab("fans that were in alarm" if len(pages) == 1 else _names(page), page) for page in pages]
+    lists = rrb.Horizontal(alarms_view(), log_view([tray.log for tray in trays], "alarm log"), name="alarms")
+    margin = max((MARGIN_FOR_LEGEND[columns_of(len(page))] for page in pages), default=0.0)
+    return blueprint(tabs or [lists], window_s, margin, for_picture=for_picture)
+
+
+def wear_blueprint(trays: Sequence[str], *, for_picture: bool = False) -> rrb.Blueprint:
+    """The layout `wear`: a tab for each of these trays."""
+    tabs = [_wear_tab(tray) for tray in trays]
+    everything = rr.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
+    return _tabbed(tabs, DAYS, everything, for_picture=for_picture)
+
+
+def _wear_tab(tray: str) -> rrb.Container:
+    views = [
+        rrb.TimeSeriesView(
+            origin=f"/{wear_path(name, tray)}",
+            name=f"{tray} / {words.title} since commissioning ({words.unit})",
+            axis_x=LINKED,
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+        )
+        for name, words in PARAMETERS.items()
+    ]
+    return rrb.Grid(*views, grid_columns=2, name=tray)
+
+
+def columns_of(plots: int) -> int:
+    """In how many columns so many plots stand."""
+    return 1 if plots <= 2 else 2 if plots <= 4 else 4
+
+
+def _tray_tab(tray: TrayLayout) -> rrb.Container:
+    pages = [
+        page_tab(_page_name(tray, fans), [(tray, fan) for fan in fans], tray.auxiliary) for fans in pages_of(tray.fans)
+    ]
     return rrb.Tabs(*pages, active_tab=0, name=tray.name) if len(pages) > 1 else pages[0]
 
 
-def _page(tray: TrayLayout, fans: Sequence[int], window_s: float) -> rrb.Container:
-    """Up to `FANS_ON_A_PAGE` plots, their state lanes and the tray's log."""
-    name = tray.name if len(fans) == len(tray.fans) else f"{tray.name} / fans {fans[0]} to {fans[-1]}"
-    columns = 1 if len(fans) <= 2 else 2 if len(fans) <= 4 else 4
-    axis = rolling(window_s, MARGIN_FOR_LEGEND[columns])
+def _page_name(tray: TrayLayout, fans: Sequence[int]) -> str:
+    return tray.name if len(fans) == len(tray.fans) else f"{tray.name} / fans {fans[0]} to {fans[-1]}"
+
+
+def _names(plots: Iterable[FanPlot]) -> str:
+    return ", ".join(f"{tray.name}/{fan}" for tray, fan in plots)
+
+
+def page_tab(name: str, plots: Sequence[FanPlot], auxiliary: Sequence[AuxiliaryColumn] = ()) -> rrb.Container:
+    """Up to `FANS_ON_A_PAGE` fans, each with speed above torque balance and score; their lanes, the alarms, the log."""
+    columns = columns_of(len(plots))
     lanes = rrb.StateTimelineView(
-        origin="/" if tray.places else f"/{tray.name}",
-        contents=[f"/{path}" for path in tray.lanes(fans)],
-        name=f"{tray.name} / state of each fan",
-        time_view=rolling(window_s, 0.0),
+        origin="/",
+        contents=[f"/{path}" for tray, fan in plots for path in tray.lanes(fan)],
+        name="state of each fan",
+        time_view=LINKED,
     )
-    lane_share = (1.7 + len(fans)) / 24
-    plots: rrb.Container = rrb.Grid(*(_fan_view(tray, fan, axis) for fan in fans), grid_columns=columns)
-    if tray.auxiliary:
-        measured = [_auxiliary_view(tray, column, fans, window_s) for column in tray.auxiliary]
-        plots = rrb.Vertical(plots, rrb.Horizontal(*measured), row_shares=[3, 1])
+    lane_share = max(MIN_LANE_SHARE, (1.6 + len(plots)) / 25)
+    above: rrb.Container = rrb.Grid(*(_fan_rows(*plot, columns) for plot in plots), grid_columns=columns)
+    if auxiliary:
+        beside = [_auxiliary_view(plots, column) for column in auxiliary]
+        above = rrb.Vertical(above, rrb.Horizontal(*beside), row_shares=[4, 1])
+    logs = list(dict.fromkeys(tray.log for tray, _ in plots))
     return rrb.Vertical(
-        plots,
-        rrb.Horizontal(
-            lanes, log_view(tray.log, "alarm log" if tray.places else f"{tray.name} / alarm log"), column_shares=[3, 2]
-        ),
+        above,
+        rrb.Horizontal(lanes, alarms_view(), log_view(logs, "alarm log"), column_shares=[4, 4, 3]),
         row_shares=[1 - lane_share, lane_share],
         name=name,
     )
 
 
-def _auxiliary_view(
-    tray: TrayLayout, column: AuxiliaryColumn, fans: Sequence[int], window_s: float
-) -> rrb.TimeSeriesView:
+def _auxiliary_view(plots: Sequence[FanPlot], column: AuxiliaryColumn) -> rrb.TimeSeriesView:
     """What is measured of some fans beside command and speed: one line for each."""
+    contents = [path for tray, fan in plots for path in _beside(tray, fan, column.name)]
     return rrb.TimeSeriesView(
-        origin=f"/{auxiliary_path(tray.name, column.name)}",
-        contents=[f"/{auxiliary_path(tray.name, column.name, fan)}" for fan in fans],
-        name=f"{tray.name} / {column.title} ({column.unit})",
-        axis_x=rolling(window_s, 0.0),
+        origin="/",
+        contents=[f"/{path}" for path in contents],
+        name=f"{column.title} ({column.unit})",
+        axis_x=LINKED,
     )
 
 
-def _fan_view(tray: TrayLayout, fan: int, axis: rrb.TimeAxis) -> rrb.TimeSeriesView:
+def _beside(tray: TrayLayout, fan: int, column: str) -> list[str]:
+    places = tray.places.get(fan, ())
+    return [place_beside(place, column) for place in places] or [auxiliary_path(tray.name, column, fan)]
+
+
+def _fan_rows(tray: TrayLayout, fan: int, columns: int) -> rrb.Container:
     fill, lines = speed_style(tray.speed_unit, 0.0), speed_style(tray.speed_unit, LINE_WIDTH)
     roots = tray.roots(fan)
-    return rrb.TimeSeriesView(
+    speed = rrb.TimeSeriesView(
         origin=f"/{roots[0]}/fan_{fan}",
         contents=[f"/{fan_path(root, fan, part)}" for root in roots for part in FAN_PARTS],
         name=f"{tray.name} / fan {fan} speed ({tray.speed_unit})",
-        axis_x=axis,
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+        axis_x=LINKED,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=columns < FANS_ON_A_PAGE // 2),
         # A single band is faint. Drawing the same data twice makes it solid and sends no more bytes.
         overrides={fan_path(root, fan, "speed"): [fill.visualizer(), lines.visualizer()] for root in roots},
     )
+    page, number = divmod(fan, FANS_ON_A_PAGE)
+    on_page = min(FANS_ON_A_PAGE, tray.all_fans - page * FANS_ON_A_PAGE)
+    names = (f"{tray.name} / fan {fan} torque balance", f"{tray.name} / fan {fan} score")
+    if columns == 4:  # narrow: a longer name is cut off
+        names = (f"balance {fan}", f"score {fan}")
+    places = tray.places.get(fan, ())
+    styles = {BALANCE: balance_style(on_page, number), SCORE: score_style(on_page, number)}
+    kinds = [
+        judged_view(
+            [place_beside(place, kind) for place in places] or [judged_path(tray.name, kind, page)],
+            name,
+            None if places else style,
+        )
+        for (kind, style), name in zip(styles.items(), names, strict=True)
+    ]
+    return rrb.Vertical(speed, rrb.Horizontal(*kinds), row_shares=[5, 3])
 
 
-def log_view(path: str, name: str) -> rrb.TextLogView:
-    """The view of a log."""
+def judged_view(paths: Sequence[str], name: str, style: rr.SeriesLines | None) -> rrb.TimeSeriesView:
+    """The view of a fan's torque balance beside what is expected, or of its score beside the limit.
+
+    style: shows the series of this fan, where an entity has those of others too.
+    """
+    return rrb.TimeSeriesView(
+        origin=f"/{paths[0]}",
+        contents=[f"/{path}" for path in paths],
+        name=name,
+        axis_x=LINKED,
+        plot_legend=rrb.PlotLegend(visible=False),
+        overrides={path: style.visualizer() for path in paths} if style else None,
+    )
+
+
+def alarms_view() -> rrb.TextDocumentView:
+    """The view of the table of alarms."""
+    return rrb.TextDocumentView(origin=f"/{ALARMS_PATH}", name="alarms")
+
+
+def log_view(paths: Sequence[str], name: str) -> rrb.TextLogView:
+    """The view of one or more logs."""
     return rrb.TextLogView(
-        origin=f"/{path}",
+        origin="/",
+        contents=[f"/{path}" for path in paths],
         name=name,
         columns=TextLogColumns(
             timeline_columns=[TimelineColumn(TIMELINE, visible=False)],  # too narrow to read: lines begin with it
             text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
         ),
     )
-
-
-def rolling(window_s: float, margin: float) -> rrb.TimeAxis:
-    """A window that follows the cursor; the share `margin` of it stays empty at the right."""
-    cursor = rrb.TimeRangeBoundary.cursor_relative
-    return rrb.TimeAxis(view_range=rr.TimeRange(start=cursor(seconds=-window_s), end=cursor(seconds=margin * window_s)))

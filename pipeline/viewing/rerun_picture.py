@@ -13,7 +13,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -24,12 +24,15 @@ import rerun as rr
 import rerun.blueprint as rrb
 from PIL import Image
 from rerun.chunk import Chunk, RrdReader
-from rerun.experimental import ViewerClient
+from rerun.experimental import View, ViewerClient
 
 from pipeline.errors import UserError
-from pipeline.viewing.rerun_fleet import CELLS, MAP, bounds_of, overview_tab
-from pipeline.viewing.rerun_layout import TIMELINE, TrayLayout, blueprint, place_in, tray_tab
+from pipeline.viewing.plot_places import FleetPlots
+from pipeline.viewing.rerun_fleet import CELLS, MAP, bounds_of
+from pipeline.viewing.rerun_layout import LayoutName, TrayLayout, wear_blueprint
+from pipeline.viewing.rerun_paths import DAYS, TIMELINE, WEAR, place_in
 from pipeline.viewing.rerun_sink import APPLICATION, LOOPBACK, rerun_program
+from pipeline.viewing.site_layout import SiteLayout
 from schemas.auxiliary import AUXILIARY
 from schemas.messages import Array
 from schemas.units import NS_PER_S, SpeedUnit
@@ -62,6 +65,7 @@ class _Rrd:
     Attributes:
         trays: by name, with the fans that have been drawn.
         map_places: (n, 2) what is on the map of a fleet; None: it is no fleet.
+        worn: the trays with wear; last_day_ns: time of its newest point, 0: there is none.
     """
 
     chunks: Sequence[Chunk]
@@ -69,6 +73,8 @@ class _Rrd:
     map_places: Array | None
     first_ns: int
     last_ns: int
+    worn: Sequence[str] = ()
+    last_day_ns: int = 0
 
 
 def has_vulkan_driver() -> bool:
@@ -89,6 +95,7 @@ def draw_picture(
     at_s: float | None = None,
     window_s: float = 30.0,
     view: str | None = None,
+    layout: LayoutName = "all",
 ) -> Picture:
     """Draw a view file written by the viewer stage.
 
@@ -98,13 +105,14 @@ def draw_picture(
         fans: which fans, counted from 0; the first eight if not given.
         at_s: end of the picture, s after the first sample of the file; its last sample if not given.
         window_s: length of time shown, s.
-        view: part of the name of the one view to draw; the whole window if not given.
+        view: part of the name of the one view to draw, of several that of a speed; the whole window if not given.
+        layout: which; `alarms` is of all fans that were in alarm, unless a tray is given.
 
     Raises:
         PictureError: no driver, no such file, tray, fan or view, or the viewer did not draw it in time.
     """
     contents = _read(rrd)
-    tab = _tab(rrd, contents, tray, fans, window_s)
+    blueprint = _blueprint(rrd, contents, layout, tray, fans, window_s)
     if not has_vulkan_driver():
         raise PictureError(
             "no Vulkan driver found, which the headless viewer needs: apt-get install mesa-vulkan-drivers"
@@ -116,15 +124,20 @@ def draw_picture(
     with _headless_viewer() as viewer:
         began_s = time.monotonic()
         recording = rr.RecordingStream(APPLICATION)
-        recording.connect_grpc(viewer.url, default_blueprint=blueprint([tab], for_picture=True))
+        recording.connect_grpc(viewer.url, default_blueprint=blueprint)
         recording.send_chunks(contents.chunks)
         recording.flush()
-        _wait_until_loaded(viewer, contents.last_ns)
-        viewer.set_time(TIMELINE, timestamp=np.datetime64(end_ns, "ns"), play_state="paused")
+        _wait_until_loaded(viewer, TIMELINE, contents.last_ns)
+        timeline = DAYS if layout == "wear" else TIMELINE
+        if layout == "wear":
+            _wait_until_loaded(viewer, DAYS, contents.last_day_ns)
+            end_ns = contents.last_day_ns
+        viewer.set_time(timeline, timestamp=np.datetime64(end_ns, "ns"), play_state="paused")
         state = viewer.get_state()
         chosen = None
         if view is not None:
-            chosen = next((shown.view_id for shown in state.views if view in shown.name), None)
+            matching = sorted((shown for shown in state.views if view in shown.name), key=_speeds_first)
+            chosen = matching[0].view_id if matching else None
             if chosen is None:
                 names = ", ".join(sorted(repr(shown.name) for shown in state.views))
                 raise PictureError(f"{rrd}: no view called {view!r}; there are {names}")
@@ -149,18 +162,24 @@ def _read(rrd: Path) -> _Rrd:
     on_map: list[Array] = []
     times: list[Array] = []
     auxiliary: set[tuple[str, str]] = set()
+    alarmed: dict[tuple[str, int], None] = {}
+    worn: dict[str, None] = {}
+    last_day_ns = 0
     for chunk in chunks:
-        path = chunk.entity_path.strip("/")
-        if path.endswith("/speed"):
-            batch = chunk.to_record_batch()
-            if chunk.is_static:
-                _add_fan(trays, path, batch.column("Measurements:names")[0].as_py()[0])
-            else:
-                times.append(_times_ns(batch))
-        elif path.startswith(MAP) and chunk.is_static and "Points2D:positions" in chunk.to_record_batch().schema.names:
-            on_map.append(np.array(chunk.to_record_batch().column("Points2D:positions")[0].as_py()))
-        elif path == CELLS:
-            times.append(_times_ns(chunk.to_record_batch()))
+        path, batch = chunk.entity_path.strip("/"), chunk.to_record_batch()
+        if path.endswith("/speed") and chunk.is_static:
+            _add_fan(trays, path, batch.column("Measurements:names")[0].as_py()[0])
+        elif path.startswith(MAP) and chunk.is_static and "Points2D:positions" in batch.schema.names:
+            on_map.append(np.array(batch.column("Points2D:positions")[0].as_py()))
+        elif chunk.is_static:
+            continue
+        elif path.endswith("/speed") or path == CELLS:
+            times.append(_times_ns(batch))
+        elif path.endswith("/deviation"):
+            alarmed[_fan_of(path)] = None
+        elif path.startswith(f"{WEAR}/"):
+            worn[path.split("/")[2]] = None
+            last_day_ns = max(last_day_ns, int(_times_ns(batch, DAYS).max()))
         elif path.count("/") == 2:
             tray, column, _ = path.split("/")
             auxiliary.add((tray, column))
@@ -170,20 +189,32 @@ def _read(rrd: Path) -> _Rrd:
     map_places = np.concatenate(on_map) if on_map else None
     for name, layout in trays.items():
         beside = [column for column in AUXILIARY if (name, column.name) in auxiliary]
-        trays[name] = replace(layout, auxiliary=beside)
-    return _Rrd(chunks, trays, map_places, int(all_times.min()), int(all_times.max()))
+        in_alarm = [fan for tray, fan in alarmed if tray == name]
+        trays[name] = replace(layout, auxiliary=beside, alarmed=in_alarm)
+    first_ns, last_ns = int(all_times.min()), int(all_times.max())
+    return _Rrd(chunks, trays, map_places, first_ns, last_ns, tuple(worn), last_day_ns)
+
+
+def _fan_of(path: str) -> tuple[str, int]:
+    """Tray and fan of one of a fan's entities, `[place/]tray/fan_3/speed`."""
+    *_, tray, fan, _ = path.split("/")
+    return tray, int(fan.removeprefix("fan_"))
 
 
 def _add_fan(trays: dict[str, TrayLayout], path: str, name: str) -> None:
     """Add the fan with this entity of its speed, `[place/]tray/fan_3/speed`, whose first series has this name."""
-    *root, tray, fan, _ = path.split("/")
-    number, place = int(fan.removeprefix("fan_")), place_in("/".join(root))
+    (tray, number), place = _fan_of(path), place_in("/".join(path.split("/")[:-3]))
     unit: SpeedUnit = "rpm" if name.endswith("(rpm)") else "rad/s"
-    known = trays.get(tray, TrayLayout(tray, [], unit))
+    known = trays.get(tray, TrayLayout(tray, [], unit, 0))
     places = dict(known.places)
     if place is not None:
         places[number] = [*places.get(number, ()), place]
-    trays[tray] = replace(known, fans=sorted({*known.fans, number}), places=places)
+    fans = sorted({*known.fans, number})
+    trays[tray] = replace(known, fans=fans, all_fans=len(fans), places=places)
+
+
+def _speeds_first(view: View) -> tuple[bool, str]:
+    return "speed" not in view.name, view.name
 
 
 def _until(contents: _Rrd, end_ns: int) -> _Rrd:
@@ -200,14 +231,31 @@ def _until(contents: _Rrd, end_ns: int) -> _Rrd:
     return replace(contents, chunks=chunks, last_ns=min(end_ns, contents.last_ns))
 
 
-def _times_ns(batch: pa.RecordBatch) -> Array:
-    return np.asarray(batch.column(TIMELINE)).astype("datetime64[ns]").astype(np.int64)
+def _times_ns(batch: pa.RecordBatch, timeline: str = TIMELINE) -> Array:
+    return np.asarray(batch.column(timeline)).astype("datetime64[ns]").astype(np.int64)
 
 
-def _tab(rrd: Path, contents: _Rrd, tray: str | None, fans: Sequence[int] | None, window_s: float) -> rrb.Container:
+def _blueprint(
+    rrd: Path, contents: _Rrd, layout: LayoutName, tray: str | None, fans: Sequence[int] | None, window_s: float
+) -> rrb.Blueprint:
+    if layout == "wear":
+        if not contents.worn or (tray is not None and tray not in contents.worn):
+            of = f" of {tray}" if tray else ""
+            raise PictureError(f"{rrd}: no wear{of}: a fan has its first point some time after it was commissioned")
+        return wear_blueprint([tray] if tray else contents.worn, for_picture=True)
     if contents.map_places is not None and tray is None and fans is None:
-        return overview_tab(bounds_of(contents.map_places), window_s)
-    return tray_tab(_layout(rrd, contents, tray, fans), window_s)
+        count = max(
+            (place for each in contents.trays.values() for of in each.places.values() for place in of), default=0
+        )
+        site = SiteLayout((), window_s, FleetPlots((), count), bounds_of(contents.map_places))
+        return site.blueprint(layout, for_picture=True)
+    if layout == "alarms" and tray is None and fans is None:
+        trays = [*contents.trays.values()]
+    else:
+        trays = [_layout(rrd, contents, tray, fans)]
+    if layout == "alarms" and not any(each.alarmed for each in trays):
+        raise PictureError(f"{rrd}: no fan{f' of {tray}' if tray else ''} was in alarm")
+    return SiteLayout(tuple(trays), window_s).blueprint(layout, for_picture=True)
 
 
 def _layout(rrd: Path, contents: _Rrd, tray: str | None, fans: Sequence[int] | None) -> TrayLayout:
@@ -229,8 +277,8 @@ def _layout(rrd: Path, contents: _Rrd, tray: str | None, fans: Sequence[int] | N
 
 
 @contextmanager
-def _headless_viewer() -> Iterator[ViewerClient]:
-    """A new viewer on a free loopback port, ended on exit."""
+def _headless_viewer(files: Sequence[Path] = ()) -> Iterator[ViewerClient]:
+    """A new viewer on a free loopback port with these views and layouts, ended on exit."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         port = probe.getsockname()[1]
@@ -238,7 +286,7 @@ def _headless_viewer() -> Iterator[ViewerClient]:
     command = [rerun_program(), "--headless", "--bind", LOOPBACK, "--port", str(port), "--window-size", size]
     with tempfile.TemporaryFile() as output:
         process = subprocess.Popen(
-            [*command, "--hide-welcome-screen", "--expect-data-soon"],
+            [*command, "--hide-welcome-screen", "--expect-data-soon", *files],
             stdout=output,
             stderr=output,
             env={**os.environ, "RERUN_APP_ONLY": "true", "RUST_LOG": "error"},
@@ -266,11 +314,11 @@ def _connect(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
     raise ConnectionError("it did not start")
 
 
-def _wait_until_loaded(viewer: ViewerClient, last_ns: int) -> None:
+def _wait_until_loaded(viewer: ViewerClient, timeline: str, last_ns: int) -> None:
     deadline = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline:
         state = viewer.get_state()
-        ends = [line.end for entry in state.recordings for line in entry.timelines if line.name == TIMELINE]
+        ends = [line.end for entry in state.recordings for line in entry.timelines if line.name == timeline]
         # Rerun reports times rounded to floating point.
         if state.views and any(end is not None and end >= last_ns - 1_000 for end in ends):
             return
@@ -279,15 +327,16 @@ def _wait_until_loaded(viewer: ViewerClient, last_ns: int) -> None:
 
 
 def _stable_screenshot(viewer: ViewerClient, view_id: str | None) -> bytes:
-    """The first screenshot that equals the one before it."""
+    """The first screenshot that equals the one before it. One that a busy machine draws too slowly is left out."""
     deadline = time.monotonic() + TIMEOUT_S
-    before = viewer.take_screenshot(view_id)
+    before = b""
     while time.monotonic() < deadline:
+        with suppress(TimeoutError):
+            now = viewer.take_screenshot(view_id)
+            if now == before:
+                return now
+            before = now
         time.sleep(POLL_S)
-        now = viewer.take_screenshot(view_id)
-        if now == before:
-            return now
-        before = now
     raise ConnectionError(f"the picture still changed after {TIMEOUT_S:.0f} s")
 
 

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -17,7 +16,6 @@ import numpy as np
 
 os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")  # otherwise every start warns of the missing footer
 import rerun as rr
-import rerun.blueprint as rrb
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import StageError
@@ -27,20 +25,15 @@ from pipeline.viewing.fleet_view import Overview
 from pipeline.viewing.loopback import LOOPBACK, check_free
 from pipeline.viewing.plot_places import FleetPlots
 from pipeline.viewing.rerun_bands import RerunBands
-from pipeline.viewing.rerun_fleet import RerunFleet, overview_tab, plots_tab
-from pipeline.viewing.rerun_layout import (
-    FLEET_LOG,
-    STAGES_PATH,
-    TIMELINE,
-    TrayLayout,
-    blueprint,
-    log_path,
-    log_styles,
-    tray_tab,
-)
+from pipeline.viewing.rerun_fleet import RerunFleet
+from pipeline.viewing.rerun_layout import LayoutName, TrayLayout, log_styles
+from pipeline.viewing.rerun_paths import ALARMS_PATH, FLEET_LOG, STAGES_PATH, TIMELINE, log_path
+from pipeline.viewing.rerun_wear import RerunWear
+from pipeline.viewing.site_layout import SiteLayout
 from pipeline.viewing.trace import Trace
 from pipeline.viewing.view_file import ViewFile
-from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
+from pipeline.viewing.wear_points import WearPoints
+from schemas.auxiliary import AUXILIARY
 from schemas.messages import Array
 from schemas.units import SpeedUnit
 
@@ -95,6 +88,7 @@ class RerunSink:
         trays: Sequence[TrayConfig],
         fleet: FleetPlots | None,
         started_t_ns: int,
+        layout: LayoutName,
         window_s: float,
         file: Path | None,
         grpc_port: int | None,
@@ -103,7 +97,7 @@ class RerunSink:
     ) -> None:
         """Open `file`, a data server at `grpc_port` and a page for browsers at `web_port`; None leaves one out.
 
-        fleet: None shows every fan with its band.
+        layout: which of the layouts is shown. fleet: None shows every fan with its band.
 
         Raises:
             StageError: the file cannot be written, or a port is taken.
@@ -114,11 +108,11 @@ class RerunSink:
         self._recording = rr.RecordingStream(APPLICATION)
         self._bands = RerunBands(self._recording)
         self._fleet = RerunFleet(self._recording, trays) if fleet else None
-        layouts = [] if fleet else [TrayLayout(tray.name, range(tray.fans), tray.speed_unit) for tray in trays]
-        self._layouts = {layout.name: layout for layout in layouts}
-        self._window_s = window_s
-        self._plots = fleet
-        self._fleet_auxiliary: list[AuxiliaryColumn] = []
+        layouts = [] if fleet else [TrayLayout(t.name, range(t.fans), t.speed_unit, t.fans) for t in trays]
+        bounds = self._fleet.bounds if self._fleet else None
+        self._layout = SiteLayout(tuple(layouts), window_s, fleet, bounds)
+        self._wear = RerunWear(self._recording)
+        self._layout_name: LayoutName = layout
         self._late = False
         self._file = _open_view(file) if file is not None else None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
@@ -128,12 +122,12 @@ class RerunSink:
         if grpc_port is not None:
             server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=memory_limit)
             sinks.append(server)
-        self._recording.set_sinks(*sinks, default_blueprint=blueprint(self._tabs()))
+        self._recording.set_sinks(*sinks, default_blueprint=self._layout.blueprint(layout))
         if self._file is not None:
             self._file.release_pipe()
         self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
-        for layout in layouts:
-            log_styles(self._recording, layout)
+        for of_tray in layouts:
+            log_styles(self._recording, of_tray)
         if fleet and self._fleet:
             self._fleet.log_styles(fleet.count)
         self.flush()  # the styles reach the file first, so that the file of a killed viewer has them
@@ -145,23 +139,29 @@ class RerunSink:
         self._bands.draw(trace)
 
     def _lay_out(self, trace: Trace) -> None:
-        """Give what a source measures beside command and speed its plots, when it comes for the first time."""
-        layout = self._layouts.get(trace.tray)
-        drawn = layout.auxiliary if layout else self._fleet_auxiliary
-        if trace.auxiliary.keys() <= {column.name for column in drawn}:
-            return
-        shown = [column for column in AUXILIARY if column in drawn or column.name in trace.auxiliary]
-        if layout:
-            self._layouts[trace.tray] = replace(layout, auxiliary=shown)
-        else:
-            self._fleet_auxiliary = shown
-        self._recording.send_blueprint(blueprint(self._tabs()))
+        """Give its plots to what a source measures beside command and speed, when it comes for the first time, and in
+        the layout `alarms` to a fan that goes into alarm for the first time."""
+        before, drawn = self._layout, self._layout.auxiliary_of(trace.tray)
+        if not trace.auxiliary.keys() <= {column.name for column in drawn}:
+            shown = [column for column in AUXILIARY if column in drawn or column.name in trace.auxiliary]
+            self._layout = self._layout.with_auxiliary(trace.tray, shown)
+        if self._layout_name == "alarms":
+            in_alarm = [trace.fan_numbers[column] for column in np.flatnonzero(trace.in_alarm.any(axis=0)).tolist()]
+            self._layout = self._layout.with_alarmed(trace.tray, in_alarm)
+        if self._layout is not before:
+            self._recording.send_blueprint(self._layout.blueprint(self._layout_name))
 
-    def _tabs(self) -> list[rrb.Container]:
-        if not (self._plots and self._fleet):
-            return [tray_tab(each, self._window_s) for each in self._layouts.values()]
-        tabs = [overview_tab(self._fleet.bounds, self._window_s)]
-        return [*tabs, plots_tab(self._plots, self._window_s, self._fleet_auxiliary)] if self._plots.count else tabs
+    def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:
+        """Send the newest points of the wear of some fans."""
+        self._wear.draw(tray, points)
+
+    def show_alarms(self, table: str, t_ns: int) -> None:
+        """Show the table of alarms from `t_ns` on."""
+        self._recording.send_columns(
+            ALARMS_PATH,
+            [rr.TimeColumn(TIMELINE, timestamp=np.array([t_ns], "datetime64[ns]"))],
+            rr.TextDocument.columns(text=[table], media_type=[rr.MediaType.MARKDOWN]),
+        )
 
     def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
         """Set the state of a fan's lane from each time on."""
@@ -186,8 +186,8 @@ class RerunSink:
         for path, group in groupby(sorted(placed, key=itemgetter(0)), key=itemgetter(0)):
             of_log = [line for _, line in group]
             times = np.array([line.t_ns for line in of_log]).astype("datetime64[ns]")
-            clocks = [text.split("T")[1] for text in np.datetime_as_string(times, unit="ms").tolist()]
-            trays = [f"{line.tray}: " if self._fleet else "" for line in of_log]
+            clocks = [text.split("T")[1] for text in np.datetime_as_string(times, unit="s").tolist()]
+            trays = [f"{line.tray} " if self._fleet else "" for line in of_log]
             texts = [f"{clock}  {tray}{line.text}" for clock, tray, line in zip(clocks, trays, of_log, strict=True)]
             columns = rr.TextLog.columns(text=texts, level=[line.level for line in of_log])
             self._recording.send_columns(path, [rr.TimeColumn(TIMELINE, timestamp=times)], columns)

@@ -1,9 +1,12 @@
-"""The data drawn for a tray: scores joined in time, in the tray's display unit. Shared by viewer and plots."""
+"""The data drawn for a tray: scores joined in time, in the tray's display unit. Shared by viewer and plots.
+
+Where no samples came, lines and bands have a hole: nothing was judged there, and a line across it would say so.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,6 +16,12 @@ from schemas.fields import LARGEST_ENUM_VALUE
 from schemas.messages import Array, Score
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
+SILENT = "silent"
+"""the state of a fan without samples, in words"""
+NO_SAMPLES = LARGEST_ENUM_VALUE
+"""the state of a row of a trace at which samples began to be missing"""
+BRIDGED_PERIODS = 2.5
+"""samples at most so far apart are joined by a line"""
 IN_ALARM = (FanState.ALARM, FanState.RETURNING)
 TRACE_COLUMNS = (
     "measured_speed_rad_s",
@@ -21,6 +30,9 @@ TRACE_COLUMNS = (
     "valid",
     "state",
     "invalid_reason",
+    "torque_balance_command",
+    "balance_baseline_command",
+    "score",
 )
 """the columns of a score that a trace is made of, its times apart"""
 MEASURED_COLUMNS = (*TRACE_COLUMNS, *(column.name for column in AUXILIARY))
@@ -38,7 +50,10 @@ class Trace:
         predicted, half_width: the twin and half the height of its band; NaN if the sample is not scored.
         outside: the sample is scored and lies outside the band.
         in_alarm: an alarm was active at the sample.
-        state, invalid_reason: `FanState` and `InvalidReason`.
+        balance, expected_balance: torque balance and what is expected of this fan, in units of the command; NaN if not
+            scored.
+        score: 1 is at the limit; NaN if not scored.
+        state, invalid_reason: `FanState` and `InvalidReason`; at the beginning of a hole `NO_SAMPLES`.
         auxiliary: what the source measures beside command and speed, by the name of its column; NaN where unknown.
     """
 
@@ -52,6 +67,9 @@ class Trace:
     outside: Array
     valid: Array
     in_alarm: Array
+    balance: Array
+    expected_balance: Array
+    score: Array
     state: Array
     invalid_reason: Array
     auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
@@ -92,6 +110,9 @@ def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit, fans: Se
         outside=column("outside") & valid,
         valid=valid,
         in_alarm=np.isin(state, IN_ALARM) & valid,
+        balance=np.where(valid, _known_or_nan("torque_balance_command", scores)[:, chosen], np.nan),
+        expected_balance=np.where(valid, _known_or_nan("balance_baseline_command", scores)[:, chosen], np.nan),
+        score=np.where(valid, column("score"), np.nan),
         state=state,
         invalid_reason=column("invalid_reason"),
         auxiliary={name: _known_or_nan(name, scores)[:, chosen] for name in present},
@@ -105,8 +126,40 @@ def _known_or_nan(name: str, scores: Sequence[Score]) -> Array:
     )
 
 
+def with_holes(trace: Trace, period_ns: int, before_t_ns: int | None = None) -> Trace:
+    """The trace with a row wherever samples begin to be missing: NaN, and `NO_SAMPLES`.
+
+    Args:
+        trace: a stretch of samples.
+        period_ns: between two samples.
+        before_t_ns: time of the sample before the trace; None: there is none.
+    """
+    before_t_ns = int(trace.t_ns[0]) if before_t_ns is None else before_t_ns
+    steps = np.diff(trace.t_ns, prepend=before_t_ns)
+    rows = np.flatnonzero(steps > BRIDGED_PERIODS * period_ns)
+    if not len(rows):
+        return trace
+    began_t_ns = trace.t_ns[rows] - steps[rows] + period_ns
+
+    def holed(column: Array, value: float) -> Array:
+        return np.insert(column, rows, value, axis=0)
+
+    floats = ("measured", "predicted", "half_width", "balance", "expected_balance", "score")
+    flags = ("outside", "valid", "in_alarm", "invalid_reason")
+    return replace(
+        trace,
+        t_ns=np.insert(trace.t_ns, rows, began_t_ns),
+        state=holed(trace.state, NO_SAMPLES),
+        auxiliary={name: holed(column, np.nan) for name, column in trace.auxiliary.items()},
+        **{name: holed(getattr(trace, name), np.nan) for name in floats},
+        **{name: holed(getattr(trace, name), 0) for name in flags},
+    )
+
+
 def state_name(state: int, invalid_reason: int) -> str:
     """A state in words; UNKNOWN with its reason: `unknown: gap`. A value of a newer scorer reads `unknown (9)`."""
+    if state == NO_SAMPLES:
+        return SILENT
     if state != FanState.UNKNOWN or invalid_reason == InvalidReason.NONE:
         return FanState(state).words
     return f"unknown: {InvalidReason(invalid_reason).words}"
@@ -115,7 +168,7 @@ def state_name(state: int, invalid_reason: int) -> str:
 def state_names() -> list[str]:
     """Every name that `state_name` gives for known values, in the order of a legend."""
     known = [state.words for state in FanState if state != FanState.UNKNOWN]
-    return known + [state_name(FanState.UNKNOWN, reason) for reason in InvalidReason]
+    return [*known, SILENT, *(state_name(FanState.UNKNOWN, reason) for reason in InvalidReason)]
 
 
 def state_codes(state: Array, invalid_reason: Array) -> Array:

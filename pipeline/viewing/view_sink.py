@@ -9,6 +9,7 @@ from pipeline.viewing.alarm_log import LogLine
 from pipeline.viewing.fleet import Fan
 from pipeline.viewing.fleet_view import Overview
 from pipeline.viewing.trace import Trace
+from pipeline.viewing.wear_points import WearPoints
 from schemas.messages import Array
 from schemas.units import SpeedUnit
 
@@ -34,6 +35,14 @@ class ViewSink(Protocol):
 
     def draw_overview(self, overview: Overview) -> None:
         """Show what has changed in the overview of a fleet."""
+        ...
+
+    def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:
+        """Show the points of the wear of some fans, as far as they are new."""
+        ...
+
+    def show_alarms(self, table: str, t_ns: int) -> None:
+        """Show this table of alarms, in Markdown, from `t_ns` on."""
         ...
 
     def log(self, lines: Sequence[LogLine]) -> None:

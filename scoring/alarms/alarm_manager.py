@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.enums import FanState, Severity, Statistic, Transition
+from schemas.enums import FanState, Feedback, Severity, Statistic, Transition
 from schemas.header import Header
 from schemas.messages import Alarm, Array, Diagnosis, Request, Score
 from schemas.units import NS_PER_S
@@ -26,6 +26,7 @@ PERSISTING_SHARE = (
     0.5  # a fault persists while the torque balance is at least this share of its value in the last message
 )
 STANDSTILL = int(Statistic.STANDSTILL)
+_OF_FEEDBACK = ("feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
 MAX_REQUESTERS = 64  # the latest whose requests are remembered; docs/reference/alarms.md gives the consequences
 
 
@@ -166,10 +167,12 @@ class AlarmManager:
             request.duration_s * NS_PER_S,
             request.operator_name,
             request.comment,
+            request.onset_t_ns,
         )
         alarms: list[Alarm] = []
         for fan, transition, refusal in answers:
             exists = 0 <= fan < self._fans
+            is_marked = transition in (Transition.MARKED_TRUE, Transition.MARKED_FALSE)
             alarm = replace(
                 self._next_message(fan),
                 t_ns=last_t_ns,
@@ -177,6 +180,7 @@ class AlarmManager:
                 request=f"{request.header.producer}/{request.header.sequence}",
                 operator_name=request.operator_name,
                 comment=request.comment,
+                marked_onset_t_ns=self._conditions.onset_meant(fan, request.onset_t_ns) if is_marked else 0,
                 **(_state_fields(self._conditions.alarm_state(fan)) if exists else {}),
             )
             alarms.append(self._emit(alarm, refusal) if exists else replace(alarm, message=f"fan {fan}: {refusal}"))
@@ -258,7 +262,7 @@ class AlarmManager:
             acknowledged=True,
             confirmed=True,
         )
-        return replace(last, header=Header(), request="", operator_name="", comment="")
+        return replace(last, header=Header(), request="", operator_name="", comment="", marked_onset_t_ns=0)
 
     def _emit(self, alarm: Alarm, refusal: str = "") -> Alarm:
         alarm = replace(alarm, message=self._alarm_text.of(alarm, refusal))
@@ -297,11 +301,17 @@ def _state_fields(state: AlarmState) -> dict[str, Any]:
         "suppressed": state.suppressed,
         "out_of_service": state.out_of_service,
         "stale": state.stale,
+        "feedback": state.feedback,
+        "feedback_by": state.feedback_by,
+        "feedback_reason": state.feedback_reason,
     }
 
 
 def _to_json(alarm: Alarm) -> dict[str, Any]:
-    return {name: value for name, value in asdict(alarm).items() if name != "header"}
+    """Without feedback if there is none, as in snapshots of before there was any."""
+    return {
+        name: value for name, value in asdict(alarm).items() if name != "header" and (value or name not in _OF_FEEDBACK)
+    }
 
 
 def _from_json(stored: Mapping[str, Any]) -> Alarm:
@@ -310,6 +320,7 @@ def _from_json(stored: Mapping[str, Any]) -> Alarm:
             **stored,
             "severity": Severity.known(stored["severity"]),
             "transition": Transition.known(stored["transition"]),
+            "feedback": Feedback.known(stored.get("feedback", 0)),
             "statistic": Statistic(stored["statistic"]),  # a detector may be added before its name
             "causes": tuple(Diagnosis(**cause) for cause in stored["causes"]),
         }

@@ -27,6 +27,8 @@ TRANSITIONS = {
     Transition.COMMISSIONING: "a new baseline is being taken",
     Transition.DATA_LOST: "not confirmed by data: there are no samples to judge",
     Transition.DATA_RESTORED: "judged again, on new samples",
+    Transition.MARKED_TRUE: "marked as a true alarm",
+    Transition.MARKED_FALSE: "marked as a false alarm",
 }
 """transitions whose line depends on nothing else"""
 CONTINUES = "the alarm continues from before the restart"
@@ -50,6 +52,8 @@ class AlarmText:
             return f"{fan}: {self._deviation(alarm)}{self._cause_if_known(alarm)}"
         if alarm.transition == Transition.REPUBLISHED:
             return f"{fan}: {_after_restart(alarm)}"
+        if alarm.marked_onset_t_ns != alarm.onset_t_ns and alarm.marked_onset_t_ns:
+            return f"{fan}: an earlier alarm is {TRANSITIONS[alarm.transition]}"
         return f"{fan}: {TRANSITIONS[alarm.transition]}"
 
     def _deviation(self, alarm: Alarm) -> str:

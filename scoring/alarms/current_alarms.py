@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from schemas.enums import Severity, Transition
+from schemas.enums import Feedback, Severity, Transition
 from schemas.messages import Alarm, Diagnosis
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_presented, is_retained, is_silenced
@@ -68,6 +68,7 @@ class CurrentAlarm:
             f"shelved {until(alarm)}": bool(alarm.shelved_until_t_ns),
             "suppressed": alarm.suppressed,
             "out of service": alarm.out_of_service,
+            marked_by(alarm): alarm.feedback != Feedback.NONE,
         }
         return [state for state, applies in states.items() if applies]
 
@@ -97,6 +98,9 @@ class CurrentAlarm:
                 for each in self.causes
             ],
             "acknowledged_by": self.acknowledged_by,
+            "feedback": alarm.feedback.name.lower(),
+            "feedback_by": alarm.feedback_by,
+            "feedback_reason": alarm.feedback_reason,
         }
 
 
@@ -173,6 +177,13 @@ def until(alarm: Alarm) -> str:
     if alarm.shelved_until_t_ns == UNTIL_IT_CLEARS_T_NS:
         return "until it clears"
     return f"until {clock(alarm.shelved_until_t_ns)}"
+
+
+def marked_by(alarm: Alarm) -> str:
+    """The feedback on the alarm, for people: what it was, who says so, and why."""
+    by = f" by {alarm.feedback_by}" if alarm.feedback_by else ""
+    reason = f": {alarm.feedback_reason}" if alarm.feedback_reason else ""
+    return f"marked as a {alarm.feedback.words}{by}{reason}"
 
 
 def clock(t_ns: int) -> str:

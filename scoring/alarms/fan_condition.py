@@ -3,7 +3,8 @@
 Names and rules are those of OPC UA Part 9 (OPC 10000-9, release 1.05.03): ActiveState with OnDelay and OffDelay
 (5.8.2), AckedState and ConfirmedState of one occurrence (4.3, 5.7; the rows of table B.1 are a test), LatchedState and
 Reset (4.8, 5.8.5), timed and one-shot shelving (5.8.17), suppressed (5.8.8), out of service (5.8.12). Only the present
-occurrence is kept; there are no branches of earlier ones (as in B.1.2). See docs/reference/alarms.md.
+occurrence is kept; there are no branches of earlier ones (as in B.1.2). What operators say of an alarm, that it was
+true or false, is not of Part 9. See docs/reference/alarms.md.
 """
 
 from __future__ import annotations
@@ -14,13 +15,20 @@ from typing import Any, Self
 
 import numpy as np
 
-from schemas.enums import Action, FanState, Severity, Transition
+from schemas.enums import Action, FanState, Feedback, Severity, Transition
+from schemas.units import NS_PER_S
 from scoring.alarms.return_rule import AlarmReturn, HoldingDetector, ReturnEvidence
 from scoring.former_snapshot_keys import FORMER_CONDITION_KEYS, current_keys
 
 NORMAL, SUSPECT, ALARM, RETURNING = map(int, (FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING))
 UNTIL_IT_CLEARS_T_NS = 2**63 - 1
 """`shelved_until_t_ns` of a one-shot shelving: until the alarm clears or is unshelved."""
+ONSET_TOLERANCE_NS = NS_PER_S
+"""of the onset by which an operator names an alarm: people read it in seconds, and a browser rounds it"""
+GIVES_FEEDBACK = {
+    Action.TRUE_ALARM: (Transition.MARKED_TRUE, Feedback.TRUE_ALARM),
+    Action.FALSE_ALARM: (Transition.MARKED_FALSE, Feedback.FALSE_ALARM),
+}
 
 
 @dataclass(frozen=True)
@@ -45,6 +53,8 @@ class ConditionSettings:
     detectors: tuple[HoldingDetector, ...] = ()
     """of which those that exceeded decide on the return, see scoring.alarms.return_rule; empty: the largest ratio of
     all decides, after off_delay_ns, as in recordings of former versions"""
+    earlier_alarms: int = 0
+    """of each fan, whose onsets are kept for feedback; 0 in recordings of former versions"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +78,11 @@ class AlarmState:
     """the state is that of before a gap: no sample has confirmed it since"""
     acknowledged_by: str = ""
     comment: str = ""
-    """of the last granted request that had one"""
+    """of the last granted request that had one, feedback apart"""
+    feedback: Feedback = Feedback.NONE
+    """the last one on this occurrence"""
+    feedback_by: str = ""
+    feedback_reason: str = ""
 
 
 class FanCondition:
@@ -82,6 +96,8 @@ class FanCondition:
         self._held_ns = 0  # time since SUSPECT or RETURNING began
         self._settled_ns = 0  # time of valid samples since the gap, while the alarm is stale
         self._return = AlarmReturn(settings.detectors, settings.return_ratio)
+        self._earlier_onsets_t_ns: tuple[int, ...] = ()
+        """of the alarms before this one, oldest first"""
 
     def update(
         self, t_ns: int, period_ns: int, ratio: float, evidence: ReturnEvidence | None = None
@@ -103,6 +119,7 @@ class FanCondition:
             self.fan_state = SUSPECT
             return ()
         self.fan_state = ALARM
+        self._keep_onset()
         if evidence is not None:
             self._return.begin()
             self._return.update(period_ns, evidence)
@@ -116,6 +133,9 @@ class FanCondition:
             latched=self._settings.latching,
             stale=False,
             acknowledged_by="",
+            feedback=Feedback.NONE,
+            feedback_by="",
+            feedback_reason="",
         )
         return ((Transition.RAISED, self.alarm_state),)
 
@@ -133,7 +153,11 @@ class FanCondition:
         return ((Transition.DATA_LOST, self.alarm_state),)
 
     def discard(self, *, keep_silenced: bool) -> None:
-        """Return to an alarm that was never raised. keep_silenced: shelved, suppressed, out of service stay as set."""
+        """Return to an alarm that was never raised. keep_silenced: shelved, suppressed, out of service stay as set, and
+        operators may still give feedback on the alarms of before."""
+        self._keep_onset()
+        if not keep_silenced:
+            self._earlier_onsets_t_ns = ()
         before, self.fan_state, self.alarm_state = self.alarm_state, NORMAL, AlarmState()
         if keep_silenced:
             self.alarm_state = AlarmState(
@@ -148,10 +172,30 @@ class FanCondition:
         self.alarm_state = replace(self.alarm_state, shelved_until_t_ns=0)
         return Transition.UNSHELVED, self.alarm_state
 
+    def onset_meant(self, onset_t_ns: int) -> int:
+        """The onset of the alarm that feedback is about, ns: of the one nearest to `onset_t_ns` within the tolerance,
+        or of the last one where that is 0. 0: there is none."""
+        known = (*self._earlier_onsets_t_ns, *self._own_onset())
+        if not onset_t_ns:
+            return known[-1] if known else 0
+        nearest = min(known, key=lambda each: abs(each - onset_t_ns), default=0)
+        return nearest if abs(nearest - onset_t_ns) <= ONSET_TOLERANCE_NS else 0
+
     def request(
-        self, action: Action, now_t_ns: int, duration_ns: float, operator_name: str, comment: str
+        self,
+        action: Action,
+        now_t_ns: int,
+        duration_ns: float,
+        operator_name: str,
+        comment: str,
+        onset_t_ns: int = 0,
     ) -> tuple[Transition, str]:
-        """Process an operator's request. Returns the transition and "", or REFUSED and the reason."""
+        """Process an operator's request. Returns the transition and "", or REFUSED and the reason.
+
+        onset_t_ns: of the alarm that feedback is about, see `onset_meant`.
+        """
+        if action in GIVES_FEEDBACK:
+            return self._take_feedback(action, operator_name, comment, onset_t_ns)
         refusal = self._refusal(action, now_t_ns, duration_ns)
         if refusal:
             return Transition.REFUSED, refusal
@@ -184,12 +228,17 @@ class FanCondition:
         alarm = asdict(self.alarm_state)
         del alarm["active"]  # follows from the fan state
         alarm["severity"] = int(self.alarm_state.severity)
+        alarm["feedback"] = int(self.alarm_state.feedback)
+        if not alarm["feedback"]:  # as in snapshots of before there was feedback
+            del alarm["feedback"], alarm["feedback_by"], alarm["feedback_reason"]
+        earlier = {"earlier_onsets_t_ns": list(self._earlier_onsets_t_ns)} if self._earlier_onsets_t_ns else {}
         return {
             "state": self.fan_state,
             "excursion_t_ns": self._excursion_t_ns,
             "held_ns": self._held_ns,
             "settled_ns": self._settled_ns,
             **({"holds": self._return.snapshot()} if self._settings.detectors else {}),
+            **earlier,
             **alarm,
         }
 
@@ -208,6 +257,7 @@ class FanCondition:
         condition._excursion_t_ns = _time(stored["excursion_t_ns"])
         condition._held_ns = _time(stored["held_ns"])
         condition._settled_ns = _time(stored.get("settled_ns", 0))
+        condition._earlier_onsets_t_ns = tuple(map(_time, stored.get("earlier_onsets_t_ns", ())))
         condition._return = AlarmReturn.restore(settings.detectors, settings.return_ratio, stored.get("holds"))
         condition.alarm_state = AlarmState(
             active=condition.fan_state in (ALARM, RETURNING),
@@ -222,8 +272,37 @@ class FanCondition:
             stale=bool(stored.get("stale", False)),
             acknowledged_by=str(stored["acknowledged_by"]),
             comment=str(stored["comment"]),
+            feedback=Feedback.known(stored.get("feedback", 0)),
+            feedback_by=str(stored.get("feedback_by", "")),
+            feedback_reason=str(stored.get("feedback_reason", "")),
         )
         return condition
+
+    def _own_onset(self) -> tuple[int, ...]:
+        """The onset of the present occurrence, if an alarm was raised."""
+        return () if self.alarm_state.severity == Severity.NONE else (self.alarm_state.onset_t_ns,)
+
+    def _keep_onset(self) -> None:
+        """The present occurrence becomes an earlier one."""
+        if most := self._settings.earlier_alarms:
+            self._earlier_onsets_t_ns = (*self._earlier_onsets_t_ns, *self._own_onset())[-most:]
+
+    def _take_feedback(
+        self, action: Action, operator_name: str, reason: str, onset_t_ns: int
+    ) -> tuple[Transition, str]:
+        """Keep what an operator says of the present occurrence; of an earlier one, its message is all that says it."""
+        meant_t_ns = self.onset_meant(onset_t_ns)
+        if not meant_t_ns:
+            began = "no alarm began then, or too many have been raised since"
+            return Transition.REFUSED, began if onset_t_ns else "no alarm has been raised"
+        if action == Action.FALSE_ALARM and not reason.strip():
+            return Transition.REFUSED, "a false alarm needs a reason: add a comment"
+        transition, feedback = GIVES_FEEDBACK[action]
+        if (meant_t_ns,) == self._own_onset():
+            self.alarm_state = replace(
+                self.alarm_state, feedback=feedback, feedback_by=operator_name, feedback_reason=reason
+            )
+        return transition, ""
 
     def _update_active(
         self, period_ns: int, ratio: float, evidence: ReturnEvidence | None

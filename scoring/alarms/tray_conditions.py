@@ -128,20 +128,26 @@ class TrayConditions:
         duration_ns: float = 0,
         operator_name: str = "",
         comment: str = "",
+        onset_t_ns: int = 0,
     ) -> list[tuple[int, Transition, str]]:
         """Process an operator's request. For each fan: the transition and "", or REFUSED and the reason.
 
         now_t_ns: time of the last sample; a shelving ends `duration_ns` later, or with 0 once the alarm has cleared.
+        onset_t_ns: see `onset_meant`.
         """
         answers: list[tuple[int, Transition, str]] = []
         for fan in fans:
             if not 0 <= fan < len(self._conditions):
                 answers.append((fan, Transition.REFUSED, f"there are fans 0 to {len(self._conditions) - 1}"))
                 continue
-            answer = self._conditions[fan].request(action, now_t_ns, duration_ns, operator_name, comment)
+            answer = self._conditions[fan].request(action, now_t_ns, duration_ns, operator_name, comment, onset_t_ns)
             answers.append((fan, *answer))
             self._refresh(fan)
         return answers
+
+    def onset_meant(self, fan: int, onset_t_ns: int) -> int:
+        """The onset of the alarm of a fan that feedback is about, see FanCondition.onset_meant."""
+        return self._conditions[fan].onset_meant(onset_t_ns)
 
     @property
     def active(self) -> Array:

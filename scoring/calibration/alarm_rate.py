@@ -9,7 +9,7 @@ number.
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from schemas.messages import Array
 
@@ -28,8 +28,8 @@ def rate_interval(counts: Array, exposures: Array, seed: int) -> tuple[float, fl
 def poisson_interval(count: float) -> tuple[float, float]:
     """95 % interval of the expected count, given the count."""
     outside = (1.0 - COVERAGE) / 2
-    low = float(chi2.ppf(outside, 2 * count)) / 2 if count > 0 else 0.0
-    return low, float(chi2.ppf(1.0 - outside, 2 * count + 2)) / 2
+    low = float(gammaincinv(count, outside)) if count > 0 else 0.0
+    return low, float(gammaincinv(count + 1, 1.0 - outside))
 
 
 def dispersion(counts: Array, exposures: Array, seed: int) -> float:

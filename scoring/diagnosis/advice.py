@@ -22,6 +22,8 @@ SOON_S = 1.0
 QUANTILES = (0.05, 0.95)
 DIGITS = 2
 
+KNOWN_SOON = "more is known in a few seconds"
+
 
 @dataclass(frozen=True)
 class Advice:
@@ -39,7 +41,7 @@ class Advice:
         command = window.as_given.command[window.onset :]
         acting, given = acting[np.isfinite(acting)], command[np.isfinite(command)]
         if len(speed) * window.period_s < SOON_S:
-            return f"{unclear}: more is known in a few seconds"
+            return f"{unclear}: {KNOWN_SOON}"
         if not np.isfinite(speed).any() or not len(given) or not len(acting):
             return unclear
         low, high = (float(np.nanquantile(speed, q)) for q in QUANTILES)

@@ -176,9 +176,17 @@ def test_the_rules_say_what_their_own_tests_expect(tmp_path):
 
 
 @needs_prometheus
-def test_prometheus_finds_nothing_to_say_against_the_metrics(gateway):
-    gateway.feed(judged(1.0), alarm(), health("scorer", 100, 10.0))
-    assert not promtool("check", "metrics", text=Client(gateway).ask("GET", "/metrics")[1])
+@pytest.mark.parametrize("counts", [(), (3,), (5, 3)])
+def test_prometheus_finds_nothing_to_say_against_the_metrics_whatever_another_program_sends(gateway, counts):
+    bounds = (0.1, math.inf) if len(counts) > 1 else (0.1,)
+    damaged = tuple(LatencyBucket(upper_s=upper_s, count=count) for upper_s, count in zip(bounds, counts, strict=False))
+    gateway.feed(judged(1.0), alarm(), health("scorer", 100, 10.0), health("learner", 100, 10.0, latencies=damaged))
+    metrics = Client(gateway).ask("GET", "/metrics")[1]
+    assert not promtool("check", "metrics", text=metrics)
+    shown = re.findall(
+        r'^fantwin_stage_latency_seconds_count\{site="hall",stage="(\w+)"\} (\S+)$', metrics, re.MULTILINE
+    )
+    assert shown == [("scorer", "100.0")]
 
 
 def test_the_board_is_one_of_grafanas_schema():

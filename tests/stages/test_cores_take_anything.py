@@ -30,6 +30,7 @@ from pipeline.runtime.twin_file import TwinFile
 from pipeline.viewing.fleet import Fan
 from pipeline.viewing.fleet_view import FleetView
 from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
+from pipeline.viewing.viewer_core import ViewerCore
 from schemas.codec import decode, encode
 from schemas.envelope import Envelope
 from schemas.header import Header
@@ -41,7 +42,7 @@ from stages.mqtt import MqttCore
 from stages.notifier import NotifierCore
 from stages.resampler import ResamplerConfig, ResamplerCore
 from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
-from stages.viewer import STAGE, ViewerCore
+from stages.viewer import STAGE
 from tests.stages.test_viewer import FakeSink
 from tests.support.message_strategies import any_message
 from tests.support.scored_blocks import CALIBRATION, core_of, prediction_of

@@ -17,10 +17,12 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from pipeline.gateway.config import GatewayConfig
 from pipeline.presenting.users import User, UserRole, hasher, write_users
+from pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
+from pipeline.recordings.rare_messages import rare_messages
 from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import Action, FanState, InvalidReason, Severity, Transition
+from schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Transition
 from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis, Request, Score, ScorerSnapshot
+from schemas.messages import Alarm, Diagnosis, ModelCard, Request, Score, ScorerSnapshot
 from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT
 from tests.support.running_chain import eventually
@@ -29,6 +31,7 @@ from tests.support.running_gateway import Client, RunningGateway
 
 NOW_NS = 1_790_000_000_000_000_000
 STEP_NS = 10_000_000
+GOLDEN = Path(__file__).parents[1] / "support" / "data" / "golden.mcap"
 PASSWORD = "correct horse battery"
 SCRIPT = "<script>alert(1)</script>"
 CONFIGURATION = f'site = "{SITE}"\nrun_folder = "."\n[[tray]]\nname = "{TRAY}"\nfans = {FANS}\nport = "p"\n[gateway]\n'
@@ -121,6 +124,7 @@ def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(g
     ]
     assert fans[1]["score"] == 0.5
     assert client.ask("GET", "/api/v1/fans?state=alarm")[1]["fans"] == fans[:1]
+    assert client.ask("GET", "/api/v1/fans?state=not_judged")[1]["fans"] == fans[3:]
     (found,) = client.ask("GET", "/api/v1/alarms")[1]["alarms"]
     assert (found["fan"], found["presented"], found["probability"]) == (2, True, 0.8)
     assert found["causes"][0]["evidence"] == "drag +20 %"
@@ -177,6 +181,23 @@ def test_metrics_are_those_of_prometheus_and_an_unjudged_fan_has_no_score(gatewa
         'fantwin_fan_alarm_unacknowledged{fan="2",severity="alarm",site="hall",tray="tray1"} 0.0'
         in (Client(gateway).ask("GET", "/metrics")[1])
     )
+
+
+def test_an_alarm_counts_once_in_each_severity_that_it_reaches(gateway):
+    warned, worse, worst = Transition.RAISED, Transition.SEVERITY, Severity.ALARM
+    gateway.feed(
+        alarm(warned, 0, severity=Severity.WARNING),
+        alarm(worse, 1, severity=worst),
+        alarm(worse, 2, severity=Severity.WARNING),
+        alarm(worse, 3, severity=worst),
+        alarm(warned, 4, severity=Severity.WARNING, onset_t_ns=NOW_NS + 1),
+    )
+    text = Client(gateway).ask("GET", "/metrics")[1]
+    counted = [line for line in text.splitlines() if line.startswith("fantwin_alarms_total{")]
+    assert [(line.partition("severity=")[2].partition(",")[0], line[-3:]) for line in counted] == [
+        ('"warning"', "2.0"),
+        ('"alarm"', "1.0"),
+    ]
 
 
 def test_an_operator_acts_under_his_own_name_and_nobody_else_acts(gateway):
@@ -259,6 +280,9 @@ def test_openapi_names_every_path_and_the_forms(gateway):
     assert "/api/v1/fans/{tray}/{fan}/requests" in document["paths"]
     form = document["components"]["schemas"]["RequestForm"]
     assert "shelve" in form["properties"]["action"]["enum"]
+    asked = {each["name"]: each["schema"] for each in document["paths"]["/api/v1/fans"]["get"]["parameters"]}
+    assert "alarm" in asked["state"]["enum"]
+    assert asked["limit"] == {"type": "integer"}
 
 
 def test_prometheus_sends_the_password_of_a_user_and_gets_nothing_else_with_it(tmp_path, users, monkeypatch):
@@ -288,6 +312,8 @@ def test_a_proxy_names_the_user_and_others_cannot(tmp_path):
         client, path, asked = Client(gateway), f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"}
         assert client.ask("GET", "/api/v1/site")[0] == 401
         assert client.ask("GET", "/api/v1/site", None, {"X-User": "vic"})[1]["site"] == SITE
+        status, answer, _ = client.ask("POST", path, asked)
+        assert (status, answer["error"][:31]) == (401, "the proxy has sent no X-User wi")
         assert client.ask("POST", path, asked, {"X-User": "vic"})[0] == 403
         assert client.ask("POST", path, asked, {"X-User": "ann"})[0] == 200
         assert gateway.sent[0].operator_name == "ann"
@@ -296,6 +322,8 @@ def test_a_proxy_names_the_user_and_others_cannot(tmp_path):
     other = RunningGateway(tmp_path / "other", user_header="X-User", operators=("ann",), proxies=("192.0.2.1",))
     try:
         assert Client(other).ask("GET", "/api/v1/site", None, {"X-User": "ann"})[0] == 401
+        status, answer, _ = Client(other).ask("POST", path, asked, {"X-User": "ann"})
+        assert (status, answer["error"]) == (401, "users come through the proxy of this page: ask there")
     finally:
         other.close()
 
@@ -389,3 +417,89 @@ def test_a_fan_shows_its_wear_its_advice_and_where_rerun_is(tmp_path):
         assert tray["viewer_url"] == "http://127.0.0.1:9090/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9876%2Fproxy"
     finally:
         gateway.close()
+
+
+def marked(feedback: Feedback, sequence: int, reason: str = "") -> Alarm:
+    transition = Transition.MARKED_TRUE if feedback == Feedback.TRUE_ALARM else Transition.MARKED_FALSE
+    more = {"feedback": feedback, "feedback_by": "ann", "feedback_reason": reason, "comment": reason}
+    return alarm(transition, sequence, marked_onset_t_ns=NOW_NS, t_ns=NOW_NS + sequence, operator_name="ann", **more)
+
+
+def test_the_rate_of_false_alarms_is_over_the_judged_time_and_beside_the_declared_one(tmp_path, users):
+    (card, *_) = (envelope.message for envelope in rare_messages(GOLDEN, "twin"))
+    assert isinstance(card, ModelCard)
+    twin = replace(card, header=Header("integrator", 0, TRAY))
+    for number in range(2):  # the second process continues with the file of the first
+        gateway = RunningGateway(tmp_path, granted, users=users)
+        try:
+            gateway.feed(twin, score(0.0 + 100 * number), score(4.0 + 100 * number), score(90.0 + 100 * number))
+            if not number:
+                gateway.feed(alarm(t_ns=NOW_NS + 10**9), alarm(sequence=1, onset_t_ns=5, t_ns=NOW_NS + 20 * 10**9))
+                gateway.feed(marked(Feedback.TRUE_ALARM, 2), marked(Feedback.FALSE_ALARM, 3, "the door was open"))
+            body = Client(gateway).ask("GET", "/api/v1/alarm-rate")[1]
+            rows = Client(gateway).ask("GET", "/api/v1/alarms/history")[1]["transitions"]
+        finally:
+            gateway.close()
+        tray = body["trays"][TRAY]
+        judged_s = 4.0 * (FANS - 1) * (number + 1)  # fan 3 is not judged, and nobody in the pauses
+        assert tray["fan_hours"] == pytest.approx(judged_s / 3600)
+        counts = (tray["false_alarms"], tray["true_alarms"], tray["unmarked"])
+        assert counts == (1, 0, 0), "one is counted, as marked last; the other came in a pause"
+        assert (tray["declared_per_day"], body["site"]["declared_per_day"]) == (24.0, 24.0)
+        assert tray["interval_95"][1] == pytest.approx(5.5716 / (judged_s / 86400), rel=1e-4)
+        assert {each["onset_t_ns"]: each["feedback"] for each in rows if each["transition"] == "raised"} == {
+            NOW_NS: "false_alarm",
+            5: "none",
+        }
+        assert tray["since_t_ns"] == NOW_NS + 4 * STEP_NS
+
+
+def test_feedback_names_its_alarm_and_a_false_alarm_needs_a_reason(gateway):
+    client, path = Client(gateway), f"/api/v1/fans/{TRAY}/2/requests"
+    client.log_in("ann", PASSWORD)
+    for form, why in (
+        ({"action": "false_alarm", "comment": " "}, "a false alarm needs a reason"),
+        ({"action": "shelve", "onset_t_ns": NOW_NS}, "onset_t_ns is for true_alarm and false_alarm only"),
+    ):
+        status, body, _ = client.ask("POST", path, form)
+        assert (status, why in body["error"]) == (422, True)
+    asked = {"action": "false_alarm", "comment": "the door was open", "onset_t_ns": NOW_NS}
+    assert client.ask("POST", path, asked)[0] == 200
+    (sent,) = gateway.sent
+    assert (sent.action, sent.onset_t_ns, sent.comment) == (Action.FALSE_ALARM, NOW_NS, "the door was open")
+    assert sent.operator_name == "ann"
+
+
+RAISED_NS = 1_800_000_000_000_000_000
+
+
+def test_clips_of_alarms_are_listed_and_downloaded_and_nothing_else_of_the_disk_is(tmp_path):
+    folder = tmp_path / "runs" / "clips"
+    folder.mkdir(parents=True)
+    content = "a recording " * 1000
+    alarms = (ClipAlarm(3, RAISED_NS, RAISED_NS, acknowledged=True),)
+    size, window = len(content), (RAISED_NS, RAISED_NS + 9, RAISED_NS)
+    kept = Clip("tray1-3-x.mcap", TRAY, *window, alarms, is_due=False, size_bytes=size)
+    others = [replace(kept, name="../secret.json"), replace(kept, name="gone.mcap"), replace(kept, tray="tray9")]
+    (folder / "recording.json").write_text(clips_as_text([kept, *others]))
+    (folder / kept.name).write_text(content)
+    (tmp_path / "runs" / "secret.json").write_text("secret")
+    text = f'[[tray]]\nname = "{TRAY}"\nfans = 4\n[recorder]\n[gateway]\n'
+    running = RunningGateway(tmp_path, configuration=text, user_header="X-User")
+    try:
+        client, viewer = Client(running), {"X-User": "vic"}
+        assert client.ask("GET", "/api/v1/clips")[0] == 401
+        assert client.ask("GET", f"/api/v1/clips/{kept.name}")[0] == 401
+        (listed, *more) = client.ask("GET", "/api/v1/clips", headers=viewer)[1]["clips"]
+        assert (listed["name"], listed["bytes"], listed["acknowledged"]) == (kept.name, size, True)
+        assert listed["alarms"] == [{"fan": 3, "onset_t_ns": RAISED_NS, "t_ns": RAISED_NS}]
+        assert more == []
+        status, body, headers = client.ask("GET", f"/api/v1/clips/{kept.name}", headers=viewer)
+        assert (status, body) == (200, content)
+        assert headers["content-type"] == "application/octet-stream"
+        assert headers["content-disposition"] == f'attachment; filename="{kept.name}"'
+        assert headers["content-length"] == str(size)
+        for name in ("gone.mcap", "recording.json", "..%2Fsecret.json", "../secret.json", "%2Fetc%2Fpasswd", "x%00"):
+            assert client.ask("GET", f"/api/v1/clips/{name}", headers=viewer)[0] == 404
+    finally:
+        running.close()

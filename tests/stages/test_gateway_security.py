@@ -134,6 +134,19 @@ def test_an_own_account_buys_no_more_guesses_and_an_ipv6_network_counts_as_one_a
     assert guesses <= 100, "in an hour"
 
 
+def test_guesses_from_elsewhere_do_not_lock_out_who_has_logged_in_where_he_is():
+    failures = login_failures.LoginFailures(lambda: 0.0)
+    assert failures.begin("ann", "192.0.2.1") == 0
+    failures.succeed("ann", "192.0.2.1")
+    for number in range(login_failures.FAILURES):
+        assert failures.begin("ann", f"198.51.100.{number}") == 0
+    assert failures.begin("ann", "198.51.100.77") > 0
+    assert failures.begin("ann", "192.0.2.1") == 0
+    failures.succeed("ann", "192.0.2.1")
+    guesses = sum(failures.begin("ann", "192.0.2.1") == 0 for _ in range(20))
+    assert guesses == login_failures.FAILURES, "there he has no more guesses than others"
+
+
 def test_a_new_password_and_another_login_end_the_session_of_before(gateway, users):
     first = logged_in(gateway)
     again = Client(gateway)
@@ -144,6 +157,29 @@ def test_a_new_password_and_another_login_end_the_session_of_before(gateway, use
     put_users(users, OTHER_PASSWORD, ann=UserRole.OPERATOR)
     assert again.ask("POST", ACT, ASKED)[0] == 401
     assert len(gateway.sent) == 1
+
+
+@pytest.mark.parametrize(
+    ("break_it", "why"),
+    [
+        (Path.unlink, "there is no such file: `fantwin users add NAME` makes it"),
+        (lambda path: path.chmod(0o644), "others may read it: chmod 600"),
+        (lambda path: path.write_text("[ann", encoding="utf-8"), "the users cannot be read"),
+    ],
+)
+def test_while_the_file_of_users_cannot_be_used_nobody_acts_or_logs_in(gateway, users, break_it, why):
+    operator, text = logged_in(gateway), users.read_text(encoding="utf-8")
+    break_it(users)
+    assert operator.ask("POST", ACT, ASKED)[0] == 401
+    status, answer, _ = Client(gateway).ask("POST", "/api/v1/login", {"name": "ann", "password": PASSWORD})
+    assert (status, "the file of users cannot be read" in answer["error"]) == (503, True)
+    assert why in gateway.problem()
+    assert Client(gateway).ask("GET", "/api/v1/site")[0] == 200, "on this host whoever looks needs no login"
+    users.write_text(text, encoding="utf-8")
+    users.chmod(0o600)
+    assert operator.ask("POST", ACT, ASKED)[0] == 401, "the session is over"
+    assert logged_in(gateway).ask("POST", ACT, ASKED)[0] == 200
+    assert gateway.problem() == ""
 
 
 def test_a_user_who_logs_in_again_and_again_ends_his_own_sessions_only(gateway, monkeypatch):
@@ -174,6 +210,9 @@ def test_through_a_proxy_that_knows_no_users_nobody_reads_without_a_login(tmp_pa
         client, host = Client(named), {"Host": "fans.plant.example"}
         assert client.ask("GET", "/api/v1/site", None, host)[0] == 401
         assert client.ask("GET", "/metrics", None, host)[0] == 401
+        own = {"Host": f"localhost:{named.port}"}, {"Host": f"[::1]:{named.port}"}
+        assert [client.ask("GET", "/healthz", None, each)[0] for each in ({}, *own)] == [200, 200, 200]
+        assert client.ask("GET", "/healthz", None, {"Host": "evil.example"})[0] == 400
         assert logged_in(gateway).ask("GET", "/api/v1/site")[0] == 200
     finally:
         named.close()
@@ -355,17 +394,44 @@ def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_na
     finally:
         gateway.close()
     with pytest.raises(StageError, match="it is over since"):
-        server.check_expiry(files["certificate"])
+        server.check_files(**files)
 
 
-def test_a_key_with_a_password_is_refused_and_not_asked_for(tmp_path):
+def test_a_key_that_everybody_reads_is_named(tmp_path):
     certificates = SiteCertificates(tmp_path)
     certificates.issue("page")
-    key = load_pem_private_key((tmp_path / "page.key").read_bytes(), None)
-    encrypted = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))
-    (tmp_path / "page.key").write_bytes(encrypted)
-    with pytest.raises(StageError, match="the key has no password"):
-        server.check_certificate(tmp_path / "page.pem", tmp_path / "page.key")
+    (tmp_path / "page.key").chmod(0o640)
+    server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
+    (tmp_path / "page.key").chmod(0o644)
+    with pytest.raises(StageError, match="everybody may read it"):
+        server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
+
+
+def encrypted(key: Path) -> None:
+    private = load_pem_private_key(key.read_bytes(), None)
+    key.write_bytes(private.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret")))
+
+
+@pytest.mark.parametrize(
+    ("file", "break_it", "why"),
+    [
+        ("key", encrypted, "the key has a password, which nobody is asked for"),
+        ("key", lambda path: path.write_bytes((path.parent / "other.key").read_bytes()), "not the key of the certific"),
+        ("key", lambda path: path.write_text("key", encoding="utf-8"), "this is no private key in PEM"),
+        ("key", Path.unlink, "No such file"),
+        ("certificate", lambda path: path.write_text("c", encoding="utf-8"), "this is no certificate in PEM"),
+        ("certificate", Path.unlink, "No such file"),
+    ],
+)
+def test_what_is_wrong_with_the_files_of_tls_is_said_and_no_password_is_asked_for(tmp_path, file, break_it, why):
+    certificates = SiteCertificates(tmp_path)
+    for name in ("page", "other"):
+        certificates.issue(name)
+    files = {"certificate": tmp_path / "page.pem", "key": tmp_path / "page.key"}
+    server.check_certificate(**files)
+    break_it(files[file])
+    with pytest.raises(StageError, match=rf"gateway\.{file} = .*: .*{why}"):
+        server.check_certificate(**files)
 
 
 def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question(

@@ -257,9 +257,11 @@ def test_requests_are_passed_on_under_the_configured_name_and_answered(tmp_path,
         assert "no such fan" in ask('{"action": "acknowledge"}', f"{ROOT}/{TRAY}/9/request")["error"]
         for malformed in ("{", "[]", '{"action": "explode"}', '{"action": "shelve", "duration_s": -1}', "x" * 9999):
             assert not ask(malformed)["ok"]
+        wrong = ask('{"action": "shelve", "duration_s": "1h", "id": "8"}')
+        assert (wrong["id"], wrong["ok"], wrong["error"].partition(":")[0]) == ("8", False, "duration_s")
         assert "operator_name" in ask('{"action": "acknowledge", "operator_name": "root"}')["error"]
         counts = stage.counters()
-        assert (counts["malformed_requests"], counts["refused_requests"], counts["accepted_requests"]) == (6, 2, 1)
+        assert (counts["malformed_requests"], counts["refused_requests"], counts["accepted_requests"]) == (7, 2, 1)
         assert len(stage.sent) == 1
     finally:
         stage.close()
@@ -362,6 +364,10 @@ def test_a_user_a_password_and_tls(tmp_path):
         assert "check username and password" in check(context)[0]
         password.chmod(0o644)
         assert "chmod 600" in check(context)[0]
+        unknown = MqttConfig(host="127.0.0.1", port=broker.port, tls=True)
+        (problem,) = check(Context(SITE, (), unknown, tmp_path, tmp_path, 0))
+        assert "no connection by TLS" in problem
+        assert "check ca, and that host is a name in the certificate of the broker" in problem
     finally:
         broker.stop()
 

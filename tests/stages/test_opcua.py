@@ -128,7 +128,7 @@ def test_a_scorer_that_does_not_answer_is_a_timeout_and_others_are_served_meanwh
     assert message.startswith("fan 2: 90 rpm")
 
 
-def test_only_trusted_clients_connect_encrypted(tmp_path):
+def test_only_trusted_clients_connect_encrypted(tmp_path, capfd):
     trusted = tmp_path / "trusted"
     trusted.mkdir()
     running = RunningOpcua(tmp_path / "site", trusted=trusted)
@@ -141,6 +141,7 @@ def test_only_trusted_clients_connect_encrypted(tmp_path):
         with pytest.raises(ua.UaStatusCodeError) as refused:
             asyncio.run(connects())
         assert refused.value.code == ua.StatusCodes.BadCertificateUntrusted
+        assert "client refused: its certificate is not in the folder `trusted`" in capfd.readouterr().err
         (trusted / "client.der").write_bytes((tmp_path / "client.der").read_bytes())
         asyncio.run(connects())
     finally:

@@ -23,6 +23,8 @@ from pipeline.config.loading import parse_config
 from pipeline.config.models import ConfigError, TrayConfig
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.disk import DiskError
+from pipeline.recordings.index import PartIndex
+from pipeline.recordings.open_part import OldPart
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
 from pipeline.recordings.writing import RecordingWriter
@@ -82,6 +84,9 @@ class Part:
         self.closed = ""
         self.size = 0
 
+    def index(self) -> PartIndex:
+        return PartIndex(self.path, {}, ())
+
     def add(self, envelope: Envelope) -> None:
         self._touch()
         self.pending.append(envelope)
@@ -128,6 +133,7 @@ class Disk:
         self.room = 1 << 40
         self.refuses = False
         self.oldest: list[str] = []
+        self.oldest_ns = 0
         self.freed_by_each = 0
         self.gone = ""
 
@@ -141,6 +147,9 @@ class Disk:
         if self.gone:
             raise DiskError(self.gone)
         return self.free
+
+    def oldest_part(self) -> OldPart | None:
+        return OldPart(self.oldest[0], self.oldest_ns) if self.oldest else None
 
     def delete_oldest(self) -> str | None:
         if not self.oldest:

@@ -17,31 +17,28 @@ import pytest
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Context, Core, StageError
-from pipeline.viewing.alarm_log import LogLine, log_line
+from pipeline.viewing.alarm_log import LINE_LENGTH, LogLine, log_line
 from pipeline.viewing.fleet import Fan
 from pipeline.viewing.fleet_view import Overview
 from pipeline.viewing.loopback import check_free
 from pipeline.viewing.trace import Trace
+from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, PAGE_PERIOD_NS, REPEAT_STATES_NS, SAMPLES_HELD, ViewerCore
+from pipeline.viewing.wear_points import WearPoints
 from schemas.codec import encode
-from schemas.enums import FanState, InvalidReason, Severity, StageStatus, Transition
+from schemas.enums import FanState, InvalidReason, Severity, StageStatus, Statistic, Transition
 from schemas.envelope import Envelope
 from schemas.header import Header
 from schemas.health import Health
-from schemas.messages import Alarm, Message, ModelCard, Score
+from schemas.messages import Alarm, Diagnosis, Message, ModelCard, Score
 from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
-from stages.viewer import (
-    FLUSH_PERIOD_NS,
-    PAGE_PERIOD_NS,
-    REPEAT_STATES_NS,
-    SAMPLES_HELD,
-    ViewerConfig,
-    ViewerCore,
-    build,
-)
+from stages.viewer import ViewerConfig, build
 from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
 
 LATER_NS = START_NS + 400 * 86_400 * 1_000_000_000  # the host's time while what was recorded at START_NS is replayed
+
+TORQUE = Diagnosis(cause="external_torque", probability=0.64, parameter="", change=0.1, change_low=0.0, change_high=0.2)
+CAUSES = (TORQUE, replace(TORQUE, cause="drag_up", probability=0.36))
 
 
 @dataclass
@@ -55,6 +52,8 @@ class FakeSink:
     hidden: list[tuple[Fan, int]] = field(default_factory=list)
     overviews: list[Overview] = field(default_factory=list)
     pages: list[str] = field(default_factory=list)
+    wear: list[tuple[str, WearPoints]] = field(default_factory=list)
+    tables: list[tuple[int, str]] = field(default_factory=list)
     flushed: int = 0
     closed: bool = False
     trouble: str = ""
@@ -74,6 +73,12 @@ class FakeSink:
 
     def draw_overview(self, overview: Overview) -> None:
         self.overviews.append(overview)
+
+    def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:
+        self.wear += [(tray, each) for each in points]
+
+    def show_alarms(self, table: str, t_ns: int) -> None:
+        self.tables.append((t_ns, table))
 
     def log(self, lines: Sequence[LogLine]) -> None:
         self.lines += lines
@@ -122,31 +127,55 @@ def play(core: Core, scores: Sequence[Score]) -> None:
 @pytest.mark.parametrize(
     ("more", "level", "text"),
     [
-        ({"transition": Transition.RAISED}, "WARN", "warning raised: so"),
+        (
+            {"transition": Transition.RAISED, "statistic": Statistic.BALANCE_DRIFT, "score": 1.73},
+            "WARN",
+            "fan 0: warning raised, torque balance 1.7 x its limit",
+        ),
+        (
+            {"transition": Transition.SEVERITY, "severity": Severity.ALARM, "statistic": Statistic.STANDSTILL},
+            "ERROR",
+            "fan 0: alarm severity, does not turn as commanded",
+        ),
+        ({"transition": Transition.DIAGNOSED, "causes": CAUSES}, "INFO", "fan 0: probably an external torque 64 %"),
         (
             {"transition": Transition.REPUBLISHED, "severity": Severity.ALARM},
             "ERROR",
-            "alarm republished: fan 0: the alarm continues from before the restart",
+            "fan 0: alarm goes on, after a restart",
         ),
-        ({"transition": Transition.CLEARED, "active": False}, "INFO", "cleared: so"),
-        ({"transition": Transition(88)}, "INFO", "unknown (88): so"),
+        ({"transition": Transition.CLEARED, "active": False}, "INFO", "fan 0: back to normal"),
+        ({"transition": Transition(88)}, "INFO", "fan 0: unknown (88)"),
         (
-            {"transition": Transition.REPUBLISHED, "active": False, "severity": Severity.NONE, "suppressed": True},
+            {"transition": Transition.REPUBLISHED, "active": False, "severity": Severity.NONE},
             "INFO",
-            "republished: fan 0: no alarm, suppressed",
+            "fan 0: no alarm, after a restart",
         ),
         (
-            {"transition": Transition.REPUBLISHED, "active": False, "severity": Severity.ALARM, "acknowledged": False},
+            {"transition": Transition.REPUBLISHED, "active": False, "severity": Severity.ALARM},
             "INFO",
-            "republished: fan 0: back to normal, unacknowledged",
+            "fan 0: back to normal, after a restart",
+        ),
+        ({"transition": Transition.ACKNOWLEDGED, "operator_name": "ann"}, "INFO", "fan 0: acknowledged by ann"),
+        (
+            {"transition": Transition.SHELVED, "operator_name": "ann", "shelved_until_t_ns": 60_000_000_000},
+            "INFO",
+            "fan 0: shelved until 60.0 s by ann",
+        ),
+        (
+            {"transition": Transition.REFUSED, "message": "fan 0: refused: " + "it is not so " * 20},
+            "INFO",
+            "fan 0: request refused: it is not so it is not so it is not so…",
         ),
     ],
 )
-def test_the_log_shows_transition_and_severity_of_an_alarm(more: dict[str, Any], level: str, text: str) -> None:
+def test_the_log_says_what_happened_in_a_line_short_enough_to_be_read(
+    more: dict[str, Any], level: str, text: str
+) -> None:
     fields = {"fan": 0, "active": True, "severity": Severity.WARNING, "t_ns": 1, "onset_t_ns": 1, "acknowledged": True}
-    fields |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so", "confirmed": True}
+    fields |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so " * 99, "confirmed": True}
     line = log_line(Alarm(header=Header("p", 0, "tray1"), **fields | more))
     assert line == ("tray1", 1, level, text)
+    assert len(line.text) <= LINE_LENGTH
 
 
 def test_samples_are_drawn_twice_a_second_and_each_exactly_once() -> None:
@@ -248,7 +277,7 @@ def test_speeds_are_shown_in_the_unit_of_the_tray() -> None:
     rpm = 60 / (2 * np.pi)
     np.testing.assert_allclose(sink.traces[0].measured, scores[0].measured_speed_rad_s * rpm)
     np.testing.assert_allclose(sink.traces[0].half_width, 2 * SIGMA * rpm)
-    assert alarms[0].message in sink.lines[0][3]
+    assert "alarm raised, speed 3.8 x its limit" in sink.lines[0].text
 
 
 def test_alarms_go_to_the_log_of_their_tray_at_the_samples_time() -> None:
@@ -262,7 +291,7 @@ def test_alarms_go_to_the_log_of_their_tray_at_the_samples_time() -> None:
         ("tray1", alarms[0].t_ns, "ERROR"),
         ("tray1", alarms[1].t_ns, "INFO"),
     ]
-    assert "alarm raised" in sink.lines[0][3] and "cleared" in sink.lines[1][3]
+    assert "alarm raised" in sink.lines[0][3] and "back to normal" in sink.lines[1][3]
 
 
 def test_health_and_twins_are_a_page_that_is_replaced_when_it_changes() -> None:
@@ -307,7 +336,8 @@ def test_without_the_extra_the_stage_loads_and_build_names_the_package(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "pipeline.viewing.rerun_sink", raising=False)
+    for name in ("rerun_sink", "view_of_site"):
+        monkeypatch.delitem(sys.modules, f"pipeline.viewing.{name}", raising=False)
     with pytest.raises(StageError, match=r"pip install -e '\.\[view\]'"):
         build(context(tmp_path))
 
@@ -397,8 +427,8 @@ def test_in_an_alarm_the_area_between_twin_and_measured_speed_is_red(tmp_path: P
 
 @pytest.mark.parametrize("background", [(13, 16, 17), (255, 255, 255)], ids=["dark", "light"])
 def test_every_line_is_legible_in_both_themes(background: tuple[int, int, int]) -> None:
-    layout: Any = pytest.importorskip("pipeline.viewing.rerun_layout", exc_type=ModuleNotFoundError)
-    for color in (layout.VIOLET, layout.GREEN, layout.RED, layout.GREY):
+    styles: Any = pytest.importorskip("pipeline.viewing.rerun_styles", exc_type=ModuleNotFoundError)
+    for color in (styles.RED, *styles.FAN_COLORS):
         lighter, darker = sorted((luminance(color), luminance(background)), reverse=True)
         assert (lighter + 0.05) / (darker + 0.05) > 3.0, f"contrast of {color}, as WCAG asks of graphics"
 
@@ -544,12 +574,12 @@ def chunks_of(path: Path) -> list[Any]:
 
 
 def rows_of(path: Path) -> dict[str, list[tuple[int, dict[str, Any]]]]:
-    """Entity -> (time in ns, component -> values) in order of time."""
+    """Entity -> (time in ns, component -> values) in order of time, of what is on the time line."""
     rows: dict[str, list[tuple[int, dict[str, Any]]]] = {}
     for chunk in chunks_of(path):
-        if chunk.is_static:
-            continue
         table = chunk.to_record_batch()
+        if "time" not in table.schema.names:  # static, or wear
+            continue
         times = np.asarray(table.column("time")).astype(np.int64)
         names = [name for name in table.schema.names if ":" in name]
         for index, t_ns in enumerate(times.tolist()):

@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-import stages.viewer
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Context, StageError
+from pipeline.viewing import viewer_core
 from pipeline.viewing.fleet import SILENT, Fan, class_names
 from pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
 from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
+from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from schemas.codec import decode_columns
 from schemas.messages import Alarm, Score
-from stages.viewer import FLUSH_PERIOD_NS, ViewerConfig, ViewerCore, build, check
+from stages.viewer import ViewerConfig, build, check, topics_read
 from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
 from tests.support.score_data import START_NS, STEP_NS, made_up_tray
 
@@ -126,7 +127,7 @@ def test_of_a_tray_without_a_plot_only_the_newest_score_is_decoded(monkeypatch: 
         decoded.append(int(score.t_ns[-1]))
         return score
 
-    monkeypatch.setattr(stages.viewer, "decode_columns", counting)
+    monkeypatch.setattr(viewer_core, "decode_columns", counting)
     core = fleet_core(FakeSink())
     messages = messages_of(seconds=10, block=1, faulty_fan=None)
     play(core, messages)
@@ -236,6 +237,8 @@ def test_a_site_of_more_than_64_fans_is_a_fleet(tmp_path: Path, fans: int, is_fl
     core.close()
     rows = rows_of(tmp_path / "view.rrd")
     assert ("/fleet/map/cells" in rows, "/tray1/fan_0/speed" in rows) == (is_fleet, not is_fleet)
+    trays = [TrayConfig(name="a", fans=fans), TrayConfig(name="b", fans=fans)]
+    assert ("snapshot" in topics_read(ViewerConfig(), trays)) == (not is_fleet), "wear is not drawn of a fleet"
 
 
 def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Path) -> None:
@@ -259,7 +262,7 @@ def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Pa
     assert max(in_alarm) == 1.0 and in_alarm[0] == in_alarm[-1] == 0.0
     assert [row["Points2D:labels"] for _, row in rows["/fleet/map/alarm_names"]].count(["tray2/2"]) >= 2
     texts = [row["TextLog:text"][0] for _, row in rows["/fleet/log"]]
-    assert texts[0].startswith("22:13:28.500  tray2: alarm raised") and len(texts) == 2
+    assert texts[0].startswith("22:13:28  tray2 fan 2: alarm raised") and len(texts) == 2
     assert "TextDocument:text" in rows["/fleet/worst"][0][1]
 
 

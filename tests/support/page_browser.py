@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
@@ -44,10 +44,18 @@ def running_browser() -> Iterator[Browser]:
             running.close()
 
 
-def opened(browser: Browser, url: str, errors: list[str], user: str = "", **context: Any) -> Page:
-    """The page in a browser of its own, logged in as a user if one is named. errors: those of its scripts."""
-    settings: dict[str, Any] = {"viewport": {"width": 1280, "height": 900}} | context
-    page = browser.new_context(**settings).new_page()
+def opened(
+    browser: Browser,
+    url: str,
+    errors: list[str],
+    user: str = "",
+    size: tuple[int, int] = (1280, 900),
+    scheme: Literal["light", "dark"] = "light",
+) -> Page:
+    """The page in a browser of its own, logged in as a user if one is named. errors: those of its scripts. size: of the
+    window, in pixels."""
+    width_px, height_px = size
+    page = browser.new_context(viewport={"width": width_px, "height": height_px}, color_scheme=scheme).new_page()
     page.set_default_timeout(DEADLINE_MS)
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(url)

@@ -31,10 +31,11 @@ class RunningGateway(RunningCore[GatewayCore]):
         *,
         configuration: str = "",
         started_t_ns: int = 0,
+        port: int = 0,
         **settings: Any,
     ) -> None:
         """configuration: the text of a configuration file in the folder; empty: there is none."""
-        self.port = free_port()
+        self.port = port or free_port()
         path = folder / "fantwin.toml" if configuration else None
         context = {"configuration_path": path, "configuration_text": configuration, "started_t_ns": started_t_ns}
         super().__init__(STAGE, GatewayConfig(port=self.port, **settings), folder, answer, fans, **context)

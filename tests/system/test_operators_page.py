@@ -112,6 +112,11 @@ def test_an_alarm_is_seen_acknowledged_shelved_and_cleared_in_two_browsers(chain
         history = opened_again.locator("tbody")
         for words in ("raised", "acknowledged", "shelved", "cleared", SCRIPT):
             expect(history).to_contain_text(words)
+        history.locator("tr", has_text="raised").first.get_by_role("button", name="False alarm").click()
+        opened_again.get_by_label("Why").fill("a door was open")
+        opened_again.get_by_role("dialog").get_by_role("button", name="False alarm").click()
+        expect(history).to_contain_text("(false alarm)")
+        expect(shown).to_contain_text("marked as a false alarm by ann: a door was open")
         assert opened_again.title() != "1"
         assert errors == []
     assert SITE in ann.title()

@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, expect
 from schemas.enums import Action, FanState, Transition
 from schemas.messages import Alarm, Diagnosis, Request
 from tests.stages.test_gateway import alarm, score
-from tests.support.page_browser import inaccessible, make_users, opened, running_browser
+from tests.support.page_browser import PASSWORD, inaccessible, make_users, opened, running_browser
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, TRAY
 from tests.support.running_gateway import RunningGateway
@@ -106,11 +106,35 @@ def test_everything_is_done_by_keyboard(gateway, browser):
     assert errors == []
 
 
+def test_whoever_must_log_in_is_asked_again_after_a_restart_and_sees_the_page_again(tmp_path, browser):
+    settings = {"users": make_users(tmp_path / "users.toml"), "hosts": ("127.0.0.1", "fans.example")}
+    running = RunningGateway(tmp_path, **settings)
+    page = browser.new_page()
+
+    def log_in() -> None:
+        page.get_by_label("Name").fill("vic")
+        page.get_by_label("Password").fill(PASSWORD)
+        page.get_by_role("dialog").get_by_role("button", name="Log in").click()
+        expect(page.locator("#connection")).to_contain_text("live")
+
+    try:
+        page.goto(f"http://127.0.0.1:{running.port}/")
+        log_in()
+        running.close()
+        expect(page.locator("#connection")).to_contain_text("no connection")
+        running = RunningGateway(tmp_path, port=running.port, **settings)
+        log_in()
+        running.feed(score())
+        expect(page.get_by_role("button", name=f"{TRAY} fan 0")).to_be_visible()
+    finally:
+        running.close()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_page_is_accessible_and_fits_a_phone(scheme, gateway, browser):
     errors: list[str] = []
     url = f"http://127.0.0.1:{gateway.port}/"
-    phone = opened(browser, url, errors, "ann", viewport={"width": 390, "height": 844}, color_scheme=scheme)
+    phone = opened(browser, url, errors, "ann", size=(390, 844), scheme=scheme)
     found: dict[str, list[str]] = {}
     views = {
         "fans": CELL,

@@ -20,6 +20,7 @@ from pipeline.cli.progress import working
 from pipeline.launch.loss_accounting import label, losses
 from pipeline.launch.refused_input import refused, refused_lines
 from pipeline.launch.stage_notes import note_lines, notes_as_json
+from pipeline.recordings.clips.clip import clip_lines
 from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
 from pipeline.recordings.dates import format_clock, format_local
 from pipeline.recordings.metadata import CONFIGURATION
@@ -184,6 +185,7 @@ def _about(part: Contents) -> list[str]:
         lines.append(f"from {format_local(part.first_ns)} to {format_local(part.last_ns)}: {_duration_s(part):,.1f} s")
     if not metadata and not part.streams:
         lines.append("not a fantwin recording: it has no fantwin channels")
+    lines += [escape(line) for line in clip_lines(metadata)]
     if "part" in metadata:
         after = f", continues {metadata['continues']}" if "continues" in metadata else ""
         session, site = metadata.get("session", "?"), metadata.get("site", "?")

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from pipeline.cli.options import JsonOption, fan_numbers
+from pipeline.cli.options import JsonOption, ViewLayout, fan_numbers
 from pipeline.errors import UserError
 from pipeline.optional_dependencies import how_to_install
 
@@ -24,6 +24,9 @@ def picture(
     ] = None,
     window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = 30.0,
     view: Annotated[str | None, typer.Option(help="Only this view, by part of its name, e.g. 'fan 2'.")] = None,
+    layout: Annotated[
+        ViewLayout, typer.Option(help="all: every fan; alarms: the fans that were in alarm; wear: change over days.")
+    ] = ViewLayout.ALL,
     json_output: JsonOption = False,
 ) -> None:
     """Draw a view file as a picture with a headless Rerun viewer (needs a Vulkan driver).
@@ -37,7 +40,9 @@ def picture(
             raise
         raise UserError(f"pictures need the extra `view`; {how_to_install('view')}") from error
     with Console(stderr=True).status(f"drawing {view_file}"):
-        drawn = draw_picture(view_file, tray=tray, fans=fan_numbers(fans), at_s=at, window_s=window, view=view)
+        drawn = draw_picture(
+            view_file, tray=tray, fans=fan_numbers(fans), at_s=at, window_s=window, view=view, layout=layout.value
+        )
     output.write_bytes(drawn.png)
     if json_output:
         typer.echo(json.dumps({"picture": str(output), "views": drawn.reports}))

@@ -19,6 +19,7 @@ from pipeline.cli.progress import interruptible, show_part
 from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
 from pipeline.cli.twins.calibration_check import Check, check_declared_rate
 from pipeline.cli.twins.drops_found import drop_lines, drops_found
+from pipeline.cli.twins.marked_running import marked_running
 from pipeline.cli.twins.outlier_run_check import outlier_warning
 from pipeline.cli.twins.training_data import FromOption, ToOption, twin_errors
 from pipeline.errors import UsageError, UserError
@@ -68,6 +69,16 @@ def calibrate(
             "TWIN.onnx and HEALTHY.mcap... before it.",
         ),
     ] = None,
+    feedback: Annotated[
+        list[Path] | None,
+        typer.Option(
+            parser=recording_path,
+            callback=matching,
+            metavar="FILE...",
+            help="Other recordings, or the alarms.sqlite of a gateway, in which operators marked alarms of these "
+            "recordings as true or false: all arguments up to the next option.",
+        ),
+    ] = None,
     extrapolate: Annotated[
         bool,
         typer.Option(
@@ -99,6 +110,8 @@ def calibrate(
     as frequent as declared. If the data cannot support the rate, the command refuses and says how much is needed.
     Without calibration only large errors of the speed, missing readings and standstill raise alarms.
 
+    The time of an alarm that an operator has marked as true is left out, with the ten minutes before it.
+
     Exit codes: 0 success; 1 error; 3 --verify found more false alarms than declared; 4 recordings were skipped;
     130 Ctrl-C.
 
@@ -120,7 +133,10 @@ def calibrate(
         if healthy:
             if false_alarms_per_day is None:
                 raise UsageError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
-            part = HealthyPart(twin, tuple(overrides or ()), from_s, to_s, tray)
+            marked = marked_running(healthy, feedback or [], tray, pool)
+            for line in marked.lines:
+                typer.echo(line, err=True)
+            part = HealthyPart(twin, tuple(overrides or ()), from_s, to_s, tray, marked.left_out)
             limits, warning, speed_unit = _calibrated(
                 healthy, part, false_alarms_per_day, pool, extrapolate, alarms_left_out, seed
             )
@@ -129,6 +145,7 @@ def calibrate(
             drops = drops_found(output, RAD_S_PER_UNIT[speed_unit])
             result = {
                 "twin": str(output),
+                "alarms": marked.as_json(),
                 "calibration": json.loads(limits.model_dump_json()),
                 "warnings": [warning] if warning else [],
                 "speed_unit": speed_unit,
@@ -139,7 +156,8 @@ def calibrate(
             if not json_output:
                 _print(output, limits, drop_lines(drops, speed_unit))
         if verify:
-            check = check_declared_rate(output or twin, verify, overrides or [], pool, tray)
+            true_ones = marked_running(verify, feedback or [], tray, pool).left_out
+            check = check_declared_rate(output or twin, verify, overrides or [], pool, tray, true_ones)
             result["verify"] = check.as_json()
     if json_output:
         typer.echo(json.dumps(result | pool.as_json()))

@@ -14,6 +14,7 @@ from pipeline.errors import UserError
 from pipeline.recordings.checksum import sha256_of
 from pipeline.replay.offline.alarm_episodes import episodes
 from pipeline.replay.offline.healthy_runs import HealthyPart
+from pipeline.replay.offline.marked_alarms import LeftOut, concerning
 from pipeline.replay.offline.rescoring import rescore
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
 from scoring.calibration.alarm_rate import poisson_interval
@@ -80,10 +81,11 @@ def check_declared_rate(
     overrides: Sequence[str],
     pool: RecordingsInParallel,
     tray: str | None = None,
+    left_out: Sequence[LeftOut] = (),
 ) -> Check:
     """Count alarms on other healthy recordings, processed as by `fantwin replay --offline`.
 
-    tray: the only one that is used; without it all are.
+    tray: the only one that is used; without it all are. left_out: times of fans in which an alarm is no false one.
 
     Raises:
         UserError: the twin declares no rate or was made from one of the recordings, a recording cannot be used, or none
@@ -96,21 +98,25 @@ def check_declared_rate(
         raise UserError(f"{twin}: its alarms were never calibrated: give healthy recordings and --false-alarms-per-day")
     made_from = _made_from(twin, loaded, declared)
     list(pool.map(partial(_refuse_its_own, made_from=made_from), recordings, "looking for its own recordings"))
-    count = partial(_count_alarms, twin=twin, overrides=tuple(overrides), tray=tray)
+    count = partial(_count_alarms, twin=twin, overrides=tuple(overrides), tray=tray, left_out=tuple(left_out))
     counts = list(pool.map(count, recordings, "scoring other healthy recordings"))
     return Check(sum(alarms for alarms, _ in counts), sum(hours for _, hours in counts), declared.false_alarms_per_day)
 
 
-def _count_alarms(path: Path, twin: Path, overrides: tuple[str, ...], tray: str | None) -> tuple[int, float]:
+def _count_alarms(
+    path: Path, twin: Path, overrides: tuple[str, ...], tray: str | None, left_out: tuple[LeftOut, ...]
+) -> tuple[int, float]:
     """Alarms of one recording, and the fan-hours that could be scored."""
     alarms, fan_hours = 0, 0.0
     with HealthyPart(twin, overrides, tray=tray).opened(path) as replay_input:
         for each, rescored in zip(replay_input.trays, rescore(replay_input, None, False), strict=True):
             if rescored.problem:
                 raise UserError(f"{path}: {rescored.problem}")
-            alarms += len(episodes(rescored.alarms))
+            spans = concerning(left_out, path, replay_input.config.site, each.name)
+            alarms += sum(not any(span.has(alarm) for span in spans) for alarm in episodes(rescored.alarms))
             fan_samples = rescored.samples * each.fans - rescored.not_judged.total()
-            fan_hours += fan_samples * rescored.period_ns / NS_PER_HOUR
+            left_out_ns = sum(span.length_ns(rescored.start_ns, rescored.end_ns) for span in spans)
+            fan_hours += max(0.0, fan_samples * rescored.period_ns - left_out_ns) / NS_PER_HOUR
     return alarms, fan_hours
 
 

@@ -131,8 +131,8 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
         if page.address:
             console.print(f"operators' page, while the demo runs: {page.address}", soft_wrap=True)
         _watch(config, bus, device, pipeline, page, stop, console)
-        if reason := page.finish():
-            console.print(f"no picture of the page: {reason}", soft_wrap=True)
+        if missing_because := page.finish():
+            console.print(f"no picture of the page: {missing_because}", soft_wrap=True)
         if pipeline.poll() is None:
             pipeline.send_signal(signal.SIGINT)
         try:

@@ -34,7 +34,7 @@ class DemoPage:
         self._browser = installed_browser()
         self._in_alarm_s: float | None = None
         self._thread: threading.Thread | None = None
-        self._no_picture = "" if self._browser else f"it needs a browser: one of {', '.join(BROWSERS)}"
+        self._missing_because = "" if self._browser else f"it needs a browser: one of {', '.join(BROWSERS)}"
 
     def look(self, fans_in_alarm: Collection[int]) -> None:
         """Called while the demo runs."""
@@ -52,8 +52,8 @@ class DemoPage:
         if self._thread:
             self._thread.join(2 * LIMIT_S)
         elif self.address and self._browser:
-            self._no_picture = f"fan {self._fan} was not in alarm for {AFTER_S:g} s"
-        return self._no_picture if self.address else ""
+            self._missing_because = f"fan {self._fan} was not in alarm for {AFTER_S:g} s"
+        return self._missing_because if self.address else ""
 
     def _take(self) -> None:
-        self._no_picture = take_picture(self._browser, self._url, _READY, SIZE, self._file)
+        self._missing_because = take_picture(self._browser, self._url, _READY, SIZE, self._file)

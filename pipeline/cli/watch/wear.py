@@ -18,7 +18,7 @@ from rich.table import Table
 from pipeline.bus.session import join_bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.progress import working
-from pipeline.cli.watch.alarms import wait_for_stages
+from pipeline.cli.watch.live_stages import wait_for_stages
 from pipeline.config.loading import load_config
 from pipeline.config.roles import roles_of
 from pipeline.errors import UserError

@@ -13,6 +13,8 @@ export const ACTIONS = {
   out_of_service: { title: "Out of service", about: "The fan is being worked on." },
   in_service: { title: "In service", about: "The fan is back." },
   reset: { title: "Reset", about: "Release an alarm that is latched." },
+  true_alarm: { title: "True alarm", about: "Something was wrong with the fan." },
+  false_alarm: { title: "False alarm", about: "Nothing was wrong with the fan. Calibration may learn from it.", needsReason: true },
   commission: { title: "Commission", about: "The fan was replaced or repaired: learn its offset again." },
 };
 const SHELVED_FOR = [["30 minutes", 1800], ["2 hours", 7200], ["8 hours", 28800], ["1 day", 86400], ["7 days", 604800], ["until it clears", 0]];
@@ -27,14 +29,20 @@ export function possible(alarm) {
     alarm.shelved_until_t_ns ? "unshelve" : "shelve",
     alarm.suppressed ? "unsuppress" : "suppress",
     alarm.out_of_service ? "in_service" : "out_of_service",
+    ...feedbackOn(alarm),
     "commission",
   ].filter(Boolean);
+}
+
+// What may still be said of an alarm: the last word counts.
+export function feedbackOn(alarm) {
+  return alarm.severity === "none" ? [] : ["true_alarm", "false_alarm"].filter((each) => each !== alarm.feedback);
 }
 
 export function buttons(tray, fan, alarm) {
   if (!me.may_act) return element("p", { class: "muted" }, hint());
   return element("div", { class: "actions" }, ...possible(alarm).map((action, number) => element("button", {
-    type: "button", class: number === 0 && action === "acknowledge" ? "primary" : "", onclick: () => askFor(action, tray, fan),
+    type: "button", class: number === 0 && action === "acknowledge" ? "primary" : "", onclick: () => askFor(action, tray, fan, alarm),
     "data-action": action }, ACTIONS[action].title)));
 }
 
@@ -63,14 +71,15 @@ function hint() {
   return me.has_login ? "Log in to act." : "To act from this page, make a user: fantwin users add NAME";
 }
 
-function askFor(action, tray, fan) {
-  const { title, about, lasts } = ACTIONS[action];
+export function askFor(action, tray, fan, alarm = null) {
+  const { title, about, lasts, needsReason } = ACTIONS[action];
   const duration = lasts ? element("select", { id: "duration" }, ...SHELVED_FOR.map(([text, s]) => element("option", { value: s }, text))) : null;
-  const comment = element("input", { id: "comment", maxlength: 500, autocomplete: "off" });
+  const comment = element("input", { id: "comment", maxlength: 500, autocomplete: "off", required: needsReason });
   dialog(`${title}: ${tray} fan ${fan}`, element("div", {}, element("p", {}, about),
     duration && element("label", { for: "duration" }, "How long"), duration ?? "",
     element("label", { for: "comment" }, "Why (for the record)"), comment), title, async () => {
     const body = { action, comment: comment.value };
+    if (action.endsWith("_alarm") && alarm) body.onset_t_ns = alarm.onset_t_ns;
     if (duration) body.duration_s = Number(duration.value);
     const { answers } = await send(`/fans/${encodeURIComponent(tray)}/${fan}/requests`, body);
     notice(answers.map((answer) => answer.message).join("; "));

@@ -1,13 +1,15 @@
 // The list of alarms, and the history of their transitions.
 
-import { buttons, buttonsForAll } from "./actions.js";
+import { ACTIONS, askFor, buttons, buttonsForAll, feedbackOn } from "./actions.js";
 import { age, clock, element, facts, keepFocus, percent, stamp } from "./dom.js";
-import { ask, learn } from "./server.js";
+import { clipLink } from "./clips.js";
+import { ask, learn, me } from "./server.js";
 
 const OF_FAN = ["raised", "severity", "diagnosed"];  // these have the colour of the severity: nothing else is bad
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
 const PAGE = 100;
 const SHOWN = 100;
+const RATE_EVERY_MS = 10000;
 
 const name = (alarm) => `${alarm.tray}/${alarm.fan}`;
 const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.tray)}/${alarm.fan}` }, `${alarm.tray} fan ${alarm.fan}`);
@@ -38,7 +40,7 @@ export function card(alarm, viewerUrl) {
       "Deviation": alarm.evidence && alarm.message.includes(alarm.evidence) ? "" : alarm.message.replace(`fan ${alarm.fan}: `, ""),
       "State": states,
     }),
-    rerunLink(viewerUrl, alarm.onset_t_ns), buttons(alarm.tray, alarm.fan, alarm));
+    rerunLink(viewerUrl, alarm.onset_t_ns), " ", clipLink(alarm), buttons(alarm.tray, alarm.fan, alarm));
 }
 
 // As many need attention as the header says.
@@ -53,7 +55,17 @@ export class AlarmsView {
   constructor(alarms, viewerUrl) {
     Object.assign(this, { alarms, viewerUrl, most: SHOWN, due: 0 });
     this.root = element("div");
+    this.rate = element("p", { class: "muted", id: "alarm-rate" });
+    this.rated_ms = -RATE_EVERY_MS;
     this.draw();
+  }
+
+  // How many alarms really were false, beside how many are declared.
+  async showRate() {
+    if (performance.now() - this.rated_ms < RATE_EVERY_MS) return;
+    this.rated_ms = performance.now();
+    const { site } = await ask("/alarm-rate");
+    if (site.since_t_ns) this.rate.textContent = `Since ${clock(site.since_t_ns)}: ${site.text}.`;
   }
 
   // When many come at once, they are drawn together.
@@ -70,7 +82,8 @@ export class AlarmsView {
     keepFocus(this.root, () => this.root.replaceChildren(element("h2", {}, title(listed)), buttonsForAll(listed),
       ...(listed.length ? listed.slice(0, this.most).map((alarm) => card(alarm, this.viewerUrl(alarm.tray)))
         : [element("p", { class: "muted" }, "No alarms.")]),
-      more > 0 ? element("button", { type: "button", onclick: () => { this.most += SHOWN; this.draw(); } }, `${more} more`) : ""));
+      more > 0 ? element("button", { type: "button", onclick: () => { this.most += SHOWN; this.draw(); } }, `${more} more`) : "", this.rate));
+    learn(() => this.showRate());
   }
 }
 
@@ -93,6 +106,10 @@ export class HistoryView {
     const found = await ask(`/alarms/history?limit=${PAGE}${before === null ? "" : `&before=${before}`}${of}`);
     const { transitions } = found;
     const isNew = (each) => this.newest === null || each.number > this.newest;
+    if (before === null && this.newest !== null && transitions.some((each) => isNew(each) && each.transition.startsWith("marked"))) {
+      this.begin();  // what was said of an alarm is in its row
+      return;
+    }
     if (before === null) this.body.prepend(...transitions.filter(isNew).map((each) => this.row(each)));
     else this.body.append(...transitions.map((each) => this.row(each)));
     if (this.oldest === null || before !== null) {
@@ -125,6 +142,15 @@ export class HistoryView {
     const what = each.transition.replaceAll("_", " ");
     return element("tr", {}, cell("Time", stamp(each.t_ns)), this.fan ? "" : cell("Fan", link(each)),
       cell("What happened", badge(OF_FAN.includes(each.transition) ? each.severity : "plain", what)), cell("By", each.operator_name),
-      cell("Message", each.message, each.comment ? ` “${each.comment}”` : ""));
+      cell("Message", each.message, each.comment ? ` “${each.comment}”` : "",
+        ...(each.transition === "raised" ? [" ", clipLink(each), this.feedback(each)] : [])));
+  }
+
+  // What was said of an alarm, and the buttons to say it.
+  feedback(each) {
+    const said = each.feedback === "none" ? "" : ` (${each.feedback.replaceAll("_", " ")})`;
+    if (!me.may_act) return said;
+    return element("span", {}, said, element("span", { class: "actions" }, ...feedbackOn(each).map((action) => element("button", {
+      type: "button", "data-action": action, onclick: () => askFor(action, each.tray, each.fan, each) }, ACTIONS[action].title))));
   }
 }

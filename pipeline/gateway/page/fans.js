@@ -13,6 +13,7 @@ const GROUPS = [
 ];
 const LARGE_UP_TO = 64;
 const LARGE_GROUPS = 2;
+const SLICE = 1250;
 export const HIGHEST_LEVEL = 250;
 export const NO_LEVEL = 255;
 const NORMAL = GROUPS.length - 1;
@@ -21,7 +22,7 @@ const NORMAL = GROUPS.length - 1;
 export let address = "#/fans";
 
 // A level, which ends at HIGHEST_LEVEL.
-export const levelText = (level) => (level >= HIGHEST_LEVEL ? `more than ${HIGHEST_LEVEL} %` : `${level} %`);
+export const levelText = (level) => `${level >= HIGHEST_LEVEL ? "≥ " : ""}${level} %`;
 
 export const bytes = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
 
@@ -31,7 +32,8 @@ export class FansView {
     this.site = site;
     this.fans = site.trays.flatMap((tray) => Array.from({ length: tray.fans }, (_, fan) => ({ tray: tray.name, fan })));
     this.groupOfClass = site.groups.map((name) => GROUPS.findIndex((group) => group.name === name));
-    this.cells = [];
+    Object.assign(this, { cells: [], classes: null, levels: null, next: 0, waiting: 0, frame: 0 });
+    this.step = this.fans.length <= LARGE_UP_TO ? 5 : 10;  // of the score shown, in per cent of its limit
     this.root = this.build();
     for (const [name, choice] of [["tray", this.tray], ["state", this.state]]) {
       if ([...choice.options].some((option) => option.value === filters.get(name))) choice.value = filters.get(name);
@@ -64,33 +66,50 @@ export class FansView {
   cell(fan, index) {
     const mark = element("span", { class: "mark", "aria-hidden": "true" });
     const words = element("span", { class: "words" });
-    const level = element("span", { class: "level", "aria-hidden": "true" });
     const root = element("button", { class: "cell", type: "button", tabindex: "-1" }, mark,
-      element("span", { class: "name" }, `${fan.tray} fan ${fan.fan}`), words, level);
+      element("span", { class: "name" }, `${fan.tray} fan ${fan.fan}`), words);
     root.index = index;
-    return { root, mark, words, level, text: "", group: -1, class: -1, percent: -1 };
+    return { root, mark, words, text: "", group: -1, class: -1, percent: -1 };
   }
 
+  // All fans at a glance have come. The first time all cells are drawn; then some in each frame, so that none takes long.
   update(fleet) {
-    const classes = bytes(fleet.classes), levels = bytes(fleet.levels);
+    const isFirst = !this.classes;
+    this.classes = bytes(fleet.classes);
+    this.levels = bytes(fleet.levels);
+    this.waiting = this.cells.length;
+    if (isFirst) this.draw(this.waiting);
+    else this.frame ||= requestAnimationFrame(() => this.draw(SLICE));
+  }
+
+  draw(most) {
+    this.frame = 0;
     const came = new Map();
-    for (let index = 0; index < this.cells.length; index++) {
-      const cell = this.cells[index];
-      const isOther = classes[index] !== cell.class;
-      if (isOther) {
-        cell.class = classes[index];
-        const group = this.groupOfClass[cell.class];
-        if (group !== cell.group) {
-          cell.group = group;
-          if (!came.has(group)) came.set(group, []);
-          came.get(group).push(index);
-        }
-      }
-      const percent = levels[index] === NO_LEVEL ? 0 : 5 * Math.round(levels[index] / 5);
-      if (isOther || percent !== cell.percent) this.label(cell, index, percent);
+    for (let drawn = 0; drawn < most && this.waiting > 0; drawn++, this.waiting--) {
+      const index = this.next;
+      this.next = (index + 1) % this.cells.length;
+      const group = this.drawCell(index);
+      if (group === null) continue;
+      if (!came.has(group)) came.set(group, []);
+      came.get(group).push(index);
     }
     for (const [group, indexes] of came) this.place(group, indexes);
     if (came.size) this.count();
+    if (this.waiting > 0) this.frame = requestAnimationFrame(() => this.draw(SLICE));
+  }
+
+  // Returns the group of a fan if it is another one than before, else null.
+  drawCell(index) {
+    const cell = this.cells[index], level = this.levels[index], before = cell.group;
+    const isOther = this.classes[index] !== cell.class;
+    if (isOther) {
+      cell.class = this.classes[index];
+      cell.group = this.groupOfClass[cell.class];
+    }
+    const percent = level === NO_LEVEL ? 0 : this.step * Math.round(level / this.step);
+    const hasMoved = percent !== cell.percent && Math.abs(level - cell.percent) >= this.step;
+    if (isOther || hasMoved) this.label(cell, index, percent);
+    return cell.group === before ? null : cell.group;
   }
 
   // An alarm was raised; what the fan's next sample says comes up to a second later. Many that come at once are shown
@@ -114,7 +133,7 @@ export class FansView {
     const words = cell.group === NORMAL ? "normal" : this.site.classes[cell.class];
     if (percent !== cell.percent) {
       cell.percent = percent;
-      cell.level.style.transform = `scaleX(${Math.min(1, percent / 100)})`;
+      cell.root.style.backgroundSize = `${Math.min(100, percent)}% .25rem`;
     }
     const share = percent ? `, ${levelText(percent)}` : "";
     const text = `${fan.tray} fan ${fan.fan} ${words}${share}${share && " of the limit"}`;

@@ -2,6 +2,7 @@
 
 import { AlarmsView, HistoryView } from "./alarms.js";
 import { logOut, showLogin } from "./actions.js";
+import { learnClips } from "./clips.js";
 import { element, notice } from "./dom.js";
 import { FanView } from "./fan.js";
 import { address, bytes, FansView } from "./fans.js";
@@ -10,10 +11,12 @@ import { ask, Events, learnWhoIAm, me, Refused } from "./server.js";
 
 const content = document.getElementById("content");
 const alarms = new Map();
+const CLIPS_MS = 20000;
 let site = null, view = null, fleet = null, stages = [], shownHash = null, alarmsDue = 0, lastFan = "";
 
 const events = new Events({
   connected: (isThere) => showConnection(isThere),
+  refused: () => start(),
   fleet: (data) => {
     fleet = data;
     showSummary();
@@ -46,7 +49,7 @@ function showConnection(isThere) {
 async function learnState() {
   try {
     await learnWhoIAm();
-    const [found, now] = await Promise.all([ask("/alarms"), ask("/stages")]);
+    const [found, now] = await Promise.all([ask("/alarms"), ask("/stages"), learnClips()]);
     alarms.clear();
     found.alarms.forEach((alarm) => alarms.set(`${alarm.tray}/${alarm.fan}`, alarm));
     stages = now.stages;
@@ -58,6 +61,11 @@ async function learnState() {
     if (failure instanceof Refused && failure.status === 401) start();
   }
 }
+
+// A clip is there a minute or two after its alarm.
+setInterval(async () => {
+  if (wasConnected && alarms.size && await learnClips().catch(() => false)) showAlarms(null);
+}, CLIPS_MS);
 
 function showSummary() {
   const { in_alarm, suspect, not_judged } = fleet.counts;

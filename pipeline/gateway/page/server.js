@@ -1,6 +1,6 @@
 // The server: questions, requests and live events. The page comes back by itself when the server does.
 
-const PREFIX = "/api/v1";
+export const PREFIX = "/api/v1";
 const RETRY_MS = 1000;
 
 export let me = { name: "", may_read: false, may_act: false, has_login: false, csrf_token: "" };
@@ -43,7 +43,7 @@ async function answered(response) {
 }
 
 // Events of the site, and the samples of one fan if its name is given. on: a handler for each kind of event, and
-// `connected` with whether the server is there.
+// `connected` with whether the server is there, and `refused` when one has to log in first.
 export class Events {
   constructor(on) {
     this.on = on;
@@ -60,15 +60,25 @@ export class Events {
     this.source.onerror = () => {
       this.on.connected(false);
       this.close();
-      this.timer = setTimeout(() => this.open(this.fan), RETRY_MS);
+      this.timer = setTimeout(() => this.again(), RETRY_MS);
     };
     for (const name of ["fleet", "alarm", "stages", "samples", "missed"]) {
       this.source.addEventListener(name, (event) => this.on[name]?.(JSON.parse(event.data)));
     }
   }
 
+  // A browser does not say why events do not come: the server is away, or it has ended the session.
+  async again() {
+    const timer = this.timer;
+    const mayRead = await learnWhoIAm().then(() => me.may_read, () => true);
+    if (timer !== this.timer) return;
+    if (mayRead) this.open(this.fan);
+    else this.on.refused();
+  }
+
   close() {
     clearTimeout(this.timer);
+    this.timer = 0;
     this.source?.close();
     this.source = null;
   }

@@ -22,12 +22,12 @@ export class StagesView {
     this.shown = shown;
     const cell = (label, content, kind = "") => element("td", { "data-label": label, class: kind }, content);
     const latency = (each, ms) => (each.latency_p99_ms ? ms.toFixed(1) : "");
-    const about = (each) => element("div", {}, each.detail ? element("p", { class: "problem" }, `▲ ${each.detail}`) : "",
+    const about = (each) => (each.detail || each.notes.length) && element("div", {}, each.detail ? element("p", { class: "problem" }, `▲ ${each.detail}`) : "",
       ...each.notes.map((note) => element("p", { class: "muted" }, note)));
     this.body.replaceChildren(...stages.map((each) => element("tr", {}, cell("Stage", each.name),
       cell("State", WELL.includes(each.state) ? element("span", { class: "badge good" }, `● ${each.state}`) : badge("warning", each.state)),
       cell("In, messages/s", each.in_hz.toFixed(1), "number"), cell("Out, messages/s", each.out_hz.toFixed(1), "number"),
       cell("Latency p50, ms", latency(each, each.latency_p50_ms), "number"), cell("Latency p99, ms", latency(each, each.latency_p99_ms), "number"),
-      cell("Lost", each.lost ? `▲ ${each.lost}` : "0", each.lost ? "number lost" : "number"), cell("Problem; notes", about(each)))));
+      cell("Lost", each.lost ? `▲ ${each.lost}` : "0", each.lost ? "number lost" : "number"), cell("Problem; notes", about(each) || ""))));
   }
 }

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from schemas.enums import Feedback
 from schemas.messages import Alarm, Diagnosis
 from scoring.alarms.current_alarms import words_of
+from scoring.alarms.fan_condition import GIVES_FEEDBACK
+
+_GIVES = dict(GIVES_FEEDBACK.values())
+_Name = tuple[str, int, int]
+"""of an alarm: tray, fan and onset"""
+_Mark = tuple[int, Feedback, str, str]
+"""place in the order, what it was, who says so, and why"""
 
 
 @dataclass(frozen=True)
@@ -27,6 +35,10 @@ class Episode:
     message: str
     causes: tuple[Diagnosis, ...]
     """the newest diagnosis"""
+    feedback: Feedback = Feedback.NONE
+    """the last one of an operator"""
+    feedback_by: str = ""
+    feedback_reason: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """The JSON form; times on the recording's clock in ns."""
@@ -41,6 +53,9 @@ class Episode:
             "torque_balance": self.torque_balance_command,
             "message": self.message,
             "causes": [asdict(cause) for cause in self.causes],
+            "feedback": self.feedback.name.lower(),
+            "feedback_by": self.feedback_by,
+            "feedback_reason": self.feedback_reason,
         }
 
 
@@ -48,17 +63,19 @@ def episodes(alarms: Iterable[Alarm]) -> list[Episode]:
     """The episodes of one or several trays, in the order they were raised.
 
     If a scorer restarts without a snapshot and raises an alarm that its predecessor raised and did not clear, both
-    are one episode.
+    are one episode. Feedback may be later than the end of its episode.
     """
     found: list[Episode] = []
     open_alarms: dict[tuple[str, int], list[Alarm]] = {}
-    for alarm in sorted(alarms, key=lambda alarm: alarm.t_ns):
+    in_order = sorted(alarms, key=lambda alarm: alarm.t_ns)
+    marks = _marks(in_order)
+    for alarm in in_order:
         fan = (alarm.header.tray, alarm.fan)
         if alarm.active:
             open_alarms.setdefault(fan, []).append(alarm)
         elif fan in open_alarms:
-            found.append(_episode([*open_alarms.pop(fan), alarm], alarm.t_ns))
-    found += [_episode(alarms_of_fan, None) for alarms_of_fan in open_alarms.values()]
+            found.append(_episode([*open_alarms.pop(fan), alarm], alarm.t_ns, marks))
+    found += [_episode(alarms_of_fan, None, marks) for alarms_of_fan in open_alarms.values()]
     return sorted(found, key=lambda episode: (episode.raised_ns, episode.tray, episode.fan))
 
 
@@ -96,9 +113,24 @@ def _to(episode: Episode) -> int:
     return 2**63 if episode.cleared_ns is None else episode.cleared_ns
 
 
-def _episode(messages: list[Alarm], cleared_ns: int | None) -> Episode:
+def _marks(in_order: list[Alarm]) -> dict[_Name, _Mark]:
+    """The last feedback on each alarm, with its place in the order."""
+    found: dict[_Name, _Mark] = {}
+    for place, alarm in enumerate(in_order):
+        fan = (alarm.header.tray, alarm.fan)
+        if alarm.feedback != Feedback.NONE:
+            found[*fan, alarm.onset_t_ns] = (place, alarm.feedback, alarm.feedback_by, alarm.feedback_reason)
+        if feedback := _GIVES.get(alarm.transition):
+            found[*fan, alarm.marked_onset_t_ns] = (place, feedback, alarm.operator_name, alarm.comment)
+    return found
+
+
+def _episode(messages: list[Alarm], cleared_ns: int | None, marks: Mapping[_Name, _Mark]) -> Episode:
     """messages: all of this episode, in order."""
     first = messages[0]
+    fan = (first.header.tray, first.fan)
+    marked = [mark for onset_ns in {each.onset_t_ns for each in messages} if (mark := marks.get((*fan, onset_ns)))]
+    _, feedback, by, reason = max(marked, default=(0, Feedback.NONE, "", ""))
     return Episode(
         tray=first.header.tray,
         fan=first.fan,
@@ -110,6 +142,9 @@ def _episode(messages: list[Alarm], cleared_ns: int | None) -> Episode:
         torque_balance_command=_known(first.torque_balance_command),
         message=words_of(first),
         causes=next((alarm.causes for alarm in reversed(messages) if alarm.causes), ()),
+        feedback=feedback,
+        feedback_by=by,
+        feedback_reason=reason,
     )
 
 

@@ -16,6 +16,7 @@ from pipeline.errors import UserError
 from pipeline.recordings.checksum import sha256_of
 from pipeline.recordings.length import longest_s
 from pipeline.replay.offline.kept_samples import KeptSamples, RecordedTray, TrayRuns
+from pipeline.replay.offline.marked_alarms import LeftOut, concerning, without
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
@@ -51,6 +52,7 @@ class HealthyPart:
     """Which samples of each recording count, and the twin that they are compared with.
 
     from_s, to_s: in seconds since the first sample of the tray. tray: the only one that is used; without it all are.
+    left_out: times of fans that are not learned from.
     """
 
     twin: Path
@@ -58,6 +60,7 @@ class HealthyPart:
     from_s: float = 0.0
     to_s: float = math.inf
     tray: str | None = None
+    left_out: tuple[LeftOut, ...] = ()
 
     @contextmanager
     def opened(self, path: Path) -> Iterator[ReplayInput]:
@@ -221,13 +224,13 @@ def _computed(path: Path, part: HealthyPart, kept: KeptSamples | None) -> TrayRu
     """The samples of each tray of a recording, computed as the stages do."""
     unseen_error = load_tray_twin(part.twin).unseen_error
     with part.opened(path) as replay_input:
-        runs = (
-            (
-                RecordedTray(path, tray.name, tray.fans),
-                (samples_of(block, unseen_error) for block in replay_input.pipeline(tray.name).predictions()),
-            )
-            for tray in replay_input.trays
-        )
+
+        def blocks_of(tray: str) -> Iterator[Samples]:
+            spans = concerning(part.left_out, path, replay_input.config.site, tray)
+            for block in replay_input.pipeline(tray).predictions():
+                yield samples_of(without(block, spans), unseen_error)
+
+        runs = ((RecordedTray(path, tray.name, tray.fans), blocks_of(tray.name)) for tray in replay_input.trays)
         yield from kept.keep(path, runs) if kept else runs
 
 

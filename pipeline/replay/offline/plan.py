@@ -72,6 +72,10 @@ class Session:
     """of its outputs or reports"""
     position: InputPosition | None = None
     """of its newest recorded output"""
+    first_position: InputPosition | None = None
+    """of its first recorded output"""
+    causes_from_t_ns: int = BEGINNING
+    """of alarms before this, the causes rest on samples that the recording lacks"""
     snapshots_t_ns: list[int] = field(default_factory=list)
     """when it took the recorded snapshots, in order: a replay takes its own there. Only where these are compared"""
 
@@ -89,6 +93,8 @@ class TrayPlan:
     """by stage in the order of the chain, each list in the order the sessions began"""
     uses_recorded_snapshots: bool = True
     """False, with another twin or configuration: a session is restored from what the replayed one before it left"""
+    uses_recorded_inputs: bool = False
+    """the last stage is given what was recorded of its input, and the stages before it do not run"""
 
     @property
     def first(self) -> list[Session]:

@@ -39,8 +39,9 @@ class NoInputPositionError(Exception):
 class PlanReader:
     """Reads a tray's outputs and side topics, in the order they were recorded."""
 
-    def __init__(self, chain: StageChain, left_out: Collection[str] = ()) -> None:
-        """left_out: topics that the recorder did not record."""
+    def __init__(self, chain: StageChain, left_out: Collection[str] = (), *, from_snapshot: bool = False) -> None:
+        """left_out: topics that the recorder did not record. from_snapshot: the recording is a clip that begins in the
+        middle of a session, with the snapshot from which this goes on."""
         self._left_out = left_out
         self._result = chain.outputs[-1]
         self._stages = {topic: stage.name for stage, topic in zip(chain.stages, chain.outputs, strict=True)}
@@ -55,6 +56,9 @@ class PlanReader:
         self._twins: dict[tuple[str, int], ModelCard] = {}
         self._answers: dict[tuple[str, str], tuple[int, int]] = {}
         self._has_positions = True
+        self._from_snapshot = from_snapshot
+        self.first_snapshot: ScorerSnapshot | None = None
+        """the first one in the recording"""
         self.alarms: dict[tuple[str, int], Alarm] = {}
         """the recorded alarms by producer and sequence, each once"""
         self.undecodable = 0
@@ -90,13 +94,19 @@ class PlanReader:
         _open_ends(plan)
         _find_repeats(plan)
         self._add_sides(plan)
-        _limit_unknown_beginnings(plan)
+        _limit_unknown_beginnings(plan, 1 if self._from_snapshot else 0)
         return plan
 
     @property
     def twins(self) -> list[ModelCard]:
         """The learned twins, each with its first sample, in order."""
         return sorted(self._twins.values(), key=lambda card: card.t_ns)
+
+    @property
+    def answered_requests(self) -> list[tuple[int, Request]]:
+        """The requests of operators, each with the time of the sample after which it was answered, in order."""
+        answers = sorted(self._answers.items(), key=lambda answer: answer[1])
+        return [(t_ns, self._requests[name]) for (_, name), (_, t_ns) in answers if name in self._requests]
 
     @property
     def no_plan_reason(self) -> str:
@@ -146,6 +156,7 @@ class PlanReader:
             began_before = stage != self._first and output.position.consumed_count > 1
             lacks_outputs = stage != self._first and output.number > 0
             session = sessions[output.producer] = Session(output.producer, began_before, lacks_outputs)
+            session.first_position = output.position
         elif output.number < session.next_number:
             return  # this part of the recording overlaps the one before
         if stage == self._first:
@@ -172,6 +183,7 @@ class PlanReader:
             key = header.producer, position.producer
             self._known[key] = max(message.t_ns, self._known.get(key, message.t_ns))
         if isinstance(message, ScorerSnapshot):
+            self.first_snapshot = self.first_snapshot or message
             if message.restored:
                 self._snapshots.setdefault(header.producer, message)
             else:
@@ -245,10 +257,11 @@ def _drop_unknown_producers(sessions: list[Session], known: set[str]) -> None:
             session.spans = [span for span in session.spans if span.producer in known]
 
 
-def _limit_unknown_beginnings(plan: TrayPlan) -> None:
+def _limit_unknown_beginnings(plan: TrayPlan, first: int) -> None:
     for sessions in plan.sessions.values():
         for number, session in enumerate(sessions):
-            if session.lacks_outputs or (session.began_before and session.snapshot is None):
+            is_unknown = session.lacks_outputs or (session.began_before and session.snapshot is None)
+            if number >= first and is_unknown:
                 reason = (
                     f"the first messages of {session.producer} were not recorded"
                     if number

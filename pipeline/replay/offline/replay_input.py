@@ -12,11 +12,13 @@ from pathlib import Path
 
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
+from pipeline.recordings.clips.clip import CLIP_SNAPSHOT_KEY
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.order import in_order
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
 from pipeline.recordings.run_recordings import run_metadata
 from pipeline.replay.default_config import default_config, first_raw
+from pipeline.replay.offline.clip_plan import NOT_TO_THE_BIT, plan_from_snapshot, plan_with_recorded_inputs
 from pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
 from pipeline.replay.offline.plan_reader import PlanReader
@@ -27,7 +29,7 @@ from pipeline.runtime.consumed import CONSUMED
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Message, ModelCard
+from schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 
 _OF_THE_PLACE = ("bus.", "launcher.", "run_folder")
 """how the names of keys begin that say where a process runs"""
@@ -81,25 +83,41 @@ class ReplayInput:
             if reading.damage:
                 self.damage[path] = reading.damage
 
-    def read_plan(self, tray: str) -> tuple[TrayPlan | None, list[Alarm], str]:
+    def read_plan(self, tray: str, *, verify: bool = False) -> tuple[TrayPlan | None, list[Alarm], str]:
         """What each session of a tray's stages consumed; the recorded alarms, each once; why there is no plan.
 
-        The plan is None if the recording does not contain it, or if another grid or only a part is replayed.
+        The plan is None if the recording does not contain it, or if another grid or only a part is replayed. verify:
+        the replay is compared with the recording, which of a clip needs another plan.
         """
         left_out = self.metadata.left_out
         recorded = [topic for topic in self.stages.outputs if topic not in left_out]
-        reader = PlanReader(self.stages, left_out)
+        from_snapshot = CLIP_SNAPSHOT_KEY in self.metadata.metadata
+        reader = PlanReader(self.stages, left_out, from_snapshot=from_snapshot)
         for envelope in self.envelopes(tray, (*recorded, *self.stages.side_topics, CONSUMED)):
             reader.add(envelope)
         if reader.undecodable:
             line = f"{self.paths[0]}: messages left out that cannot be decoded: {reader.undecodable}"
             self.damage[self.paths[0]] = line
+        if from_snapshot and reader.first_snapshot:
+            plan, reason = self._clip_plan(tray, reader, reader.first_snapshot, verify=verify)
+            return plan, list(reader.alarms.values()), reason
         plan = reader.plan() if self.is_same_grid and not self.is_part else None
         if plan:
             plan.uses_recorded_snapshots = self.is_as_recorded
             if self.twins[tray] is not None:
                 plan.without_learned_twins()
         return plan, list(reader.alarms.values()), reader.no_plan_reason
+
+    def _clip_plan(
+        self, tray: str, reader: PlanReader, snapshot: ScorerSnapshot, *, verify: bool
+    ) -> tuple[TrayPlan | None, str]:
+        if not verify:
+            twins = reader.twins if self.twins[tray] is None else []
+            return plan_from_snapshot(self.stages, snapshot, twins, reader.answered_requests), ""
+        if self.stages.outputs[-2] in self.metadata.left_out:
+            return None, NOT_TO_THE_BIT
+        plan = reader.plan()
+        return (plan_with_recorded_inputs(plan, snapshot) if plan else None), reader.no_plan_reason
 
     def learned_twins(self, tray: str) -> list[ModelCard]:
         """Those that replace one another in the recording, each with its first sample; none if another twin is used."""
@@ -117,7 +135,8 @@ class ReplayInput:
         raw = RawBlocks(lambda: self.envelopes(tray, ("raw",)), observe, (self.start_s, self.end_s))
         contexts = self.contexts(self.config.tray(tray))
         plan = plan or undisturbed_plan(self.stages, self.learned_twins(tray))
-        return OfflinePipeline(self.stages, contexts, raw, plan, observe)
+        inputs = self.stages.outputs[-2]
+        return OfflinePipeline(self.stages, contexts, raw, plan, observe, lambda: self.envelopes(tray, (inputs,)))
 
     def contexts(self, tray: TrayConfig) -> list[Context]:
         """What each stage of a tray is built from, in the order of the chain."""

@@ -123,7 +123,7 @@ def rescore(
 def _rescore_tray(
     replay_input: ReplayInput, tray: str, verify: bool, writer: RecordingWriter | None, progress: Progress
 ) -> RescoredTray:
-    plan, recorded_alarms, no_plan_reason = replay_input.read_plan(tray)
+    plan, recorded_alarms, no_plan_reason = replay_input.read_plan(tray, verify=verify)
     plan_used = plan or undisturbed_plan(replay_input.stages, replay_input.learned_twins(tray))
     rescored = RescoredTray(tray, plan_used, recorded_alarms=recorded_alarms)
     output = TrayOutput(writer, replay_input.config.site, tray) if writer else None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.recordings.dates import format_utc
 from pipeline.replay.offline.compare_snapshots import SnapshotVerifier
 from pipeline.replay.offline.comparison import CAUSE_TOLERANCE, Comparison
-from pipeline.replay.offline.plan import Limit, Session
+from pipeline.replay.offline.plan import BEGINNING, Limit, Session
 from schemas.blocks import cut
 from schemas.enums import Transition
 from schemas.envelope import Envelope
@@ -25,6 +25,7 @@ from schemas.fields import columns
 from schemas.messages import Alarm, Array, Score, ScorerSnapshot
 
 SCORE, SNAPSHOT = "score", "snapshot"
+CAUSES = "causes of alarms soon after the beginning of a clip rest on samples from before it"
 _BLOCK_MESSAGES = 512
 _SAMPLE_COLUMNS = {
     name: column.dtype
@@ -83,7 +84,7 @@ class TrayVerifier:
                 for listed in (alarms, recorded)
             )
             limit = self._limit_of(session.producer)
-            compare_alarms(replayed, known, session.last_t_ns, self._found, limit)
+            compare_alarms(replayed, known, session.last_t_ns, self._found, limit, session.causes_from_t_ns)
             if limit is not None and limit.t_ns < session.last_t_ns and not self._found.has_scores:
                 self._found.add_limit(limit)
         return self._found
@@ -177,11 +178,19 @@ def compare_alarms(
     last_scored_t_ns: int,
     found: Comparison,
     limit: Limit | None = None,
+    causes_from_t_ns: int = BEGINNING,
 ) -> None:
     """Compare the alarms of one session with the recorded ones, matched by fan, time, transition and request.
 
     An alarm is published right after its score, so those of the last recorded score may be missing in the recording.
+    causes_from_t_ns: the causes of earlier ones rest on samples that the recording lacks.
     """
+
+    def is_of_causes(alarm: Alarm, other: Alarm | None) -> bool:
+        """Whether only the causes may differ."""
+        is_same = other is not None and _decided(replace(alarm, message="")) == _decided(replace(other, message=""))
+        return alarm.t_ns < causes_from_t_ns and (is_same or alarm.transition == Transition.DIAGNOSED)
+
     left = {(alarm.fan, alarm.t_ns, alarm.transition, alarm.request): alarm for alarm in recorded}
     for alarm in made:
         other = left.pop((alarm.fan, alarm.t_ns, alarm.transition, alarm.request), None)
@@ -189,6 +198,9 @@ def compare_alarms(
             found.alarms_equal += 1
         elif limit is not None and alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
+        elif is_of_causes(alarm, other):
+            found.alarms_not_comparable += 1
+            found.add_reason(f"{found.tray}: {CAUSES}")
         elif other is not None:
             found.alarms_different += 1
             found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, {other.message!r} recorded")
@@ -200,6 +212,10 @@ def compare_alarms(
     for alarm in left.values():
         if limit is not None and alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
+            continue
+        if is_of_causes(alarm, None):
+            found.alarms_not_comparable += 1
+            found.add_reason(f"{found.tray}: {CAUSES}")
             continue
         found.alarms_different += 1
         found.name(f"{found.tray}: alarm {_describe(alarm)} recorded, none replayed")

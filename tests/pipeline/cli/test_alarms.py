@@ -10,13 +10,15 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from datetime import datetime
 from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.bus.session import Bus
-from pipeline.cli.watch.alarms import OperatorAction, alarm_lines
+from pipeline.cli.watch.alarm_list import alarm_lines
+from pipeline.cli.watch.alarms import OperatorAction
 from pipeline.config.loading import load_config
 from pipeline.runtime.healthy_twin import ScorerConfig
 from pipeline.runtime.runner import Runner
@@ -46,7 +48,7 @@ class AlarmOnRequestScorer(Core):
     """The conditions of a tray whose ratios a test sets; answers requests as a scorer does."""
 
     def __init__(self) -> None:
-        self.conditions = TrayConditions(FANS, ConditionSettings(0, 0))
+        self.conditions = TrayConditions(FANS, ConditionSettings(0, 0, earlier_alarms=4))
         self.ratio: dict[int, float] = {}
         self.deaf = False
         self.not_judged: tuple[InvalidReason, ...] = ()
@@ -67,7 +69,8 @@ class AlarmOnRequestScorer(Core):
         if self.deaf or not isinstance(item, Request):
             return []
         fans = range(FANS) if item.fan < 0 else [item.fan]
-        asked = (item.action, fans, self._now_ns, item.duration_s * 1e9, item.operator_name, item.comment)
+        said = (item.operator_name, item.comment, item.onset_t_ns)
+        asked = (item.action, fans, self._now_ns, item.duration_s * 1e9, *said)
         name = f"{item.header.producer}/{item.header.sequence}"
         return [
             replace(
@@ -75,6 +78,7 @@ class AlarmOnRequestScorer(Core):
                 request=name,
                 operator_name=item.operator_name,
                 comment=item.comment,
+                marked_onset_t_ns=self.conditions.onset_meant(fan, item.onset_t_ns),
             )
             for fan, transition, why in self.conditions.request(*asked)
         ]
@@ -98,6 +102,9 @@ class AlarmOnRequestScorer(Core):
             suppressed=standing.suppressed,
             out_of_service=standing.out_of_service,
             causes=CAUSES if transition == Transition.RAISED else (),
+            feedback=standing.feedback,
+            feedback_by=standing.feedback_by,
+            feedback_reason=standing.feedback_reason,
         )
 
 
@@ -357,7 +364,7 @@ def test_a_scorer_that_does_not_answer_is_reported_after_the_timeout(site):
 
 @pytest.mark.parametrize("words", [(), ("ack", TRAY, 3)], ids=["list", "ack"])
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, monkeypatch):
-    monkeypatch.setattr("pipeline.cli.watch.alarms._DISCOVERY_S", 0.3)
+    monkeypatch.setattr("pipeline.cli.watch.live_stages._DISCOVERY_S", 0.3)
     error = error_of("alarms", *words, "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
     assert f"alarms unknown: no scorer of site '{SITE}' answers at {endpoint}" in error
 
@@ -372,7 +379,11 @@ def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, m
         ("shelve tray1 3 --for 0m", "--for 0m: give a time such as 90s, 30m, 8h or 2d"),
         ("ack tray1 3 --for 3m", "--for can be used with shelve only, not with ack"),
         ("ack tray1 3 --watch", "--all and --watch apply to the list only: leave them out with ack"),
-        ("--operator Ann", "--for, --comment and --operator need an action"),
+        ("ack tray1 3 --onset 14:03:10", "--onset can be used with true-alarm and false-alarm only, not with ack"),
+        ("true-alarm tray1 3 --onset noon", "--onset noon: give a time such as 14:03:10 or '2026-01-31 14:03:10'"),
+        ("--history --watch", "--history only lists: of the other options it takes --recordings and --json"),
+        ("--recordings a.mcap", "--recordings needs --history"),
+        ("--operator Ann", "--for, --comment, --operator and --onset need an action"),
     ],
 )
 def test_wrong_arguments_are_a_one_line_error(words, expected):
@@ -381,3 +392,30 @@ def test_wrong_arguments_are_a_one_line_error(words, expected):
 
 def test_every_action_can_be_typed():
     assert [asked.action for asked in OperatorAction] == [action for action in Action if action != Action.NONE]
+
+
+def test_an_operator_says_whether_an_alarm_was_true_while_it_stands_and_after_it(site):
+    site.raise_alarm(3)
+    assert "a false alarm needs a reason" in site.refused("false-alarm", TRAY, 3)
+    said = site.ask("false-alarm", TRAY, 3, "--comment", "the door was open", "--operator", "ann")
+    assert said == f"{TRAY}: fan 3: marked_false\n"
+    (first,) = site.listed()
+    assert (first["feedback"], first["feedback_by"], first["feedback_reason"]) == (
+        "false_alarm",
+        "ann",
+        "the door was open",
+    )
+    assert "marked as a false alarm by ann: the door was open" in site.ask().splitlines()[0]
+    site.core.ratio[3] = 0.0
+    eventually(lambda: not site.core.conditions.alarm_state(3).active, "it has cleared")
+    shown = datetime.fromtimestamp(first["onset_t_ns"] / 1e9)
+    (answer,) = json.loads(site.ask("true-alarm", TRAY, 3, "--onset", f"{shown:%Y-%m-%d %H:%M:%S}", "--json"))[
+        "answers"
+    ]
+    assert (answer["transition"], answer["marked_onset_t_ns"]) == ("marked_true", first["onset_t_ns"])
+    assert "no alarm began then" in site.refused("true-alarm", TRAY, 3, "--onset", "2020-01-01 10:00:00")
+
+
+def test_without_a_gateway_the_history_says_where_else_it_could_come_from(tmp_path):
+    error = error_of("alarms", "--history", "-c", DEMO / "demo.toml", "--set", f"run_folder='{tmp_path}'")
+    assert f"{tmp_path}/alarms.sqlite: no gateway has kept a history of alarms there" in error

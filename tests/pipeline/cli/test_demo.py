@@ -133,9 +133,9 @@ def test_a_pipeline_that_does_not_stop_is_one_line_and_is_killed(tmp_path, endpo
 def test_a_browser_that_takes_no_picture_is_one_line_and_ends(program, tmp_path, monkeypatch):
     monkeypatch.setattr("pipeline.cli.watch.page_picture.LIMIT_S", 1.0)
     path = shutil.which(program) or f"/{program}"
-    reason = take_picture(path, "http://127.0.0.1:1/", "true", (100, 100), tmp_path / "page.png")
-    assert reason.startswith(f"{program} has taken none: ")
-    assert "\n" not in reason
+    missing_because = take_picture(path, "http://127.0.0.1:1/", "true", (100, 100), tmp_path / "page.png")
+    assert missing_because.startswith(f"{program} has taken none: ")
+    assert "\n" not in missing_because
     assert not (tmp_path / "page.png").exists()
 
 

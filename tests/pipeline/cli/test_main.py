@@ -125,7 +125,7 @@ def test_a_mistake_is_one_line_with_what_to_do(command, words, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        ("alarms CONFIG --for 5m", "--for, --comment and --operator need an action"),
+        ("alarms CONFIG --for 5m", "--for, --comment, --operator and --onset need an action"),
         ("alarms shelve tray1 3 CONFIG --for soon", "--for soon: give a time such as 90s"),
         ("alarms ack tray1 9 CONFIG", "fan 9: tray tray1 has fans 0 to 7"),
         ("calibrate TWIN RECORDING", "declare a rate: --false-alarms-per-day"),

@@ -110,6 +110,22 @@ def test_only_the_stages_whose_sections_are_checked_are_imported(tmp_path):
     assert run.stdout.strip() == "['stages.resampler']"
 
 
+def test_all_that_is_wrong_in_a_section_is_one_line():
+    target = 'name = "a"\nurl_file = "u"\nquiet_hours = { begin = "22", end = "6" }\n'
+    with pytest.raises(ConfigError) as caught:
+        parse(f"{GOOD}[notifier]\ndigest_abov = 3\n[[notifier.target]]\n{target}")
+    assert str(caught.value).partition(".toml: ")[2] == (
+        "unknown key 'notifier.digest_abov'; did you mean 'digest_above'?; "
+        "notifier.target.0.quiet_hours.begin = '22': hours and minutes, such as \"22:00\"; "
+        "notifier.target.0.quiet_hours.end = '6': hours and minutes, such as \"22:00\""
+    )
+    with pytest.raises(ConfigError) as caught:
+        parse(GOOD + '[notifier.target]\nname = "a"\nurl_file = "u"\n')
+    assert "notifier.target: write [[notifier.target]], with two brackets on each side" in str(caught.value)
+    with pytest.raises(ConfigError, match=r"\(and 2 more\)$"):
+        parse(GOOD + "[gateway]\n" + "".join(f"x{n} = 1\n" for n in range(7)))
+
+
 def test_two_trays_of_one_name_are_refused():
     with pytest.raises(ConfigError, match="same name"):
         parse(GOOD + '[[tray]]\nname = "a"\nfans = 1\n')

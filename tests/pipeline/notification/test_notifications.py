@@ -12,7 +12,7 @@ from pipeline.notification.config import NotifierConfig
 from pipeline.notification.deciding import Event
 from pipeline.notification.notifications import FIRST_LOOK_NS, Changes, Notifications, Saved
 from pipeline.notification.wording import Level, Place, Text
-from schemas.enums import Severity, Transition
+from schemas.enums import Feedback, Severity, Transition
 from schemas.messages import Alarm, Diagnosis
 from schemas.units import NS_PER_S
 from tests.support.notified_alarms import START_NS, alarm, cleared
@@ -70,7 +70,7 @@ def test_an_alarm_is_raised_worse_and_cleared_and_each_is_said_once_with_cause_a
     assert raised.level == Level.WARNING
     assert raised.body.splitlines() == [
         "fan 2 of tray1 at hall: WARNING since 2026-09-21 14:13:20 UTC",
-        "90 rpm below the twin (limit 50)",
+        "90 rpm below the twin (limit 50) at 2026-09-21 14:13:20 UTC",
         "Cause: more drag (airflow blocked, filter clogged), 80 % (drag +20 %), or more friction (bearing), 20 %",
         "What to do: see whether the airflow is free and the filter is clean",
         "Not acknowledged.",
@@ -82,7 +82,7 @@ def test_an_alarm_is_raised_worse_and_cleared_and_each_is_said_once_with_cause_a
     desk.hear(cleared(severity=Severity.ALARM))
     (over,) = desk.wait(10)
     assert (over.title, over.level) == ("Cleared: alarm, fan 2 of tray1 (hall)", Level.GOOD)
-    assert "It was: 90 rpm below the twin (limit 50)" in over.body
+    assert "It was: 90 rpm below the twin (limit 50) at 2026-09-21 14:13:20 UTC" in over.body
     assert desk.wait(20_000) == [], "what is over is not sent again"
 
 
@@ -103,6 +103,19 @@ def test_it_is_sent_again_until_it_is_acknowledged_and_silenced_fans_send_nothin
     assert desk.wait(2000) == []
     desk.hear(alarm(Transition.UNSHELVED, fan=3, onset_s=5))
     assert titles(desk.wait(10)) == ["WARNING, fan 3 of tray1"], "from now on it is presented"
+
+
+def test_feedback_on_an_alarm_sends_nothing():
+    desk = Desk()
+    desk.hear(alarm())
+    assert len(desk.wait(10)) == 1
+    said = {"operator_name": "ann", "comment": "a door was open", "marked_onset_t_ns": START_NS}
+    desk.hear(alarm(Transition.MARKED_FALSE, feedback=Feedback.FALSE_ALARM, **said))
+    assert desk.wait(1000) == []
+    desk.hear(cleared())
+    assert titles(desk.wait(10)) == ["Cleared: alarm, fan 2 of tray1"]
+    desk.hear(alarm(Transition.MARKED_TRUE, active=False, feedback=Feedback.TRUE_ALARM, **said))
+    assert desk.wait(1000) == []
 
 
 def test_what_an_operator_shelves_while_its_message_waits_is_not_sent_and_sent_again_when_that_ends():
@@ -286,6 +299,16 @@ def test_the_first_notifier_of_a_site_says_what_is_presented_and_not_what_was():
     assert titles(desk.wait(10)) == ["WARNING, fan 3 of tray1"]
 
 
+def test_a_message_about_many_that_are_over_says_so_first():
+    desk = Desk()
+    desk.hear(*(alarm(fan=fan) for fan in range(5)))
+    assert titles(desk.wait(60)) == ["5 alarms in 1 tray (hall): 5 WARNING"]
+    desk.hear(*(cleared(fan) for fan in range(5)))
+    (over,) = desk.wait(60)
+    assert (over.title, over.level) == ("5 alarms cleared in 1 tray (hall)", Level.GOOD)
+    assert over.body.startswith("5 alarms cleared in 1 tray at hall\ntray1: cleared: 5 fans: 0-4\n")
+
+
 @pytest.mark.parametrize(
     "target",
     [
@@ -301,6 +324,22 @@ def test_the_first_notifier_of_a_site_says_what_is_presented_and_not_what_was():
 def test_targets_that_cannot_be_are_refused(target):
     with pytest.raises(ValidationError):
         NotifierConfig.model_validate({"target": [target]})
+
+
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        ({"target": {"name": "a", "url_file": "x"}}, "write \\[\\[notifier.target\\]\\], with two brackets"),
+        (
+            {"target": [{**TARGET, "quiet_hours": {"begin": "22", "end": "06:00"}}]},
+            'hours and minutes, such as "22:00"',
+        ),
+        ({"target": [{**TARGET, "quiet_hours": {"begin": "22:00", "end": "06:00\n"}}]}, "hours and minutes"),
+    ],
+)
+def test_what_is_easily_written_wrong_is_said_in_plain_words(section, words):
+    with pytest.raises(ValidationError, match=words):
+        NotifierConfig.model_validate(section)
 
 
 def test_two_targets_of_one_name_and_unknown_time_zones_are_refused():

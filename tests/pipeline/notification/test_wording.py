@@ -7,14 +7,16 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.errors import UserError
 from pipeline.notification.config import NotifierConfig
 from pipeline.notification.fan_alarm import NamedCause
 from pipeline.notification.gathering import ranges
 from pipeline.notification.services import Service
 from pipeline.notification.wording import Level, Place, Text, cause_line
 from schemas.units import NS_PER_S
+from scoring.diagnosis.advice import KNOWN_SOON
 from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, WHAT_TO_DO, advice
-from tests.support.message_receivers import HttpReceiver, free_port
+from tests.support.message_receivers import HttpReceiver, MailServer, free_port
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "notify.md"
 
@@ -26,6 +28,8 @@ def test_there_is_an_advice_for_every_cause():
 def test_where_the_cause_is_unclear_its_evidence_says_what_to_do():
     unclear = (NamedCause(CANNOT_TELL, 1.0, "cannot tell yet: move the command to 0.6 for ten seconds, and back"),)
     assert cause_line(unclear) == "Cause: cannot tell yet: move the command to 0.6 for ten seconds, and back"
+    soon = (NamedCause(CANNOT_TELL, 1.0, f"cannot tell yet: {KNOWN_SOON}"),)
+    assert cause_line(soon) == "Cause: cannot tell yet: the page, or `fantwin alarms`, may know it by now"
     assert advice(unclear) == ""
     assert cause_line(()) == "Cause: unknown"
 
@@ -58,6 +62,30 @@ def test_no_reason_of_a_failure_shows_a_secret(url, capfd):
     receiver.stop()
     said = capfd.readouterr()
     assert "123" not in said.out + said.err
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("mailtos://127.0.0.1:{port}/?from=f@hall.example&to=a@hall.example", "the mail server has no TLS: mailto://"),
+        ("mailto://ann:secret@127.0.0.1:{port}/?from=f@hall.example&to=a@hall.example", "leave user and password out"),
+        ("mailtos://127.0.0.1:{port}/?mode=ssl&from=f@hall.example&to=a@hall.example", "has no TLS at this port"),
+    ],
+)
+def test_what_a_mail_server_does_not_have_is_said_with_what_to_do(url, words):
+    server = MailServer()
+    server.start()
+    try:
+        failure = Service(url.format(port=server.port)).deliver(Text("t", "b", Level.INFO))
+    finally:
+        server.stop()
+    assert failure is not None
+    assert words in failure.reason
+
+
+def test_a_mail_without_an_address_to_send_from_is_refused_with_what_it_needs():
+    with pytest.raises(UserError, match="a mail needs .* and a user or from=ADDRESS"):
+        Service("mailto://mail.example?to=ann@hall.example")
 
 
 def test_the_configuration_of_the_how_to_is_one():

@@ -48,7 +48,9 @@ def test_a_comment_stays_until_the_next_and_that_of_a_refused_request_does_not_c
     said = alarm(Transition.ACKNOWLEDGED, 1, acknowledged=True, operator_name="ann", comment="seen")
     refused = alarm(Transition.REFUSED, 2, acknowledged=True, operator_name="bob", comment="no")
     cleared = alarm(Transition.CLEARED, 3, active=False, acknowledged=True)
-    fields = after(alarm(), said, refused, cleared).fields(NOW_NS)
+    of_earlier = {"marked_onset_t_ns": 5, "comment": "a door was open"}
+    marked = alarm(Transition.MARKED_FALSE, 4, active=False, acknowledged=True, **of_earlier)
+    fields = after(alarm(), said, refused, cleared, marked).fields(NOW_NS)
     assert (fields["Comment"], fields["ClientUserId"]) == ("seen", "ann")
 
 

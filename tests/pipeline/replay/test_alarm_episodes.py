@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from pipeline.replay.offline.alarm_episodes import Episode, compare_episodes, episodes
-from schemas.enums import Severity, Transition
+from schemas.enums import Feedback, Severity, Transition
 from schemas.header import Header
 from schemas.messages import Alarm, Diagnosis
 
@@ -91,3 +91,33 @@ def test_an_alarm_is_in_both_lists_where_the_same_fans_overlap() -> None:
     assert [e.fan for e in found.gained] == [1]
     assert [e.raised_ns for e in found.kept] == [12]
     assert [e.raised_ns for e in found.lost] == [50]
+
+
+def marked(t_ns: int, transition: Transition, meant_t_ns: int, comment: str = "", **more: Any) -> Alarm:
+    return alarm(
+        t_ns, transition, active=False, marked_onset_t_ns=meant_t_ns, operator_name="ann", comment=comment, **more
+    )
+
+
+def test_feedback_belongs_to_the_alarm_that_it_names_and_the_last_word_counts() -> None:
+    first, second = episodes(
+        [
+            alarm(10),
+            alarm(20, Transition.CLEARED),
+            alarm(40, onset_t_ns=35),
+            alarm(50, Transition.CLEARED, onset_t_ns=35),
+            marked(60, Transition.MARKED_TRUE, 5, onset_t_ns=35),
+            marked(60, Transition.MARKED_FALSE, 35, "first", onset_t_ns=35, feedback=Feedback.FALSE_ALARM),
+            marked(70, Transition.MARKED_FALSE, 5, "a door", onset_t_ns=35),
+            marked(70, Transition.MARKED_TRUE, 5, fan=1, onset_t_ns=35),
+        ]
+    )
+    assert (first.feedback, first.feedback_by, first.feedback_reason) == (Feedback.FALSE_ALARM, "ann", "a door")
+    assert (second.feedback, second.feedback_reason) == (Feedback.FALSE_ALARM, "first")
+    assert (first.raised_ns, first.cleared_ns, second.raised_ns) == (10, 20, 40), "feedback is no part of an alarm"
+
+
+def test_later_messages_about_an_alarm_bring_feedback_whose_own_message_is_missing() -> None:
+    given = {"feedback": Feedback.TRUE_ALARM, "feedback_by": "bob", "feedback_reason": "worn"}
+    episode = one(alarm(10), alarm(20, Transition.CLEARED, **given))
+    assert (episode.feedback, episode.feedback_by, episode.feedback_reason) == (Feedback.TRUE_ALARM, "bob", "worn")

@@ -18,7 +18,7 @@ from pipeline.errors import UserError
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.viewing import band_plot
 from pipeline.viewing.band_plot import Fault, plot_bands, plot_recording, read_trace
-from pipeline.viewing.trace import trace_of
+from pipeline.viewing.trace import SILENT, trace_of
 from schemas.enums import FanState
 from schemas.messages import Alarm, Score
 from schemas.topics import tray_key
@@ -44,9 +44,9 @@ def test_every_state_has_a_colour_of_its_own() -> None:
     names = {state.words for state in FanState} - {FanState.UNKNOWN.words}
     assert set(band_plot.STATE_COLORS) == names
     assert len({*band_plot.STATE_COLORS.values(), band_plot.UNKNOWN_COLOR}) == len(names) + 1
-    layout = pytest.importorskip("pipeline.viewing.rerun_layout", exc_type=ModuleNotFoundError)
-    assert set(layout.STATE_COLORS) == names
-    assert len({*layout.STATE_COLORS.values(), layout.UNKNOWN_COLOR}) == len(names) + 1
+    styles = pytest.importorskip("pipeline.viewing.rerun_styles", exc_type=ModuleNotFoundError)
+    assert set(styles.STATE_COLORS) == {*names, SILENT}
+    assert len({*styles.STATE_COLORS.values(), styles.UNKNOWN_COLOR}) == len(names) + 2
 
 
 def test_without_alarms_one_fan_is_drawn(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from pipeline.config.models import TrayConfig
 from pipeline.viewing import view_file
 from pipeline.viewing.rerun_sink import RerunSink
 from pipeline.viewing.view_file import ViewFile
+from pipeline.viewing.viewer_core import ViewerCore
 from schemas.units import NS_PER_S
-from stages.viewer import ViewerCore
 from tests.stages.test_viewer import sent
 from tests.support.score_data import START_NS, made_up_tray
 
@@ -40,6 +40,7 @@ def test_row_09_a_view_on_a_full_disk_is_reported_and_the_viewer_goes_on_and_end
         trays=trays,
         fleet=None,
         started_t_ns=START_NS,
+        layout="all",
         window_s=30.0,
         file=small_disk / "view.rrd",
         grpc_port=None,

@@ -1,0 +1,60 @@
+"""`fantwin view`: a recording as a view file for Rerun."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from pipeline.cli.options import JsonOption, ViewLayout
+from pipeline.errors import UsageError, UserError
+from pipeline.optional_dependencies import how_to_install
+
+
+def view(
+    recordings: Annotated[list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The view file to write.")] = Path("view.rrd"),
+    layout: Annotated[
+        ViewLayout, typer.Option(help="all: every fan; alarms: the fans that were in alarm; wear: change over days.")
+    ] = ViewLayout.ALL,
+    window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = 30.0,
+    fleet_above: Annotated[
+        int, typer.Option(min=0, help="With more fans than this, an overview and few plots are shown.")
+    ] = 64,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing view file.")] = False,
+    json_output: JsonOption = False,
+) -> None:
+    """Make a view of a recording, as the stage viewer shows it live.
+
+    Exits with 3 if the recording could not be read in full; the view then shows what could be read.
+
+    Example: fantwin view runs/demo/recording.mcap --layout alarms -o alarms.rrd
+    """
+    try:
+        from pipeline.viewing.recorded_view import recorded_site, write_view  # noqa: PLC0415  the extra `view`
+        from pipeline.viewing.view_of_site import ViewOptions  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        if error.name != "rerun":
+            raise
+        raise UserError(f"views need the extra `view`; {how_to_install('view')}") from error
+    if output.suffix != ".rrd":
+        raise UsageError(f"{output}: name a file that ends in .rrd with -o")
+    if output.exists() and not force:
+        raise UserError(f"{output}: exists; name another file with -o, or use --force")
+    site = recorded_site(recordings)
+    output.unlink(missing_ok=True)
+    with Console(stderr=True).status(f"drawing {output}"):
+        options = ViewOptions(layout=layout.value, window_s=window, fleet_above=fleet_above)
+        damage = write_view(site, output, options)
+    fans = sum(tray.fans for tray in site.trays)
+    if json_output:
+        typer.echo(json.dumps({"view": str(output), "fans": fans, "damage": damage}))
+    else:
+        typer.echo(f"{output}: {fans} fans")
+    for line in damage:
+        typer.echo(line, err=True)
+    if damage:
+        raise typer.Exit(3)

@@ -1,0 +1,224 @@
+"""The list of current alarms of `fantwin alarms`, and the transitions that `--watch` prints."""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from datetime import datetime
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from pipeline.bus.session import Bus
+from pipeline.cli.watch.live_stages import wait_for_stages
+from pipeline.config.models import Config
+from pipeline.config.roles import roles_of
+from pipeline.launch.judged_fans import JudgedChanges, JudgedFans, Unjudged, as_judged
+from pipeline.launch.processes import process_list
+from pipeline.launch.site_state import site_states
+from pipeline.launch.site_watcher import SiteWatcher
+from pipeline.launch.stage_notes import note_lines
+from schemas.codec import CodecError, decode
+from schemas.enums import Severity
+from schemas.messages import Alarm, Diagnosis, newest_t_ns
+from schemas.topics import tray_key
+from schemas.units import NS_PER_S
+from scoring.alarms.alarm_flags import is_listed, is_presented
+from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, words_of
+from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
+from scoring.wear.slow_change import is_of_slow_change
+
+_SCORES_S = 3.0  # a score of every tray arrives in this time
+_POLL_S = 0.02
+_WATCH_S = 0.2  # between two looks at the stages while no alarm comes
+_STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
+
+
+def show_list(
+    bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, watch: bool, json_output: bool
+) -> None:
+    """Print the list. watch: then print each transition until `stop`.
+
+    Raises:
+        UserError: no scorer is alive.
+        typer.Exit: 1, a fan is not judged.
+    """
+    key = tray_key(config.site, "*", "alarm")
+    news: queue.Queue[Alarm] = queue.Queue()
+    bus.subscribe(key, lambda its_key, payload: _decoded(config.site, its_key, payload, news.put))
+    watcher = SiteWatcher(bus, config.site, roles_of(config))
+    judged = JudgedFans(bus, config.site, config.trays, watcher)
+    wait_for_stages(bus, watcher, config, stop)
+    known: list[Alarm] = []
+    for its_key, payload in bus.recover(key):
+        _decoded(config.site, its_key, payload, known.append)
+    known = [alarm for alarm in known if _counts(watcher, config.site, alarm)]
+    found = [each for each in current_alarms(sorted(known, key=newest_t_ns)) if show_all or is_listed(each.newest)]
+    console = Console(soft_wrap=True, highlight=False)
+    unjudged = _wait_until_judged(watcher, judged, config, stop)
+    found = as_judged(found, unjudged)
+    slow = _slow_changes(watcher)
+    if json_output:
+        shown = {"alarms": [each.as_json() for each in found], "not_judged": [each.as_json() for each in unjudged]}
+        shown |= {"at_rest": [each.as_json() for each in judged.at_rest()], "slow_changes": slow}
+        typer.echo(json.dumps(shown))
+    else:
+        now = judged.words_now()
+        for each in found:
+            console.print(alarm_lines(each, now.get((each.newest.header.tray, each.newest.fan), "")))
+        lines = [Text(line, style="yellow") for line in slow] + [Text(each.line(), style="red") for each in unjudged]
+        for line in lines:
+            console.print(line)
+        if not found and not unjudged:
+            console.print(Text("no alarms", style="green"))
+    if watch:
+        changes = JudgedChanges(unjudged)
+
+        def judged_changes() -> list[str]:
+            return changes.lines(judged.unjudged(site_states(watcher, process_list(config))))
+
+        listed = {_identity(alarm) for alarm in known}
+        _watch(news, listed, watcher, config.site, judged_changes, stop, console, json_output=json_output)
+    elif unjudged:
+        raise typer.Exit(1)
+
+
+def _watch(
+    news: queue.Queue[Alarm],
+    listed: set[tuple[str, int, str]],
+    watcher: SiteWatcher,
+    site: str,
+    judged_changes: Callable[[], list[str]],
+    stop: threading.Event,
+    console: Console,
+    *,
+    json_output: bool,
+) -> None:
+    """Print each transition that is not listed already, which fans are judged now and were not, or the other way round,
+    and when the last scorer goes or one is back."""
+    has_scorer = True
+    while not stop.is_set():
+        try:
+            alarm = news.get(timeout=_WATCH_S)
+        except queue.Empty:
+            if has_scorer != any(view.alive and view.health.stage == "scorer" for view in watcher.stages()):
+                has_scorer = not has_scorer
+                said = "a scorer is back" if has_scorer else "no scorer is alive: alarms are unknown until one is back"
+                typer.echo(f"{datetime.now():%H:%M:%S}  site {site!r}: {said}", err=True)
+            for line in judged_changes() if has_scorer else ():
+                typer.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)
+            continue
+        if _identity(alarm) in listed or not _counts(watcher, site, alarm):
+            continue
+        if json_output:
+            typer.echo(json.dumps({"transition": word(alarm), **alone(alarm).as_json()}))
+        else:
+            console.print(_transition_line(alarm))
+
+
+def _identity(alarm: Alarm) -> tuple[str, int, str]:
+    return alarm.header.producer, alarm.header.sequence, alarm.header.tray
+
+
+def _slow_changes(watcher: SiteWatcher) -> list[str]:
+    """What scorers say about fans that change slowly, which is no alarm yet."""
+    healths = (view.health for view in watcher.stages() if view.alive)
+    return note_lines(
+        replace(health, notes=tuple(note for note in health.notes if is_of_slow_change(note.text)))
+        for health in healths
+    )
+
+
+def _wait_until_judged(
+    watcher: SiteWatcher, judged: JudgedFans, config: Config, stop: threading.Event
+) -> list[Unjudged]:
+    """The fans that are not judged now; waits for scores, which come in blocks."""
+    until_s = time.monotonic() + _SCORES_S
+    while True:
+        unjudged = judged.unjudged(site_states(watcher, process_list(config)))
+        if not unjudged or time.monotonic() > until_s or stop.wait(_POLL_S):
+            return unjudged
+
+
+def _decoded(site: str, key: str, payload: bytes, then: Callable[[Alarm], None]) -> None:
+    """Unreadable messages, and those of another tray than their key says, are skipped; the stages count them."""
+    try:
+        alarm = decode(Alarm, payload)
+    except CodecError:
+        return
+    assert isinstance(alarm, Alarm)
+    if key == tray_key(site, alarm.header.tray, "alarm"):
+        then(alarm)
+
+
+def _counts(watcher: SiteWatcher, site: str, alarm: Alarm) -> bool:
+    """Whether an alarm is one of the site, not of a stranger."""
+    return watcher.counts(tray_key(site, alarm.header.tray, "alarm"), alarm.header.producer)
+
+
+def alone(alarm: Alarm) -> CurrentAlarm:
+    """The alarm as this message alone describes it."""
+    by = alarm.operator_name if alarm.acknowledged else ""
+    return CurrentAlarm(alarm, alarm.message, alarm.causes, by, alarm.t_ns)
+
+
+def word(alarm: Alarm) -> str:
+    """The transition, for machines."""
+    return alarm.transition.name.lower()
+
+
+def alarm_lines(current: CurrentAlarm, now: str = "") -> Text:
+    """The alarm for people, in up to three lines: state, causes, message. now: what the fan does, if it is known."""
+    alarm = current.newest
+    by = f" by {current.acknowledged_by}" if current.acknowledged_by else ""
+    words = [f"{word}{by}" if word == "acknowledged" else word for word in current.states()]
+    words += [f"now {now}"] if now else []
+    style = _STYLES.get(alarm.severity, "bold red") if is_presented(alarm) else "dim"
+    text = Text.assemble((f"{name_of(alarm)}  {alarm.severity.name:7}", style), f"  {', '.join(words)}")
+    if alarm.severity != Severity.NONE:
+        text.append(f"  since {clock(alarm.onset_t_ns)} ({_age(time.time_ns() - alarm.onset_t_ns)})")
+    if current.causes:
+        evidence = current.causes[0].evidence
+        is_shown = not evidence or evidence in current.message
+        why = "" if is_shown else f": {evidence.removeprefix(f'{CAUSES[CANNOT_TELL]}: ')}"
+        text.append(f"\n    {probable(current.causes)}{why}")
+    if about := current.about():
+        text.append(f"\n    {about}")
+    return text
+
+
+def _transition_line(alarm: Alarm) -> Text:
+    by = f" by {alarm.operator_name}" if alarm.operator_name else ""
+    why = f"  {probable(alarm.causes)}" if alarm.causes else ""
+    word = Text(
+        f"{alarm.transition.name.replace('_', ' ')}{by}",
+        style=_STYLES.get(alarm.severity, "bold red") if alarm.active else "",
+    )
+    return Text.assemble(
+        f"{clock(alarm.t_ns)}  {name_of(alarm)}  {alarm.severity.name:7}  ", word, f"{why}  {words_of(alarm)}"
+    )
+
+
+def name_of(alarm: Alarm) -> str:
+    """The fan, for people."""
+    return f"{alarm.header.tray} fan {alarm.fan}"
+
+
+def probable(causes: Iterable[Diagnosis]) -> str:
+    """The most probable cause, and the others that are probable enough to be listed."""
+    return ", ".join(
+        with_share(each) for number, each in enumerate(causes) if not number or each.probability >= MIN_PROBABILITY
+    )
+
+
+def _age(age_ns: int) -> str:
+    seconds = max(0, age_ns // NS_PER_S)
+    for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds // size} {unit}"
+    return f"{seconds} s"

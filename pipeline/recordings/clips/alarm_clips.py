@@ -1,0 +1,111 @@
+"""The alarm clips of one recorder: what its core asks of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from pipeline.recordings.clips.clip import NOT_A_LIST, clips_in, list_path
+from pipeline.recordings.clips.cutting import LEAD_NS
+from pipeline.recordings.clips.tracker import LONGEST_NS, ClipTracker
+from pipeline.recordings.clips.worker import ClipMaker
+from pipeline.recordings.index import PartIndex
+from pipeline.recordings.rare_messages import last_message_ns, rare_messages
+from pipeline.recordings.reading import RecordingError
+from schemas.envelope import Envelope
+from schemas.messages import Alarm
+
+
+def tracker_of(recording: Path, before_s: float, after_s: float, most_bytes: int, settled_s: float) -> ClipTracker:
+    """What follows the clips of a recording, which continues the list that is there. recording: its first part."""
+    try:
+        clips = clips_in(list_path(recording))
+    except NOT_A_LIST:
+        clips = []
+    return ClipTracker(clips, before_s, after_s, most_bytes, settled_s)
+
+
+CLOSE_S = 3.0
+"""for clips that are cut when the recorder stops"""
+
+
+class AlarmClips:
+    """Follows the alarms, has clips cut when they are due, and says what may be deleted."""
+
+    def __init__(self, tracker: ClipTracker, maker: ClipMaker) -> None:
+        self._tracker, self._maker = tracker, maker
+        self._saved = tracker.version
+
+    def continue_after(self, last_part: Path) -> None:
+        """Follow the last alarms that a recorder before this one has recorded: it may have been killed before it had
+        written down that clips are due."""
+        since_ns = last_message_ns(last_part) - LONGEST_NS
+        with suppress(RecordingError):
+            for envelope in rare_messages(last_part, "alarm"):
+                if envelope.received_t_ns >= since_ns:
+                    self.add(envelope)
+
+    def add(self, envelope: Envelope) -> None:
+        """Follow a message of topic alarm."""
+        alarm = envelope.message
+        assert isinstance(alarm, Alarm)
+        self._tracker.add(alarm, envelope.received_t_ns)
+
+    def tick(self, now_ns: int, open_part: Callable[[], PartIndex | None]) -> None:
+        """Take what was cut, delete what is too much, and have cut what is due. open_part: of the part that is being
+        written, asked for only where something is due."""
+        for result in self._maker.results():
+            self._tracker.cut(result)
+        for clip in self._tracker.to_delete():
+            self._maker.delete(clip)
+        self._save()  # before it is cut: a clip that is due survives a crash
+        if due := self._tracker.due(now_ns):
+            self._maker.cut(due, open_part())
+        self._save()
+
+    def oldest_acknowledged_until_ns(self) -> int | None:
+        """The end of the first clip that may be deleted; None: there is none."""
+        clip = self._tracker.oldest_acknowledged
+        return clip.until_ns if clip else None
+
+    def delete_oldest_acknowledged(self) -> str | None:
+        """Delete the first clip that may be deleted, and give its name; None if there is none."""
+        clip = self._tracker.oldest_acknowledged
+        if clip is None:
+            return None
+        self._tracker.deleted(clip)
+        self._maker.delete(clip)
+        return clip.name
+
+    def needs(self, last_ns: int) -> bool:
+        """Whether a clip that is still to be cut needs what was received up to this time."""
+        since_ns = self._tracker.needed_since_ns
+        return since_ns is not None and since_ns - LEAD_NS <= last_ns
+
+    def part_deleted(self) -> None:
+        """A part that due clips need was deleted, because the disk was full."""
+        self._tracker.part_deleted()
+
+    def close(self, open_part: Callable[[], PartIndex | None]) -> None:
+        """The recorder stops: cut what is due as far as it goes. After a restart it is cut again, with what follows."""
+        if unfinished := self._tracker.unfinished():
+            self._maker.cut(unfinished, open_part())
+        self._maker.end(CLOSE_S)
+        for result in self._maker.results():
+            self._tracker.cut(result)
+        self._save()
+        self._maker.end(CLOSE_S)
+
+    def counters(self) -> Mapping[str, int]:
+        """Clips that were cut, that could not be kept, and that were deleted."""
+        return self._tracker.counts
+
+    def problem(self) -> str:
+        """Why clips cannot be cut or kept; empty if all is well."""
+        return self._tracker.problem() or self._maker.problem()
+
+    def _save(self) -> None:
+        if self._tracker.version != self._saved:
+            self._saved = self._tracker.version
+            self._maker.save(self._tracker.clips)

@@ -1,0 +1,138 @@
+"""An alarm clip: what it is called, what it holds, which alarms it is of; and the list of clips beside a recording."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from schemas.messages import Alarm
+from schemas.units import NS_PER_S
+
+CLIPS = "clips"
+"""the folder, beside the recording"""
+CLIP_KEY = "clip"
+"""in the metadata of a clip: what `Clip.about` says, as JSON"""
+CLIP_SNAPSHOT_KEY = "clip_snapshot_t_ns"
+"""in the metadata of a clip that begins in the middle of a scorer's session: time of the snapshot in it from which the
+session continues"""
+NOT_A_LIST = (OSError, ValueError, TypeError, KeyError)
+"""what `clips_in` raises where there is no list of clips"""
+
+
+@dataclass(frozen=True)
+class ClipAlarm:
+    """One alarm of a clip. Tray, fan and onset identify it."""
+
+    fan: int
+    onset_t_ns: int
+    t_ns: int
+    """when it was raised"""
+    acknowledged: bool = False
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A clip that is kept, or is due. Times are times of receipt."""
+
+    name: str
+    """of the file"""
+    tray: str
+    since_ns: int
+    until_ns: int
+    judged_since_ns: int
+    """the scorer of a replay continues from a snapshot before this, so that its diagnosis has all samples it needs"""
+    alarms: tuple[ClipAlarm, ...]
+    is_due: bool = True
+    """it is still to be cut, or to be cut again because what follows was not recorded yet"""
+    size_bytes: int = 0
+    """0: there is no file"""
+    problem: str = ""
+    """why it was not cut, or what it lacks"""
+
+    @property
+    def is_acknowledged(self) -> bool:
+        """Whether all its alarms are: then it may be deleted."""
+        return all(alarm.acknowledged for alarm in self.alarms)
+
+    def with_acknowledged(self, alarm: Alarm) -> Clip:
+        """After a message that says that nothing about this fan waits for an operator."""
+        alarms = tuple(
+            replace(each, acknowledged=each.acknowledged or (each.fan == alarm.fan and each.t_ns <= alarm.t_ns))
+            for each in self.alarms
+        )
+        return self if alarms == self.alarms else replace(self, alarms=alarms)
+
+    def about(self) -> dict[str, Any]:
+        """What the metadata of the file say of it."""
+        of_alarms = [{"fan": each.fan, "onset_t_ns": each.onset_t_ns, "t_ns": each.t_ns} for each in self.alarms]
+        return {"tray": self.tray, "since_ns": self.since_ns, "until_ns": self.until_ns, "alarms": of_alarms}
+
+
+def clip_name(alarm: Alarm, taken: Iterable[str]) -> str:
+    """TRAY-FAN-UTCTIME.mcap; with a number if that is taken."""
+    at = datetime.fromtimestamp(alarm.t_ns / NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
+    stem = f"{alarm.header.tray}-{alarm.fan}-{at}"
+    names = set(taken)
+    number = 1
+    while (name := f"{stem}.mcap" if number == 1 else f"{stem}-{number}.mcap") in names:
+        number += 1
+    return name
+
+
+def clip_folder(recording: Path) -> Path:
+    """Where the clips of a recording are. recording: its first part."""
+    return recording.parent / CLIPS
+
+
+def list_path(recording: Path) -> Path:
+    """The list of the clips of a recording."""
+    return clip_folder(recording) / f"{recording.stem}.json"
+
+
+def clips_as_text(clips: Iterable[Clip]) -> str:
+    """The content of a list of clips."""
+    return json.dumps({"clips": [asdict(clip) for clip in clips]}, indent=1)
+
+
+def clips_in(path: Path) -> list[Clip]:
+    """The clips of a list, the oldest first.
+
+    Raises one of NOT_A_LIST.
+    """
+    return [
+        Clip(**{**values, "alarms": tuple(ClipAlarm(**alarm) for alarm in values["alarms"])})
+        for values in json.loads(path.read_text())["clips"]
+    ]
+
+
+def kept_clips(folder: Path) -> list[Clip]:
+    """The clips of all recordings of a folder that have a file, the newest first; of lists that cannot be read none."""
+    found: list[Clip] = []
+    for path in sorted(folder.glob("*.json")):
+        try:
+            clips = clips_in(path)
+        except NOT_A_LIST:
+            continue
+        named = [clip for clip in clips if clip.size_bytes and Path(clip.name).name == clip.name]
+        found += [clip for clip in named if (folder / clip.name).is_file()]
+    return sorted(found, key=lambda clip: clip.since_ns, reverse=True)
+
+
+def clip_lines(metadata: Mapping[str, str]) -> list[str]:
+    """For people, what the metadata of a recording say of the alarms that it is a clip of; empty if it is none."""
+    try:
+        about = json.loads(metadata.get(CLIP_KEY, "null"))
+        if about is None:
+            return []
+        tray = about["tray"]
+        return [f"alarm clip: {tray} fan {each['fan']}, raised {_utc(each['t_ns'])}" for each in about["alarms"]]
+    except (ValueError, TypeError, KeyError, OverflowError):
+        return ["alarm clip, whose metadata are damaged"]
+
+
+def _utc(t_ns: int) -> str:
+    return datetime.fromtimestamp(t_ns / NS_PER_S, UTC).isoformat(sep=" ", timespec="milliseconds")

@@ -1,0 +1,215 @@
+"""Which alarm clips are due, kept and may be deleted: a pure core that follows the messages on alarms.
+
+Alarms of one tray that are raised while a clip of that tray is still running share the clip, which is then longer: the
+recording of a tray is not kept once for each of its fans. All times are times of receipt on the host's clock.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from pipeline.recordings.clips.clip import Clip, ClipAlarm, clip_name
+from schemas.enums import Transition
+from schemas.messages import Alarm
+from schemas.units import NS_PER_S
+from scoring.alarms.alarm_flags import is_silenced
+
+LONGEST_NS = 600 * NS_PER_S
+"""of a clip that more and more alarms extend; the next alarm then begins another one"""
+LONGEST_DELAY_NS = 300 * NS_PER_S
+"""of an alarm after its onset, that a clip goes back further"""
+JUDGED_NS = 100 * NS_PER_S
+"""of judged samples before the onset of an alarm: a diagnosis looks at the last 95 s"""
+RETRY_NS = 10 * NS_PER_S
+"""after a clip could not be cut"""
+SET_BACK_NS = NS_PER_S
+"""by which the host's clock goes back without being noticed"""
+
+
+@dataclass(frozen=True)
+class CutResult:
+    """What came of cutting a clip."""
+
+    name: str
+    size_bytes: int = 0
+    """0: it could not be cut"""
+    problem: str = ""
+    """why not, or what it lacks"""
+    may_pass: bool = False
+    """it can be cut later: the disk is full, say"""
+
+
+class ClipTracker:
+    """The clips of one recorder."""
+
+    def __init__(
+        self, clips: Iterable[Clip], before_s: float, after_s: float, most_bytes: int, settled_s: float = 2.0
+    ) -> None:
+        """clips: those known from before a restart. before_s, after_s: how much a clip holds around its alarm.
+        most_bytes: of all clips together; 0: no limit. settled_s: how long after its end all of a clip is on the disk.
+        """
+        self._clips = {clip.name: clip for clip in clips}
+        self._before_ns, self._after_ns = round(before_s * NS_PER_S), round(after_s * NS_PER_S)
+        self._settled_ns = round(settled_s * NS_PER_S)
+        self._most_bytes = most_bytes
+        self._being_cut: set[str] = set()
+        self._ends_ns: dict[str, int] = {}
+        """of clips that ended when the host's clock was set back: by the new time"""
+        self._retry_ns = self._now_ns = 0
+        self._problem = self._full = ""
+        self.counts: Counter[str] = Counter()
+        self.version = 0
+        """higher after each change of `clips`"""
+
+    @property
+    def clips(self) -> list[Clip]:
+        """All clips, due ones too, in the order of their alarms."""
+        return list(self._clips.values())
+
+    @property
+    def needed_since_ns(self) -> int | None:
+        """What was received from here on is needed by clips that are still to be cut; None: nothing is."""
+        return min((clip.judged_since_ns for clip in self._clips.values() if clip.is_due), default=None)
+
+    @property
+    def oldest_acknowledged(self) -> Clip | None:
+        """The first clip that may be deleted."""
+        may_go = (clip for clip in self._clips.values() if clip.is_acknowledged and not clip.is_due)
+        return min(may_go, key=lambda clip: clip.until_ns, default=None)
+
+    def add(self, alarm: Alarm, received_t_ns: int) -> None:
+        """Follow the next message about an alarm."""
+        if alarm.acknowledged:
+            for clip in [clip for clip in self._clips.values() if clip.tray == alarm.header.tray]:
+                self._put(clip.with_acknowledged(alarm))
+        elif alarm.transition == Transition.RAISED and not is_silenced(alarm):
+            self._raise(alarm, received_t_ns)
+
+    def due(self, now_ns: int) -> list[Clip]:
+        """The clips to be cut now, which count as being cut until `cut` says what came of it. What a clip over the
+        limit of bytes needs is never due: it is not kept."""
+        if now_ns < self._now_ns - SET_BACK_NS:
+            self._end_running(now_ns)
+        self._now_ns = now_ns
+        found = [
+            clip
+            for clip in self._clips.values()
+            if clip.is_due
+            and clip.name not in self._being_cut
+            and self._ends_ns.get(clip.name, clip.until_ns) + self._settled_ns <= now_ns
+        ]
+        if now_ns < self._retry_ns or not found:
+            return []
+        if self._is_full():
+            for clip in found:
+                self._drop(clip)
+            self._full = f"the clip of {found[-1].name} is not kept"
+            return []
+        self._being_cut |= {clip.name for clip in found}
+        return found
+
+    def unfinished(self) -> list[Clip]:
+        """The clips that are still running, to be cut as far as they go because the recorder stops."""
+        running = (clip for clip in self._clips.values() if clip.is_due and clip.name not in self._being_cut)
+        return [] if self._is_full() else list(running)
+
+    def cut(self, result: CutResult) -> None:
+        """What came of cutting a clip. One that was still running stays due: it goes on after a restart."""
+        clip = self._clips.get(result.name)
+        is_over = result.name in self._being_cut
+        self._being_cut.discard(result.name)
+        if clip is None:
+            return
+        if result.size_bytes:
+            self._put(replace(clip, is_due=not is_over, size_bytes=result.size_bytes, problem=_joined(clip, result)))
+            self.counts["clips"] += int(is_over)
+            self._problem = ""
+        elif result.may_pass:
+            self._retry_ns = self._now_ns + RETRY_NS
+            self._problem = f"clip {result.name} cannot be cut yet: {result.problem}"
+        elif is_over:
+            self._drop(clip)
+            self._problem = f"clip {clip.name} is not kept: {result.problem}"
+
+    def to_delete(self) -> list[Clip]:
+        """The oldest acknowledged clips beyond the limit of bytes, which are then no longer known."""
+        deleted: list[Clip] = []
+        while self._is_full() and (clip := self.oldest_acknowledged):
+            self.deleted(clip)
+            deleted.append(clip)
+        return deleted
+
+    def deleted(self, clip: Clip) -> None:
+        """A clip is deleted to make room."""
+        del self._clips[clip.name]
+        self.version += 1
+        self.counts["clips_deleted"] += 1
+
+    def part_deleted(self) -> None:
+        """A part that due clips may need was deleted, because the disk was full."""
+        for clip in [clip for clip in self._clips.values() if clip.is_due]:
+            self._put(replace(clip, problem="a part that it needs was deleted to make room"))
+
+    def problem(self) -> str:
+        """Why clips cannot be cut or kept; empty if all is well."""
+        if self._full and self._is_full():
+            return (
+                f"{self._full}: clips whose alarms nobody has acknowledged fill recorder.clip_bytes; "
+                "acknowledge alarms, or allow more"
+            )
+        return self._problem
+
+    def _raise(self, alarm: Alarm, received_t_ns: int) -> None:
+        tray = alarm.header.tray
+        new = ClipAlarm(alarm.fan, alarm.onset_t_ns, alarm.t_ns)
+        of_tray = [clip for clip in self._clips.values() if clip.tray == tray]
+        if any((each.fan, each.onset_t_ns) == (new.fan, new.onset_t_ns) for clip in of_tray for each in clip.alarms):
+            return
+        delay_ns = min(max(0, alarm.t_ns - alarm.onset_t_ns), LONGEST_DELAY_NS)
+        onset_ns, until_ns = received_t_ns - delay_ns, received_t_ns + self._after_ns
+        since_ns, judged_since_ns = onset_ns - self._before_ns, onset_ns - max(self._before_ns, JUDGED_NS)
+        running = next((clip for clip in of_tray if self._is_joined(clip, received_t_ns, until_ns)), None)
+        if running:
+            longer = replace(running, alarms=(*running.alarms, new), until_ns=max(running.until_ns, until_ns))
+            judged_since_ns = min(running.judged_since_ns, judged_since_ns)
+            self._put(replace(longer, since_ns=min(running.since_ns, since_ns), judged_since_ns=judged_since_ns))
+            return
+        self._put(Clip(clip_name(alarm, self._clips), tray, since_ns, until_ns, judged_since_ns, (new,)))
+
+    def _is_joined(self, clip: Clip, received_t_ns: int, until_ns: int) -> bool:
+        """Whether an alarm that is received now belongs to a clip, which then goes on until `until_ns`."""
+        is_running = clip.is_due and clip.name not in self._being_cut and clip.name not in self._ends_ns
+        is_short = until_ns - clip.since_ns <= LONGEST_NS + self._before_ns + self._after_ns
+        return is_running and is_short and clip.since_ns <= received_t_ns <= clip.until_ns
+
+    def _end_running(self, now_ns: int) -> None:
+        """The host's clock was set back: what is running ends there, and does not wait for that time again."""
+        for clip in [clip for clip in self._clips.values() if clip.is_due and clip.until_ns > now_ns]:
+            self._put(replace(clip, until_ns=max(clip.since_ns, min(clip.until_ns, self._now_ns))))
+            self._ends_ns[clip.name] = now_ns
+        self._retry_ns = min(self._retry_ns, now_ns)
+
+    def _is_full(self) -> bool:
+        return bool(self._most_bytes) and self._total() >= self._most_bytes
+
+    def _total(self) -> int:
+        return sum(clip.size_bytes for clip in self._clips.values())
+
+    def _drop(self, clip: Clip) -> None:
+        self.counts["clips_not_kept"] += 1
+        if clip.size_bytes:
+            self._put(replace(clip, is_due=False))
+        else:
+            del self._clips[clip.name]
+            self.version += 1
+
+    def _put(self, clip: Clip) -> None:
+        if self._clips.get(clip.name) != clip:
+            self._clips[clip.name] = clip
+            self.version += 1
+
+
+def _joined(clip: Clip, result: CutResult) -> str:
+    return "; ".join(dict.fromkeys(filter(None, (clip.problem, result.problem))))

@@ -1,0 +1,141 @@
+"""Cutting alarm clips in a thread of its own, so that recording never waits for it."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Protocol
+
+from pipeline.recordings.clips.clip import Clip, clip_folder, clips_as_text, list_path
+from pipeline.recordings.clips.cutting import cut_clips, remove_unfinished
+from pipeline.recordings.clips.tracker import CutResult
+from pipeline.recordings.disk import DiskError, sync_folder
+from pipeline.recordings.index import PartIndex
+from pipeline.recordings.records import RecordingError
+
+AT_ONCE = 16
+"""clips that are written in one pass over the parts"""
+ROOM_BYTES = 4 << 20
+"""that must be free beyond recorder.min_free_bytes for clips to be cut"""
+REST_S = 0.002
+"""after each chunk, for the thread that records"""
+
+
+class ClipMaker(Protocol):
+    """What `AlarmClips` needs of the disk; tests stand in for it."""
+
+    def save(self, clips: Sequence[Clip]) -> None:
+        """Write the list of clips."""
+        ...
+
+    def cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
+        """Cut clips; `results` says what came of it. open_part: of the part that is being written."""
+        ...
+
+    def results(self) -> list[CutResult]:
+        """What came of clips since the last call."""
+        ...
+
+    def delete(self, clip: Clip) -> None:
+        """Delete the file of a clip."""
+        ...
+
+    def problem(self) -> str:
+        """Why the list cannot be written; empty if it can."""
+        ...
+
+    def end(self, timeout_s: float) -> None:
+        """Finish what was asked for, as far as there is time, and stop."""
+        ...
+
+
+class ClipWorker(ClipMaker):
+    """Cuts the clips of one recording."""
+
+    def __init__(self, recording: Path, min_free_bytes: int, free_bytes: Callable[[], int]) -> None:
+        """recording: its first part. free_bytes: of its disk; raises DiskError."""
+        self._recording, self._folder, self._list = recording, clip_folder(recording), list_path(recording)
+        self._min_free_bytes, self._free_bytes = min_free_bytes, free_bytes
+        self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._results: SimpleQueue[CutResult] = SimpleQueue()
+        self._to_save: Sequence[Clip] | None = None
+        self._problem = ""
+        self._thread: threading.Thread | None = None
+        remove_unfinished(self._folder)
+
+    def save(self, clips: Sequence[Clip]) -> None:
+        """See ClipMaker. Of lists that wait, only the newest is written."""
+        self._to_save = tuple(clips)
+        self._put(self._save)
+
+    def cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
+        """See ClipMaker."""
+        for first in range(0, len(clips), AT_ONCE):
+            some = tuple(clips[first : first + AT_ONCE])
+            self._put(lambda some=some: self._cut(some, open_part))
+
+    def results(self) -> list[CutResult]:
+        """See ClipMaker."""
+        found: list[CutResult] = []
+        while not self._results.empty():
+            found.append(self._results.get())
+        return found
+
+    def delete(self, clip: Clip) -> None:
+        """See ClipMaker."""
+        self._put(lambda: (self._folder / clip.name).unlink(missing_ok=True))
+
+    def problem(self) -> str:
+        """See ClipMaker."""
+        return self._problem
+
+    def end(self, timeout_s: float) -> None:
+        """See ClipMaker."""
+        if self._thread is not None:
+            self._jobs.put(None)
+            self._thread.join(timeout_s)
+            self._thread = None
+
+    def _put(self, job: Callable[[], None]) -> None:
+        if self._thread is None:  # only once there is something to do: most recorders never have an alarm
+            self._thread = threading.Thread(target=self._work, name="clips", daemon=True)
+            self._thread.start()
+        self._jobs.put(job)
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                job()
+            except OSError as error:
+                self._problem = f"{self._folder}: cannot be written: {error.strerror}; make room, or correct the folder"
+
+    def _save(self) -> None:
+        clips, self._to_save = self._to_save, None
+        if clips is None:
+            return
+        self._folder.mkdir(parents=True, exist_ok=True)
+        unfinished = self._list.with_name(f"{self._list.name}.new")
+        with unfinished.open("w") as file:
+            file.write(clips_as_text(clips))
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(self._list)
+        sync_folder(self._folder)
+        self._problem = ""
+
+    def _cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
+        try:
+            free, wanted = self._free_bytes(), self._min_free_bytes + ROOM_BYTES
+            if free < wanted:
+                raise DiskError(f"{free / 1e6:,.1f} MB are free on the disk, and {wanted / 1e6:,.1f} MB are required")
+            found = cut_clips(clips, self._recording, self._folder, open_part, lambda: time.sleep(REST_S))
+        except (RecordingError, OSError) as error:
+            found = [CutResult(clip.name, problem=str(error), may_pass=True) for clip in clips]
+        except Exception as error:  # noqa: BLE001  a recorder goes on recording whatever is wrong with a clip
+            found = [CutResult(clip.name, problem=f"{type(error).__name__}: {error}") for clip in clips]
+        for result in found:
+            self._results.put(result)

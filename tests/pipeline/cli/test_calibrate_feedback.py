@@ -1,0 +1,165 @@
+"""`fantwin calibrate` on a recording with an alarm: what an operator said of it decides what is learned."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.cli.main import expand_variadic
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from pipeline.cli.twins.calibration_check import check_declared_rate
+from pipeline.cli.twins.marked_running import marked_running
+from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.recordings.writing import RecordingWriter
+from pipeline.replay.offline.marked_alarms import LeftOut, alarms_in, concerning, marked_alarms
+from schemas.enums import Action, Severity, Transition
+from schemas.header import Header
+from schemas.messages import Alarm
+from schemas.topics import tray_key
+from schemas.units import NS_PER_S
+from scoring.alarms.fan_condition import GIVES_FEEDBACK
+from tests.support.fantwin_command import fantwin
+
+EPOCH_NS = 1_790_000_000 * NS_PER_S
+PER_DAY = 2500
+FAULT_S = (20, 50)
+"""of fan 1 in faulty.mcap, and in other.mcap"""
+FAULT = ("--fault", "inlet:fan=1,start=20,stop=50,size=1.6")
+ONSET_NS = EPOCH_NS + 5_020 * NS_PER_S
+DAY_NS = 86_400 * NS_PER_S
+
+
+def simulated(path: Path, seed: int, seconds: float, *more: object) -> Path:
+    """Every recording has other times, as those of a plant have."""
+    result = fantwin(
+        "simulate", "--fans", 2, "--profile", "multisine", "--seed", seed, "--duration", seconds,
+        "--epoch-ns", EPOCH_NS + seed * 1_000 * NS_PER_S, "--recording", path, *more,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("feedback")
+    simulated(path / "training.mcap", 1, 60)
+    simulated(path / "healthy.mcap", 2, 70)
+    simulated(path / "faulty.mcap", 5, 60, *FAULT)
+    result = fantwin("train", path / "training.mcap", "--model", "physical", "-o", path / "twin.onnx")
+    assert result.exit_code == 0, result.output
+    return path
+
+
+def with_alarm(path: Path, action: Action | None) -> Path:
+    """A recording that has nothing but the alarm of the fault, and what an operator says of it."""
+    onset_t_ns, cleared_t_ns = (EPOCH_NS + (5_000 + second) * NS_PER_S for second in FAULT_S)
+    state: dict[str, Any] = {"fan": 1, "severity": Severity.ALARM, "onset_t_ns": onset_t_ns, "message": "slow"}
+    state |= {"residual_rad_s": 1.0, "limit_rad_s": 1.0}
+    alarms = [
+        Alarm(**state, active=True, t_ns=onset_t_ns + NS_PER_S, transition=Transition.RAISED),
+        Alarm(**state, active=False, t_ns=cleared_t_ns + NS_PER_S, transition=Transition.CLEARED),
+    ]
+    if action is not None:
+        said = {"transition": GIVES_FEEDBACK[action][0], "marked_onset_t_ns": onset_t_ns, "operator_name": "ann"}
+        alarms.append(Alarm(**state, **said, active=False, t_ns=cleared_t_ns + 60 * NS_PER_S, comment="door"))
+    path.unlink(missing_ok=True)
+    with RecordingWriter(path, {"site": "simulated", "trays": "tray1"}) as writer:
+        for number, alarm in enumerate(alarms):
+            message = replace(alarm, header=Header("scorer-1", number, "tray1"))
+            writer.add_message(tray_key("simulated", "tray1", "alarm"), message, message.t_ns)
+    return path
+
+
+def calibrated(folder: Path, action: Action) -> tuple[dict[str, Any], list[str]]:
+    """The output for machines, and the lines about alarms that are marked."""
+    with_alarm(folder / "alarms.mcap", action)
+    words = [
+        *("calibrate", folder / "twin.onnx", folder / "healthy.mcap", folder / "faulty.mcap", "-o", folder / "o.onnx"),
+        *("--feedback", folder / "alarms.mcap", "--false-alarms-per-day", PER_DAY, "--json"),
+    ]
+    result = fantwin(*expand_variadic(list(map(str, words))))
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout), [line for line in result.stderr.splitlines() if "marked" in line]
+
+
+def test_what_is_marked_as_false_is_learned_from_and_what_is_marked_as_true_is_not(folder: Path) -> None:
+    false, [line] = calibrated(folder, Action.FALSE_ALARM)
+    assert line.endswith("marked as a false alarm by ann (door): used as healthy running")
+    true, [line] = calibrated(folder, Action.TRUE_ALARM)
+    assert "alarms.mcap: tray1 fan 1: alarm of 20" in line
+    assert "marked as a true alarm by ann (door): left out, from 10 min before it until 20" in line
+    learned, healthy = (each["calibration"] for each in (false, true))
+    assert max(learned["speed"]["residual_std"]) > 3 * max(healthy["speed"]["residual_std"]), "the fault is variation"
+    drift = [each["detectors"]["speed_drift"]["limit"] for each in (learned, healthy)]
+    assert drift[0] > 10 * drift[1], "the fault is within the limit"
+    assert (bool(false["warnings"]), true["warnings"]) == (True, [])
+    hours = [each["calibration"]["declared_rate"]["fan_hours"] for each in (false, true)]
+    assert hours[0] - hours[1] == pytest.approx((FAULT_S[1] + 1) / 3600, rel=0.25), "that time of that fan"
+    assert [(each["feedback"], each["is_left_out"]) for each in true["alarms"]] == [("true_alarm", True)]
+    count = partial(check_declared_rate, folder / "o.onnx", [simulated(folder / "other.mcap", 6, 60, *FAULT)], [])
+    with RecordingsInParallel() as pool:
+        (span,) = (each.left_out for each in marked_alarms([(folder, alarms_in(folder / "alarms.mcap"))]))
+        assert span is not None
+        shifted = replace(span, from_t_ns=span.from_t_ns + 1_000 * NS_PER_S, to_t_ns=span.to_t_ns + 1_000 * NS_PER_S)
+        raised, left_out = count(pool), count(pool, left_out=[shifted])
+    assert raised.alarms > left_out.alarms, "a true alarm is no false one when the declared rate is tested"
+    assert left_out.fan_hours < raised.fan_hours - 0.8 * FAULT_S[1] / 3600
+
+
+def test_an_alarm_that_nobody_has_marked_leaves_nothing_out(tmp_path: Path) -> None:
+    path = with_alarm(tmp_path / "alarms.mcap", None)
+    with RecordingsInParallel() as pool:
+        found = marked_running([path], [], None, pool)
+        assert found.lines == ["1 alarm in the recordings is not marked as true or false: used as healthy running"]
+        assert found.left_out == ()
+        assert marked_running([path], [], "tray2", pool).lines == []
+
+
+def test_what_a_gateway_has_kept_counts_for_the_times_of_the_recordings(tmp_path: Path) -> None:
+    recording = with_alarm(tmp_path / "alarms.mcap", None)
+    store = AlarmStore(tmp_path / "alarms.sqlite")
+    alarms = [alarm for _, alarm in alarms_in(with_alarm(tmp_path / "marked.mcap", Action.TRUE_ALARM))]
+    long_ago = [
+        replace(each, header=replace(each.header, producer="s0"), t_ns=each.t_ns - DAY_NS, onset_t_ns=5 * NS_PER_S)
+        for each in alarms[:2]
+    ]
+    for alarm in [*long_ago, *alarms]:
+        store.add(alarm)
+    store.close()
+    with RecordingsInParallel() as pool:
+        found = marked_running([recording], [tmp_path / "alarms.sqlite"], None, pool)
+    (span,) = found.left_out
+    assert (span.site, span.path, span.tray, span.fan) == ("simulated", None, "tray1", 1)
+    assert span.from_t_ns == ONSET_NS - 600 * NS_PER_S
+    assert len(found.alarms) == 1, "that of long ago is of no recording here"
+
+
+@pytest.mark.parametrize(
+    ("more", "is_meant"),
+    [({}, True), ({"site": ""}, True), ({"site": "b"}, False), ({"tray": "t2"}, False), ({"path": Path("x")}, False)],
+)
+def test_a_time_is_left_out_of_its_own_tray_site_and_recording(more: dict[str, Any], is_meant: bool) -> None:
+    span = replace(LeftOut("a", None, "t1", 1, 0, 1), **more)
+    assert bool(concerning([span], Path("r"), "a", "t1")) == is_meant
+
+
+def test_where_times_are_no_dates_an_alarm_belongs_to_its_recording_alone(tmp_path: Path) -> None:
+    alarms = alarms_in(with_alarm(tmp_path / "alarms.mcap", Action.TRUE_ALARM))
+    undated = [
+        (
+            site,
+            replace(
+                alarm, t_ns=alarm.t_ns - EPOCH_NS, onset_t_ns=alarm.onset_t_ns - EPOCH_NS,
+                marked_onset_t_ns=max(0, alarm.marked_onset_t_ns - EPOCH_NS),
+            ),
+        )
+        for site, alarm in alarms
+    ]  # fmt: skip
+    paths = Path("one"), Path("two")
+    found = marked_alarms([(path, undated) for path in paths])
+    assert [span.path for each in found if (span := each.left_out)] == list(paths)

@@ -1,0 +1,136 @@
+"""Alarm clips of a chain's recording: what they hold, and that they decide the same again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.recordings.clips.clip import Clip, clip_lines
+from pipeline.recordings.clips.cutting import cut_clips
+from pipeline.recordings.contents import contents_of
+from pipeline.recordings.reading import read_metadata, read_recording
+from pipeline.recordings.records import active_path
+from pipeline.recordings.writing import RecordingWriter
+from pipeline.replay.offline.comparison import CannotCompareError
+from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.replay.offline.rescoring import RescoredTray, rescore
+from schemas.enums import Transition
+from schemas.messages import Alarm
+from tests.support.clipped_recordings import S, clip_of, of_tray, record
+from tests.support.failing_writers import disk_of
+from tests.support.offline_replay import recorded, verified
+
+MADE = ("grid", "prediction", "score")
+MARGIN_S = 0.8
+
+
+def first_raised(path: Path) -> Alarm:
+    return next(alarm for alarm in recorded(path, "alarm") if alarm.transition == Transition.RAISED)
+
+
+def cut(source: Path, folder: Path, left_out: tuple[str, ...] = ()) -> Path:
+    """The clip of the first alarm of a recording, from its parts, the last of which is still being written."""
+    clip = clip_of(first_raised(source), before_s=0.5, after_s=2.0)
+    core = record(source, folder / "recording.mcap", left_out, part_s=1.0)
+    (result,) = cut_clips([clip], folder / "recording.mcap", folder / "clips", core._index(), margin_s=MARGIN_S)
+    core.close()
+    assert result.size_bytes == (folder / "clips" / clip.name).stat().st_size
+    assert not result.problem
+    return folder / "clips" / clip.name
+
+
+def again(path: Path) -> RescoredTray:
+    with open_replay_input([path], None, (), None) as replay_input:
+        (tray,) = rescore(replay_input, None, verify=False)
+    return tray
+
+
+def test_a_clip_has_every_message_of_its_time_with_its_bytes(undisturbed, tmp_path):
+    alarm = first_raised(undisturbed)
+    clip = cut(undisturbed, tmp_path)
+    window = range(alarm.t_ns - S // 2, alarm.t_ns + 2 * S + 1)
+    wanted = [(e.key, e.payload, e.received_t_ns) for e in read_recording(undisturbed) if e.received_t_ns in window]
+    found = [(e.key, e.payload, e.received_t_ns) for e in read_recording(clip) if e.received_t_ns in window]
+    assert len(wanted) > 900
+    assert [each for each in found if each in wanted] == wanted
+    (snapshot, *_) = recorded(clip, "snapshot")
+    (taken_ns, *_) = [each.received_t_ns for each in read_recording(undisturbed, ("snapshot",))]
+    before_s = (taken_ns - recorded(clip, "raw")[0].host_receive_t_ns[0]) / S
+    assert MARGIN_S - 0.03 < before_s <= MARGIN_S
+    assert recorded(clip, "prediction")[0].t_ns[0] == snapshot.t_ns + 10_000_000
+    contents = contents_of(clip)
+    assert not contents.damage and not any(counts.missing for counts in contents.streams.values())
+    assert "raised 2027-01-15" in clip_lines(contents.metadata)[0]
+
+
+def test_the_same_alarm_comes_out_of_a_clip_again(undisturbed, tmp_path):
+    alarm = first_raised(undisturbed)
+    tray = again(cut(undisturbed, tmp_path))
+    (raised,) = [each for each in tray.alarms if each.transition == Transition.RAISED]
+    assert (raised.fan, raised.severity, raised.statistic) == (alarm.fan, alarm.severity, alarm.statistic)
+    assert abs(raised.t_ns - alarm.t_ns) < 0.1 * S
+    assert tray.lost == 0
+
+
+def test_the_same_alarm_comes_out_of_a_clip_with_raw_samples_only(undisturbed, tmp_path):
+    alarm = first_raised(undisturbed)
+    clip = cut(undisturbed, tmp_path, MADE)
+    (raised,) = [each for each in again(clip).alarms if each.transition == Transition.RAISED]
+    assert (raised.fan, raised.severity) == (alarm.fan, alarm.severity)
+    with pytest.raises(CannotCompareError, match="without predictions cannot be compared to the bit"):
+        verified(clip)
+
+
+def test_a_clip_is_verified_to_the_bit_from_its_snapshot_and_predictions(undisturbed, tmp_path):
+    clip = cut(undisturbed, tmp_path)
+    found = verified(clip).comparison
+    assert found and found.is_equal and found.alarms_equal >= 1
+    assert found.equal == sum(len(score.t_ns) for score in recorded(clip, "score")) > 200
+    (reason,) = found.reasons  # the fixture is shorter than what a diagnosis looks back at
+    assert "causes of alarms soon after the beginning of a clip" in reason
+
+
+def test_a_clip_has_its_tray_only(undisturbed, tmp_path):
+    source = tmp_path / "two-trays.mcap"
+    head = read_metadata(undisturbed)
+    about = {"trays": "tray1,tray2", "fans.tray1": "3", "fans.tray2": "3"}
+    twins = {**head.attachments, "tray2.onnx": b"another twin"}
+    with RecordingWriter(source, {**head.metadata, **about}, twins) as writer:
+        for envelope in read_recording(undisturbed):
+            writer.add(envelope)
+            writer.add(of_tray(envelope, "tray2"))
+    clip = cut(source, tmp_path / "runs")
+    assert {envelope.key.split("/")[2] for envelope in read_recording(clip)} == {"tray1"}
+    found = read_metadata(clip)
+    assert found.trays == ("tray1",)
+    assert "fans.tray2" not in found.metadata
+    assert set(found.attachments) == {"configuration.toml", "tray1.onnx"}
+
+
+def test_what_cannot_be_written_leaves_no_file_and_can_be_tried_again(undisturbed, tmp_path):
+    clip = clip_of(first_raised(undisturbed), before_s=0.5, after_s=2.0)
+    record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
+    folder = tmp_path / "clips"
+    with disk_of(40_000):
+        (result,) = cut_clips([clip], tmp_path / "recording.mcap", folder)
+    assert result.may_pass and not result.size_bytes and "File too large" in result.problem
+    assert list(folder.iterdir()) == []
+    (result,) = cut_clips([clip], tmp_path / "recording.mcap", folder)
+    assert result.size_bytes and [path.name for path in folder.iterdir()] == [clip.name]
+
+
+def test_a_clip_of_parts_that_are_gone_is_not_written_and_one_of_some_has_the_rest(undisturbed, tmp_path):
+    alarm = first_raised(undisturbed)
+    record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
+    (tmp_path / "recording.mcap").unlink()
+    clip = clip_of(alarm, before_s=0.5, after_s=2.0)
+    (result,) = cut_clips([clip], tmp_path / "recording.mcap", tmp_path / "clips")
+    assert result.size_bytes
+    first = recorded(tmp_path / "clips" / clip.name, "raw")[0].host_receive_t_ns[0]
+    assert first == recorded(tmp_path / "recording-2.mcap", "raw")[0].host_receive_t_ns[0]
+    past = Clip("past.mcap", "tray1", 5 * S, 9 * S, 5 * S, clip.alarms)
+    (result,) = cut_clips([past], tmp_path / "recording.mcap", tmp_path / "clips")
+    assert (result.size_bytes, result.may_pass) == (0, False)
+    assert "nothing of that time is recorded" in result.problem
+    assert not active_path(tmp_path / "clips" / past.name).exists()

@@ -1,0 +1,140 @@
+"""`fantwin view`: a recording looks as the live view did."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.cli.options import ViewLayout
+from pipeline.cli.recordings.view import view
+from pipeline.errors import UserError
+from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import Alarm, Message, Score
+from schemas.topics import health_key, tray_key
+from stages.viewer import build
+from tests.stages.test_viewer import card, chunks_of, context, health, rows_of, sent
+from tests.stages.test_viewer_fleet import TRAYS, messages_of
+from tests.support.score_data import START_NS, made_up_tray
+from tests.support.wear_data import worn_snapshot
+
+pytest.importorskip("rerun")
+TOPICS = {"Score": "score", "Alarm": "alarm", "ModelCard": "twin", "Health": "health", "ScorerSnapshot": "snapshot"}
+HOLE_S = (4.0, 6.0)
+
+
+def messages() -> list[Message]:
+    """Ten seconds of three fans with all that a view shows: an alarm, a hole, temperatures, wear, twin and health."""
+    scores, alarms = made_up_tray(seconds=10, fault_s=(6.5, 8.0))
+    seen = [s for s in scores if not HOLE_S[0] <= (s.t_ns[0] - START_NS) / 1e9 < HOLE_S[1]]
+    warm = [replace(s, temperature_c=np.full(s.score.shape, 21.0, np.float32)) for s in seen]
+    alarms = [replace(alarm, header=replace(alarm.header, sequence=n)) for n, alarm in enumerate(alarms)]
+    return [card(), health(), worn_snapshot("tray1", 3, 2, START_NS), *sorted([*warm, *alarms], key=last_t_ns)]
+
+
+def last_t_ns(message: Score | Alarm) -> int:
+    return int(np.max(message.t_ns))
+
+
+def live_view(folder: Path, layout: str = "all", **config: Any) -> Path:
+    """What the stage writes while messages come one by one."""
+    core = build(context(folder, layout=layout, **config)).core
+    for number, message in enumerate(messages()):
+        core.step(sent(message))
+        core.tick(START_NS + number * 37_000_000)
+    core.close()
+    return folder / "view.rrd"
+
+
+def recording(folder: Path) -> Path:
+    metadata = {"site": "site", "trays": "tray1", "fans.tray1": "3", "speed_unit.tray1": "rad/s"}
+    with RecordingWriter(folder / "rec.mcap", metadata, {}) as writer:
+        for number, message in enumerate(messages()):
+            topic = TOPICS[type(message).__name__]
+            key = health_key("site", "scorer", "all") if topic == "health" else tray_key("site", "tray1", topic)
+            writer.add_message(key, message, START_NS + number * 100_000_000)
+    return writer.path
+
+
+def recorded_view(folder: Path, layout: str = "all") -> Path:
+    view([recording(folder)], folder / "recorded.rrd", ViewLayout(layout), json_output=True)
+    return folder / "recorded.rrd"
+
+
+def parts_of(path: Path) -> dict[str, set[str]]:
+    """Entity -> its components and timelines."""
+    parts: dict[str, set[str]] = {}
+    for chunk in chunks_of(path):
+        names = [n for n in chunk.to_record_batch().schema.names if ":" in n or n in ("time", "day")]
+        parts.setdefault(chunk.entity_path, set()).update(names)
+    return {entity: names for entity, names in parts.items() if not entity.startswith("/__")}
+
+
+def test_a_recording_has_the_entities_and_components_of_the_live_view_and_the_same_samples(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    live, recorded = live_view(tmp_path), recorded_view(tmp_path)
+    document = json.loads(capsys.readouterr().out)
+    assert document["fans"] == 3 and document["damage"] == []
+    parts = parts_of(recorded)
+    assert parts == parts_of(live)
+    shown = ("/tray1/fan_2/speed", "/tray1/fan_2/deviation", "/tray1/balance/page_0", "/tray1/score/page_0")
+    for entity in (*shown, "/tray1/temperature_c/fan_0", "/tray1/state/fan_2", "/tray1/log", "/site/alarms"):
+        assert "time" in parts[entity], entity
+    assert parts["/wear/drag/tray1/fan_2"] == {"day", "Measurements:values", "Measurements:variances"} | {
+        f"Measurements:{name}" for name in ("names", "colors", "widths")
+    }
+    assert "TextDocument:text" in parts["/stages"]
+    for entity in shown:
+        np.testing.assert_array_equal(samples(recorded, entity), samples(live, entity))
+
+
+def samples(path: Path, entity: str) -> np.ndarray:
+    """Times and values of an entity, without what depends on the flushes: the ends of the band, and rows of NaN."""
+    rows = rows_of(path)[entity]
+    component = next(name for name in rows[0][1] if name.endswith((":values", ":scalars")))
+    count = 2 if entity.endswith("/speed") else None
+    of_entity = np.array([[t_ns, *row[component][:count]] for t_ns, row in rows], float)
+    return of_entity[np.isfinite(of_entity[:, 1:]).any(axis=1)]
+
+
+def test_an_existing_view_is_kept_and_a_recording_without_scores_is_one_line(tmp_path: Path) -> None:
+    path = recording(tmp_path)
+    (tmp_path / "kept.rrd").write_bytes(b"kept")
+    with pytest.raises(UserError, match="exists; name another file with -o, or use --force"):
+        view([path], tmp_path / "kept.rrd")
+    assert (tmp_path / "kept.rrd").read_bytes() == b"kept"
+    with RecordingWriter(tmp_path / "none.mcap", {"site": "site"}, {}) as writer:
+        writer.add_message(tray_key("site", "tray1", "twin"), card(), START_NS)
+    with pytest.raises(UserError, match="holds no scores to show"):
+        view([writer.path], tmp_path / "new.rrd")
+    assert not (tmp_path / "new.rrd").exists()
+
+
+def test_a_recording_of_a_fleet_shows_its_overview_at_each_time_and_has_a_plot_for_the_fan_in_alarm(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trays = {f"fans.{tray}": "3" for tray in TRAYS}
+    with RecordingWriter(tmp_path / "fleet.mcap", {"trays": ",".join(TRAYS), **trays}, {}) as writer:
+        for number, message in enumerate(messages_of()):
+            header = replace(message.header, sequence=number)
+            key = tray_key("site", message.header.tray, TOPICS[type(message).__name__])
+            writer.add_message(key, replace(message, header=header), last_t_ns(message))
+    view([writer.path], tmp_path / "fleet.rrd", fleet_above=3, json_output=True)
+    assert json.loads(capsys.readouterr().out)["fans"] == 9
+    rows = rows_of(tmp_path / "fleet.rrd")
+    times = [(t_ns - START_NS) / 1e9 for t_ns, _ in rows["/fleet/counts/in_alarm"]]
+    assert len(times) in (40, 41) and times[-1] > 19.0
+    in_alarm = [at_s for at_s, (_, row) in zip(times, rows["/fleet/counts/in_alarm"], strict=True) if any_of(row)]
+    assert 8.5 <= in_alarm[0] <= 9.1 and 14.0 <= in_alarm[-1] <= 15.1
+    assert "/shown/plot_1/tray2/fan_2/speed" in rows and "/shown/score/plot_1" in rows
+    with pytest.raises(UserError, match=r'viewer\.layout = "wear": not with more than 3 fans'):
+        view([writer.path], tmp_path / "wear.rrd", ViewLayout.WEAR, fleet_above=3)
+
+
+def any_of(row: dict[str, list[float]]) -> bool:
+    return row["Scalars:scalars"][0] > 0.0

@@ -1,0 +1,191 @@
+"""The recorder keeps a clip of each alarm, while it records and across crashes, restarts and full disks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.recordings.clips.alarm_clips import AlarmClips, tracker_of
+from pipeline.recordings.clips.clip import Clip, clips_in, kept_clips, list_path
+from pipeline.recordings.clips.tracker import ClipTracker, CutResult
+from pipeline.recordings.clips.worker import ClipMaker, ClipWorker
+from pipeline.recordings.index import PartIndex
+from pipeline.recordings.parts import RecordingParts
+from pipeline.recordings.reading import read_recording
+from schemas.enums import Severity, Transition
+from schemas.header import Header
+from schemas.messages import Alarm
+from stages.recorder import Recorder, RecorderConfig
+from tests.stages.test_recorder import NOW_NS, SECOND_NS, Disk, envelope
+from tests.support.clipped_recordings import record
+from tests.support.offline_replay import recorded, recording_of
+
+FREE = 1 << 40
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An alarm is raised after 1.7 s."""
+    return recording_of(tmp_path_factory.mktemp("chain"), 1, 400)
+
+
+class Maker(ClipMaker):
+    """A stand-in for the disk of the clips."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self.deleted: list[str] = []
+        self.saved: list[Clip] = []
+        self.waiting: list[CutResult] = []
+
+    def save(self, clips: Sequence[Clip]) -> None:
+        self.saved = list(clips)
+
+    def cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
+        self.asked += [clip.name for clip in clips]
+
+    def results(self) -> list[CutResult]:
+        results, self.waiting = self.waiting, []
+        return results
+
+    def delete(self, clip: Clip) -> None:
+        self.deleted.append(clip.name)
+
+    def problem(self) -> str:
+        return ""
+
+    def end(self, timeout_s: float) -> None: ...
+
+
+def clips_of(recording: Path, free: int = FREE, after_s: float = 1.0) -> AlarmClips:
+    """As a recorder has them, with short clips."""
+    tracker = tracker_of(recording, before_s=0.5, after_s=after_s, most_bytes=0, settled_s=0.3)
+    return AlarmClips(tracker, ClipWorker(recording, min_free_bytes=1000, free_bytes=lambda: free))
+
+
+def raised(fan: int, t_ns: int, **more: Any) -> Alarm:
+    fields: dict[str, Any] = {"transition": Transition.RAISED, "active": True, "severity": Severity.ALARM} | more
+    about: dict[str, Any] = {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "", "confirmed": True}
+    return Alarm(header=Header("scorer-1", fan, "tray1"), fan=fan, t_ns=t_ns, onset_t_ns=t_ns, **about, **fields)
+
+
+def crash(core: Recorder) -> None:
+    """The process is gone: the system unlocks the file, and nothing more is written."""
+    assert core._part
+    core._part._file.close()  # type: ignore[attr-defined]
+
+
+def test_a_recorder_cuts_a_clip_and_lists_it_while_it_records(chain, tmp_path):
+    recording = tmp_path / "recording.mcap"
+    core = record(chain, recording, clips=clips_of(recording), part_s=1.0)
+    core.close()
+    (clip,) = kept_clips(tmp_path / "clips")
+    assert not clip.is_due and clip.size_bytes == (tmp_path / "clips" / clip.name).stat().st_size
+    assert core.counters()["clips"] == 1 and core.problem() == ""
+    (alarm, *_) = recorded(tmp_path / "clips" / clip.name, "alarm")
+    assert (alarm.fan, alarm.onset_t_ns) == (clip.alarms[0].fan, clip.alarms[0].onset_t_ns)
+
+
+def test_a_clip_that_was_due_at_a_crash_is_cut_after_the_restart(chain, tmp_path):
+    recording = tmp_path / "recording.mcap"
+    clips = clips_of(recording, after_s=60)
+    core = record(chain, recording, clips=clips)
+    clips._maker.end(60)  # the list is on the disk
+    crash(core)
+    (due,) = clips_in(list_path(recording))
+    assert due.is_due and not kept_clips(tmp_path / "clips")
+    again = clips_of(recording)
+    core = Recorder(RecordingParts(recording, {}, {}, "s2"), RecorderConfig(), due.until_ns, clips=again)
+    core.tick(due.until_ns + SECOND_NS)
+    core.close()
+    (clip,) = kept_clips(tmp_path / "clips")
+    assert clip.name == due.name and not clip.is_due
+    assert sum(1 for _ in read_recording(tmp_path / "clips" / clip.name, ("raw",))) > 300
+
+
+def test_an_alarm_of_which_only_the_recording_knows_after_a_crash_gets_its_clip(chain, tmp_path):
+    recording = tmp_path / "recording.mcap"
+    crash(record(chain, recording))  # without clips: killed before anything was written down of them
+    parts = RecordingParts(recording, {}, {}, "s2")
+    clips = clips_of(recording)
+    assert parts.last_part
+    clips.continue_after(parts.last_part)
+    core = Recorder(parts, RecorderConfig(), NOW_NS, clips=clips)
+    core.tick(2 * 10**18)
+    core.close()
+    assert len(kept_clips(tmp_path / "clips")) == 1
+
+
+def test_a_recorder_that_stops_before_the_end_of_a_clip_cuts_it_and_its_successor_cuts_all_of_it(chain, tmp_path):
+    recording = tmp_path / "recording.mcap"
+    record(chain, recording, clips=clips_of(recording, after_s=60)).close()
+    (short,) = kept_clips(tmp_path / "clips")
+    assert short.is_due
+    core = Recorder(RecordingParts(recording, {}, {}, "s2"), RecorderConfig(), NOW_NS, clips=clips_of(recording))
+    core.tick(short.until_ns + SECOND_NS)
+    core.close()
+    (whole,) = kept_clips(tmp_path / "clips")
+    assert whole.name == short.name and not whole.is_due
+
+
+def test_no_clip_is_cut_where_that_would_fill_the_disk_and_the_recorder_says_so(chain, tmp_path):
+    recording = tmp_path / "recording.mcap"
+    clips = clips_of(recording, free=2000)
+    core = record(chain, recording, clips=clips)
+    clips._maker.end(60)
+    core.tick(2 * 10**18)
+    assert "cannot be cut yet" in core.problem() and "are free on the disk" in core.problem()
+    assert not kept_clips(tmp_path / "clips")
+    core.close()
+
+
+def test_an_alarm_that_a_restarted_recorder_receives_again_gives_one_clip():
+    maker = Maker()
+    core = Recorder(Disk(), RecorderConfig(), NOW_NS, clips=AlarmClips(ClipTracker((), 60, 60, 0), maker))
+    for _ in range(2):
+        core.step(envelope(raised(0, NOW_NS), "alarm", NOW_NS))
+    core.tick(NOW_NS + 10 * SECOND_NS)
+    assert [clip.is_due for clip in maker.saved] == [True]
+    assert maker.asked == []
+
+
+def test_the_disk_guard_takes_what_is_oldest_but_no_unacknowledged_clip_and_last_what_a_clip_needs():
+    disk, maker = Disk(), Maker()
+    config = RecorderConfig(min_free_bytes=50_000_000, delete_oldest=True)
+    core = Recorder(disk, config, NOW_NS, clips=AlarmClips(ClipTracker((), 60, 60, 0), maker))
+    now_ns = NOW_NS
+    for fan in range(2):
+        core.step(envelope(raised(fan, now_ns), "alarm", now_ns))
+        now_ns += 70 * SECOND_NS
+        core.tick(now_ns)
+        maker.waiting = [CutResult(maker.asked[-1], 100)]
+        core.tick(now_ns)
+    core.step(envelope(raised(0, now_ns, acknowledged=True, transition=Transition.ACKNOWLEDGED), "alarm", now_ns))
+    core.step(envelope(raised(2, now_ns), "alarm", now_ns))
+    acknowledged, _, running = [clip.name for clip in core._clips._tracker.clips]  # type: ignore[union-attr]
+    disk.free, disk.oldest, disk.oldest_ns = 1, ["r-0.mcap", "r-1.mcap"], NOW_NS - 1000 * SECOND_NS
+    core.tick(now_ns := now_ns + SECOND_NS)
+    assert disk.oldest == ["r-1.mcap"] and maker.deleted == []  # this part is older than any clip
+    disk.oldest_ns = now_ns
+    core.tick(now_ns := now_ns + SECOND_NS)
+    assert disk.oldest == ["r-1.mcap"] and maker.deleted == [acknowledged]
+    assert core.problem() == ""
+    core.tick(now_ns := now_ns + SECOND_NS)
+    assert disk.oldest == []  # the running clip needs it, but the disk is full
+    lacking = next(clip for clip in maker.saved if clip.name == running)
+    assert lacking.problem == "a part that it needs was deleted to make room"
+    core.tick(now_ns + SECOND_NS)
+    assert "NOTHING IS RECORDED" in core.problem() and len(maker.deleted) == 1
+    assert core.counters()["parts_deleted"] == 2 and core.counters()["clips_deleted"] == 1
+
+
+def test_files_that_a_killed_recorder_left_of_a_clip_are_removed(tmp_path):
+    recording = tmp_path / "recording.mcap"
+    (tmp_path / "clips").mkdir()
+    (tmp_path / "clips" / ".unfinished-tray1-0.mcap.active").touch()
+    (tmp_path / "clips" / "tray1-0.mcap").touch()
+    clips_of(recording)
+    assert [path.name for path in (tmp_path / "clips").iterdir()] == ["tray1-0.mcap"]

@@ -1,0 +1,137 @@
+"""stages.scorer: what operators say of an alarm, whether it was true, while it stands and after it."""
+
+from __future__ import annotations
+
+from itertools import count
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
+from pipeline.runtime.tray_scorer import EARLIER_ALARMS
+from schemas.enums import Action, Feedback, Transition
+from schemas.messages import Alarm
+from schemas.units import NS_PER_S
+from stages.scorer import ScorerCore
+from tests.support.scored_blocks import commissioned, core_of, feed, prediction_of, request_of, snapshot_of
+
+EXCURSION = [0.0] * 20 + [9.0] * 20 + [0.0] * 90
+"""of 1.3 s: raises one alarm, and clears it"""
+SEQUENCES = count()
+
+
+def scorer(**more: Any) -> ScorerCore:
+    return commissioned(core_of(smoothing_s=0.0, on_delay_s=0.05, off_delay_s=0.1, **more))
+
+
+def excursions(core: ScorerCore, count: int, first: int = 0) -> list[int]:
+    """Onsets of so many alarms."""
+    alarms: list[Alarm] = []
+    for number in range(first, first + count):
+        alarms += feed(core, [prediction_of(np.array(EXCURSION), first=number * len(EXCURSION))])[1]
+    return [alarm.onset_t_ns for alarm in alarms if alarm.transition == Transition.RAISED]
+
+
+def asked(core: ScorerCore, action: Action, comment: str = "", **more: Any) -> Alarm:
+    _, (answer,) = feed(core, [request_of(action, 0, sequence=next(SEQUENCES), comment=comment, **more)])
+    return answer
+
+
+def of(alarm: Alarm) -> tuple[Feedback, str, str]:
+    return alarm.feedback, alarm.feedback_by, alarm.feedback_reason
+
+
+def test_feedback_on_an_alarm_that_stands_is_in_every_message_about_it_and_not_in_those_about_the_next() -> None:
+    core = scorer()
+    _, (raised,) = feed(core, [prediction_of(np.array([9.0] * 20))])
+    answer = asked(core, Action.FALSE_ALARM, "a door was open")
+    assert (answer.transition, answer.marked_onset_t_ns) == (Transition.MARKED_FALSE, raised.onset_t_ns)
+    assert (answer.message, answer.comment) == ("fan 0: marked as a false alarm", "a door was open")
+    assert (answer.active, answer.acknowledged, answer.severity) == (True, False, raised.severity), (
+        "nothing else changes"
+    )
+    _, (cleared,) = feed(core, [prediction_of(np.zeros(30), first=20)])
+    assert of(cleared) == of(answer) == (Feedback.FALSE_ALARM, answer.operator_name, "a door was open")
+    assert cleared.marked_onset_t_ns == 0
+    _, (raised_again, *_) = feed(core, [prediction_of(np.array([9.0] * 20), first=60)])
+    assert of(raised_again) == (Feedback.NONE, "", "")
+
+
+def test_the_last_word_counts() -> None:
+    core = scorer()
+    excursions(core, 1)
+    assert asked(core, Action.FALSE_ALARM, "dust on the sensor").feedback == Feedback.FALSE_ALARM
+    last = asked(core, Action.TRUE_ALARM)
+    assert of(last) == (Feedback.TRUE_ALARM, last.operator_name, ""), "a true alarm needs no reason"
+
+
+def test_an_earlier_alarm_is_named_by_its_onset_to_within_a_second() -> None:
+    core = scorer()
+    onsets = excursions(core, 3)
+    for onset, off_ns in zip(onsets, (999_999_999, -500_000_000, 0), strict=True):
+        answer = asked(core, Action.TRUE_ALARM, onset_t_ns=onset - off_ns)
+        nearest = min(onsets, key=lambda each: abs(each - onset + off_ns))
+        assert (answer.transition, answer.marked_onset_t_ns) == (Transition.MARKED_TRUE, nearest)
+    earlier = asked(core, Action.FALSE_ALARM, "test", onset_t_ns=onsets[0])
+    assert (earlier.onset_t_ns, earlier.feedback) == (onsets[2], Feedback.TRUE_ALARM), "that of the last alarm stays"
+    assert earlier.message == "fan 0: an earlier alarm is marked as a false alarm"
+    assert asked(core, Action.TRUE_ALARM).marked_onset_t_ns == onsets[2], "without an onset it is the last one"
+
+
+@pytest.mark.parametrize(
+    ("comment", "onset_t_ns", "why"),
+    [
+        ("", 0, "fan 0: refused: a false alarm needs a reason: add a comment"),
+        (" \t", 0, "fan 0: refused: a false alarm needs a reason: add a comment"),
+        ("why", 5, "fan 0: refused: no alarm began then, or too many have been raised since"),
+    ],
+)
+def test_what_cannot_be_granted_changes_nothing(comment: str, onset_t_ns: int, why: str) -> None:
+    core = scorer()
+    excursions(core, 1)
+    answer = asked(core, Action.FALSE_ALARM, comment, onset_t_ns=onset_t_ns)
+    assert (answer.transition, answer.message) == (Transition.REFUSED, why)
+    assert (answer.feedback, answer.marked_onset_t_ns) == (Feedback.NONE, 0)
+
+
+def test_a_fan_without_an_alarm_gets_no_feedback() -> None:
+    answer = asked(scorer(), Action.TRUE_ALARM)
+    assert answer.message == "fan 0: refused: no alarm has been raised"
+
+
+def test_only_the_last_alarms_of_a_fan_are_kept() -> None:
+    core = scorer()
+    onsets = excursions(core, EARLIER_ALARMS + 2)
+    assert asked(core, Action.TRUE_ALARM, onset_t_ns=onsets[0]).transition == Transition.REFUSED
+    assert asked(core, Action.TRUE_ALARM, onset_t_ns=onsets[1]).marked_onset_t_ns == onsets[1]
+
+
+def test_after_a_restart_feedback_and_earlier_alarms_are_those_of_before() -> None:
+    core = scorer()
+    onsets = excursions(core, 2)
+    marked = asked(core, Action.FALSE_ALARM, "test run")
+    successor = scorer()
+    _, republished = successor.restore(snapshot_of(core))
+    assert isinstance(republished, Alarm)
+    assert (republished.transition, of(republished)) == (Transition.REPUBLISHED, of(marked))
+    assert asked(successor, Action.TRUE_ALARM, onset_t_ns=onsets[0]).marked_onset_t_ns == onsets[0]
+
+
+def test_with_another_twin_alarms_of_before_can_still_be_marked() -> None:
+    core = scorer()
+    onsets = excursions(core, 2)
+    successor = scorer()
+    successor.tray.alarms.restore(core.tray.alarms.snapshot())
+    successor.tray.alarms.discard_all(onsets[1] + NS_PER_S, keep_silenced=True)
+    answer = asked(successor, Action.TRUE_ALARM)
+    assert (answer.marked_onset_t_ns, answer.feedback) == (onsets[1], Feedback.NONE)
+
+
+@pytest.mark.parametrize(("rules", "is_kept"), [(DecisionRules.SMALL_STEPS, False), (CURRENT_RULES, True)])
+def test_snapshots_of_earlier_recordings_are_made_as_they_were(rules: DecisionRules, is_kept: bool) -> None:
+    core = scorer(decision_rules=rules)
+    excursions(core, 2)
+    state = snapshot_of(core).state_json
+    assert ("earlier_onsets_t_ns" in state) == is_kept
+    assert "feedback" not in state and "marked" not in state
