@@ -194,7 +194,7 @@ def test_a_stopped_fan_stays_in_alarm_filters_are_kept_and_all_alarms_of_a_tray_
     stopped = score(2.0, state=FanState.STOPPED)
     stopped = replace(stopped, score=np.full_like(stopped.score, np.nan))
     gateway.feed(alarm(sequence=1, causes=tie), replace(alarm(sequence=2), fan=1), stopped)
-    page = opened(browser, url, errors, "ann", viewport={"width": 1366, "height": 768})
+    page = opened(browser, url, errors, "ann")
     section = page.locator("section", has=page.get_by_role("heading", name="In alarm"))
     cell = section.get_by_role("button", name=f"{TRAY} fan {FAULTY}")
     expect(cell).to_contain_text("alarm, now stopped by its command")
