@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import subprocess
 import sys
 import threading
@@ -13,8 +12,6 @@ from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
-
-os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")  # otherwise every start warns of the missing footer
 import rerun as rr
 
 from pipeline.config.models import TrayConfig

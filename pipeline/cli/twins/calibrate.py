@@ -257,7 +257,7 @@ def _too_little(error: TooLittleError, per_day: float, *, extrapolate: bool) -> 
         return (
             f"{error.fan_hours:.2g} fan-hours of healthy running cannot support {_rate(per_day)}: that takes "
             f"{error.needed_fan_hours:.3g}; record more, declare {_round_up(error.least_per_day):g} or more, or set "
-            "limits without a declared rate: --extrapolate"
+            "limits beyond what was recorded, which declare no rate: add --extrapolate"
         )
     scored = f"{error.fan_hours * 3600:.0f} s of healthy running could be scored, all fans together"
     return (

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from pipeline.recordings.clips.clip import require_no_clip
 from pipeline.recordings.contents import contents_of
 from pipeline.replay.offline.marked_alarms import LeftOut, MarkedAlarm, alarms_in, marked_alarms
 from schemas.enums import Feedback
@@ -47,14 +48,19 @@ def marked_running(
     that is used.
 
     Raises:
-        UserError: one cannot be read.
+        UserError: one cannot be read, or a recording is the clip of an alarm.
     """
-    found = [*pool.map(_named, recordings, "looking for alarms in recordings"), *map(_named, feedback)]
+    found = [*pool.map(_of_recording, recordings, "looking for alarms in recordings"), *map(_named, feedback)]
     alarms = [each for each in marked_alarms(found) if tray in (None, each.alarm.tray)]
     if feedback:
         spans = [(contents.first_ns or 0, contents.last_ns or 0) for contents in map(contents_of, recordings)]
         alarms = [each for each in alarms if each.first_file in recordings or _is_within(each, spans)]
     return MarkedRunning(tuple(alarms))
+
+
+def _of_recording(path: Path) -> tuple[Path, list[tuple[str, Alarm]]]:
+    require_no_clip(path, "and no picture of healthy running")
+    return _named(path)
 
 
 def _named(path: Path) -> tuple[Path, list[tuple[str, Alarm]]]:

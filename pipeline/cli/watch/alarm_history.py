@@ -18,6 +18,7 @@ from pipeline.config.shards import own_file, shards_of
 from pipeline.errors import UserError
 from pipeline.presenting.alarm_rates import AlarmRates
 from pipeline.presenting.alarm_store import HISTORY
+from pipeline.recordings.clips.clip import require_no_clip
 from pipeline.recordings.dates import format_local
 from pipeline.recordings.rare_messages import rare_messages
 from pipeline.recordings.reading import read_metadata, read_recording
@@ -118,6 +119,7 @@ def _recorded(paths: Sequence[Path]) -> _Past:
     without_scores: list[Path] = []
     newest: dict[tuple[str, str], int] = {}
     for path in _in_order(paths):
+        require_no_clip(path, "and a rate from clips says nothing")
         for _, alarm in alarms_in(path):
             alarms[alarm.header.producer, alarm.header.tray, alarm.header.sequence] = alarm
         for envelope in rare_messages(path, "twin"):

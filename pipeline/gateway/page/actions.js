@@ -68,7 +68,7 @@ function acknowledgeAll(tray, count) {
 
 function hint() {
   if (me.name) return `${me.name} may look, and not act.`;
-  return me.has_login ? "Log in to act." : "To act from this page, make a user: fantwin users add NAME";
+  return me.has_login ? "Log in to act." : "To act from this page, name a file of users in the configuration: [gateway] users";
 }
 
 export function askFor(action, tray, fan, alarm = null) {

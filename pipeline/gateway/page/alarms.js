@@ -9,7 +9,7 @@ const OF_FAN = ["raised", "severity", "diagnosed"];  // these have the colour of
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
 const PAGE = 100;
 const SHOWN = 100;
-const RATE_EVERY_MS = 10000;
+const RATE_EVERY_MS = 5000;
 
 const name = (alarm) => `${alarm.tray}/${alarm.fan}`;
 const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.tray)}/${alarm.fan}` }, `${alarm.tray} fan ${alarm.fan}`);
@@ -56,14 +56,17 @@ export class AlarmsView {
     Object.assign(this, { alarms, viewerUrl, most: SHOWN, due: 0 });
     this.root = element("div");
     this.rate = element("p", { class: "muted", id: "alarm-rate" });
-    this.rated_ms = -RATE_EVERY_MS;
+    this.timer = setInterval(() => learn(() => this.showRate()), RATE_EVERY_MS);
+    learn(() => this.showRate());
     this.draw();
+  }
+
+  close() {
+    clearInterval(this.timer);
   }
 
   // How many alarms really were false, beside how many are declared.
   async showRate() {
-    if (performance.now() - this.rated_ms < RATE_EVERY_MS) return;
-    this.rated_ms = performance.now();
     const { site } = await ask("/alarm-rate");
     if (site.since_t_ns) this.rate.textContent = `Since ${clock(site.since_t_ns)}: ${site.text}.`;
   }
@@ -83,7 +86,6 @@ export class AlarmsView {
       ...(listed.length ? listed.slice(0, this.most).map((alarm) => card(alarm, this.viewerUrl(alarm.tray)))
         : [element("p", { class: "muted" }, "No alarms.")]),
       more > 0 ? element("button", { type: "button", onclick: () => { this.most += SHOWN; this.draw(); } }, `${more} more`) : "", this.rate));
-    learn(() => this.showRate());
   }
 }
 

@@ -9,6 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from pipeline.recordings.reading import read_metadata
+from pipeline.recordings.records import RecordingError
 from schemas.messages import Alarm
 from schemas.units import NS_PER_S
 
@@ -136,3 +138,13 @@ def clip_lines(metadata: Mapping[str, str]) -> list[str]:
 
 def _utc(t_ns: int) -> str:
     return datetime.fromtimestamp(t_ns / NS_PER_S, UTC).isoformat(sep=" ", timespec="milliseconds")
+
+
+def require_no_clip(path: Path, why: str) -> None:
+    """Refuse the clip of an alarm where only whole recordings tell the truth.
+
+    Raises:
+        RecordingError: it is one, or the file cannot be opened or is not a recording.
+    """
+    if CLIP_KEY in read_metadata(path).metadata:
+        raise RecordingError(f"{path}: this is the clip of an alarm, {why}: name the recordings that it was cut from")

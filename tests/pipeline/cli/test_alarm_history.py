@@ -14,6 +14,7 @@ from pipeline.cli.main import expand_variadic
 from pipeline.presenting.alarm_rates import AlarmRates
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.judged_time import JudgedStretch
+from pipeline.recordings.clips.clip import CLIP_KEY
 from pipeline.recordings.rare_messages import rare_messages
 from pipeline.recordings.reading import read_recording
 from pipeline.recordings.writing import RecordingWriter
@@ -114,3 +115,17 @@ def test_a_gateway_on_this_host_has_kept_the_history(tmp_path: Path) -> None:
     assert [alarm["feedback"] for alarm in found["alarms"]] == ["false_alarm"]
     rate = found["rate"]
     assert (rate["fan_hours"], rate["false_alarms"], rate["declared_per_day"]) == (1.0, 1, 0.5)
+
+
+def test_the_clip_of_an_alarm_gives_no_rate_and_is_no_healthy_running(tmp_path):
+    path = tmp_path / "tray1-1-20270115T080000Z.mcap"
+    with RecordingWriter(path, {"site": "golden", "trays": "tray1", CLIP_KEY: "{}"}) as writer:
+        for alarm in golden_alarms():
+            writer.add_message(tray_key("golden", "tray1", "alarm"), alarm, alarm.t_ns)
+    for command in (
+        ("alarms", "--history", "--recordings", path),
+        ("calibrate", DEMO / "twin.onnx", path, "--false-alarms-per-day", "24", "-o", tmp_path / "limited.onnx"),
+    ):
+        result = fantwin(*command)
+        assert result.exit_code == 1
+        assert str(result.exception).startswith(f"{path}: this is the clip of an alarm")
