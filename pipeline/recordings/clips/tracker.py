@@ -51,6 +51,12 @@ class ClipTracker:
         most_bytes: of all clips together; 0: no limit. settled_s: how long after its end all of a clip is on the disk.
         """
         self._clips = {clip.name: clip for clip in clips}
+        self._of_fan: dict[tuple[str, int], dict[int, str]] = {}
+        """by tray and fan: the clip of each of its alarms, by onset. A power cut raises a thousand, and all of them are
+        acknowledged at once"""
+        for clip in self._clips.values():
+            for each in clip.alarms:
+                self._of_fan.setdefault((clip.tray, each.fan), {})[each.onset_t_ns] = clip.name
         self._before_ns, self._after_ns = round(before_s * NS_PER_S), round(after_s * NS_PER_S)
         self._settled_ns = round(settled_s * NS_PER_S)
         self._most_bytes = most_bytes
@@ -82,8 +88,8 @@ class ClipTracker:
     def add(self, alarm: Alarm, received_t_ns: int) -> None:
         """Follow the next message about an alarm."""
         if alarm.acknowledged:
-            for clip in [clip for clip in self._clips.values() if clip.tray == alarm.header.tray]:
-                self._put(clip.with_acknowledged(alarm))
+            for name in set(self._of_fan.get((alarm.header.tray, alarm.fan), {}).values()):
+                self._put(self._clips[name].with_acknowledged(alarm))
         elif alarm.transition == Transition.RAISED and not is_silenced(alarm):
             self._raise(alarm, received_t_ns)
 
@@ -143,8 +149,7 @@ class ClipTracker:
 
     def deleted(self, clip: Clip) -> None:
         """A clip is deleted to make room."""
-        del self._clips[clip.name]
-        self.version += 1
+        self._remove(clip)
         self.counts["clips_deleted"] += 1
 
     def part_deleted(self) -> None:
@@ -164,9 +169,10 @@ class ClipTracker:
     def _raise(self, alarm: Alarm, received_t_ns: int) -> None:
         tray = alarm.header.tray
         new = ClipAlarm(alarm.fan, alarm.onset_t_ns, alarm.t_ns)
-        of_tray = [clip for clip in self._clips.values() if clip.tray == tray]
-        if any((each.fan, each.onset_t_ns) == (new.fan, new.onset_t_ns) for clip in of_tray for each in clip.alarms):
+        of_fan = self._of_fan.setdefault((tray, alarm.fan), {})
+        if alarm.onset_t_ns in of_fan:
             return
+        of_tray = (clip for clip in self._clips.values() if clip.tray == tray)
         delay_ns = min(max(0, alarm.t_ns - alarm.onset_t_ns), LONGEST_DELAY_NS)
         onset_ns, until_ns = received_t_ns - delay_ns, received_t_ns + self._after_ns
         since_ns, judged_since_ns = onset_ns - self._before_ns, onset_ns - max(self._before_ns, JUDGED_NS)
@@ -175,8 +181,11 @@ class ClipTracker:
             longer = replace(running, alarms=(*running.alarms, new), until_ns=max(running.until_ns, until_ns))
             judged_since_ns = min(running.judged_since_ns, judged_since_ns)
             self._put(replace(longer, since_ns=min(running.since_ns, since_ns), judged_since_ns=judged_since_ns))
+            of_fan[alarm.onset_t_ns] = running.name
             return
-        self._put(Clip(clip_name(alarm, self._clips), tray, since_ns, until_ns, judged_since_ns, (new,)))
+        clip = Clip(clip_name(alarm, self._clips), tray, since_ns, until_ns, judged_since_ns, (new,))
+        self._put(clip)
+        of_fan[alarm.onset_t_ns] = clip.name
 
     def _is_joined(self, clip: Clip, received_t_ns: int, until_ns: int) -> bool:
         """Whether an alarm that is received now belongs to a clip, which then goes on until `until_ns`."""
@@ -202,8 +211,13 @@ class ClipTracker:
         if clip.size_bytes:
             self._put(replace(clip, is_due=False))
         else:
-            del self._clips[clip.name]
-            self.version += 1
+            self._remove(clip)
+
+    def _remove(self, clip: Clip) -> None:
+        del self._clips[clip.name]
+        for each in clip.alarms:
+            self._of_fan[clip.tray, each.fan].pop(each.onset_t_ns, None)
+        self.version += 1
 
     def _put(self, clip: Clip) -> None:
         if self._clips.get(clip.name) != clip:
