@@ -93,9 +93,10 @@ class ClipTracker:
         elif alarm.transition == Transition.RAISED and not is_silenced(alarm):
             self._raise(alarm, received_t_ns)
 
-    def due(self, now_ns: int) -> list[Clip]:
+    def due(self, now_ns: int, unsaved_since_ns: int | None = None) -> list[Clip]:
         """The clips to be cut now, which count as being cut until `cut` says what came of it. What a clip over the
-        limit of bytes needs is never due: it is not kept."""
+        limit of bytes needs is never due: it is not kept. unsaved_since_ns: what was received from then on is not on
+        the disk yet; None: all is."""
         if now_ns < self._now_ns - SET_BACK_NS:
             self._end_running(now_ns)
         self._now_ns = now_ns
@@ -105,6 +106,7 @@ class ClipTracker:
             if clip.is_due
             and clip.name not in self._being_cut
             and self._ends_ns.get(clip.name, clip.until_ns) + self._settled_ns <= now_ns
+            and (unsaved_since_ns is None or clip.until_ns < unsaved_since_ns or clip.name in self._ends_ns)
         ]
         if now_ns < self._retry_ns or not found:
             return []

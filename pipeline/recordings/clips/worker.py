@@ -56,10 +56,15 @@ class ClipMaker(Protocol):
 class ClipWorker(ClipMaker):
     """Cuts the clips of one recording."""
 
-    def __init__(self, recording: Path, min_free_bytes: int, free_bytes: Callable[[], int]) -> None:
-        """recording: its first part. free_bytes: of its disk; raises DiskError."""
+    def __init__(
+        self, recording: Path, min_free_bytes: int, free_bytes: Callable[[], int], *, others_make_room: bool = False
+    ) -> None:
+        """recording: its first part. free_bytes: of its disk; raises DiskError. others_make_room: below min_free_bytes
+        the oldest part is deleted, and recording does not pause; then half of them may be used meanwhile."""
         self._recording, self._folder, self._list = recording, clip_folder(recording), list_path(recording)
-        self._min_free_bytes, self._free_bytes = min_free_bytes, free_bytes
+        self._begin_bytes = min_free_bytes + ROOM_BYTES
+        self._least_bytes = min_free_bytes // 2 if others_make_room else self._begin_bytes
+        self._free_bytes = free_bytes
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._results: SimpleQueue[CutResult] = SimpleQueue()
         self._to_save: Sequence[Clip] | None = None
@@ -86,8 +91,11 @@ class ClipWorker(ClipMaker):
         return found
 
     def delete(self, clip: Clip) -> None:
-        """See ClipMaker."""
-        self._put(lambda: (self._folder / clip.name).unlink(missing_ok=True))
+        """See ClipMaker. At once: what waits behind clips that are being cut makes no room, and more is deleted."""
+        try:
+            (self._folder / clip.name).unlink(missing_ok=True)
+        except OSError as error:
+            self._problem = self._refused(error)
 
     def problem(self) -> str:
         """See ClipMaker."""
@@ -111,7 +119,10 @@ class ClipWorker(ClipMaker):
             try:
                 job()
             except OSError as error:
-                self._problem = f"{self._folder}: cannot be written: {error.strerror}; make room, or correct the folder"
+                self._problem = self._refused(error)
+
+    def _refused(self, error: OSError) -> str:
+        return f"{self._folder}: cannot be written: {error.strerror}; make room, or correct the folder"
 
     def _save(self) -> None:
         clips, self._to_save = self._to_save, None
@@ -129,13 +140,20 @@ class ClipWorker(ClipMaker):
 
     def _cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
         try:
-            free, wanted = self._free_bytes(), self._min_free_bytes + ROOM_BYTES
-            if free < wanted:
-                raise DiskError(f"{free / 1e6:,.1f} MB are free on the disk, and {wanted / 1e6:,.1f} MB are required")
-            found = cut_clips(clips, self._recording, self._folder, open_part, lambda: time.sleep(REST_S))
+            self._require(self._begin_bytes)
+            found = cut_clips(clips, self._recording, self._folder, open_part, self._rest)
         except (RecordingError, OSError) as error:
             found = [CutResult(clip.name, problem=str(error), may_pass=True) for clip in clips]
         except Exception as error:  # noqa: BLE001  a recorder goes on recording whatever is wrong with a clip
             found = [CutResult(clip.name, problem=f"{type(error).__name__}: {error}") for clip in clips]
         for result in found:
             self._results.put(result)
+
+    def _rest(self) -> None:
+        time.sleep(REST_S)
+        self._require(self._least_bytes)
+
+    def _require(self, least_bytes: int) -> None:
+        free = self._free_bytes()
+        if free < least_bytes:
+            raise DiskError(f"{free / 1e6:,.1f} MB are free on the disk, and {least_bytes / 1e6:,.1f} MB are required")
