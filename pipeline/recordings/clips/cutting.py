@@ -19,7 +19,7 @@ from pathlib import Path
 
 from pipeline.recordings.clips.clip import CLIP_KEY, CLIP_SNAPSHOT_KEY, Clip
 from pipeline.recordings.clips.part_chunks import PartChunks, parts_backwards
-from pipeline.recordings.clips.tracker import CutResult
+from pipeline.recordings.clips.tracker import SET_BACK_NS, CutResult
 from pipeline.recordings.disk import DiskError, is_being_written, refused, sync_folder
 from pipeline.recordings.index import PartIndex
 from pipeline.recordings.reading import TACHO_KEY, RecordingMetadata
@@ -115,11 +115,17 @@ class _Parts:
     def go_back_to(self, t_ns: int, more: int = 0) -> list[PartChunks]:
         """The parts with a message from this time on, and so many before them; the newest first."""
         before = sum(part.last_ns < t_ns for part in self.read)
-        while before <= more and (part := next(self._unread, None)):
+        while before <= more and not self._is_at_set_back and (part := next(self._unread, None)):
             self.read.append(part)
             before += part.last_ns < t_ns
         needed = list(takewhile(lambda part: part.last_ns >= t_ns, self.read))
         return self.read[: len(needed) + more]
+
+    @property
+    def _is_at_set_back(self) -> bool:
+        """Whether the host's clock was set back after the last one that was read: all before it have later times, and
+        may be thousands."""
+        return len(self.read) > 1 and self.read[-1].first_ns > self.read[-2].first_ns + SET_BACK_NS
 
     def last_before(self, key: str, t_ns: int) -> Envelope | None:
         """The last message of a key that was received up to this time."""

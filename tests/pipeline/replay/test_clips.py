@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from pipeline.recordings.clips.clip import Clip, clip_lines
-from pipeline.recordings.clips.cutting import cut_clips
+from pipeline.recordings.clips.cutting import _Parts, cut_clips
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.disk import DiskError
+from pipeline.recordings.parts import part_path
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.records import active_path
 from pipeline.recordings.writing import RecordingWriter
@@ -155,3 +156,20 @@ def test_where_room_runs_out_while_clips_are_written_the_last_one_is_given_up(un
     assert (last.size_bytes, last.may_pass, last.problem) == (0, True, "0.1 MB are free")
     assert files[:3] == [2, 2, 1]  # there is room again before the first one goes on
     assert [path.name for path in folder.iterdir()] == [clip.name]
+
+
+def test_of_parts_from_before_the_clock_was_set_back_only_the_last_is_read(undisturbed, tmp_path):
+    recording = tmp_path / "recording.mcap"
+    head = read_metadata(undisturbed)
+    raws = list(read_recording(undisturbed, ("raw",)))
+    for number in range(1, 9):  # a day apart; the last two are of a clock that was set back
+        moved_ns = (number - (100 if number > 6 else 0)) * 86400 * S
+        about = {**head.metadata, "recording": "recording.mcap"}
+        with RecordingWriter(part_path(recording, number), about, t_ns=raws[0].received_t_ns) as writer:
+            for each in raws:
+                writer.add(each.received_at(each.received_t_ns + moved_ns))
+    parts = _Parts(recording, None)
+    first_ns = raws[0].received_t_ns
+    found = parts.go_back_to(first_ns - 98 * 86400 * S)
+    assert len(parts.read) <= 3
+    assert [part.first_ns for part in found][:1] == [first_ns - 92 * 86400 * S]
