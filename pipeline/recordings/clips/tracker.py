@@ -64,7 +64,7 @@ class ClipTracker:
         self._ends_ns: dict[str, int] = {}
         """of clips that ended when the host's clock was set back: by the new time"""
         self._retry_ns = self._now_ns = 0
-        self._problem = self._full = ""
+        self._waits = self._not_kept = self._full = ""
         self.counts: Counter[str] = Counter()
         self.version = 0
         """higher after each change of `clips`"""
@@ -133,13 +133,13 @@ class ClipTracker:
         if result.size_bytes:
             self._put(replace(clip, is_due=not is_over, size_bytes=result.size_bytes, problem=_joined(clip, result)))
             self.counts["clips"] += int(is_over)
-            self._problem = ""
+            self._waits = self._not_kept = ""
         elif result.may_pass:
             self._retry_ns = self._now_ns + RETRY_NS
-            self._problem = f"clip {result.name} cannot be cut yet: {result.problem}"
+            self._waits = f"clip {result.name} cannot be cut yet: {result.problem}"
         elif is_over:
             self._drop(clip)
-            self._problem = f"clip {clip.name} is not kept: {result.problem}"
+            self._not_kept = f"clip {clip.name} is not kept: {result.problem}"
 
     def to_delete(self) -> list[Clip]:
         """The oldest acknowledged clips beyond the limit of bytes, which are then no longer known."""
@@ -166,7 +166,8 @@ class ClipTracker:
                 f"{self._full}: clips whose alarms nobody has acknowledged fill recorder.clip_bytes; "
                 "acknowledge alarms, or allow more"
             )
-        return self._problem
+        is_waiting = any(clip.is_due for clip in self._clips.values())
+        return self._waits if self._waits and is_waiting else self._not_kept
 
     def _raise(self, alarm: Alarm, received_t_ns: int) -> None:
         tray = alarm.header.tray

@@ -196,3 +196,17 @@ def test_acknowledging_a_storm_touches_each_of_its_alarms_once(monkeypatch):
     follow(of, *(alarm(fan, 90.0, transition=Transition.ACKNOWLEDGED, acknowledged=True) for fan in range(200)))
     assert [(clip.tray, clip.is_acknowledged) for clip in of.clips] == [("tray1", True), ("tray2", False)]
     assert len(touched) <= 2 * 200
+
+
+def test_that_a_clip_waits_for_the_disk_is_said_no_longer_once_none_waits():
+    of = tracker(most_bytes=1000)
+    follow(of, alarm(0, 10.0), alarm(0, 10.0, "tray2"))
+    first, second = (clip.name for clip in of.due(T0 + 80 * S))
+    of.cut(CutResult(first, 2000))
+    of.cut(CutResult(second, problem="the disk is full", may_pass=True))
+    assert "cannot be cut yet: the disk is full" in of.problem()
+    follow(of, alarm(0, 85.0, transition=Transition.ACKNOWLEDGED, acknowledged=True))
+    assert "cannot be cut yet" in of.problem()
+    assert of.due(T0 + 100 * S) == []  # it is over the limit now, and is dropped
+    assert [clip.name for clip in of.to_delete()] == [first]
+    assert of.problem() == ""
