@@ -11,12 +11,13 @@ from pipeline.config.models import TrayConfig
 from pipeline.presenting import alarm_rates
 from pipeline.presenting.alarm_rates import AlarmRates
 from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.judged_time import JudgedStretch
+from pipeline.presenting.judged_time import JudgedStretch, JudgedTime
 from pipeline.presenting.site_model import SiteModel
 from schemas.enums import Feedback, Severity, Transition
 from schemas.header import Header
 from schemas.messages import Alarm
 from schemas.units import NS_PER_S
+from tests.stages.test_gateway import score
 
 HOUR_NS = 3600 * NS_PER_S
 FIRST = JudgedStretch("tray1", "twin", NS_PER_S, NS_PER_S + HOUR_NS, 8 * HOUR_NS, 0.1)
@@ -78,3 +79,14 @@ def test_what_was_said_of_an_alarm_before_the_first_start_is_known_and_counts_in
     rates.catch_up(store, [FIRST])
     assert (rates.observed()["tray1"].false_alarms, rates.observed()["tray1"].unmarked) == (0, 0)
     model.close()
+
+
+def test_the_time_of_fans_that_are_sampled_slowly_counts() -> None:
+    judged, period_ns = JudgedTime(), 10 * NS_PER_S
+    for number in range(7):
+        one = replace(score(number * 10.0, samples=1), period_ns=period_ns)
+        judged.add(one, "twin", None)
+    (growing,) = judged.growing()
+    assert growing.fan_ns == 6 * period_ns * int(score().valid[-1].sum())
+    judged.add(replace(score(60.0 + 31.0, samples=1), period_ns=period_ns), "twin", None)
+    assert judged.growing()[0].fan_ns == 0, "a longer pause ends it"
