@@ -64,7 +64,6 @@ class AlarmClips:
         self._save(now_ns)  # before it is cut: a clip that is due survives a crash
         if due := self._tracker.due(now_ns, unsaved_since_ns):
             self._maker.cut(due, open_part())
-        self._save(now_ns)
 
     def oldest_acknowledged_until_ns(self) -> int | None:
         """The end of the first clip that may be deleted; None: there is none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -12,10 +13,10 @@ from pipeline.notification.config import NotifierConfig
 from pipeline.notification.fan_alarm import NamedCause
 from pipeline.notification.gathering import ranges
 from pipeline.notification.services import Service
-from pipeline.notification.wording import WHAT_TO_DO, Level, Place, Text, cause_line, to_do
+from pipeline.notification.wording import Level, Place, Text, cause_line
 from schemas.units import NS_PER_S
 from scoring.diagnosis.advice import KNOWN_SOON
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES
+from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, WHAT_TO_DO, advice
 from tests.support.message_receivers import HttpReceiver, MailServer, free_port
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "notify.md"
@@ -30,7 +31,7 @@ def test_where_the_cause_is_unclear_its_evidence_says_what_to_do():
     assert cause_line(unclear) == "Cause: cannot tell yet: move the command to 0.6 for ten seconds, and back"
     soon = (NamedCause(CANNOT_TELL, 1.0, f"cannot tell yet: {KNOWN_SOON}"),)
     assert cause_line(soon) == "Cause: cannot tell yet: the page, or `fantwin alarms`, may know it by now"
-    assert to_do(unclear) == ""
+    assert advice(unclear) == ""
     assert cause_line(()) == "Cause: unknown"
 
 
@@ -62,6 +63,11 @@ def test_no_reason_of_a_failure_shows_a_secret(url, capfd):
     receiver.stop()
     said = capfd.readouterr()
     assert "123" not in said.out + said.err
+
+
+def test_the_urls_of_the_how_to_can_be_used():
+    urls = re.findall(r"`((?:mailtos?|json)://[^`]+)`", PAGE.read_text(encoding="utf-8"))
+    assert [Service(url) and url.partition(":")[0] for url in urls] == ["mailtos", "mailto", "json"]
 
 
 @pytest.mark.parametrize(

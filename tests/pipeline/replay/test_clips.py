@@ -19,7 +19,7 @@ from pipeline.replay.offline.comparison import CannotCompareError
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import RescoredTray, rescore
 from schemas.enums import Transition
-from schemas.messages import Alarm
+from schemas.messages import Alarm, Score, ScorerSnapshot
 from tests.support.clipped_recordings import S, clip_of, of_tray, record
 from tests.support.failing_writers import disk_of
 from tests.support.offline_replay import recorded, verified
@@ -74,6 +74,16 @@ def test_the_same_alarm_comes_out_of_a_clip_again(undisturbed, tmp_path):
     assert (raised.fan, raised.severity, raised.statistic) == (alarm.fan, alarm.severity, alarm.statistic)
     assert abs(raised.t_ns - alarm.t_ns) < 0.1 * S
     assert tray.lost == 0
+
+
+def test_the_scorer_of_a_replay_continues_from_the_snapshot_of_the_clip(undisturbed, tmp_path):
+    clip = cut(undisturbed, tmp_path)
+    with open_replay_input([clip], None, (), None) as replay_input:
+        plan, _, _ = replay_input.read_plan("tray1")
+        first, second, *_ = (each.message for each in replay_input.pipeline("tray1", plan).run())
+    assert isinstance(first, ScorerSnapshot) and first.restored
+    assert first.state_json == recorded(clip, "snapshot")[0].state_json
+    assert isinstance(second, Score) and second.t_ns[0] > first.t_ns
 
 
 def test_the_same_alarm_comes_out_of_a_clip_with_raw_samples_only(undisturbed, tmp_path):
