@@ -259,3 +259,21 @@ def test_a_clip_is_not_cut_before_what_was_received_in_a_pause_is_on_the_disk():
     assert core.problem() == "" and core.unsaved() and maker.asked == []
     core.tick(NOW_NS + 75 * SECOND_NS)
     assert not core.unsaved() and len(maker.asked) == 1
+
+
+def test_the_list_is_written_at_the_end_also_where_a_clip_takes_too_long(tmp_path):
+    may_go_on = threading.Event()
+
+    def free_bytes() -> int:
+        may_go_on.wait(60)
+        return 0
+
+    recording = tmp_path / "recording.mcap"
+    worker = ClipWorker(recording, 0, free_bytes)
+    clip = Clip("slow.mcap", "tray1", 0, 1, 0, ())
+    worker.cut([clip], None)
+    worker.end(0.0)
+    worker.save([clip])
+    is_there = list_path(recording).exists()
+    may_go_on.set()
+    assert is_there and clips_in(list_path(recording)) == [clip]

@@ -96,7 +96,6 @@ class AlarmClips:
         for result in self._maker.results():
             self._tracker.cut(result)
         self._save(self._saved_ns)
-        self._maker.end(CLOSE_S)
 
     def counters(self) -> Mapping[str, int]:
         """Clips that were cut, that could not be kept, and that were deleted."""

@@ -70,12 +70,17 @@ class ClipWorker(ClipMaker):
         self._to_save: Sequence[Clip] | None = None
         self._problem = ""
         self._thread: threading.Thread | None = None
+        self._has_ended = False
         remove_unfinished(self._folder)
 
     def save(self, clips: Sequence[Clip]) -> None:
-        """See ClipMaker. Of lists that wait, only the newest is written."""
+        """See ClipMaker. Of lists that wait, only the newest is written. After `end` it is written at once: a clip that
+        takes longer than there was time for may still be cut."""
         self._to_save = tuple(clips)
-        self._put(self._save)
+        if self._has_ended:
+            self._do(self._save)
+        else:
+            self._put(self._save)
 
     def cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
         """See ClipMaker."""
@@ -92,10 +97,7 @@ class ClipWorker(ClipMaker):
 
     def delete(self, clip: Clip) -> None:
         """See ClipMaker. At once: what waits behind clips that are being cut makes no room, and more is deleted."""
-        try:
-            (self._folder / clip.name).unlink(missing_ok=True)
-        except OSError as error:
-            self._problem = self._refused(error)
+        self._do(lambda: (self._folder / clip.name).unlink(missing_ok=True))
 
     def problem(self) -> str:
         """See ClipMaker."""
@@ -103,6 +105,7 @@ class ClipWorker(ClipMaker):
 
     def end(self, timeout_s: float) -> None:
         """See ClipMaker."""
+        self._has_ended = True
         if self._thread is not None:
             self._jobs.put(None)
             self._thread.join(timeout_s)
@@ -116,13 +119,13 @@ class ClipWorker(ClipMaker):
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
-            try:
-                job()
-            except OSError as error:
-                self._problem = self._refused(error)
+            self._do(job)
 
-    def _refused(self, error: OSError) -> str:
-        return f"{self._folder}: cannot be written: {error.strerror}; make room, or correct the folder"
+    def _do(self, job: Callable[[], None]) -> None:
+        try:
+            job()
+        except OSError as error:
+            self._problem = f"{self._folder}: cannot be written: {error.strerror}; make room, or correct the folder"
 
     def _save(self) -> None:
         clips, self._to_save = self._to_save, None
