@@ -143,7 +143,8 @@ class Recorder(Core):
             if not self._problem:
                 self._attempt(lambda: self._begin({}))
         if self._clips:
-            self._clips.tick(now_ns, self._index)
+            held_since_ns = self._held.first_received_t_ns
+            self._clips.tick(now_ns, self._index, self._unflushed_ns if held_since_ns is None else held_since_ns)
         return ()
 
     def close(self) -> Sequence[Message]:
@@ -356,7 +357,8 @@ def build(context: Context) -> BuiltStage:
 
 def _clips_of(parts: RecordingParts, config: RecorderConfig, flush_s: float) -> AlarmClips:
     tracker = tracker_of(parts.path, config.clip_before_s, config.clip_after_s, config.clip_bytes, flush_s + 1.0)
-    clips = AlarmClips(tracker, ClipWorker(parts.path, config.min_free_bytes, parts.free_bytes))
+    worker = ClipWorker(parts.path, config.min_free_bytes, parts.free_bytes, others_make_room=config.delete_oldest)
+    clips = AlarmClips(tracker, worker)
     if parts.last_part:
         clips.continue_after(parts.last_part)
     return clips

@@ -45,6 +45,22 @@ CREATE TABLE IF NOT EXISTS judged (
     PRIMARY KEY (tray, first_t_ns)
 );
 """
+_GROW = """
+INSERT INTO judged (tray, twin, first_t_ns, last_t_ns, fan_ns, declared_per_day) VALUES (?, ?, ?, ?, ?, ?)
+ON CONFLICT DO UPDATE SET
+    twin = excluded.twin,
+    last_t_ns = excluded.last_t_ns,
+    fan_ns = excluded.fan_ns,
+    declared_per_day = excluded.declared_per_day
+"""
+"""keeps the rowid, by which the oldest ones are deleted"""
+_COUNT_WHILE_JUDGED = """
+SELECT feedback, COUNT(*) FROM alarm WHERE tray = ?1 AND ?2 = (
+    SELECT CASE WHEN last_t_ns >= raised_t_ns THEN twin END FROM judged
+    WHERE judged.tray = ?1 AND first_t_ns <= raised_t_ns ORDER BY first_t_ns DESC LIMIT 1
+) GROUP BY feedback
+"""
+"""by the last stretch that had begun, which the key finds: 200,000 alarms and as many stretches are a second"""
 
 
 class AlarmRates:
@@ -78,7 +94,7 @@ class AlarmRates:
             self._file.execute("BEGIN")
             for _, alarm in new:
                 self._add(alarm)
-            self._file.executemany("INSERT OR REPLACE INTO judged VALUES (?, ?, ?, ?, ?, ?)", map(astuple, stretches))
+            self._file.executemany(_GROW, map(astuple, stretches))
             for table in ("alarm", "judged"):
                 self._file.execute(f"DELETE FROM {table} WHERE rowid <= (SELECT MAX(rowid) FROM {table}) - {MOST_KEPT}")
             self._file.execute("COMMIT")
@@ -92,6 +108,20 @@ class AlarmRates:
             store.set_position(_READER, new[-1][0])  # not kept: they are taken again, and nothing changes
             if len(new) == _AT_ONCE:
                 self.catch_up(store, ())
+
+    def add_earlier(self, alarms: Sequence[Alarm]) -> None:
+        """Take what operators said of alarms of before the gateway's first start. They count in no rate: for how long
+        fans were judged then is not known here.
+
+        Raises:
+            UserError: it cannot be kept.
+        """
+        try:
+            for alarm in alarms:
+                if alarm.transition in _GIVEN:
+                    self._add(alarm)
+        except sqlite3.Error as error:
+            raise UserError(f"{self._path}: {error}: feedback on alarms of recordings is not kept") from error
 
     def observed(self) -> dict[str, ObservedRate]:
         """Of each tray, since its twin of now began to judge it.
@@ -129,11 +159,7 @@ class AlarmRates:
         since_t_ns, fan_ns = self._file.execute(
             "SELECT MIN(first_t_ns), SUM(fan_ns) FROM judged WHERE tray = ? AND twin = ?", (tray, twin)
         ).fetchone()
-        rows = self._file.execute(
-            "SELECT feedback, COUNT(*) FROM alarm WHERE tray = ?1 AND EXISTS (SELECT 1 FROM judged WHERE"
-            " judged.tray = ?1 AND twin = ?2 AND raised_t_ns BETWEEN first_t_ns AND last_t_ns) GROUP BY feedback",
-            (tray, twin),
-        )
+        rows = self._file.execute(_COUNT_WHILE_JUDGED, (tray, twin))
         counts = {Feedback.known(feedback): count for feedback, count in rows}
         return ObservedRate(
             since_t_ns=since_t_ns,

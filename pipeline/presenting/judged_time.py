@@ -15,6 +15,8 @@ from schemas.units import NS_PER_S
 
 LONGEST_STEP_NS = 5 * NS_PER_S
 """between two scores of a stretch; after a longer pause another one begins"""
+LONGEST_PERIODS = 3
+"""and so long where samples come more slowly than that"""
 SAVED_EVERY_NS = 10 * NS_PER_S
 LEARNED = "learned"
 """names the twins of a tray that learns them: each version continues the time of the one before"""
@@ -49,7 +51,8 @@ class JudgedTime:
         tray, t_ns = score.header.tray, int(score.t_ns[-1])
         before = self._growing.get(tray)
         step_ns = t_ns - before.last_t_ns if before else -1
-        if before is None or before.twin != twin or not 0 <= step_ns <= LONGEST_STEP_NS:
+        longest_ns = max(LONGEST_STEP_NS, LONGEST_PERIODS * score.period_ns)
+        if before is None or before.twin != twin or not 0 <= step_ns <= longest_ns:
             self._growing[tray] = JudgedStretch(tray, twin, t_ns, t_ns, 0, declared_per_day)
             self._saved_t_ns[tray] = t_ns
             return [before] if before else []

@@ -36,7 +36,8 @@ class RecordedAlarms:
         """recordings: the first part of each, NAME.mcap; those of shards are several."""
         self._model = model
         self._recordings = recordings
-        self._began_t_ns: list[int] = []
+        self._began_t_ns: dict[Path, int] = {}
+        """by recording: when the first part of it began that was read"""
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._read, name="recorded alarms", daemon=True)
         self.problem = ""
@@ -66,10 +67,10 @@ class RecordedAlarms:
             while batch := list(islice(found, BATCH)):
                 kept = self._model.add_earlier_alarms(batch)
                 if kept < len(batch):
-                    self._began_t_ns = [batch[kept - 1].t_ns] if kept else []
+                    self._began_t_ns = {Path(): batch[kept - 1].t_ns} if kept else {}
                     break
-            if not self._stopped.is_set():
-                self._model.finish_reading(READER, min(self._began_t_ns, default=None))
+            if not self._stopped.is_set():  # of shards, all are complete from where the last one begins
+                self._model.finish_reading(READER, max(self._began_t_ns.values(), default=None))
         except UserError as error:
             self.problem = str(error)
 
@@ -91,7 +92,8 @@ class RecordedAlarms:
                 self.problem = f"the history lacks the alarms of a recording: {error}"
                 continue
             yield from (alarm for alarm in alarms if isinstance(alarm, Alarm))
-            self._began_t_ns += [began_t_ns] if began_t_ns else []
+            if began_t_ns:
+                self._began_t_ns[recording] = began_t_ns
 
 
 def _began_t_ns(path: Path) -> int:

@@ -288,7 +288,10 @@ class SiteModel:
     def add_earlier_alarms(self, alarms: Sequence[Alarm]) -> int:
         """Transitions of before all others: `AlarmStore.add_earlier`."""
         with self._lock:
-            return self._store.add_earlier(alarms)
+            kept = self._store.add_earlier(alarms)
+            if self._rates is not None:
+                self._rates.add_earlier(alarms[:kept])
+            return kept
 
     def has_read(self, reader: str) -> bool:
         """Whether a reader of earlier alarms has finished, in this process or one before."""

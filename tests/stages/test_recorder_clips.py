@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from pipeline.recordings.clips.worker import ClipMaker, ClipWorker
 from pipeline.recordings.index import PartIndex
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import read_recording
+from pipeline.recordings.writing import RecordingWriter
 from schemas.enums import Severity, Transition
 from schemas.header import Header
 from schemas.messages import Alarm
@@ -40,9 +42,11 @@ class Maker(ClipMaker):
         self.deleted: list[str] = []
         self.saved: list[Clip] = []
         self.waiting: list[CutResult] = []
+        self.refuses = ""
 
     def save(self, clips: Sequence[Clip]) -> None:
-        self.saved = list(clips)
+        if not self.refuses:
+            self.saved = list(clips)
 
     def cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
         self.asked += [clip.name for clip in clips]
@@ -55,7 +59,7 @@ class Maker(ClipMaker):
         self.deleted.append(clip.name)
 
     def problem(self) -> str:
-        return ""
+        return self.refuses
 
     def end(self, timeout_s: float) -> None: ...
 
@@ -189,3 +193,87 @@ def test_files_that_a_killed_recorder_left_of_a_clip_are_removed(tmp_path):
     (tmp_path / "clips" / "tray1-0.mcap").touch()
     clips_of(recording)
     assert [path.name for path in (tmp_path / "clips").iterdir()] == ["tray1-0.mcap"]
+
+
+def test_what_another_recorder_is_writing_stays(tmp_path):
+    recording = tmp_path / "recording.mcap"
+    (tmp_path / "clips").mkdir()
+    with RecordingWriter(tmp_path / "clips" / ".unfinished-tray2-0.mcap", {}):
+        clips_of(recording)
+        assert [path.name for path in (tmp_path / "clips").iterdir()] == [".unfinished-tray2-0.mcap.active"]
+
+
+def test_the_disk_guard_has_room_at_once_also_while_clips_are_cut(tmp_path):
+    is_cutting, may_go_on = threading.Event(), threading.Event()
+
+    def free_bytes() -> int:
+        is_cutting.set()
+        may_go_on.wait(60)
+        return 0
+
+    worker = ClipWorker(tmp_path / "recording.mcap", 0, free_bytes)
+    old, new = (Clip(name, "tray1", 0, 1, 0, (), is_due=False) for name in ("old.mcap", "new.mcap"))
+    (tmp_path / "clips").mkdir()
+    (tmp_path / "clips" / old.name).touch()
+    worker.cut([new], None)
+    assert is_cutting.wait(60)
+    worker.delete(old)
+    is_there = (tmp_path / "clips" / old.name).exists()
+    may_go_on.set()
+    worker.end(60)
+    assert not is_there
+
+
+def test_the_list_that_a_full_disk_has_refused_is_written_once_there_is_room():
+    maker = Maker()
+    core = Recorder(Disk(), RecorderConfig(), NOW_NS, clips=AlarmClips(ClipTracker((), 60, 60, 0), maker))
+    maker.refuses = "clips: cannot be written: No space left on device"
+    core.step(envelope(raised(0, NOW_NS), "alarm", NOW_NS))
+    core.tick(NOW_NS + SECOND_NS)
+    assert maker.saved == []
+    maker.saved, real_save = [], maker.save
+
+    def save(clips: Sequence[Clip]) -> None:
+        maker.refuses = ""
+        real_save(clips)
+
+    maker.save = save  # type: ignore[method-assign]
+    core.tick(NOW_NS + 2 * SECOND_NS)
+    assert maker.saved == []
+    core.tick(NOW_NS + 12 * SECOND_NS)
+    assert len(maker.saved) == 1 and core.problem() == ""
+
+
+def test_a_clip_is_not_cut_before_what_was_received_in_a_pause_is_on_the_disk():
+    disk, maker = Disk(), Maker()
+    core = Recorder(disk, RecorderConfig(), NOW_NS, clips=AlarmClips(ClipTracker((), 60, 60, 0), maker))
+    core.step(envelope(raised(0, NOW_NS), "alarm", NOW_NS))
+    core.tick(NOW_NS + 2 * SECOND_NS)
+    disk.free = 1
+    core.tick(NOW_NS + 4 * SECOND_NS)
+    core.step(envelope(raised(0, NOW_NS, transition=Transition.CLEARED), "alarm", NOW_NS + 5 * SECOND_NS))
+    core.tick(NOW_NS + 70 * SECOND_NS)
+    assert "NOTHING IS RECORDED" in core.problem() and maker.asked == []
+    disk.free = FREE
+    core.tick(NOW_NS + 72 * SECOND_NS)
+    assert core.problem() == "" and core.unsaved() and maker.asked == []
+    core.tick(NOW_NS + 75 * SECOND_NS)
+    assert not core.unsaved() and len(maker.asked) == 1
+
+
+def test_the_list_is_written_at_the_end_also_where_a_clip_takes_too_long(tmp_path):
+    may_go_on = threading.Event()
+
+    def free_bytes() -> int:
+        may_go_on.wait(60)
+        return 0
+
+    recording = tmp_path / "recording.mcap"
+    worker = ClipWorker(recording, 0, free_bytes)
+    clip = Clip("slow.mcap", "tray1", 0, 1, 0, ())
+    worker.cut([clip], None)
+    worker.end(0.0)
+    worker.save([clip])
+    is_there = list_path(recording).exists()
+    may_go_on.set()
+    assert is_there and clips_in(list_path(recording)) == [clip]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.recordings.clips.clip import NOT_A_LIST, clips_in, list_path
 from pipeline.recordings.clips.cutting import LEAD_NS
-from pipeline.recordings.clips.tracker import LONGEST_NS, ClipTracker
+from pipeline.recordings.clips.tracker import LONGEST_NS, RETRY_NS, ClipTracker
 from pipeline.recordings.clips.worker import ClipMaker
 from pipeline.recordings.index import PartIndex
 from pipeline.recordings.rare_messages import last_message_ns, rare_messages
@@ -35,7 +35,7 @@ class AlarmClips:
 
     def __init__(self, tracker: ClipTracker, maker: ClipMaker) -> None:
         self._tracker, self._maker = tracker, maker
-        self._saved = tracker.version
+        self._saved, self._saved_ns = tracker.version, 0
 
     def continue_after(self, last_part: Path) -> None:
         """Follow the last alarms that a recorder before this one has recorded: it may have been killed before it had
@@ -52,15 +52,17 @@ class AlarmClips:
         assert isinstance(alarm, Alarm)
         self._tracker.add(alarm, envelope.received_t_ns)
 
-    def tick(self, now_ns: int, open_part: Callable[[], PartIndex | None]) -> None:
+    def tick(self, now_ns: int, open_part: Callable[[], PartIndex | None], unsaved_since_ns: int | None = None) -> None:
         """Take what was cut, delete what is too much, and have cut what is due. open_part: of the part that is being
-        written, asked for only where something is due."""
+        written, asked for only where something is due. unsaved_since_ns: see `ClipTracker.due`."""
         for result in self._maker.results():
             self._tracker.cut(result)
         for clip in self._tracker.to_delete():
             self._maker.delete(clip)
-        self._save()  # before it is cut: a clip that is due survives a crash
-        if due := self._tracker.due(now_ns):
+        if self._maker.problem() and abs(now_ns - self._saved_ns) >= RETRY_NS:
+            self._saved = -1  # the disk has refused it
+        self._save(now_ns)  # before it is cut: a clip that is due survives a crash
+        if due := self._tracker.due(now_ns, unsaved_since_ns):
             self._maker.cut(due, open_part())
 
     def oldest_acknowledged_until_ns(self) -> int | None:
@@ -93,8 +95,7 @@ class AlarmClips:
         self._maker.end(CLOSE_S)
         for result in self._maker.results():
             self._tracker.cut(result)
-        self._save()
-        self._maker.end(CLOSE_S)
+        self._save(self._saved_ns)
 
     def counters(self) -> Mapping[str, int]:
         """Clips that were cut, that could not be kept, and that were deleted."""
@@ -104,7 +105,7 @@ class AlarmClips:
         """Why clips cannot be cut or kept; empty if all is well."""
         return self._tracker.problem() or self._maker.problem()
 
-    def _save(self) -> None:
+    def _save(self, now_ns: int) -> None:
         if self._tracker.version != self._saved:
-            self._saved = self._tracker.version
+            self._saved, self._saved_ns = self._tracker.version, now_ns
             self._maker.save(self._tracker.clips)

@@ -62,11 +62,11 @@ class Clip:
 
     def with_acknowledged(self, alarm: Alarm) -> Clip:
         """After a message that says that nothing about this fan waits for an operator."""
-        alarms = tuple(
-            replace(each, acknowledged=each.acknowledged or (each.fan == alarm.fan and each.t_ns <= alarm.t_ns))
-            for each in self.alarms
-        )
-        return self if alarms == self.alarms else replace(self, alarms=alarms)
+        alarms = list(self.alarms)
+        for place, each in enumerate(self.alarms):
+            if each.fan == alarm.fan and not each.acknowledged and each.t_ns <= alarm.t_ns:
+                alarms[place] = replace(each, acknowledged=True)
+        return replace(self, alarms=tuple(alarms))
 
     def about(self) -> dict[str, Any]:
         """What the metadata of the file say of it."""

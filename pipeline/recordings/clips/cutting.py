@@ -19,8 +19,8 @@ from pathlib import Path
 
 from pipeline.recordings.clips.clip import CLIP_KEY, CLIP_SNAPSHOT_KEY, Clip
 from pipeline.recordings.clips.part_chunks import PartChunks, parts_backwards
-from pipeline.recordings.clips.tracker import CutResult
-from pipeline.recordings.disk import DiskError, refused, sync_folder
+from pipeline.recordings.clips.tracker import SET_BACK_NS, CutResult
+from pipeline.recordings.disk import DiskError, is_being_written, refused, sync_folder
 from pipeline.recordings.index import PartIndex
 from pipeline.recordings.reading import TACHO_KEY, RecordingMetadata
 from pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, active_path
@@ -57,7 +57,8 @@ def cut_clips(
     """Write clips to a folder, and say what came of each; all in one pass over the parts.
 
     recording: its first part. open_part: of the part that is being written, what is flushed. rest: is called now and
-    then, so that others have their turn. margin_s: of raw samples before all else.
+    then, so that others have their turn; where it raises RecordingError, because there is no more room, the last clip
+    is given up. margin_s: of raw samples before all else.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -85,15 +86,22 @@ def cut_clips(
                 continue
             for cut in takers:
                 cut.add(part, envelopes)
-            rest()
+            try:
+                rest()
+            except RecordingError as error:
+                begun = [cut for cut in cuts if cut.is_being_written]
+                if not begun:
+                    continue
+                begun[-1].give_up(error)
     return [cut.finish() for cut in cuts]
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what a killed recorder has left of clips that it was writing."""
+    """Remove what a killed recorder has left of clips that it was writing. Others, of shards, may be writing now."""
     with suppress(OSError):
         for path in folder.glob(f"{UNFINISHED}*"):
-            path.unlink()
+            if not is_being_written(path):
+                path.unlink()
 
 
 class _Parts:
@@ -107,11 +115,17 @@ class _Parts:
     def go_back_to(self, t_ns: int, more: int = 0) -> list[PartChunks]:
         """The parts with a message from this time on, and so many before them; the newest first."""
         before = sum(part.last_ns < t_ns for part in self.read)
-        while before <= more and (part := next(self._unread, None)):
+        while before <= more and not self._is_at_set_back and (part := next(self._unread, None)):
             self.read.append(part)
             before += part.last_ns < t_ns
         needed = list(takewhile(lambda part: part.last_ns >= t_ns, self.read))
         return self.read[: len(needed) + more]
+
+    @property
+    def _is_at_set_back(self) -> bool:
+        """Whether the host's clock was set back after the last one that was read: all before it have later times, and
+        may be thousands."""
+        return len(self.read) > 1 and self.read[-1].first_ns > self.read[-2].first_ns + SET_BACK_NS
 
     def last_before(self, key: str, t_ns: int) -> Envelope | None:
         """The last message of a key that was received up to this time."""
@@ -147,6 +161,16 @@ class _Cut:
         twin = parts.last_before(tray_key(site, clip.tray, "twin"), self.start_ns)
         self._first = [each.received_at(self.start_ns) for each in (twin, snapshot) if each]
 
+    @property
+    def is_being_written(self) -> bool:
+        """Whether it takes room on the disk."""
+        return self._writer is not None and self._failed is None
+
+    def give_up(self, error: RecordingError) -> None:
+        """Make room again."""
+        self._failed = error
+        self._remove()
+
     def add(self, part: PartChunks, envelopes: Sequence[Envelope]) -> None:
         """Add what belongs to the clip."""
         for envelope in envelopes if self._failed is None else ():
@@ -175,13 +199,16 @@ class _Cut:
             self._failed = error
         except OSError as error:
             self._failed = refused(f"{self._path}: cannot be written", error, "make room")
+        self._remove()
+        return CutResult(self.clip.name, problem=str(self._failed), may_pass=isinstance(self._failed, DiskError))
+
+    def _remove(self) -> None:
         with suppress(OSError):
             if self._writer is not None:
                 self._writer.discard()
         for path in (self._path, active_path(self._path)):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
-        return CutResult(self.clip.name, problem=str(self._failed), may_pass=isinstance(self._failed, DiskError))
 
     def _begin(self, of_part: RecordingMetadata) -> RecordingWriter:
         metadata, attachments = _about(of_part, self.clip, self.start_ns)

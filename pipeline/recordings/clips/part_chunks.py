@@ -23,6 +23,7 @@ class PartChunks:
     def __init__(self, index: PartIndex) -> None:
         self._path = index.path
         self.chunks = sorted(index.chunks, key=lambda chunk: chunk.chunk_start_offset)
+        self.first_ns = min((chunk.message_start_time for chunk in self.chunks), default=0)
         self.last_ns = max((chunk.message_end_time for chunk in self.chunks), default=0)
         self._reading = Reading(index.path, None, None)
         self._channels: dict[int, tuple[str, str]] = {}

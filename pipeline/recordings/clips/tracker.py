@@ -51,6 +51,12 @@ class ClipTracker:
         most_bytes: of all clips together; 0: no limit. settled_s: how long after its end all of a clip is on the disk.
         """
         self._clips = {clip.name: clip for clip in clips}
+        self._of_fan: dict[tuple[str, int], dict[int, str]] = {}
+        """by tray and fan: the clip of each of its alarms, by onset. A power cut raises a thousand, and all of them are
+        acknowledged at once"""
+        for clip in self._clips.values():
+            for each in clip.alarms:
+                self._of_fan.setdefault((clip.tray, each.fan), {})[each.onset_t_ns] = clip.name
         self._before_ns, self._after_ns = round(before_s * NS_PER_S), round(after_s * NS_PER_S)
         self._settled_ns = round(settled_s * NS_PER_S)
         self._most_bytes = most_bytes
@@ -58,7 +64,7 @@ class ClipTracker:
         self._ends_ns: dict[str, int] = {}
         """of clips that ended when the host's clock was set back: by the new time"""
         self._retry_ns = self._now_ns = 0
-        self._problem = self._full = ""
+        self._waits = self._not_kept = self._full = ""
         self.counts: Counter[str] = Counter()
         self.version = 0
         """higher after each change of `clips`"""
@@ -82,14 +88,15 @@ class ClipTracker:
     def add(self, alarm: Alarm, received_t_ns: int) -> None:
         """Follow the next message about an alarm."""
         if alarm.acknowledged:
-            for clip in [clip for clip in self._clips.values() if clip.tray == alarm.header.tray]:
-                self._put(clip.with_acknowledged(alarm))
+            for name in set(self._of_fan.get((alarm.header.tray, alarm.fan), {}).values()):
+                self._put(self._clips[name].with_acknowledged(alarm))
         elif alarm.transition == Transition.RAISED and not is_silenced(alarm):
             self._raise(alarm, received_t_ns)
 
-    def due(self, now_ns: int) -> list[Clip]:
+    def due(self, now_ns: int, unsaved_since_ns: int | None = None) -> list[Clip]:
         """The clips to be cut now, which count as being cut until `cut` says what came of it. What a clip over the
-        limit of bytes needs is never due: it is not kept."""
+        limit of bytes needs is never due: it is not kept. unsaved_since_ns: what was received from then on is not on
+        the disk yet; None: all is."""
         if now_ns < self._now_ns - SET_BACK_NS:
             self._end_running(now_ns)
         self._now_ns = now_ns
@@ -99,6 +106,7 @@ class ClipTracker:
             if clip.is_due
             and clip.name not in self._being_cut
             and self._ends_ns.get(clip.name, clip.until_ns) + self._settled_ns <= now_ns
+            and (unsaved_since_ns is None or clip.until_ns < unsaved_since_ns or clip.name in self._ends_ns)
         ]
         if now_ns < self._retry_ns or not found:
             return []
@@ -125,13 +133,13 @@ class ClipTracker:
         if result.size_bytes:
             self._put(replace(clip, is_due=not is_over, size_bytes=result.size_bytes, problem=_joined(clip, result)))
             self.counts["clips"] += int(is_over)
-            self._problem = ""
+            self._waits = self._not_kept = ""
         elif result.may_pass:
             self._retry_ns = self._now_ns + RETRY_NS
-            self._problem = f"clip {result.name} cannot be cut yet: {result.problem}"
+            self._waits = f"clip {result.name} cannot be cut yet: {result.problem}"
         elif is_over:
             self._drop(clip)
-            self._problem = f"clip {clip.name} is not kept: {result.problem}"
+            self._not_kept = f"clip {clip.name} is not kept: {result.problem}"
 
     def to_delete(self) -> list[Clip]:
         """The oldest acknowledged clips beyond the limit of bytes, which are then no longer known."""
@@ -143,8 +151,7 @@ class ClipTracker:
 
     def deleted(self, clip: Clip) -> None:
         """A clip is deleted to make room."""
-        del self._clips[clip.name]
-        self.version += 1
+        self._remove(clip)
         self.counts["clips_deleted"] += 1
 
     def part_deleted(self) -> None:
@@ -159,14 +166,16 @@ class ClipTracker:
                 f"{self._full}: clips whose alarms nobody has acknowledged fill recorder.clip_bytes; "
                 "acknowledge alarms, or allow more"
             )
-        return self._problem
+        is_waiting = any(clip.is_due for clip in self._clips.values())
+        return self._waits if self._waits and is_waiting else self._not_kept
 
     def _raise(self, alarm: Alarm, received_t_ns: int) -> None:
         tray = alarm.header.tray
         new = ClipAlarm(alarm.fan, alarm.onset_t_ns, alarm.t_ns)
-        of_tray = [clip for clip in self._clips.values() if clip.tray == tray]
-        if any((each.fan, each.onset_t_ns) == (new.fan, new.onset_t_ns) for clip in of_tray for each in clip.alarms):
+        of_fan = self._of_fan.setdefault((tray, alarm.fan), {})
+        if alarm.onset_t_ns in of_fan:
             return
+        of_tray = (clip for clip in self._clips.values() if clip.tray == tray)
         delay_ns = min(max(0, alarm.t_ns - alarm.onset_t_ns), LONGEST_DELAY_NS)
         onset_ns, until_ns = received_t_ns - delay_ns, received_t_ns + self._after_ns
         since_ns, judged_since_ns = onset_ns - self._before_ns, onset_ns - max(self._before_ns, JUDGED_NS)
@@ -175,8 +184,11 @@ class ClipTracker:
             longer = replace(running, alarms=(*running.alarms, new), until_ns=max(running.until_ns, until_ns))
             judged_since_ns = min(running.judged_since_ns, judged_since_ns)
             self._put(replace(longer, since_ns=min(running.since_ns, since_ns), judged_since_ns=judged_since_ns))
+            of_fan[alarm.onset_t_ns] = running.name
             return
-        self._put(Clip(clip_name(alarm, self._clips), tray, since_ns, until_ns, judged_since_ns, (new,)))
+        clip = Clip(clip_name(alarm, self._clips), tray, since_ns, until_ns, judged_since_ns, (new,))
+        self._put(clip)
+        of_fan[alarm.onset_t_ns] = clip.name
 
     def _is_joined(self, clip: Clip, received_t_ns: int, until_ns: int) -> bool:
         """Whether an alarm that is received now belongs to a clip, which then goes on until `until_ns`."""
@@ -202,8 +214,13 @@ class ClipTracker:
         if clip.size_bytes:
             self._put(replace(clip, is_due=False))
         else:
-            del self._clips[clip.name]
-            self.version += 1
+            self._remove(clip)
+
+    def _remove(self, clip: Clip) -> None:
+        del self._clips[clip.name]
+        for each in clip.alarms:
+            self._of_fan[clip.tray, each.fan].pop(each.onset_t_ns, None)
+        self.version += 1
 
     def _put(self, clip: Clip) -> None:
         if self._clips.get(clip.name) != clip:

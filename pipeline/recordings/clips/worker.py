@@ -56,21 +56,31 @@ class ClipMaker(Protocol):
 class ClipWorker(ClipMaker):
     """Cuts the clips of one recording."""
 
-    def __init__(self, recording: Path, min_free_bytes: int, free_bytes: Callable[[], int]) -> None:
-        """recording: its first part. free_bytes: of its disk; raises DiskError."""
+    def __init__(
+        self, recording: Path, min_free_bytes: int, free_bytes: Callable[[], int], *, others_make_room: bool = False
+    ) -> None:
+        """recording: its first part. free_bytes: of its disk; raises DiskError. others_make_room: below min_free_bytes
+        the oldest part is deleted, and recording does not pause; then half of them may be used meanwhile."""
         self._recording, self._folder, self._list = recording, clip_folder(recording), list_path(recording)
-        self._min_free_bytes, self._free_bytes = min_free_bytes, free_bytes
+        self._begin_bytes = min_free_bytes + ROOM_BYTES
+        self._least_bytes = min_free_bytes // 2 if others_make_room else self._begin_bytes
+        self._free_bytes = free_bytes
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._results: SimpleQueue[CutResult] = SimpleQueue()
         self._to_save: Sequence[Clip] | None = None
         self._problem = ""
         self._thread: threading.Thread | None = None
+        self._has_ended = False
         remove_unfinished(self._folder)
 
     def save(self, clips: Sequence[Clip]) -> None:
-        """See ClipMaker. Of lists that wait, only the newest is written."""
+        """See ClipMaker. Of lists that wait, only the newest is written. After `end` it is written at once: a clip that
+        takes longer than there was time for may still be cut."""
         self._to_save = tuple(clips)
-        self._put(self._save)
+        if self._has_ended:
+            self._do(self._save)
+        else:
+            self._put(self._save)
 
     def cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
         """See ClipMaker."""
@@ -86,8 +96,8 @@ class ClipWorker(ClipMaker):
         return found
 
     def delete(self, clip: Clip) -> None:
-        """See ClipMaker."""
-        self._put(lambda: (self._folder / clip.name).unlink(missing_ok=True))
+        """See ClipMaker. At once: what waits behind clips that are being cut makes no room, and more is deleted."""
+        self._do(lambda: (self._folder / clip.name).unlink(missing_ok=True))
 
     def problem(self) -> str:
         """See ClipMaker."""
@@ -95,6 +105,7 @@ class ClipWorker(ClipMaker):
 
     def end(self, timeout_s: float) -> None:
         """See ClipMaker."""
+        self._has_ended = True
         if self._thread is not None:
             self._jobs.put(None)
             self._thread.join(timeout_s)
@@ -108,10 +119,13 @@ class ClipWorker(ClipMaker):
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
-            try:
-                job()
-            except OSError as error:
-                self._problem = f"{self._folder}: cannot be written: {error.strerror}; make room, or correct the folder"
+            self._do(job)
+
+    def _do(self, job: Callable[[], None]) -> None:
+        try:
+            job()
+        except OSError as error:
+            self._problem = f"{self._folder}: cannot be written: {error.strerror}; make room, or correct the folder"
 
     def _save(self) -> None:
         clips, self._to_save = self._to_save, None
@@ -129,13 +143,20 @@ class ClipWorker(ClipMaker):
 
     def _cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
         try:
-            free, wanted = self._free_bytes(), self._min_free_bytes + ROOM_BYTES
-            if free < wanted:
-                raise DiskError(f"{free / 1e6:,.1f} MB are free on the disk, and {wanted / 1e6:,.1f} MB are required")
-            found = cut_clips(clips, self._recording, self._folder, open_part, lambda: time.sleep(REST_S))
+            self._require(self._begin_bytes)
+            found = cut_clips(clips, self._recording, self._folder, open_part, self._rest)
         except (RecordingError, OSError) as error:
             found = [CutResult(clip.name, problem=str(error), may_pass=True) for clip in clips]
         except Exception as error:  # noqa: BLE001  a recorder goes on recording whatever is wrong with a clip
             found = [CutResult(clip.name, problem=f"{type(error).__name__}: {error}") for clip in clips]
         for result in found:
             self._results.put(result)
+
+    def _rest(self) -> None:
+        time.sleep(REST_S)
+        self._require(self._least_bytes)
+
+    def _require(self, least_bytes: int) -> None:
+        free = self._free_bytes()
+        if free < least_bytes:
+            raise DiskError(f"{free / 1e6:,.1f} MB are free on the disk, and {least_bytes / 1e6:,.1f} MB are required")

@@ -63,7 +63,7 @@ def episodes(alarms: Iterable[Alarm]) -> list[Episode]:
     """The episodes of one or several trays, in the order they were raised.
 
     If a scorer restarts without a snapshot and raises an alarm that its predecessor raised and did not clear, both
-    are one episode. Feedback may be later than the end of its episode.
+    are one episode. Feedback may be later than the end of its episode; the episode was true if one of both was.
     """
     found: list[Episode] = []
     open_alarms: dict[tuple[str, int], list[Alarm]] = {}
@@ -125,12 +125,19 @@ def _marks(in_order: list[Alarm]) -> dict[_Name, _Mark]:
     return found
 
 
+def _weight(mark: _Mark) -> tuple[bool, int]:
+    """Of the marks on the alarms that are one episode: one that was true counts most, since nothing is learned from it,
+    and then the last one."""
+    place, feedback, _, _ = mark
+    return feedback == Feedback.TRUE_ALARM, place
+
+
 def _episode(messages: list[Alarm], cleared_ns: int | None, marks: Mapping[_Name, _Mark]) -> Episode:
     """messages: all of this episode, in order."""
     first = messages[0]
     fan = (first.header.tray, first.fan)
     marked = [mark for onset_ns in {each.onset_t_ns for each in messages} if (mark := marks.get((*fan, onset_ns)))]
-    _, feedback, by, reason = max(marked, default=(0, Feedback.NONE, "", ""))
+    _, feedback, by, reason = max(marked, default=(0, Feedback.NONE, "", ""), key=_weight)
     return Episode(
         tray=first.header.tray,
         fan=first.fan,

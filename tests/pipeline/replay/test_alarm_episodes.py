@@ -121,3 +121,14 @@ def test_later_messages_about_an_alarm_bring_feedback_whose_own_message_is_missi
     given = {"feedback": Feedback.TRUE_ALARM, "feedback_by": "bob", "feedback_reason": "worn"}
     episode = one(alarm(10), alarm(20, Transition.CLEARED, **given))
     assert (episode.feedback, episode.feedback_by, episode.feedback_reason) == (Feedback.TRUE_ALARM, "bob", "worn")
+
+
+def test_an_episode_of_two_alarms_of_which_one_was_true_is_not_learned_from() -> None:
+    joined = one(
+        alarm(10),
+        alarm(30, onset_t_ns=25),
+        alarm(40, Transition.CLEARED, onset_t_ns=25),
+        marked(50, Transition.MARKED_TRUE, 5, "worn", onset_t_ns=25),
+        marked(60, Transition.MARKED_FALSE, 25, "a door", onset_t_ns=25),
+    )
+    assert (joined.feedback, joined.feedback_reason) == (Feedback.TRUE_ALARM, "worn")

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from pipeline.recordings.clips.clip import Clip, clip_lines
-from pipeline.recordings.clips.cutting import cut_clips
+from pipeline.recordings.clips.cutting import _Parts, cut_clips
 from pipeline.recordings.contents import contents_of
+from pipeline.recordings.disk import DiskError
+from pipeline.recordings.parts import part_path
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.records import active_path
 from pipeline.recordings.writing import RecordingWriter
@@ -144,3 +147,39 @@ def test_a_clip_of_parts_that_are_gone_is_not_written_and_one_of_some_has_the_re
     assert (result.size_bytes, result.may_pass) == (0, False)
     assert "nothing of that time is recorded" in result.problem
     assert not active_path(tmp_path / "clips" / past.name).exists()
+
+
+def test_where_room_runs_out_while_clips_are_written_the_last_one_is_given_up(undisturbed, tmp_path):
+    clip = clip_of(first_raised(undisturbed), before_s=0.5, after_s=2.0)
+    record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
+    folder = tmp_path / "clips"
+    files: list[int] = []
+
+    def rest() -> None:
+        files.append(len(list(folder.iterdir())))
+        if len(files) == 2:
+            raise DiskError("0.1 MB are free")
+
+    clips = [clip, replace(clip, name="last.mcap")]
+    first, last = cut_clips(clips, tmp_path / "recording.mcap", folder, rest=rest)
+    assert first.size_bytes and not first.problem
+    assert (last.size_bytes, last.may_pass, last.problem) == (0, True, "0.1 MB are free")
+    assert files[:3] == [2, 2, 1]  # there is room again before the first one goes on
+    assert [path.name for path in folder.iterdir()] == [clip.name]
+
+
+def test_of_parts_from_before_the_clock_was_set_back_only_the_last_is_read(undisturbed, tmp_path):
+    recording = tmp_path / "recording.mcap"
+    head = read_metadata(undisturbed)
+    raws = list(read_recording(undisturbed, ("raw",)))
+    for number in range(1, 9):  # a day apart; the last two are of a clock that was set back
+        moved_ns = (number - (100 if number > 6 else 0)) * 86400 * S
+        about = {**head.metadata, "recording": "recording.mcap"}
+        with RecordingWriter(part_path(recording, number), about, t_ns=raws[0].received_t_ns) as writer:
+            for each in raws:
+                writer.add(each.received_at(each.received_t_ns + moved_ns))
+    parts = _Parts(recording, None)
+    first_ns = raws[0].received_t_ns
+    found = parts.go_back_to(first_ns - 98 * 86400 * S)
+    assert len(parts.read) <= 3
+    assert [part.first_ns for part in found][:1] == [first_ns - 92 * 86400 * S]
