@@ -100,7 +100,7 @@ class Api:
         if tray:
             self._tray(tray)
         if state and state not in (known := state_words()):
-            raise HTTPException(422, f"state: one of {', '.join(known)}, please")
+            raise HTTPException(422, f"state must be one of {', '.join(known)}")
         found = [each for each in self.model.every_fan() if not tray or each.fan.tray == tray]
         return JSONResponse({"fans": [fan_json(each) for each in found if each.state.startswith(state)][:most]})
 
@@ -323,7 +323,7 @@ async def _form(request: Request, kind: type[Form]) -> Form:
                 if len(body) > LARGEST_BODY_BYTES:
                     raise HTTPException(413, f"at most {LARGEST_BODY_BYTES} bytes are accepted")
     except TimeoutError as error:
-        raise HTTPException(408, "the request takes too long") from error
+        raise HTTPException(408, "the request took too long") from error
     try:
         return kind.model_validate_json(bytes(body))
     except ValidationError as error:
@@ -337,7 +337,7 @@ def _number(request: Request, name: str, default: int) -> int:
     if number is None:
         return default
     if number < 0:
-        raise HTTPException(422, f"{name}: no number below 0, please")
+        raise HTTPException(422, f"{name} must not be below 0")
     return number
 
 
@@ -346,5 +346,5 @@ def _whole(request: Request, name: str) -> int | None:
     if not text:
         return None
     if not re.fullmatch("-?[0-9]{1,15}", text):
-        raise HTTPException(422, f"{name}: a whole number, please")
+        raise HTTPException(422, f"{name} must be a whole number")
     return int(text)
