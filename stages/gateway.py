@@ -71,9 +71,10 @@ class GatewayCore(SiteCore):
         """Keep it, and send a transition to all pages."""
         is_new = self._model.add_alarm(alarm)
         self._desk.add(alarm)
-        current = self._model.current_alarm(Fan(alarm.header.tray, alarm.fan))
-        if is_new and current is not None:
-            self._feed.publish("alarm", alarm_json(current))
+        fan = Fan(alarm.header.tray, alarm.fan)
+        current = self._model.current_alarm(fan)
+        if is_new and current is not None and self._feed.readers:
+            self._feed.publish("alarm", alarm_json(current) | {"now": self._model.words_now([fan])[0]})
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Send the pages the state of the fleet, and the scorers what operators ask."""

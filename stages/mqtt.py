@@ -193,9 +193,8 @@ class MqttCore(SiteCore):
             self._update_site()
 
     def _update_site(self) -> None:
-        counts = {name.replace(" ", "_"): count for name, count in self._model.counts().items()}
         fans = sum(tray.fans for tray in self._model.trays)
-        self._outbox.retain(self._topics.summary, json_text({"fans": fans} | counts))
+        self._outbox.retain(self._topics.summary, json_text({"fans": fans} | self._model.counts()))
         self._outbox.retain(self._topics.stages, json_text(stages_json(self._model.stages())))
         if not self._has_devices:
             self._has_devices = True

@@ -11,7 +11,7 @@ from pipeline.presenting.site_model import SiteModel, TrayNow
 from pipeline.recordings.dates import format_utc
 from pipeline.viewing.fleet import Fan, FanNow
 from schemas.units import RAD_S_PER_UNIT
-from scoring.alarms.alarm_flags import is_listed, is_silenced
+from scoring.alarms.alarm_flags import is_listed
 from scoring.alarms.current_alarms import CurrentAlarm
 
 AT_ONCE = ("state", "in_alarm", "judged")
@@ -31,19 +31,18 @@ class FanStates:
         is_full: also those of which only a number has changed. with_silent: also of trays that were never heard.
         """
         trays = {each.tray: each for each in self._model.trays_now()}
-        active = {Fan(a.newest.header.tray, a.newest.fan) for a in self._model.current_alarms() if _is_problem(a)}
         found: dict[Fan, dict[str, Any]] = {}
         for now in self._model.every_fan():
             tray = trays.get(now.fan.tray)
-            if tray is None and not with_silent and now.fan not in active:
+            if tray is None and not with_silent and not now.is_in_alarm:
                 continue
-            state, before = self._state(now, tray, now.fan in active), self._published.get(now.fan)
+            state, before = self._state(now, tray), self._published.get(now.fan)
             if before is None or any(state[name] != before[name] for name in (state if is_full else AT_ONCE)):
                 self._published[now.fan] = state
                 found[now.fan] = state | {"time": format_utc(tray.t_ns) if tray else None}
         return found
 
-    def _state(self, now: FanNow, newest: TrayNow | None, in_alarm: bool) -> dict[str, Any]:
+    def _state(self, now: FanNow, newest: TrayNow | None) -> dict[str, Any]:
         tray = self._model.tray(now.fan.tray)
         assert tray is not None
         measured = predicted = math.nan
@@ -54,7 +53,7 @@ class FanStates:
         unit = RAD_S_PER_UNIT[tray.speed_unit]
         return {
             "state": now.state,
-            "in_alarm": in_alarm,
+            "in_alarm": now.is_in_alarm and not now.is_silenced,
             "judged": judged,
             "score": _number(now.score),
             "speed": _number(measured / unit),
@@ -72,10 +71,6 @@ def shown_alarm(current: CurrentAlarm) -> dict[str, Any] | None:
 def topics_of(topics: Topics, fan: Fan) -> tuple[str, str]:
     """The retained topics of a fan."""
     return topics.state(fan), topics.alarm(fan)
-
-
-def _is_problem(current: CurrentAlarm) -> bool:
-    return current.newest.active and not is_silenced(current.newest)
 
 
 def _number(value: float) -> float | None:

@@ -176,6 +176,8 @@ class BrokerLink:
         """What is wrong now; empty if nothing is."""
         if self._refused:
             return self._refused
+        if not self._is_up and self._config.tls and not self._sessions:  # the client does not say why
+            return f"the broker {self._address} is away, or TLS fails: `fantwin doctor` says which"
         if not self._is_up:
             return f"the broker {self._address} is away: what is new is published when it is back"
         with self._lock:

@@ -26,6 +26,7 @@ from pipeline.gateway.forms import LoginForm
 from pipeline.gateway.live_feed import LiveFeed, encoded
 from pipeline.gateway.metrics import metrics_text
 from pipeline.gateway.shared_answer import SharedAnswer
+from pipeline.presenting.fan_groups import FanGroup
 from pipeline.presenting.fan_history import HISTORY_S
 from pipeline.presenting.recorded_alarms import RecordedAlarms
 from pipeline.presenting.request_desk import RequestDesk
@@ -44,7 +45,7 @@ from pipeline.presenting.shown import (
 )
 from pipeline.presenting.site_model import SiteModel
 from pipeline.recordings.clips.clip import Clip, kept_clips
-from pipeline.viewing.fleet import Fan, state_words
+from pipeline.viewing.fleet import Fan
 from schemas.enums import Transition
 from schemas.messages import Request as OperatorRequest
 from schemas.units import NS_PER_S
@@ -94,15 +95,18 @@ class Api:
 
     @reads
     async def fans(self, request: Request) -> Response:
-        """All fans, the worst first; ?tray=NAME, ?state=WORD and ?limit=N choose."""
-        tray, state = request.query_params.get("tray", ""), request.query_params.get("state", "")
-        most = _number(request, "limit", 10_000_000)
+        """All fans, the worst first; ?tray=NAME, ?state=GROUP and ?limit=N choose."""
+        tray, group = request.query_params.get("tray", ""), _group(request)
         if tray:
             self._tray(tray)
-        if state and state not in (known := state_words()):
-            raise HTTPException(422, f"state must be one of {', '.join(known)}")
-        found = [each for each in self.model.every_fan() if not tray or each.fan.tray == tray]
-        return JSONResponse({"fans": [fan_json(each) for each in found if each.state.startswith(state)][:most]})
+        most = _number(request, "limit", 10_000_000)
+        groups = self.model.groups()
+        found = [
+            (each, groups[each.fan])
+            for each in self.model.every_fan()
+            if tray in ("", each.fan.tray) and group in (None, groups[each.fan])
+        ]
+        return JSONResponse({"fans": [fan_json(each, of) for each, of in found[:most]]})
 
     @reads
     async def fan(self, request: Request) -> Response:
@@ -330,6 +334,14 @@ async def _form(request: Request, kind: type[Form]) -> Form:
         found = json.loads(error.json(include_url=False, include_input=False))[0]
         where = ".".join(map(str, found["loc"]))
         raise HTTPException(422, f"{where}: {found['msg']}" if where else found["msg"]) from error
+
+
+def _group(request: Request) -> FanGroup | None:
+    """The group that is asked for; None: all."""
+    name = request.query_params.get("state", "")
+    if name and name not in list(FanGroup):
+        raise HTTPException(422, f"state must be one of {', '.join(FanGroup)}")
+    return FanGroup(name) if name else None
 
 
 def _number(request: Request, name: str, default: int) -> int:

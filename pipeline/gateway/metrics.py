@@ -64,6 +64,10 @@ class SiteMetrics(Collector):
         presented = GaugeMetricFamily(
             "fantwin_alarms_presented", "Alarms that need attention: neither silenced nor dealt with.", labels=["site"]
         )
+        fans_in_alarm = GaugeMetricFamily(
+            "fantwin_fans_in_alarm", "Fans whose alarm is active and not silenced.", labels=["site"]
+        )
+        fans_in_alarm.add_metric([self._model.site], self._model.counts()["in_alarm"])
         total = CounterMetricFamily(
             "fantwin_alarms",
             "Alarms that have reached this severity since the gateway started.",
@@ -85,7 +89,7 @@ class SiteMetrics(Collector):
                 name = severity.name.lower()
                 total.add_metric([self._model.site, tray.name, name], raised[tray.name, name])
         presented.add_metric([self._model.site], sum(is_presented(each.newest) for each in alarms))
-        return active, unacknowledged, presented, total
+        return active, unacknowledged, presented, fans_in_alarm, total
 
     def _of_stages(self, states: Iterable[StageState]) -> Iterable[Metric]:
         up = GaugeMetricFamily("fantwin_stage_up", "1: the stage is working.", labels=_STAGE)

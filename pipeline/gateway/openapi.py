@@ -10,12 +10,12 @@ from pydantic.json_schema import models_json_schema
 
 from pipeline.gateway.access import CSRF_HEADER
 from pipeline.gateway.forms import LoginForm
+from pipeline.presenting.fan_groups import FanGroup
 from pipeline.presenting.request_form import RequestForm
-from pipeline.viewing.fleet import state_words
 
 _FORMS = {"/login": LoginForm, "/fans/{tray}/{fan}/requests": RequestForm}
 _QUERY: Mapping[str, Mapping[str, str | list[str]]] = {
-    "/fans": {"tray": "string", "state": state_words(), "limit": "integer"},
+    "/fans": {"tray": "string", "state": list(FanGroup), "limit": "integer"},
     "/fans/{tray}/{fan}/curves": {"seconds": "integer"},
     "/alarms": {"all": "integer"},
     "/alarms/history": {"tray": "string", "fan": "integer", "limit": "integer", "before": "integer"},

@@ -16,14 +16,14 @@ from pipeline.launch.event_log import without_figures
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode
-from schemas.enums import FanState, InvalidReason
+from schemas.enums import InvalidReason
 from schemas.fan_numbers import fans_in_words
 from schemas.messages import Alarm, Score
 from schemas.topics import tray_key
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST, REASONS
+from scoring.alarms.words_now import STARTING, STOPPED, words_now
 
-RETURNING = "within its limits (the alarm clears once it stays there, for most faults near the speeds of the alarm)"
 JUDGED_WITHIN_S = 5.0
 """a fan is judged now if it had a valid score, or was stopped or starting, this recently"""
 _SAMPLED_S = 0.1  # scores of a tray are looked at this often: a fast line sends hundreds a second
@@ -70,8 +70,9 @@ class AtRest:
     @property
     def words(self) -> str:
         """The state, for people."""
-        whose = "its" if len(self.fans) == 1 else "their"
-        return f"stopped by {whose} command" if self.reason == InvalidReason.STOPPED else "starting"
+        if self.reason != InvalidReason.STOPPED:
+            return STARTING
+        return STOPPED if len(self.fans) == 1 else STOPPED.replace("its", "their")
 
     def as_json(self) -> dict[str, object]:
         """For machines."""
@@ -136,16 +137,17 @@ class JudgedFans:
 
     def words_now(self) -> dict[tuple[str, int], str]:
         """What each fan does that is stopped, starting or returning now, for people, by tray and fan."""
-        at_rest = {(each.tray, fan): replace(each, fans=(fan,)).words for each in self.at_rest() for fan in each.fans}
         oldest_s = self._now_s() - JUDGED_WITHIN_S
         with self._lock:
-            returning = {
-                (tray.name, fan): RETURNING
+            newest = [
+                (tray.name, fan, words_now(state, reason))
                 for tray in self._trays
                 if self._seen_s.get(tray.name, -np.inf) >= oldest_s
-                for fan in np.flatnonzero(self._states[tray.name] == FanState.RETURNING).tolist()
-            }
-        return returning | at_rest
+                for fan, (state, reason) in enumerate(
+                    zip(self._states[tray.name].tolist(), self._reasons[tray.name].tolist(), strict=True)
+                )
+            ]
+        return {(tray, fan): words for tray, fan, words in newest if words}
 
     def unjudged(self, states: Sequence[StageState]) -> list[Unjudged]:
         """The fans that are not judged now, and why. states: of the site's stages; one may be the reason."""

@@ -15,7 +15,15 @@ from pipeline.notification.gathering import Happened, ranges
 from schemas.enums import Severity
 from schemas.units import NS_PER_S
 from scoring.diagnosis.advice import KNOWN_SOON
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, WHAT_TO_DO
+from scoring.diagnosis.shown_causes import (
+    CANNOT_TELL,
+    CAUSES,
+    advice,
+    less_likely,
+    likely_causes,
+    likely_evidence,
+    likely_with_share,
+)
 
 MOST_TRAYS, MOST_RANGE_CHARACTERS, MOST_NAMED_CAUSES = 20, 120, 4
 """of a message about many fans"""
@@ -72,21 +80,16 @@ class Place:
 
 
 def cause_line(causes: Sequence[NamedCause]) -> str:
-    """The most probable cause with its probability and evidence, and other ones that are probable."""
+    """The likely causes with probability and evidence, and other ones that are probable."""
     if not causes:
         return "Cause: unknown"
     first = causes[0]
     if first.cause == CANNOT_TELL:
         # a message does not change: what is known later is elsewhere
         return f"Cause: {first.evidence or CAUSES[CANNOT_TELL]}".replace(KNOWN_SOON, _WHERE_IT_IS_KNOWN)
-    others = [_with_probability(each) for each in causes[1:] if each.probability >= MIN_PROBABILITY]
-    evidence = f" ({first.evidence})" if first.evidence else ""
-    return f"Cause: {_with_probability(first)}{evidence}{''.join(f', or {each}' for each in others)}"
-
-
-def to_do(causes: Sequence[NamedCause]) -> str:
-    """What to do; empty where nothing is known."""
-    return WHAT_TO_DO.get(causes[0].cause, "") if causes else ""
+    others = [_with_probability(each) for each in less_likely(causes)]
+    evidence = f" ({found})" if (found := likely_evidence(causes)) else ""
+    return f"Cause: {likely_with_share(causes)}{evidence}{''.join(f', or {each}' for each in others)}"
 
 
 def about_fan(place: Place, alarm: FanAlarm, happened: Happened, now_ns: int) -> Text:
@@ -117,8 +120,8 @@ def describe(place: Place, alarm: FanAlarm) -> list[str]:
     else:
         lines = [f"{fan}: {alarm.severity_name} since {place.clock(alarm.onset_t_ns)}"]
         lines += [_deviation(place, alarm) or "away from its twin", cause_line(alarm.causes)]
-        if advice := to_do(alarm.causes):
-            lines.append(f"What to do: {advice}")
+        if to_do := advice(alarm.causes):
+            lines.append(f"What to do: {to_do}")
     if alarm.acknowledged:
         lines.append(f"Acknowledged{f' by {alarm.acknowledged_by}' if alarm.acknowledged_by else ''}.")
     else:
@@ -148,8 +151,8 @@ def about_many(
         lines.insert(0, "Held during quiet hours:")
     lines += _of_each_tray(alarms)
     if active:
-        causes = Counter(each.causes[0].cause if each.causes else "" for each in active)
-        named = [f"{CAUSES.get(c, c) or 'unknown'} {n}" for c, n in causes.most_common(MOST_NAMED_CAUSES)]
+        causes = Counter(likely_causes(each.causes) or "unknown" for each in active)
+        named = [f"{words} {count}" for words, count in causes.most_common(MOST_NAMED_CAUSES)]
         lines.append(f"Most probable causes: {'; '.join(named)}")
         lines.append(f"The first began {place.clock(min(each.onset_t_ns for each in active))}")
         if (stale := sum(each.stale for each in active)) > 0:

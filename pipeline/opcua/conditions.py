@@ -17,7 +17,7 @@ from schemas.messages import Alarm
 from scoring.alarms.alarm_flags import is_retained, is_silenced
 from scoring.alarms.current_alarms import CurrentAlarm, words_of
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES
+from scoring.diagnosis.shown_causes import CANNOT_TELL, likely_causes, likely_evidence
 
 SEVERITIES = {Severity.NONE: 1, Severity.WARNING: 500, Severity.ALARM: 900}
 """of Part 5: 401 to 600 is medium, 801 to 1000 high"""
@@ -198,8 +198,8 @@ def _fields(condition: Condition, now_ns: int) -> dict[str, Any]:
     suppressed, out = bool(newest and newest.suppressed), bool(newest and newest.out_of_service)
     latched = bool(newest and newest.latched)
     at = Time(newest.t_ns if newest else 0)
-    first = current.causes[0] if current and current.causes else None
-    probability = first.probability if first and first.cause != CANNOT_TELL else math.nan
+    causes = current.causes if current else ()
+    probability = causes[0].probability if causes and causes[0].cause != CANNOT_TELL else math.nan
     return {
         "EventId": event_id(newest) if newest else b"",
         "EventType": OwnNode(FAN_ALARM_TYPE),
@@ -243,8 +243,8 @@ def _fields(condition: Condition, now_ns: int) -> dict[str, Any]:
         "MaxTimeShelved": LONGEST_SHELVING_S * 1e3,
         "LatchedState": "Latched" if latched else "Unlatched",
         "LatchedState/Id": latched,
-        "Cause": CAUSES.get(first.cause, first.cause) if first else "",
+        "Cause": likely_causes(causes),
         "CauseProbability": probability,
-        "Evidence": first.evidence if first else "",
+        "Evidence": likely_evidence(causes),
         "Score": newest.score if newest else math.nan,
     }

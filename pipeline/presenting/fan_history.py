@@ -13,11 +13,19 @@ from schemas.units import NS_PER_S
 
 HISTORY_S = 3600
 FINE_STEP_S, COARSE_STEP_S = 0.5, 5.0
-"""the second where a site has more than FINE_UP_TO fans: 5,000 fans then take 72 MB"""
+"""the second where a site has more than FINE_UP_TO fans: 5,000 fans then take 86 MB"""
 FINE_UP_TO = 64
-CURVES = ("measured_speed_rad_s", "predicted_speed_rad_s", "band_half_width_rad_s", "torque_balance_command", "score")
+CURVES = (
+    "measured_speed_rad_s",
+    "predicted_speed_rad_s",
+    "band_half_width_rad_s",
+    "torque_balance_command",
+    "score",
+    "command",
+)
 """of a fan, in the order of the last axis; NaN where nothing was measured or judged"""
 COLUMNS = (
+    "command",
     "measured_speed_rad_s",
     "predicted_speed_rad_s",
     "band_variance",
@@ -96,5 +104,6 @@ def values_of(score: Score, rows: slice = slice(None)) -> Array:
         judged(np.sqrt(score.band_variance)),
         judged(score.torque_balance_command) if len(score.torque_balance_command) else np.full(valid.shape, np.nan),
         judged(score.score) if len(score.score) else np.full(valid.shape, np.nan),
+        score.command[rows],
     )
     return np.stack(columns, axis=-1).astype(np.float32)

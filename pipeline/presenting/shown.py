@@ -11,10 +11,11 @@ import numpy as np
 
 from pipeline.config.models import TrayConfig
 from pipeline.launch.site_state import StageState
+from pipeline.presenting.fan_groups import SHOWN_CLASSES, FanGroup
 from pipeline.presenting.fan_history import Curves
 from pipeline.presenting.site_model import SiteModel
 from pipeline.recordings.clips.clip import Clip
-from pipeline.viewing.fleet import Fan, FanNow, class_names
+from pipeline.viewing.fleet import Fan, FanNow
 from schemas.enums import Feedback
 from schemas.messages import Alarm, Array, ModelCard
 from schemas.twin_card import CardError, TwinCard
@@ -22,7 +23,15 @@ from schemas.units import RAD_S_PER_UNIT
 from scoring.alarms.alarm_flags import is_listed
 from scoring.alarms.current_alarms import CurrentAlarm, words_of
 from scoring.calibration.observed_rate import together
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, WHAT_TO_DO, short_name
+from scoring.diagnosis.shown_causes import (
+    CANNOT_TELL,
+    advice,
+    less_likely,
+    likely_causes,
+    likely_evidence,
+    likely_with_share,
+    short_name,
+)
 
 LEVELS, NO_LEVEL = 250, 255
 """a score of 1, at the limit, is level 100; what is not judged has none"""
@@ -31,7 +40,8 @@ _SPEEDS = 3
 
 
 def site_json(model: SiteModel, viewer_urls: Mapping[str, str]) -> dict[str, Any]:
-    """What does not change while the gateway runs: the trays in the order of the cells, and what their classes mean."""
+    """What does not change while the gateway runs: the trays in the order of the cells, and what their classes mean:
+    name, group, and what a fan with an alarm does now."""
     trays = [
         {
             "name": tray.name,
@@ -41,7 +51,14 @@ def site_json(model: SiteModel, viewer_urls: Mapping[str, str]) -> dict[str, Any
         }
         for tray in model.trays
     ]
-    return {"site": model.site, "trays": trays, "classes": class_names(), "level_at_limit": 100}
+    return {
+        "site": model.site,
+        "trays": trays,
+        "classes": [each.name for each in SHOWN_CLASSES],
+        "groups": [str(each.group) for each in SHOWN_CLASSES],
+        "now": [each.now for each in SHOWN_CLASSES],
+        "level_at_limit": 100,
+    }
 
 
 def fleet_json(model: SiteModel) -> dict[str, Any]:
@@ -51,19 +68,20 @@ def fleet_json(model: SiteModel) -> dict[str, Any]:
     return {
         "classes": _packed(now.classes),
         "levels": _packed(level.astype(np.uint8)),
-        "counts": {name.replace(" ", "_"): count for name, count in model.counts().items()},
+        "counts": model.counts(),
     }
 
 
-def fan_json(now: FanNow) -> dict[str, Any]:
+def fan_json(now: FanNow, group: FanGroup) -> dict[str, Any]:
     """One fan in a list."""
     return {
         "tray": now.fan.tray,
         "fan": now.fan.number,
         "state": now.state,
+        "group": str(group),
         "score": None if math.isnan(now.score) else round(now.score, 4),
         "since_t_ns": now.since_t_ns,
-        "in_alarm": now.is_in_alarm,
+        "in_alarm": group == FanGroup.ALARM,
     }
 
 
@@ -71,9 +89,9 @@ def fan_in_full(model: SiteModel, fan: Fan) -> dict[str, Any]:
     """One fan with its alarm and its twin."""
     alarm, twin = model.current_alarm(fan), model.twin(fan.tray)
     return {
-        **fan_json(model.fan_now(fan)),
+        **fan_json(model.fan_now(fan), model.groups()[fan]),
         "newest_t_ns": model.newest_t_ns(fan.tray),
-        "alarm": alarm_json(alarm) if alarm else None,
+        "alarm": alarm_json(alarm) | {"now": model.words_now([fan])[0]} if alarm else None,
         "twin": twin_json(twin, fan.number) if twin else None,
         "wear": [_wear_json(row) for row in model.wear(fan)],
     }
@@ -118,34 +136,34 @@ def curves_json(curves: Curves, tray: TrayConfig) -> dict[str, Any]:
     """Columns by name; speeds in the unit of the tray, null where nothing was measured or judged."""
     values = curves.values.astype(np.float64)
     values[:, :_SPEEDS] /= RAD_S_PER_UNIT[tray.speed_unit]
-    names = ("measured", "predicted", "half_width", "torque_balance_command", "score")
+    names = ("measured", "predicted", "half_width", "torque_balance_command", "score", "command")
     columns = {name: _or_null(values[:, number]) for number, name in enumerate(names)}
     return {"speed_unit": tray.speed_unit, "t_s": (curves.t_ns / 1e9).round(3).tolist(), **columns}
 
 
 def alarm_json(current: CurrentAlarm) -> dict[str, Any]:
-    """A current alarm with what the page says of it."""
-    first = current.causes[0] if current.causes else None
+    """A current alarm with what the page says of it. probability: of the first of the likely causes."""
+    causes = current.causes
     return {
         **current.as_json(),
         "listed": is_listed(current.newest),
         "states": current.states(),
-        "cause": CAUSES.get(first.cause, first.cause) if first else "",
-        "probability": first.probability if first and first.cause != CANNOT_TELL else None,
-        "evidence": first.evidence if first else "",
-        "advice": WHAT_TO_DO.get(first.cause, "") if first else "",
+        "cause": likely_causes(causes),
+        "cause_with_share": likely_with_share(causes),
+        "probability": causes[0].probability if causes and causes[0].cause != CANNOT_TELL else None,
+        "evidence": likely_evidence(causes),
+        "advice": advice(causes),
         "other_causes": [
-            {"cause": short_name(each.cause), "probability": each.probability}
-            for each in current.causes[1:]
-            if each.probability >= MIN_PROBABILITY
+            {"cause": short_name(each.cause), "probability": each.probability} for each in less_likely(causes)
         ],
     }
 
 
 def alarms_json(model: SiteModel, *, everything: bool) -> dict[str, Any]:
-    """All current alarms. everything: also those that are over."""
+    """All current alarms, each with what its fan does `now`. everything: also those that are over."""
     found = [each for each in model.current_alarms() if everything or is_listed(each.newest)]
-    return {"alarms": [alarm_json(each) for each in found]}
+    words = model.words_now([Fan(each.newest.header.tray, each.newest.fan) for each in found])
+    return {"alarms": [alarm_json(each) | {"now": now} for each, now in zip(found, words, strict=True)]}
 
 
 def clip_json(clip: Clip) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from pipeline.launch.site_watcher import StageView
 from pipeline.launch.watched_alarms import WatchedAlarms
 from pipeline.presenting.alarm_rates import AlarmRates
 from pipeline.presenting.alarm_store import AlarmStore
+from pipeline.presenting.fan_groups import SHOWN_CLASSES, FanGroup, classes_of, counts_of
 from pipeline.presenting.fan_history import COLUMNS, Curves, FanHistory, values_of
 from pipeline.presenting.judged_time import LEARNED, JudgedTime
 from pipeline.viewing.fleet import Fan, FanNow, Fleet
@@ -41,8 +42,8 @@ SILENT_AFTER_S = 5.0
 
 @dataclass(frozen=True, eq=False)
 class FleetNow:
-    """Of all fans, tray after tray in the order of the configuration: the class of each fan's cell, (fans,) uint8, and
-    its score, (fans,) float32, NaN where it is not judged."""
+    """Of all fans, tray after tray in the order of the configuration: the class of each fan's cell, (fans,) uint8, an
+    index into `SHOWN_CLASSES`, and its score, (fans,) float32, NaN where it is not judged."""
 
     classes: Array
     score: Array
@@ -83,14 +84,14 @@ class SiteModel:
         rates: AlarmRates | None = None,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 72 MB.
+        """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 86 MB.
         rates: takes for how long fans are judged, for `observed_rates`. now_s: a clock that is never set."""
         self._now_s = now_s
         self.site = site
         self.trays = tuple(trays)
         self._by_name = {tray.name: tray for tray in trays}
         self._lock = threading.Lock()
-        self._fleet = Fleet(trays)
+        self._fleet = Fleet(trays, has_all_alarms=True)
         self._history = FanHistory(trays) if keeps_curves else None
         self._heard_s: dict[str, float] = {}
         self._newest: dict[str, Score] = {}
@@ -140,7 +141,8 @@ class SiteModel:
         """A transition has arrived; returns whether it is new."""
         with self._lock:
             self._alarms.add(alarm, len(encode(alarm)))
-            self._fleet.add_alarm(alarm)
+            current = self._alarms.of(alarm.header.tray, alarm.fan)
+            self._fleet.add_alarm(current.newest if current else alarm)  # this one may be late
             is_new = self._store.add(alarm)
             if is_new and alarm.transition in (Transition.RAISED, Transition.SEVERITY):
                 self._count(alarm)
@@ -185,7 +187,7 @@ class SiteModel:
     def fans_now(self) -> FleetNow:
         """All fans at a glance."""
         with self._lock:
-            return FleetNow(self._fleet.classes(), self._fleet.scores())
+            return FleetNow(classes_of(self._fleet), self._fleet.scores())
 
     def every_fan(self) -> list[FanNow]:
         """All fans in words, the worst first."""
@@ -197,10 +199,28 @@ class SiteModel:
         with self._lock:
             return self._fleet.fan_now(fan)
 
-    def counts(self) -> dict[str, int]:
-        """How many fans are in alarm, suspect and not judged."""
+    def groups(self) -> dict[Fan, FanGroup]:
+        """The group of each fan."""
         with self._lock:
-            return self._fleet.counts()
+            classes = classes_of(self._fleet).tolist()
+            return {fan: SHOWN_CLASSES[each].group for fan, each in zip(self._fleet.fans, classes, strict=True)}
+
+    def words_now(self, fans: Sequence[Fan]) -> list[str]:
+        """Of each: that it is stopped, starting or back within its limits; empty: none of these."""
+        with self._lock:
+            classes = classes_of(self._fleet)
+            return [SHOWN_CLASSES[classes[self._fleet.index(fan)]].now for fan in fans]
+
+    def counts(self) -> dict[str, int]:
+        """How many fans are in alarm, suspect, not judged, and in an alarm that an operator has silenced."""
+        with self._lock:
+            found = counts_of(classes_of(self._fleet))
+        return {
+            "in_alarm": found[FanGroup.ALARM],
+            "suspect": found[FanGroup.SUSPECT],
+            "not_judged": found[FanGroup.NOT_JUDGED],
+            "silenced": found[FanGroup.SILENCED],
+        }
 
     def history(self, fan: Fan, since_t_ns: int) -> Curves:
         """The last hour of a fan."""

@@ -14,6 +14,7 @@ from schemas.enums import FanState, Transition
 from schemas.fields import LARGEST_ENUM_VALUE
 from schemas.messages import Alarm, Array, Score
 from scoring.alarms.alarm_flags import is_silenced
+from scoring.alarms.words_now import words_now
 
 FLEET_COLUMNS = ("state", "invalid_reason", "score")
 """the columns of a score that a fleet is made of"""
@@ -44,6 +45,7 @@ class FanNow:
         state: in words.
         score: 1 is at the limit; NaN if the newest sample is not scored.
         since_t_ns: time of the sample at which the state began; of an alarm, its onset.
+        is_in_alarm: an alarm is active; an operator may have silenced it.
     """
 
     fan: Fan
@@ -51,6 +53,7 @@ class FanNow:
     score: float
     since_t_ns: int
     is_in_alarm: bool
+    is_silenced: bool = False
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,10 @@ class UnscoredFans:
 class Fleet:
     """The newest state of every fan. All arrays are (fans,), tray after tray in the order of the configuration."""
 
-    def __init__(self, trays: Sequence[TrayConfig]) -> None:
+    def __init__(self, trays: Sequence[TrayConfig], *, has_all_alarms: bool = False) -> None:
+        """has_all_alarms: all messages about alarms arrive, also those of before the start: what is active by them is
+        active, whatever samples say."""
+        self._has_all_alarms = has_all_alarms
         self.fans = [Fan(tray.name, number) for tray in trays for number in range(tray.fans)]
         ends = np.cumsum([tray.fans for tray in trays])
         self._of_tray = {
@@ -115,10 +121,15 @@ class Fleet:
         return np.where(self._codes < 0, len(class_names()) - 1, classes).astype(np.uint8)
 
     def in_alarm(self) -> Array:
-        """Whether each fan is in alarm, (fans,). If its newest sample is not judged, its last alarm message says it."""
+        """Whether each fan is in alarm, (fans,). If its newest sample does not say it, its last alarm message does."""
         state = self._states()
+        says_it = (state > FanState.UNKNOWN) & (state < FanState.COMMISSIONING) & (not self._has_all_alarms)
         is_active = (state == FanState.ALARM) | (state == FanState.RETURNING)
-        return is_active | (~self._judged() & (self._onset_t_ns != _NEVER_NS))
+        return is_active | (~says_it & (self._onset_t_ns != _NEVER_NS))
+
+    def silenced(self) -> Array:
+        """Whether an operator has silenced the alarm of each fan, (fans,)."""
+        return self._silenced.copy()
 
     def worst(self, most: int) -> list[FanNow]:
         """The worst fans first: in alarm, suspect, in an alarm that is silenced, and then all others by their score.
@@ -184,11 +195,13 @@ class Fleet:
         onset_t_ns = int(self._onset_t_ns[index])
         if in_alarm and onset_t_ns != _NEVER_NS:
             since_t_ns = onset_t_ns
+        is_silenced = bool(self._silenced[index])
         if in_alarm and not name.startswith((FanState.ALARM.words, FanState.RETURNING.words)):
-            name = f"alarm, {name}"
-        if in_alarm and self._silenced[index]:
+            words = words_now(int(self._states()[index]))
+            name = f"alarm, now {words}" if words else f"alarm, {name}"
+        if in_alarm and is_silenced:
             name += " (silenced)"
-        return FanNow(self.fans[index], name, float(self._score[index]), since_t_ns, in_alarm)
+        return FanNow(self.fans[index], name, float(self._score[index]), since_t_ns, in_alarm, is_silenced)
 
     def _change(self, of_tray: slice, codes: Array, t_ns: int) -> None:
         changed = self._codes[of_tray] != codes
@@ -204,11 +217,6 @@ class Fleet:
 
     def _name(self, code: int) -> str:
         return SILENT if code < 0 else state_name(*divmod(code, LARGEST_ENUM_VALUE + 1))
-
-
-def state_words() -> list[str]:
-    """The words with which states of fans begin; after `unknown` comes the reason."""
-    return [*(state.words for state in FanState), SILENT]
 
 
 def class_names() -> list[str]:

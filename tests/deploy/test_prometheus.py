@@ -162,7 +162,7 @@ def test_every_query_of_the_board_and_every_rule_works_on_what_a_site_sends(gate
     eventually(lambda: have_gone_off("FantwinManyFansNotScored", "FantwinGatewayAbsent"), "the rules go off")
     feed_and_wait(7, 1.0, 1, 3, 4, lost=5, latency_s=5.0, status=StageStatus.DEGRADED)
     eventually(lambda: have_gone_off("FantwinFansNotScored", "FantwinGatewayAbsent"), "many fans are one alert")
-    gateway.core.close()
+    gateway.close()
     eventually(lambda: prometheus.alert_states()["FantwinGatewayAbsent"] != "inactive", "nothing is scraped any more")
 
 

@@ -27,7 +27,7 @@ from tests.stages.test_gateway import alarm, granted, score
 from tests.support.mosquitto import Listener, Mosquitto, needs_mosquitto, retained_by
 from tests.support.mqtt_broker import free_port
 from tests.support.running_chain import RunningCommand, eventually
-from tests.support.running_core import SITE, TRAY
+from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_mqtt import ROOT, RunningMqtt
 
 pytestmark = needs_mosquitto
@@ -93,6 +93,19 @@ def test_states_alarms_and_status_are_retained(tmp_path, broker, listener):
     finally:
         stage.close()
     assert retained_by(broker.port)[f"{ROOT}/status"] == "offline"
+
+
+def test_a_fan_that_its_command_stops_stays_in_alarm_in_its_state_and_in_the_summary(tmp_path, broker, listener):
+    stage = RunningMqtt(tmp_path, broker.port)
+    try:
+        stage.feed(score(state=FanState.ALARM), alarm(), score(1.0, state=FanState.STOPPED))
+        stopped = "alarm, now stopped by its command"
+        eventually(lambda: state_of(listener).get("state") == stopped, "the state is there")
+        assert state_of(listener)["in_alarm"] is True
+        summary = eventually(lambda: json.loads(listener.last(f"{ROOT}/summary") or "null"), "the summary is there")
+        assert summary == {"fans": FANS, "in_alarm": 1, "suspect": 0, "not_judged": 1, "silenced": 0}
+    finally:
+        stage.close()
 
 
 def test_what_has_not_changed_is_not_published_again(tmp_path, broker, listener):
@@ -352,6 +365,9 @@ def test_a_user_a_password_and_tls(tmp_path):
         password.chmod(0o644)
         assert "chmod 600" in check(context)[0]
         unknown = MqttConfig(host="127.0.0.1", port=broker.port, tls=True)
+        stage = RunningMqtt(tmp_path, broker.port, tls=True)
+        assert stage.problem().endswith("is away, or TLS fails: `fantwin doctor` says which")
+        stage.close()
         (problem,) = check(Context(SITE, (), unknown, tmp_path, tmp_path, 0))
         assert "no connection by TLS" in problem
         assert "check ca, and that host is a name in the certificate of the broker" in problem

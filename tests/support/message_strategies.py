@@ -23,6 +23,7 @@ HEADER = st.builds(Header, TEXT, UINT64, TEXT, st.none() | POSITION)
 _TIMES = (
     "t_ns",
     "onset_t_ns",
+    "marked_onset_t_ns",
     "shelved_until_t_ns",
     "since_t_ns",
     "newest_input_t_ns",

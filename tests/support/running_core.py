@@ -44,6 +44,7 @@ class RunningCore(Generic[CoreType]):
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._now_ns = 0
+        self._is_closed = False
         self._thread = threading.Thread(target=self._tick, daemon=True)
         self._thread.start()
 
@@ -68,8 +69,11 @@ class RunningCore(Generic[CoreType]):
         self._thread.join()
 
     def close(self) -> None:
-        self.kill()
-        self.core.close()
+        """Once, however often it is called."""
+        if not self._is_closed:
+            self._is_closed = True
+            self.kill()
+            self.core.close()
 
     def _tick(self) -> None:
         while not self._ended.wait(TICK_S):

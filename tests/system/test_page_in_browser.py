@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
 from schemas.enums import Action, FanState, Transition
-from schemas.messages import Alarm, Request
+from schemas.messages import Alarm, Diagnosis, Request
 from tests.stages.test_gateway import alarm, score
 from tests.support.page_browser import PASSWORD, inaccessible, make_users, opened, running_browser
 from tests.support.running_chain import eventually
-from tests.support.running_core import TRAY
+from tests.support.running_core import FANS, TRAY
 from tests.support.running_gateway import RunningGateway
 
 pytestmark = pytest.mark.slow
@@ -39,7 +41,8 @@ class Scorer:
         }[request.action]
         self._state |= change
         name, comment = request.operator_name, request.comment
-        return [alarm(transition, operator_name=name, comment=comment, message=f"{name} asks", **self._state)]
+        granted = alarm(transition, operator_name=name, comment=comment, message=f"{name} asks", **self._state)
+        return [replace(granted, fan=fan) for fan in (range(FANS) if request.fan < 0 else [FAULTY])]
 
 
 @pytest.fixture
@@ -83,7 +86,7 @@ def test_everything_is_done_by_keyboard(gateway, browser):
     for button, done in (("Acknowledge", "by ann, unconfirmed"), ("Confirm", "by ann"), ("Shelve", "shelved until")):
         tab_to(button)
         keyboard.press("Enter")
-        page.get_by_label("Why").focus()
+        page.get_by_label("Reason").focus()
         keyboard.type(f"{button} by key")
         keyboard.press("Enter")
         expect(page.get_by_role("dialog")).to_be_hidden()
@@ -181,6 +184,50 @@ def test_forged_sessions_other_sites_and_scripts_in_comments_get_nowhere(gateway
     expect(ann.locator("tbody")).to_contain_text(SCRIPT)
     assert ann.locator("tbody img").count() == 0
     assert ann.title() != "1"
+    assert errors == []
+
+
+def test_a_stopped_fan_stays_in_alarm_filters_are_kept_and_all_alarms_of_a_tray_are_acknowledged(gateway, browser):
+    errors: list[str] = []
+    url = f"http://127.0.0.1:{gateway.port}/"
+    tie = (Diagnosis(cause="blocked", probability=0.4), Diagnosis(cause="no_power", probability=0.4))
+    stopped = score(2.0, state=FanState.STOPPED)
+    stopped = replace(stopped, score=np.full_like(stopped.score, np.nan))
+    gateway.feed(alarm(sequence=1, causes=tie), replace(alarm(sequence=2), fan=1), stopped)
+    page = opened(browser, url, errors, "ann")
+    section = page.locator("section", has=page.get_by_role("heading", name="In alarm"))
+    cell = section.get_by_role("button", name=f"{TRAY} fan {FAULTY}")
+    expect(cell).to_contain_text("alarm, now stopped by its command")
+    is_cut = cell.locator(".words").evaluate("(words) => words.scrollWidth > words.clientWidth")
+    assert not is_cut
+    expect(page.locator("#summary")).to_contain_text("2 in alarm")
+    page.get_by_label("State").select_option("alarm")
+    page.reload()
+    expect(page.get_by_label("State")).to_have_value("alarm")
+    expect(page.get_by_role("heading", name="Normal")).to_be_hidden()
+    cell.click()
+    expect(page.locator("main")).to_contain_text("no twin, torque balance and score while it is stopped by its command")
+    page.keyboard.press("Escape")
+    expect(page.get_by_label("State")).to_have_value("alarm")
+
+    page.get_by_role("link", name="Alarms (2)").click()
+    heading = page.get_by_role("heading", name="Alarms (2): 2 active")
+    expect(heading).to_be_in_viewport()
+    header = page.locator("header").bounding_box()
+    shown = heading.bounding_box()
+    assert header is not None and shown is not None and shown["y"] >= header["height"], "the header hides it"
+    card = page.locator(f'article[data-fan="{TRAY}/{FAULTY}"]')
+    expect(card).to_contain_text("blocked or no power, 40 % each")
+    expect(card).to_contain_text("now stopped by its command")
+    gateway.feed(score(3.0, state=FanState.RETURNING))
+    expect(card).to_contain_text("now within its limits")
+    page.get_by_role("button", name=f"Acknowledge all 2 of {TRAY}").click()
+    page.get_by_role("dialog").get_by_role("button", name="Acknowledge all").click()
+    expect(page.get_by_role("dialog")).to_be_hidden()
+    (asked,) = gateway.sent
+    assert (asked.action, asked.fan, asked.operator_name) == (Action.ACKNOWLEDGE, -1, "ann")
+    page.goto(f"{url}#/fan/{TRAY}/77")
+    expect(page.locator("main")).to_contain_text(f"There is no fan 77 of {TRAY}")
     assert errors == []
 
 

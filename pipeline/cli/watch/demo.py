@@ -46,7 +46,7 @@ SHOWN_FAN = 5
 """in the picture of the page, while it is in alarm"""
 OUTPUTS = (
     *("recording*.mcap*", "view*.rrd", "bands.png", PICTURE, "summary.json", "truth.json", "up.log", "tray"),
-    *("*.snapshot", f"*{FORMER_SUFFIX}", "alarms.sqlite*"),
+    *("*.snapshot", f"*{FORMER_SUFFIX}", "alarms.sqlite*", "clips/*"),
 )
 _START_TIMEOUT_S = 60.0
 _STOP_TIMEOUT_S = 60.0

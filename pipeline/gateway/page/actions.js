@@ -46,6 +46,26 @@ export function buttons(tray, fan, alarm) {
     "data-action": action }, ACTIONS[action].title)));
 }
 
+// To acknowledge all alarms of a tray at once, where there are several.
+export function buttonsForAll(alarms) {
+  const open = new Map();
+  for (const alarm of alarms.filter((each) => me.may_act && each.presented && !each.acknowledged)) {
+    open.set(alarm.tray, (open.get(alarm.tray) ?? 0) + 1);
+  }
+  const several = [...open].filter(([, count]) => count > 1);
+  return several.length === 0 ? "" : element("div", { class: "actions" }, ...several.map(([tray, count]) => element("button", {
+    type: "button", onclick: () => acknowledgeAll(tray, count), "data-action": `acknowledge ${tray}` }, `Acknowledge all ${count} of ${tray}`)));
+}
+
+function acknowledgeAll(tray, count) {
+  const comment = element("input", { id: "comment", maxlength: 500, autocomplete: "off" });
+  dialog(`Acknowledge all alarms of ${tray}`, element("div", {}, element("p", {}, `I have seen all ${count}. One that comes meanwhile is acknowledged, too.`),
+    element("label", { for: "comment" }, "Reason (for the record)"), comment), "Acknowledge all", async () => {
+    const { answers } = await send(`/fans/${encodeURIComponent(tray)}/all/requests`, { action: "acknowledge", comment: comment.value });
+    notice(`${answers.filter((answer) => answer.transition !== "refused").length} alarms of ${tray} are acknowledged.`);
+  });
+}
+
 function hint() {
   if (me.name) return `${me.name} may view but not act.`;
   return me.has_login ? "Log in to act." : "To act from this page, add a user: fantwin users add NAME";

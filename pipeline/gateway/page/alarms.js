@@ -1,10 +1,11 @@
 // The list of alarms, and the history of their transitions.
 
-import { ACTIONS, askFor, buttons, feedbackOn } from "./actions.js";
-import { age, clock, element, facts, keepFocus, percent } from "./dom.js";
+import { ACTIONS, askFor, buttons, buttonsForAll, feedbackOn } from "./actions.js";
+import { age, clock, element, facts, keepFocus, percent, stamp } from "./dom.js";
 import { clipLink } from "./clips.js";
 import { ask, learn, me } from "./server.js";
 
+const OF_FAN = ["raised", "severity", "diagnosed"];  // these have the colour of the severity: nothing else is bad
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
 const PAGE = 100;
 const SHOWN = 100;
@@ -12,10 +13,10 @@ const RATE_EVERY_MS = 10000;
 
 const name = (alarm) => `${alarm.tray}/${alarm.fan}`;
 const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.tray)}/${alarm.fan}` }, `${alarm.tray} fan ${alarm.fan}`);
-const share = (cause) => `${cause.cause}${cause.probability === null ? "" : `, ${percent(cause.probability)}`}`;
+const share = (cause) => `${cause.cause}, ${percent(cause.probability)}`;
 
 export function badge(severity, text) {
-  return element("span", { class: `badge ${severity}` }, `${MARKS[severity] ?? ""} ${text}`);
+  return element("span", { class: `badge ${severity}` }, `${MARKS[severity] ?? ""} ${text}`.trim());
 }
 
 // Rerun's viewer follows the newest sample; its address takes no time, so the text says where to look.
@@ -27,18 +28,27 @@ export function rerunLink(url, t_ns) {
 export function card(alarm, viewerUrl) {
   const kind = alarm.presented ? alarm.severity : "silenced";
   const by = alarm.acknowledged_by ? ` by ${alarm.acknowledged_by}` : "";
-  const states = alarm.states.map((state) => (state === "acknowledged" ? state + by : state)).join(", ");
+  const states = alarm.states.map((state) => (state === "acknowledged" ? state + by : state))
+    .concat(alarm.now ? `now ${alarm.now}` : []).join(", ");
   return element("article", { class: `card ${kind}`, "data-fan": name(alarm), "aria-label": `Alarm of ${alarm.tray} fan ${alarm.fan}` },
     element("p", {}, badge(alarm.active ? alarm.severity : "none", alarm.active ? alarm.severity : "over"), " ",
       element("strong", {}, link(alarm)), ` since ${clock(alarm.onset_t_ns)} (`, age(alarm.onset_t_ns), ")"),
     facts({
-      "Cause": [alarm, ...alarm.other_causes].filter((each) => each.cause).map(share).join("; or "),
+      "Cause": [alarm.cause_with_share, ...alarm.other_causes.map(share)].filter(Boolean).join("; or "),
       "Evidence": alarm.evidence,
       "What to do": alarm.advice,
       "Deviation": alarm.evidence && alarm.message.includes(alarm.evidence) ? "" : alarm.message.replace(`fan ${alarm.fan}: `, ""),
       "State": states,
     }),
     rerunLink(viewerUrl, alarm.onset_t_ns), " ", clipLink(alarm), buttons(alarm.tray, alarm.fan, alarm));
+}
+
+// As many need attention as the header says.
+function title(listed) {
+  const open = listed.filter((alarm) => alarm.presented);
+  const active = open.filter((alarm) => alarm.active).length, over = open.length - active, silenced = listed.length - open.length;
+  const parts = [[active, "active"], [over, "over but not dealt with"], [silenced, "silenced"]].filter(([count]) => count);
+  return `Alarms (${open.length})${parts.length ? `: ${parts.map(([count, words]) => `${count} ${words}`).join(", ")}` : ""}`;
 }
 
 export class AlarmsView {
@@ -69,7 +79,7 @@ export class AlarmsView {
     const listed = [...this.alarms.values()].filter((alarm) => alarm.listed);
     listed.sort((one, other) => rank(one) - rank(other) || other.onset_t_ns - one.onset_t_ns);
     const more = listed.length - this.most;
-    keepFocus(this.root, () => this.root.replaceChildren(element("h2", {}, `Alarms (${listed.length})`),
+    keepFocus(this.root, () => this.root.replaceChildren(element("h2", {}, title(listed)), buttonsForAll(listed),
       ...(listed.length ? listed.slice(0, this.most).map((alarm) => card(alarm, this.viewerUrl(alarm.tray)))
         : [element("p", { class: "muted" }, "No alarms.")]),
       more > 0 ? element("button", { type: "button", onclick: () => { this.most += SHOWN; this.draw(); } }, `${more} more`) : "", this.rate));
@@ -130,8 +140,8 @@ export class HistoryView {
   row(each) {
     const cell = (label, ...content) => element("td", { "data-label": label }, ...content);
     const what = each.transition.replaceAll("_", " ");
-    return element("tr", {}, cell("Time", clock(each.t_ns)), this.fan ? "" : cell("Fan", link(each)),
-      cell("What happened", badge(each.active ? each.severity : "none", what)), cell("By", each.operator_name),
+    return element("tr", {}, cell("Time", stamp(each.t_ns)), this.fan ? "" : cell("Fan", link(each)),
+      cell("What happened", badge(OF_FAN.includes(each.transition) ? each.severity : "plain", what)), cell("By", each.operator_name),
       cell("Message", each.message, each.comment ? ` “${each.comment}”` : "",
         ...(each.transition === "raised" ? [" ", clipLink(each), this.feedback(each)] : [])));
   }

@@ -2,7 +2,7 @@
 
 import { HistoryView, card, rerunLink } from "./alarms.js";
 import { buttons } from "./actions.js";
-import { bytes, HIGHEST_LEVEL, NO_LEVEL } from "./fans.js";
+import { address, bytes, levelText, NO_LEVEL } from "./fans.js";
 import { Plot } from "./plot.js";
 import { clock, element, facts, keepFocus } from "./dom.js";
 import { ask, learn } from "./server.js";
@@ -10,7 +10,7 @@ import { wearTable } from "./wear.js";
 
 const KEPT_S = 3600;
 const HOLE_S = 12;  // without samples for longer, there is a hole in the plots
-const COLUMNS = ["t_s", "measured", "predicted", "half_width", "torque_balance_command", "score"];
+const COLUMNS = ["t_s", "measured", "predicted", "half_width", "torque_balance_command", "score", "command"];
 const WINDOWS = [["1 min", 60], ["10 min", 600], ["1 hour", KEPT_S]];
 const POINTS = 1200;
 const MEANINGS = {
@@ -34,7 +34,7 @@ export class FanView {
     this.windows = element("div", { class: "actions", role: "group", "aria-label": "Time shown" }, ...WINDOWS.map(([text, s]) =>
       element("button", { type: "button", "aria-pressed": String(s === this.window_s), onclick: (event) => this.show(s, event.target) }, text)));
     this.root = element("div", {}, element("div", { class: "title" }, element("h2", {}, `${tray} fan ${fan}`),
-      element("a", { href: "#/fans" }, "← all fans (Esc)")), element("p", {}, this.state, this.score, " ", rerunLink(viewerUrl, 0)),
+      element("a", { href: address }, "← all fans (Esc)")), element("p", {}, this.state, this.score, " ", rerunLink(viewerUrl, 0)),
       this.alarm, this.windows, this.charts, element("h2", {}, "Wear"), this.wear, element("h2", {}, "Twin"), this.twin,
       this.history.root);
     this.updateAlarm(alarm);
@@ -68,7 +68,8 @@ export class FanView {
   // What does not come by itself: since when, the twin and the wear.
   async learn() {
     const now = await ask(this.path);
-    this.state.textContent = `${now.state} since ${clock(now.since_t_ns)}; `;
+    const since = now.alarm?.active ? "" : ` since ${clock(now.since_t_ns)}`;  // the alarm says its own time
+    this.state.textContent = `${now.state}${since}; `;
     const twin = now.twin;
     this.twin.replaceChildren(twin ? facts({ "name": twin.name, "kind": twin.kind, "in force since": clock(twin.since_t_ns) || "the start",
       ...Object.fromEntries(Object.entries(twin.parameters).map(([name, value]) =>
@@ -81,14 +82,16 @@ export class FanView {
   update(fleet) {
     const level = bytes(fleet.levels)[this.index], was = this.class;
     this.class = bytes(fleet.classes)[this.index];
-    this.score.textContent = level === NO_LEVEL ? "not judged." : `score ${level >= HIGHEST_LEVEL ? "≥ " : ""}${level} % of the limit.`;
+    const now = this.site.now[this.class];
+    this.score.textContent = level === NO_LEVEL ? (now ? `no twin, torque balance and score while it is ${now}.` : "not judged.") : `score ${levelText(level)} of the limit.`;
     if (was !== this.class && was >= 0 && this.site.classes[was] !== this.site.classes[this.class]) learn(() => this.learn());
   }
 
-  updateAlarm(alarm) {
+  // isNew: a transition has come.
+  updateAlarm(alarm, isNew = true) {
     keepFocus(this.alarm, () => this.alarm.replaceChildren(
       alarm?.listed ? card(alarm, this.viewerUrl) : buttons(this.tray, this.fan, null)));
-    if (this.known && alarm) this.history.update();
+    if (this.known && isNew && alarm) this.history.update();
     this.known = true;
   }
 
@@ -113,6 +116,7 @@ export class FanView {
     this.plots = [];
     this.speedPlot = add("Speed", this.speedUnit, [{ label: "measured", color: "measured" },
       { label: "twin", color: "twin", dash: [6, 4] }, { label: "band of a healthy fan, twin ± 2σ", color: "band", isBand: true }]);
+    this.commandPlot = add("Command", "command", [{ label: "command", color: "measured" }]);
     this.balancePlot = add("Torque balance: command beyond that of a healthy fan", "command", [{ label: "torque balance", color: "measured" }]);
     this.scorePlot = add("Score: an alarm is raised at 1", "of the limit", [{ label: "score", color: "measured" },
       { label: "limit", color: "limit", dash: [2, 4] }], [0, 1.2]);
@@ -126,6 +130,7 @@ export class FanView {
       const shown = this.shown();
       const side = (sign) => shown.predicted.map((value, i) => (value === null || shown.half_width[i] === null ? null : value + sign * shown.half_width[i]));
       this.speedPlot.set(shown.t_s, [shown.measured, shown.predicted, side(-1), side(1)]);
+      this.commandPlot.set(shown.t_s, [shown.command]);
       this.balancePlot.set(shown.t_s, [shown.torque_balance_command]);
       this.scorePlot.set(shown.t_s, [shown.score, shown.t_s.map(() => 1)]);
     });

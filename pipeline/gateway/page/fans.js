@@ -6,8 +6,9 @@ import { element } from "./dom.js";
 const GROUPS = [
   { name: "alarm", title: "In alarm", mark: "✖" },
   { name: "suspect", title: "Suspect", mark: "▲" },
-  { name: "unjudged", title: "Not judged", mark: "?" },
-  { name: "rest", title: "Stopped or starting", mark: "■" },
+  { name: "not_judged", title: "Not judged", mark: "?" },
+  { name: "silenced", title: "In a silenced alarm", mark: "◌" },
+  { name: "at_rest", title: "Stopped or starting", mark: "■" },
   { name: "normal", title: "Normal", mark: "●" },
 ];
 const LARGE_UP_TO = 64;
@@ -15,32 +16,35 @@ const LARGE_GROUPS = 2;
 const SLICE = 1250;
 export const HIGHEST_LEVEL = 250;
 export const NO_LEVEL = 255;
-const REST = ["stopped", "starting"];
+const NORMAL = GROUPS.length - 1;
 
-function groupOf(words) {
-  if (words === "alarm" || words === "returning") return 0;
-  if (words === "suspect") return 1;
-  if (REST.includes(words)) return 3;
-  if (words.startsWith("normal")) return 4;
-  return 2;
-}
+// Of the view as it was chosen last: its address has the filters.
+export let address = "#/fans";
+
+// A level, which ends at HIGHEST_LEVEL.
+export const levelText = (level) => `${level >= HIGHEST_LEVEL ? "≥ " : ""}${level} %`;
 
 export const bytes = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
 
 export class FansView {
-  constructor(site) {
+  // filters: of the address.
+  constructor(site, filters) {
     this.site = site;
     this.fans = site.trays.flatMap((tray) => Array.from({ length: tray.fans }, (_, fan) => ({ tray: tray.name, fan })));
-    this.groupOfClass = site.classes.map(groupOf);
+    this.groupOfClass = site.groups.map((name) => GROUPS.findIndex((group) => group.name === name));
     Object.assign(this, { cells: [], classes: null, levels: null, next: 0, waiting: 0, frame: 0 });
     this.step = this.fans.length <= LARGE_UP_TO ? 5 : 10;  // of the score shown, in per cent of its limit
     this.root = this.build();
+    for (const [name, choice] of [["tray", this.tray], ["state", this.state]]) {
+      if ([...choice.options].some((option) => option.value === filters.get(name))) choice.value = filters.get(name);
+    }
+    this.filter();
   }
 
   build() {
-    this.tray = element("select", { id: "tray", onchange: () => this.filter() }, element("option", { value: "" }, "all trays"),
+    this.tray = element("select", { id: "tray", onchange: () => this.choose() }, element("option", { value: "" }, "all trays"),
       ...this.site.trays.map((tray) => element("option", { value: tray.name }, tray.name)));
-    this.state = element("select", { id: "state", onchange: () => this.filter() }, element("option", { value: "" }, "all states"),
+    this.state = element("select", { id: "state", onchange: () => this.choose() }, element("option", { value: "" }, "all states"),
       ...GROUPS.map((group) => element("option", { value: group.name }, group.title.toLowerCase())));
     this.sections = GROUPS.map((group, number) => {
       const count = element("span");
@@ -126,12 +130,12 @@ export class FansView {
 
   label(cell, index, percent) {
     const group = GROUPS[cell.group], fan = this.fans[index];
-    const words = cell.group === 4 ? "normal" : this.site.classes[cell.class];
+    const words = cell.group === NORMAL ? "normal" : this.site.classes[cell.class];
     if (percent !== cell.percent) {
       cell.percent = percent;
       cell.root.style.backgroundSize = `${Math.min(100, percent)}% .25rem`;
     }
-    const share = percent ? `, ${percent >= HIGHEST_LEVEL ? "≥ " : ""}${percent} %` : "";
+    const share = percent ? `, ${levelText(percent)}` : "";
     const text = `${fan.tray} fan ${fan.fan} ${words}${share}${share && " of the limit"}`;
     if (cell.text !== text) {
       cell.text = text;
@@ -207,12 +211,19 @@ export class FansView {
     cell.focus();
   }
 
+  choose() {
+    this.filter();
+    history.replaceState(null, "", address);
+  }
+
   filter() {
     this.cells.forEach((cell, index) => {
       const isHidden = this.tray.value !== "" && this.fans[index].tray !== this.tray.value;
       if (cell.root.hidden !== isHidden) cell.root.hidden = isHidden;
     });
     this.count();
+    const chosen = [["tray", this.tray.value], ["state", this.state.value]].filter(([, value]) => value);
+    address = `#/fans${chosen.length ? `?${new URLSearchParams(chosen)}` : ""}`;
   }
 
   chosen(event) {

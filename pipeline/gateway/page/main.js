@@ -5,7 +5,7 @@ import { logOut, showLogin } from "./actions.js";
 import { learnClips } from "./clips.js";
 import { element, notice } from "./dom.js";
 import { FanView } from "./fan.js";
-import { FansView } from "./fans.js";
+import { address, bytes, FansView } from "./fans.js";
 import { StagesView } from "./stages.js";
 import { ask, Events, learnWhoIAm, me, Refused } from "./server.js";
 
@@ -17,10 +17,15 @@ let site = null, view = null, fleet = null, stages = [], shownHash = null, alarm
 const events = new Events({
   connected: (isThere) => showConnection(isThere),
   refused: () => start(),
-  fleet: (data) => { fleet = data; showSummary(); if (view instanceof FansView || view instanceof FanView) view.update(fleet); },
+  fleet: (data) => {
+    fleet = data;
+    showSummary();
+    if (view instanceof FansView || view instanceof FanView) view.update(fleet);
+    showWhatFansDo();
+  },
   alarm: (alarm) => {
     const name = `${alarm.tray}/${alarm.fan}`;
-    if (view instanceof FansView && alarm.active && !alarms.get(name)?.active) view.raise(indexOf(alarm.tray, alarm.fan));
+    if (view instanceof FansView && alarm.active && alarm.presented && !alarms.get(name)?.active) view.raise(indexOf(alarm.tray, alarm.fan));
     alarms.set(name, alarm);
     showAlarms(alarm);
     showCount();
@@ -76,6 +81,18 @@ function showAlarms(changed) {
   }
 }
 
+// What fans with an alarm do now changes without a transition.
+function showWhatFansDo() {
+  const classes = bytes(fleet.classes);
+  for (const alarm of alarms.values()) {
+    const now = site.now[classes[indexOf(alarm.tray, alarm.fan)]];
+    if (now === alarm.now) continue;
+    alarm.now = now;
+    if (view instanceof AlarmsView) view.update();
+    if (view instanceof FanView && alarm.tray === view.tray && alarm.fan === view.fan) view.updateAlarm(alarm, false);
+  }
+}
+
 // When many alarms come at once, they are counted together.
 function showCount() {
   alarmsDue ||= requestAnimationFrame(() => {
@@ -97,9 +114,10 @@ function showUser() {
 function showView() {
   if (!site || location.hash === shownHash) return;
   shownHash = location.hash;
-  const [kind, tray, fan] = location.hash.replace(/^#\//, "").split("/").map(decodeURIComponent);
+  const [path, filters] = location.hash.replace(/^#\//, "").split("?");
+  const [kind, tray, fan] = path.split("/").map(decodeURIComponent);
   view?.close?.();
-  const isFan = kind === "fan" && site.trays.some((each) => each.name === tray && Number(fan) < each.fans);
+  const isFan = kind === "fan" && site.trays.some((each) => each.name === tray && /^\d+$/.test(fan) && Number(fan) < each.fans);
   const wanted = isFan ? `${tray}/${fan}` : "";
   if (events.fan !== wanted || !events.source) events.open(wanted);
   if (isFan) lastFan = wanted;
@@ -107,7 +125,8 @@ function showView() {
   else if (kind === "alarms") view = new AlarmsView(alarms, viewerUrl);
   else if (kind === "history") view = new HistoryView();
   else if (kind === "stages") view = new StagesView();
-  else view = new FansView(site);
+  else if (kind === "fan") view = { root: element("p", {}, `There is no fan ${fan ?? ""} of ${tray ?? ""}. `, element("a", { href: address }, "All fans")) };
+  else view = new FansView(site, new URLSearchParams(filters));
   content.replaceChildren(view.root);
   if ((view instanceof FansView || view instanceof FanView) && fleet) view.update(fleet);
   if (view instanceof StagesView) view.update(stages);
@@ -152,10 +171,13 @@ async function start() {
 
 window.addEventListener("hashchange", () => {
   showView();
-  if (!(view instanceof FansView && view.focus(lastFan))) content.focus();
+  if (!(view instanceof FansView && view.focus(lastFan))) {
+    content.focus({ preventScroll: true });  // it would scroll the first line behind the header
+    scrollTo(0, 0);
+  }
 });
 window.addEventListener("keydown", (event) => {
   const isElsewhere = document.getElementById("dialog").open || event.target.matches("input, select");
-  if (event.key === "Escape" && !isElsewhere && view instanceof FanView) location.hash = "#/fans";
+  if (event.key === "Escape" && !isElsewhere && view instanceof FanView) location.hash = address;
 });
 start();

@@ -43,7 +43,7 @@ export class Plot {
     const at = cursor.idx ?? data[0].length - 1;
     this.lines.forEach((line, i) => {
       const text = line.isBand ? (data[i + 1][at] ?? null) === null ? "none" : `${number(data[i + 1][at])} to ${number(data[i + 2][at])}` : number(data[i + 1][at]);
-      this.values[i].textContent = ` ${text}${text === "none" ? "" : ` ${this.unit}`}`;
+      this.values[i].textContent = ` ${text}${text === "none" || line.label === this.unit ? "" : ` ${this.unit}`}`;
     });
   }
 

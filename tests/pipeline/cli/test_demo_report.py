@@ -180,4 +180,4 @@ def test_paths_that_are_to_be_copied_are_not_broken_into_lines(tmp_path):
     _print_report(Run(tmp_path).summary(), tmp_path, 60.0, Console(file=narrow, width=40))
     results, picture = narrow.getvalue().splitlines()[-2:]
     assert results.startswith("results: ") and results.endswith("recording.mcap")
-    assert picture.startswith("picture: ") and picture.endswith("view.rrd")
+    assert picture.startswith("pictures: ") and picture.endswith("view.rrd")

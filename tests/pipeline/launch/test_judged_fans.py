@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.config.models import TrayConfig
-from pipeline.launch.judged_fans import JUDGED_WITHIN_S, RETURNING, JudgedChanges, JudgedFans, Unjudged, as_judged
+from pipeline.launch.judged_fans import JUDGED_WITHIN_S, JudgedChanges, JudgedFans, Unjudged, as_judged
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import encode
@@ -19,6 +19,7 @@ from schemas.health import Output
 from schemas.messages import Alarm
 from schemas.topics import tray_key
 from scoring.alarms.current_alarms import CurrentAlarm
+from scoring.alarms.words_now import RETURNING
 from tests.pipeline.launch.test_site_watcher import SCORER, STRANGER, StubBus, health
 from tests.support.score_data import one_sample
 

@@ -13,10 +13,10 @@ from pipeline.notification.config import NotifierConfig
 from pipeline.notification.fan_alarm import NamedCause
 from pipeline.notification.gathering import ranges
 from pipeline.notification.services import Service
-from pipeline.notification.wording import WHAT_TO_DO, Level, Place, Text, cause_line, to_do
+from pipeline.notification.wording import Level, Place, Text, cause_line
 from schemas.units import NS_PER_S
 from scoring.diagnosis.advice import KNOWN_SOON
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES
+from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, WHAT_TO_DO, advice
 from tests.support.message_receivers import HttpReceiver, MailServer, free_port
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "notify.md"
@@ -31,7 +31,7 @@ def test_where_the_cause_is_unclear_its_evidence_says_what_to_do():
     assert cause_line(unclear) == "Cause: cannot tell yet: move the command to 0.6 for ten seconds, and back"
     soon = (NamedCause(CANNOT_TELL, 1.0, f"cannot tell yet: {KNOWN_SOON}"),)
     assert cause_line(soon) == "Cause: cannot tell yet: the page, or `fantwin alarms`, may know it by now"
-    assert to_do(unclear) == ""
+    assert advice(unclear) == ""
     assert cause_line(()) == "Cause: unknown"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +65,14 @@ def test_all_time_axes_are_linked_and_show_the_window_before_the_cursor(tmp_path
 def score_line(viewer: Any, seconds: float) -> float:
     """The share of a score's plot that its line covers, with the cursor there."""
     viewer.set_time("time", timestamp=np.datetime64(START_NS + round(seconds * 1e9), "ns"), play_state="paused")
-    view = next(view for view in viewer.get_state().views if view.name == "tray1 / fan 0 score")
-    return colors(rerun_picture._stable_screenshot(viewer, view.view_id))["measured"]
+
+    def drawn() -> list[float]:
+        view = next(view for view in viewer.get_state().views if view.name == "tray1 / fan 0 score")
+        with suppress(ConnectionError):  # the viewer has made its views again meanwhile
+            return [colors(rerun_picture._stable_screenshot(viewer, view.view_id))["measured"]]
+        return []
+
+    return eventually(drawn, "the plot is drawn")[0]
 
 
 def shown(viewer: Any) -> dict[str, list[str]]:

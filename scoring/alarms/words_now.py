@@ -1,0 +1,20 @@
+"""What a fan with an alarm does now, in words: its alarm may go on although its newest samples have no deviation."""
+
+from __future__ import annotations
+
+from schemas.enums import FanState, InvalidReason
+
+RETURNING = "within its limits (the alarm clears once it stays there, for most faults near the speeds of the alarm)"
+STOPPED, STARTING = "stopped by its command", "starting"
+
+
+def words_now(state: int, invalid_reason: int = InvalidReason.NONE) -> str:
+    """After "now": that the fan is stopped, starting or back within its limits; empty: none of these.
+
+    state and invalid_reason: `FanState` and `InvalidReason` of the newest sample.
+    """
+    if state == FanState.STOPPED or invalid_reason == InvalidReason.STOPPED:
+        return STOPPED
+    if state == FanState.STARTING or invalid_reason == InvalidReason.STARTING:
+        return STARTING
+    return RETURNING if state == FanState.RETURNING else ""
