@@ -59,10 +59,10 @@ export function buttonsForAll(alarms) {
 
 function acknowledgeAll(tray, count) {
   const comment = element("input", { id: "comment", maxlength: 500, autocomplete: "off" });
-  dialog(`Acknowledge all alarms of ${tray}`, element("div", {}, element("p", {}, `I have seen all ${count}. One that comes meanwhile is acknowledged, too.`),
+  dialog(`Acknowledge all alarms of ${tray}`, element("div", {}, element("p", {}, `I have seen all ${count}. Any alarm raised in the meantime is acknowledged, too.`),
     element("label", { for: "comment" }, "Reason (for the record)"), comment), "Acknowledge all", async () => {
     const { answers } = await send(`/fans/${encodeURIComponent(tray)}/all/requests`, { action: "acknowledge", comment: comment.value });
-    notice(`${answers.filter((answer) => answer.transition !== "refused").length} alarms of ${tray} are acknowledged.`);
+    notice(`${answers.filter((answer) => answer.transition !== "refused").length} alarms of ${tray} acknowledged.`);
   });
 }
 
