@@ -206,7 +206,9 @@ def test_a_stopped_fan_stays_in_alarm_filters_are_kept_and_all_alarms_of_a_tray_
     expect(page.get_by_label("State")).to_have_value("alarm")
     expect(page.get_by_role("heading", name="Normal")).to_be_hidden()
     cell.click()
-    expect(page.locator("main")).to_contain_text("no twin, torque balance or score while the fan is stopped by its command")
+    expect(page.locator("main")).to_contain_text(
+        "no twin, torque balance or score while the fan is stopped by its command"
+    )
     page.keyboard.press("Escape")
     expect(page.get_by_label("State")).to_have_value("alarm")
 
