@@ -45,14 +45,14 @@ class ViewerConfig(StageConfig):
         default=9876,
         ge=1,
         le=65535,
-        description="port of the data, for native and browser viewer; of shard K the K-th from here on",
+        description="port for the data, for the native and the browser viewer; shard K uses the K-th port from here on",
     )
     web_port: int = Field(
-        default=9090, ge=0, le=65535, description="port of the browser viewer's page, counted alike; 0: no page"
+        default=9090, ge=0, le=65535, description="port of the browser viewer's page, for shards as above; 0: no page"
     )
     layout: Literal["all", "alarms", "wear"] = Field(
         default="all",
-        description="all: every fan; alarms: only the fans that are in alarm or were; wear: change over days",
+        description="all: every fan; alarms: only the fans that are or have been in alarm; wear: change over days",
     )
     window_s: float = Field(default=30.0, gt=0, description="length of the rolling window, s")
     memory_limit: str = Field(
@@ -68,7 +68,7 @@ class ViewerConfig(StageConfig):
         default=8, ge=0, le=64, description="how many fans in alarm have a plot at a time, in the view of a fleet"
     )
     alarm_plot_hold_s: float = Field(
-        default=60.0, ge=0, description="how long such a plot stays after the alarm is over, s"
+        default=60.0, ge=0, description="how long such a plot stays after the alarm has cleared, s"
     )
 
 

@@ -29,10 +29,11 @@ class MqttConfig(StageConfig, BrokerSettings, frozen=True):  # pyright: ignore[r
         default=10_000,
         ge=1,
         le=100_000,
-        description="transitions of alarms that wait on disk while the broker is away; of more, the oldest are lost",
+        description="most transitions of alarms that wait on disk while the broker is away; beyond that, the oldest "
+        "are lost",
     )
     accept: tuple[OperatorAction, ...] = Field(
-        default=(), description="what may be asked by MQTT; by default nothing, and no request is read"
+        default=(), description="actions that may be requested by MQTT; by default none, and no request is read"
     )
     operator_name: Annotated[str, Field(pattern=r"^[^\x00-\x1f]*$", max_length=64)] = Field(
         default="",
@@ -40,7 +41,7 @@ class MqttConfig(StageConfig, BrokerSettings, frozen=True):  # pyright: ignore[r
         "sent a message",
     )
     home_assistant: Literal["off", "publish", "remove"] = Field(
-        default="off", description="publish: fans become devices of Home Assistant; remove: these devices are removed"
+        default="off", description="publish: fans become devices in Home Assistant; remove: these devices are removed"
     )
     home_assistant_prefix: TopicPrefix = Field(
         default="homeassistant", description="discovery prefix of Home Assistant"
@@ -49,7 +50,7 @@ class MqttConfig(StageConfig, BrokerSettings, frozen=True):  # pyright: ignore[r
         default=(), description="trays whose fans become devices; empty: all"
     )
     home_assistant_fans: int = Field(
-        default=64, ge=0, le=10_000, description="most fans that become devices, with 5 entities each"
+        default=64, ge=0, le=10_000, description="how many fans at most become devices, with 5 entities each"
     )
 
     @model_validator(mode="after")

@@ -23,12 +23,10 @@ class BrokerSettings(BaseModel, frozen=True):
     password_env: str = Field(
         default="", description="instead of password_file: environment variable that holds the password"
     )
-    tls: bool = Field(
-        default=False, description="whether the connection is encrypted and the certificate of the broker checked"
-    )
+    tls: bool = Field(default=False, description="whether to encrypt the connection and check the broker's certificate")
     ca: Path | None = Field(
         default=None,
-        description="certificate of the authority that signed the broker's; without it those of the system",
+        description="certificate of the authority that signed the broker's; without it, those of the system are used",
     )
     certificate: Path | None = Field(default=None, description="certificate of this client, if the broker asks for one")
     key: Path | None = Field(default=None, description="private key of that certificate")

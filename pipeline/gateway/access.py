@@ -116,7 +116,7 @@ class Access:
             if visitor.session is not None:
                 require_token(request, visitor.session)
             if not visitor.may_act:
-                raise HTTPException(403, f"{name} may look, and not act")
+                raise HTTPException(403, f"{name} may view but not act")
         except HTTPException as error:
             self.log.add("request refused", user=name, path=request.url.path, why=error.detail, **address_of(request))
             raise
@@ -161,7 +161,7 @@ class Access:
         """
         where = address_of(request)
         if self._logins >= MOST_LOGINS:
-            raise HTTPException(503, "too many log in at once: try again")
+            raise HTTPException(503, "too many logins at once: try again")
         user = users.of(name)
         if users.problem:
             raise HTTPException(503, "nobody can log in: the file of users cannot be read; health says why")
@@ -176,7 +176,7 @@ class Access:
             self._logins -= 1
         if user is None or not is_right:
             self.log.add("login refused: wrong name or password", user=name, **where)
-            raise HTTPException(401, "no such user, or another password")
+            raise HTTPException(401, "wrong name or password")
         self._failures.succeed(name, where["address"])
         return user
 
@@ -214,7 +214,7 @@ def _name_and_password(encoded: str) -> tuple[str, str]:
     try:
         name, _, password = b64decode(encoded, validate=True).decode().partition(":")
     except ValueError as error:
-        raise HTTPException(401, "this is no name and password") from error
+        raise HTTPException(401, "no valid name and password") from error
     return name, password
 
 

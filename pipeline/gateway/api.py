@@ -327,7 +327,7 @@ async def _form(request: Request, kind: type[Form]) -> Form:
                 if len(body) > LARGEST_BODY_BYTES:
                     raise HTTPException(413, f"at most {LARGEST_BODY_BYTES} bytes are accepted")
     except TimeoutError as error:
-        raise HTTPException(408, "the request takes too long") from error
+        raise HTTPException(408, "the request took too long") from error
     try:
         return kind.model_validate_json(bytes(body))
     except ValidationError as error:
@@ -340,7 +340,7 @@ def _group(request: Request) -> FanGroup | None:
     """The group that is asked for; None: all."""
     name = request.query_params.get("state", "")
     if name and name not in list(FanGroup):
-        raise HTTPException(422, f"state: one of {', '.join(FanGroup)}, please")
+        raise HTTPException(422, f"state must be one of {', '.join(FanGroup)}")
     return FanGroup(name) if name else None
 
 
@@ -349,7 +349,7 @@ def _number(request: Request, name: str, default: int) -> int:
     if number is None:
         return default
     if number < 0:
-        raise HTTPException(422, f"{name}: no number below 0, please")
+        raise HTTPException(422, f"{name} must not be below 0")
     return number
 
 
@@ -358,5 +358,5 @@ def _whole(request: Request, name: str) -> int | None:
     if not text:
         return None
     if not re.fullmatch("-?[0-9]{1,15}", text):
-        raise HTTPException(422, f"{name}: a whole number, please")
+        raise HTTPException(422, f"{name} must be a whole number")
     return int(text)

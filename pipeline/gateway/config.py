@@ -22,7 +22,7 @@ class GatewayConfig(StageConfig):
     """
 
     host: str = Field(default="127.0.0.1", description="address to listen on")
-    port: int = Field(default=8080, ge=1, le=65535, description="port; of shard K the K-th from here on")
+    port: int = Field(default=8080, ge=1, le=65535, description="port; shard K uses the K-th from here on")
     certificate: Path | None = Field(default=None, description="PEM file: serve https with this certificate")
     key: Path | None = Field(default=None, description="PEM file: its private key")
     users: Path | None = Field(
@@ -31,18 +31,18 @@ class GatewayConfig(StageConfig):
     user_header: str = Field(
         default="",
         pattern=r"^[A-Za-z0-9-]*$",
-        description='header in which a proxy passes the name of the user that it has authenticated; "": none',
+        description='header in which a proxy passes the name of the user it has authenticated; "": none',
     )
     proxies: tuple[str, ...] = Field(
-        default=("127.0.0.1", "::1"), description="addresses of that proxy; the header of others is refused"
+        default=("127.0.0.1", "::1"), description="addresses of that proxy; the header is refused from any other"
     )
     operators: tuple[str, ...] = Field(
-        default=(), description="users of the proxy who may act; all others may only look"
+        default=(), description="users of the proxy who may act; all others may only view"
     )
     hosts: tuple[str, ...] = Field(
         default=(),
-        description="names under which browsers may ask for the page on loopback, beside localhost and its addresses: "
-        'such as that of a proxy; "*": any',
+        description="names, besides localhost and its addresses, under which browsers may request the page on "
+        'loopback, such as the name of a proxy; "*": any',
     )
 
     @property
@@ -73,7 +73,7 @@ class GatewayConfig(StageConfig):
         if (self.certificate is None) != (self.key is None):
             raise ValueError("certificate and key belong together: give both, or none")
         if self.user_header and self.users:
-            raise ValueError("users and user_header exclude each other: either this file or a proxy knows the users")
+            raise ValueError("users and user_header exclude each other: users are known to this file or to a proxy")
         if self.operators and not self.user_header:
             raise ValueError("operators are users of a proxy: they need user_header")
         if not self.is_loopback:

@@ -58,7 +58,7 @@ class SiteMetrics(Collector):
         active = GaugeMetricFamily("fantwin_fan_alarm_active", "1: an alarm of this severity is active.", labels=of_fan)
         unacknowledged = GaugeMetricFamily(
             "fantwin_fan_alarm_unacknowledged",
-            "1: an alarm of this severity is neither acknowledged nor silenced; it may be over.",
+            "1: an alarm of this severity is neither acknowledged nor silenced; it may have cleared.",
             labels=of_fan,
         )
         presented = GaugeMetricFamily(
@@ -70,7 +70,7 @@ class SiteMetrics(Collector):
         fans_in_alarm.add_metric([self._model.site], self._model.counts()["in_alarm"])
         total = CounterMetricFamily(
             "fantwin_alarms",
-            "Alarms that have reached this severity since the gateway began.",
+            "Alarms that have reached this severity since the gateway started.",
             labels=[*_TRAY, "severity"],
         )
         alarms = self._model.current_alarms()
@@ -92,14 +92,16 @@ class SiteMetrics(Collector):
         return active, unacknowledged, presented, fans_in_alarm, total
 
     def _of_stages(self, states: Iterable[StageState]) -> Iterable[Metric]:
-        up = GaugeMetricFamily("fantwin_stage_up", "1: the stage is at work.", labels=_STAGE)
+        up = GaugeMetricFamily("fantwin_stage_up", "1: the stage is working.", labels=_STAGE)
         degraded = GaugeMetricFamily("fantwin_stage_degraded", "1: the stage reports a problem.", labels=_STAGE)
         uptime = GaugeMetricFamily("fantwin_stage_uptime_seconds", "Time since its process started.", labels=_STAGE)
-        lost = CounterMetricFamily("fantwin_stage_lost", "What the stage has lost since it started.", labels=_STAGE)
+        lost = CounterMetricFamily(
+            "fantwin_stage_lost", "Messages and samples lost since the stage started.", labels=_STAGE
+        )
         received = CounterMetricFamily("fantwin_stage_received_messages", "Messages received.", labels=_STAGE)
         published = CounterMetricFamily("fantwin_stage_published_messages", "Messages published.", labels=_STAGE)
         latency = HistogramMetricFamily(
-            "fantwin_stage_latency_seconds", "Age of the newest sample of an output when it was sent.", labels=_STAGE
+            "fantwin_stage_latency_seconds", "Age of the newest sample in an output when it was sent.", labels=_STAGE
         )
         for state in states:
             labels = [self._model.site, state.label]

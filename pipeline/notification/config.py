@@ -18,13 +18,13 @@ _TIME = re.compile(r"([01][0-9]|2[0-3]):[0-5][0-9]")
 
 
 class QuietHours(Section):
-    """A time of each day in which messages are held; at its end one message says what was held."""
+    """A time of day during which messages are held; when it ends, one message lists what was held."""
 
     begin: str = Field(description='time of day, such as "22:00"')
-    end: str = Field(description='time of day, such as "06:30"; if it is earlier, of the next day')
+    end: str = Field(description='time of day, such as "06:30"; if earlier than begin, on the next day')
     sent_from: Literal["alarm", "none"] = Field(
         default="alarm",
-        description="messages about alarms at least as severe are sent all the same; none: all are held",
+        description="messages about alarms of at least this severity are sent anyway; none: all are held",
     )
 
     @field_validator("begin", "end")
@@ -49,27 +49,30 @@ class QuietHours(Section):
 class TargetConfig(Section):
     """Who gets messages, and which."""
 
-    name: Name = Field(description="letters, digits, `_` and `-`; names of targets differ")
+    name: Name = Field(description="unique name of the target: letters, digits, `_` and `-`")
     kind: Literal["apprise", "alertmanager"] = Field(
         default="apprise",
-        description="apprise: mail, chat, webhook, whatever its URLs name; alertmanager: that of Prometheus",
+        description="apprise: mail, chat, webhook or any other of its services; alertmanager: that of Prometheus",
     )
     url_file: Path | None = Field(
         default=None, description="file with the URL in its first line; only its owner may be able to read it"
     )
-    url_env: str = Field(default="", description="variable of the environment that holds the URL, instead of a file")
-    url: str = Field(default="", description="of an Alertmanager without a password: its address")
-    severity: Literal["warning", "alarm"] = Field(default="warning", description="the least severity it hears of")
-    trays: tuple[Name, ...] = Field(default=(), description="the trays it hears of; without it, all")
+    url_env: str = Field(default="", description="environment variable that holds the URL, instead of a file")
+    url: str = Field(default="", description="address of an Alertmanager without a password")
+    severity: Literal["warning", "alarm"] = Field(
+        default="warning", description="least severity of the alarms that this target gets"
+    )
+    trays: tuple[Name, ...] = Field(default=(), description="trays whose alarms this target gets; without it, all")
     repeat_s: float = Field(
         default=3600.0,
         ge=0,
-        description="after so long, an alarm that is active and not acknowledged is sent again; 0: never",
+        description="an alarm that stays active and unacknowledged is sent again after this time; 0: never",
     )
     escalation_after_s: float | None = Field(
         default=None,
         gt=0,
-        description="it hears only of alarms that nobody has acknowledged for so long; without it, of all at once",
+        description="this target gets only alarms that have been unacknowledged for this long; without it, all alarms, "
+        "at once",
     )
     quiet_hours: QuietHours | None = Field(default=None, description="hours in which messages are held")
     pause_s: float | None = Field(
@@ -103,26 +106,28 @@ class TargetConfig(Section):
 class NotifierConfig(StageConfig):
     """Who gets messages about alarms, and how many alarms make one message."""
 
-    target: tuple[TargetConfig, ...] = Field(default=(), description="one table `[[notifier.target]]` for each")
+    target: tuple[TargetConfig, ...] = Field(default=(), description="one table `[[notifier.target]]` for each target")
     page: str = Field(
         default="", pattern=r"^(https?://\S+)?$", description="address of the operators' page, for a link in messages"
     )
     timezone: str = Field(
-        default="", description='of quiet hours and times in messages, such as "Europe/Berlin"; "": that of the host'
+        default="",
+        description='time zone of quiet hours and of times in messages, such as "Europe/Berlin"; "": that of the host',
     )
     gather_s: float = Field(
-        default=5.0, ge=0, description="a message waits for so long for others that could go with it"
+        default=5.0, ge=0, description="how long a message waits for others that it could be combined with"
     )
-    digest_above: int = Field(default=3, ge=1, description="more fans than this at a time are one message")
+    digest_above: int = Field(default=3, ge=1, description="messages about more fans than this are combined into one")
     digest_within_s: float = Field(
         default=30.0,
         gt=0,
-        description="while more fans keep coming, the message waits for so long; the next one twice as long, and so on",
+        description="while more fans keep coming, a combined message waits for up to this time, and each further one "
+        "twice as long as the one before",
     )
     most_messages: int = Field(
-        default=10_000, ge=1, description="messages that wait for their targets; beyond, the oldest are lost"
+        default=10_000, ge=1, description="most messages that wait for their targets; beyond that, the oldest are lost"
     )
-    kept_s: float = Field(default=3 * 86_400.0, gt=0, description="a message that has waited for so long is lost")
+    kept_s: float = Field(default=3 * 86_400.0, gt=0, description="a message that has waited this long is lost")
 
     @field_validator("target", mode="before")
     @classmethod

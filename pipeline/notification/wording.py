@@ -35,7 +35,7 @@ _BEGINNING = {
     Kind.ESCALATED: "Nobody has acknowledged: ",
     Kind.NOT_CONFIRMED: "Not confirmed by data: ",
 }
-_WHERE_IT_IS_KNOWN = "the page, or `fantwin alarms`, may know it by now"
+_WHERE_IT_IS_KNOWN = "the page or `fantwin alarms` may show it by now"
 _BY_IMPORTANCE = (Kind.ESCALATED, Kind.RAISED, Kind.WORSE, Kind.NOT_CONFIRMED, Kind.AGAIN, Kind.CLEARED)
 
 
@@ -116,10 +116,10 @@ def describe(place: Place, alarm: FanAlarm) -> list[str]:
         return [f"{fan}: no alarm"]
     if not alarm.active:
         lines = [f"{fan}: back to normal; the alarm began {place.clock(alarm.onset_t_ns)}"]
-        lines += [f"It was: {_deviation(place, alarm)}"] if alarm.deviation else []
+        lines += [f"Deviation: {_deviation(place, alarm)}"] if alarm.deviation else []
     else:
         lines = [f"{fan}: {alarm.severity_name} since {place.clock(alarm.onset_t_ns)}"]
-        lines += [_deviation(place, alarm) or "away from its twin", cause_line(alarm.causes)]
+        lines += [_deviation(place, alarm) or "deviates from its twin", cause_line(alarm.causes)]
         if to_do := advice(alarm.causes):
             lines.append(f"What to do: {to_do}")
     if alarm.acknowledged:
@@ -154,7 +154,7 @@ def about_many(
         causes = Counter(likely_causes(each.causes) or "unknown" for each in active)
         named = [f"{words} {count}" for words, count in causes.most_common(MOST_NAMED_CAUSES)]
         lines.append(f"Most probable causes: {'; '.join(named)}")
-        lines.append(f"The first began {place.clock(min(each.onset_t_ns for each in active))}")
+        lines.append(f"The first alarm began {place.clock(min(each.onset_t_ns for each in active))}")
         if (stale := sum(each.stale for each in active)) > 0:
             lines.append(f"Not confirmed by data: {stale}")
     lines.append(f"As of {place.clock(now_ns)}")
@@ -182,7 +182,7 @@ def _how_many(fans: Sequence[tuple[FanAlarm, Happened]]) -> list[str]:
         parts.append(f"{cleared} cleared")
     reasons = (
         (Kind.WORSE, "worse"),
-        (Kind.AGAIN, "not acknowledged for long"),
+        (Kind.AGAIN, "not acknowledged for a long time"),
         (Kind.ESCALATED, "acknowledged by nobody"),
         (Kind.NOT_CONFIRMED, "no longer confirmed by data"),
     )

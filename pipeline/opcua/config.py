@@ -17,7 +17,7 @@ class OpcuaConfig(StageConfig):
     """
 
     host: str = Field(default="127.0.0.1", description="address to listen on")
-    port: int = Field(default=4840, ge=1, le=65535, description="port; of shard K the K-th from here on")
+    port: int = Field(default=4840, ge=1, le=65535, description="port; shard K uses the K-th from here on")
     certificate: Path | None = Field(
         default=None, description="PEM or DER file: the server's certificate; without it, the stage makes one"
     )
@@ -26,11 +26,12 @@ class OpcuaConfig(StageConfig):
         default=(), description="names under which clients reach this host, for the certificate that the stage makes"
     )
     users: Path | None = Field(
-        default=None, description="file of users, written by `fantwin users`; without it nobody can act by OPC UA"
+        default=None, description="file of users, written by `fantwin users`; without it nobody can act over OPC UA"
     )
     trusted: Path | None = Field(
         default=None,
-        description="folder of certificates (PEM or DER): only these clients may connect encrypted; without it, all",
+        description="folder of client certificates (PEM or DER): only these clients may connect encrypted; without it, "
+        "all may",
     )
 
     @property

@@ -154,7 +154,7 @@ def checked_password(password: str, name: str) -> str:
     """
     if not SHORTEST_PASSWORD <= len(password) <= LONGEST_PASSWORD:
         raise UserError(
-            f"the password has {len(password)} characters: {SHORTEST_PASSWORD} to {LONGEST_PASSWORD}, please"
+            f"the password has {len(password)} characters: it must have {SHORTEST_PASSWORD} to {LONGEST_PASSWORD}"
         )
     rest = password.casefold()
     for word in (name.casefold(), *GUESSED_WORDS):

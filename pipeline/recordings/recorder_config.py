@@ -48,13 +48,13 @@ class RecorderConfig(StageConfig):
     )
 
     clips: bool = Field(default=True, description="keep a clip of each alarm, in the folder clips beside the recording")
-    clip_before_s: float = Field(default=60.0, ge=0, le=600, description="how much a clip holds before its alarm")
-    clip_after_s: float = Field(default=60.0, ge=0, le=600, description="and after it")
+    clip_before_s: float = Field(default=60.0, ge=0, le=600, description="how long before the alarm a clip begins")
+    clip_after_s: float = Field(default=60.0, ge=0, le=600, description="how long after the alarm a clip ends")
     clip_bytes: int = Field(
         default=1_000_000_000,
         ge=0,
-        description="of all clips together; beyond it the oldest are deleted whose alarms are acknowledged, and no "
-        "others; 0: no limit",
+        description="most space for all clips together; beyond it the oldest clips are deleted, but only those whose "
+        "alarms are acknowledged; 0: no limit",
     )
 
     @field_validator("topics")

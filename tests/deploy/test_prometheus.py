@@ -36,7 +36,7 @@ VARIABLES = {"$site": SITE, "$tray": TRAY, "$fan": "2", "$__rate_interval": "5m"
 ALL_FANS = 2 * FANS
 EMPTY_WHILE_HEALTHY = ["Fans in alarm"]
 """a table"""
-BAD_NUMBERS = {"Number of fans in alarm": [1], "Fans not judged": [1], "Stages not at work": [1]}
+BAD_NUMBERS = {"Number of fans in alarm": [1], "Fans not judged": [1], "Stages not working": [1]}
 NOT_WITHIN_A_TEST = {"FantwinStageMissing"}
 """it looks an hour back; `promtool test rules` has that hour"""
 
@@ -143,7 +143,7 @@ def test_every_query_of_the_board_and_every_rule_works_on_what_a_site_sends(gate
     eventually(is_shown, "every other panel shows something")
     values = {title: [value for _, value in found] for title, found in shown.items()}
     assert values["Fans"] == [ALL_FANS]
-    assert values["Fans not judged"] == values["Stages not at work"] == values["Lost in the last hour"] == [0.0]
+    assert values["Fans not judged"] == values["Stages not working"] == values["Lost in the last hour"] == [0.0]
     assert set(values["Score against its limit"]) == {0.5}
     eventually(lambda: set(prometheus.alert_states().values()) == {"inactive"}, "no alert")
 

@@ -99,7 +99,7 @@ def test_a_state_or_a_tray_that_is_none_is_refused_with_those_that_are(gateway):
     client = Client(gateway)
     status, body, _ = client.ask("GET", "/api/v1/fans?state=alarms")
     groups = "alarm, suspect, not_judged, silenced, at_rest, normal"
-    assert (status, body["error"]) == (422, f"state: one of {groups}, please")
+    assert (status, body["error"]) == (422, f"state must be one of {groups}")
     assert client.ask("GET", "/api/v1/fans?tray=nowhere")[0] == 404
     asked = client.ask("GET", "/api/v1/openapi.json")[1]["paths"]["/api/v1/fans"]["get"]["parameters"]
     assert {"name": "state", "in": "query", "required": False} | {

@@ -73,7 +73,7 @@ def test_an_alarm_is_seen_acknowledged_shelved_and_cleared_in_two_browsers(chain
         expect(ann.locator("canvas")).to_have_count(3)
         vic.get_by_role("link", name="Alarms").click()
         shown = vic.locator(f'article[data-fan="{TRAY}/{FAULTY}"]')
-        expect(shown).to_contain_text("vic may look, and not act")
+        expect(shown).to_contain_text("vic may view but not act")
         refused = vic.evaluate(
             """async (path) => {
                 const me = await (await fetch("/api/v1/me")).json();
@@ -85,7 +85,7 @@ def test_an_alarm_is_seen_acknowledged_shelved_and_cleared_in_two_browsers(chain
         assert refused == 403
 
         card.get_by_role("button", name="Acknowledge").click()
-        ann.get_by_label("Why").fill(SCRIPT)
+        ann.get_by_label("Reason").fill(SCRIPT)
         ann.get_by_role("dialog").get_by_role("button", name="Acknowledge").click()
         for page in (card, shown):
             expect(page).to_contain_text("acknowledged by ann")
@@ -113,7 +113,7 @@ def test_an_alarm_is_seen_acknowledged_shelved_and_cleared_in_two_browsers(chain
         for words in ("raised", "acknowledged", "shelved", "cleared", SCRIPT):
             expect(history).to_contain_text(words)
         history.locator("tr", has_text="raised").first.get_by_role("button", name="False alarm").click()
-        opened_again.get_by_label("Why").fill("a door was open")
+        opened_again.get_by_label("Reason").fill("a door was open")
         opened_again.get_by_role("dialog").get_by_role("button", name="False alarm").click()
         expect(history).to_contain_text("(false alarm)")
         expect(shown).to_contain_text("marked as a false alarm by ann: a door was open")

@@ -86,7 +86,7 @@ def test_everything_is_done_by_keyboard(gateway, browser):
     for button, done in (("Acknowledge", "by ann, unconfirmed"), ("Confirm", "by ann"), ("Shelve", "shelved until")):
         tab_to(button)
         keyboard.press("Enter")
-        page.get_by_label("Why").focus()
+        page.get_by_label("Reason").focus()
         keyboard.type(f"{button} by key")
         keyboard.press("Enter")
         expect(page.get_by_role("dialog")).to_be_hidden()
@@ -206,7 +206,9 @@ def test_a_stopped_fan_stays_in_alarm_filters_are_kept_and_all_alarms_of_a_tray_
     expect(page.get_by_label("State")).to_have_value("alarm")
     expect(page.get_by_role("heading", name="Normal")).to_be_hidden()
     cell.click()
-    expect(page.locator("main")).to_contain_text("no twin, torque balance and score while it is stopped by its command")
+    expect(page.locator("main")).to_contain_text(
+        "no twin, torque balance or score while the fan is stopped by its command"
+    )
     page.keyboard.press("Escape")
     expect(page.get_by_label("State")).to_have_value("alarm")
 

@@ -18,7 +18,7 @@ def view(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The view file to write.")] = Path("view.rrd"),
     layout: Annotated[
-        ViewLayout, typer.Option(help="all: every fan; alarms: the fans that were in alarm; wear: change over days.")
+        ViewLayout, typer.Option(help="all: every fan; alarms: fans that were in alarm; wear: change over days.")
     ] = ViewLayout.ALL,
     window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = 30.0,
     fleet_above: Annotated[
@@ -27,7 +27,7 @@ def view(
     force: Annotated[bool, typer.Option("--force", help="Replace an existing view file.")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Make a view of a recording, as the stage viewer shows it live.
+    """Turn a recording into a view file that shows what the stage `viewer` shows live.
 
     Exits with 3 if the recording could not be read in full; the view then shows what could be read.
 

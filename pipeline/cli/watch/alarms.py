@@ -69,24 +69,24 @@ def alarms(
     duration: Annotated[
         str | None, typer.Option("--for", metavar="TIME", help="How long to shelve: 90s, 30m, 8h or 2d.")
     ] = None,
-    comment: Annotated[str, typer.Option(help="Comment for the record; of false-alarm, why it was one.")] = "",
+    comment: Annotated[str, typer.Option(help="Comment for the record; for false-alarm, why it was false.")] = "",
     onset: Annotated[
         str | None,
         typer.Option(
             metavar="TIME",
-            help="The alarm that true-alarm or false-alarm is about, by the time since when it was there, as the list "
-            "and the history show it: [YYYY-MM-DD ]HH:MM:SS. Without it: the last one of the fan.",
+            help="For true-alarm and false-alarm: the start of the alarm, as shown in the list and the history: "
+            "[YYYY-MM-DD ]HH:MM:SS. If omitted: the fan's last alarm.",
         ),
     ] = None,
     operator: Annotated[str | None, typer.Option(help="Name of the operator; default: your login name.")] = None,
-    show_all: Annotated[bool, typer.Option("--all", help="Also list alarms that are over.")] = False,
+    show_all: Annotated[bool, typer.Option("--all", help="Also list alarms that have cleared.")] = False,
     watch: Annotated[bool, typer.Option("--watch", help="Keep running and print every transition.")] = False,
     history: Annotated[
         bool,
         typer.Option(
             "--history",
-            help="List the alarms that were, what operators said of them, and the rate of false alarms beside the "
-            "declared one: from what the gateway keeps on this host, or from --recordings.",
+            help="List past alarms with the operators' feedback, and compare the rate of false alarms with the "
+            "declared rate. The data come from the gateway's file on this host, or from --recordings.",
         ),
     ] = False,
     recordings: Annotated[
@@ -95,7 +95,7 @@ def alarms(
             parser=recording_path,
             callback=matching,
             metavar="FILE...",
-            help="With --history: take the alarms from these recordings. All words up to the next option.",
+            help="With --history: read the alarms from these recordings (all arguments up to the next option).",
         ),
     ] = None,
     timeout_s: Annotated[float, typer.Option("--timeout", metavar="S", help="How long to wait for answers.")] = 5.0,

@@ -17,14 +17,16 @@ from pipeline.notification.wording import Place
 
 
 def notify(
-    targets: Annotated[list[str] | None, typer.Argument(metavar="[TARGET]...", help="Without any: all.")] = None,
+    targets: Annotated[
+        list[str] | None, typer.Argument(metavar="[TARGET]...", help="Names of targets; all if omitted.")
+    ] = None,
     config: ConfigOption = DEFAULT_CONFIG,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Send a test message to the targets of the notifier, and say which have taken it.
+    """Send a test message to the targets of the notifier, and say which ones accepted it.
 
-    The notifier need not run.
+    The notifier need not be running.
 
     Example: fantwin notify on_call
     """

@@ -31,14 +31,14 @@ class UserAction(StrEnum):
 def users(
     action: Annotated[UserAction, typer.Argument(metavar="ACTION", help=f"{', '.join(UserAction)}.")] = UserAction.LIST,
     name: Annotated[str | None, typer.Argument(help="Letters, digits, `.`, `_`, `@` and `-`.")] = None,
-    role: Annotated[str, typer.Option(help="viewer: may look; operator: may act, too.")] = "viewer",
+    role: Annotated[str, typer.Option(help="viewer: may only view; operator: may also act.")] = "viewer",
     config: ConfigOption = DEFAULT_CONFIG,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """List the users, who may log in to the operators' page and by OPC UA; add one, or remove one.
+    """List the users who may log in to the operators' page and over OPC UA; add or remove one.
 
-    `add` asks for the password, or reads it from a pipe; it also gives a user another password and role.
+    `add` asks for the password, or reads it from a pipe. For an existing user, it changes the password and the role.
 
     Example: fantwin users add ann --role operator
 
@@ -86,7 +86,7 @@ def _list(path: Path, found: Mapping[str, User], *, json_output: bool) -> None:
 
 def _asked_for(name: str, role: str) -> User:
     if not NAME.fullmatch(name):
-        raise UsageError(f"{name!r} is no name: letters, digits, `.`, `_`, `@` and `-`, at most 64")
+        raise UsageError(f"{name!r} is not a valid name: use up to 64 letters, digits, `.`, `_`, `@` and `-`")
     roles = [each.value for each in UserRole]
     if role not in roles:
         raise UsageError(f"--role {role}: {' or '.join(roles)}")

@@ -4,15 +4,15 @@ import { element, notice } from "./dom.js";
 import { learnWhoIAm, me, Refused, send } from "./server.js";
 
 export const ACTIONS = {
-  acknowledge: { title: "Acknowledge", about: "I have seen it." },
-  confirm: { title: "Confirm", about: "It is over, and dealt with." },
-  shelve: { title: "Shelve", about: "Hide it for a while.", lasts: true },
-  unshelve: { title: "Unshelve", about: "Show it again." },
-  suppress: { title: "Suppress", about: "Hide it until it is unsuppressed." },
-  unsuppress: { title: "Unsuppress", about: "Show it again." },
+  acknowledge: { title: "Acknowledge", about: "I have seen this alarm." },
+  confirm: { title: "Confirm", about: "This alarm is over and has been dealt with." },
+  shelve: { title: "Shelve", about: "Hide the fan's alarm for a while.", lasts: true },
+  unshelve: { title: "Unshelve", about: "Show the fan's alarm again." },
+  suppress: { title: "Suppress", about: "Hide the fan's alarm until it is unsuppressed." },
+  unsuppress: { title: "Unsuppress", about: "Show the fan's alarm again." },
   out_of_service: { title: "Out of service", about: "The fan is being worked on." },
-  in_service: { title: "In service", about: "The fan is back." },
-  reset: { title: "Reset", about: "Release an alarm that is latched." },
+  in_service: { title: "In service", about: "The fan is back in service." },
+  reset: { title: "Reset", about: "Release the latched alarm." },
   true_alarm: { title: "True alarm", about: "Something was wrong with the fan." },
   false_alarm: { title: "False alarm", about: "Nothing was wrong with the fan. Calibration may learn from it.", needsReason: true },
   commission: { title: "Commission", about: "The fan was replaced or repaired: learn its offset again." },
@@ -59,16 +59,16 @@ export function buttonsForAll(alarms) {
 
 function acknowledgeAll(tray, count) {
   const comment = element("input", { id: "comment", maxlength: 500, autocomplete: "off" });
-  dialog(`Acknowledge all alarms of ${tray}`, element("div", {}, element("p", {}, `I have seen all ${count}. One that comes meanwhile is acknowledged, too.`),
-    element("label", { for: "comment" }, "Why (for the record)"), comment), "Acknowledge all", async () => {
+  dialog(`Acknowledge all alarms of ${tray}`, element("div", {}, element("p", {}, `I have seen all ${count}. Any alarm raised in the meantime is acknowledged, too.`),
+    element("label", { for: "comment" }, "Reason (for the record)"), comment), "Acknowledge all", async () => {
     const { answers } = await send(`/fans/${encodeURIComponent(tray)}/all/requests`, { action: "acknowledge", comment: comment.value });
-    notice(`${answers.filter((answer) => answer.transition !== "refused").length} alarms of ${tray} are acknowledged.`);
+    notice(`${answers.filter((answer) => answer.transition !== "refused").length} alarms of ${tray} acknowledged.`);
   });
 }
 
 function hint() {
-  if (me.name) return `${me.name} may look, and not act.`;
-  return me.has_login ? "Log in to act." : "To act from this page, name a file of users in the configuration: [gateway] users";
+  if (me.name) return `${me.name} may view but not act.`;
+  return me.has_login ? "Log in to act." : "To act from this page, set a file of users in the configuration: [gateway] users";
 }
 
 export function askFor(action, tray, fan, alarm = null) {
@@ -77,7 +77,7 @@ export function askFor(action, tray, fan, alarm = null) {
   const comment = element("input", { id: "comment", maxlength: 500, autocomplete: "off", required: needsReason });
   dialog(`${title}: ${tray} fan ${fan}`, element("div", {}, element("p", {}, about),
     duration && element("label", { for: "duration" }, "How long"), duration ?? "",
-    element("label", { for: "comment" }, "Why (for the record)"), comment), title, async () => {
+    element("label", { for: "comment" }, "Reason (for the record)"), comment), title, async () => {
     const body = { action, comment: comment.value };
     if (action.endsWith("_alarm") && alarm) body.onset_t_ns = alarm.onset_t_ns;
     if (duration) body.duration_s = Number(duration.value);

@@ -47,7 +47,7 @@ export function card(alarm, viewerUrl) {
 function title(listed) {
   const open = listed.filter((alarm) => alarm.presented);
   const active = open.filter((alarm) => alarm.active).length, over = open.length - active, silenced = listed.length - open.length;
-  const parts = [[active, "active"], [over, "over but not dealt with"], [silenced, "silenced"]].filter(([count]) => count);
+  const parts = [[active, "active"], [over, "cleared but not dealt with"], [silenced, "silenced"]].filter(([count]) => count);
   return `Alarms (${open.length})${parts.length ? `: ${parts.map(([count, words]) => `${count} ${words}`).join(", ")}` : ""}`;
 }
 
@@ -96,7 +96,7 @@ export class HistoryView {
     this.more = element("button", { type: "button", onclick: () => learn(() => this.load(this.oldest)), hidden: true }, "Older");
     this.reach = element("p", { class: "muted" });
     const heads = ["Time", ...(fan ? [] : ["Fan"]), "What happened", "By", "Message"].map((text) => element("th", { scope: "col" }, text));
-    this.root = element("div", {}, element("h2", {}, fan ? "History of its alarms" : "History of alarms"), this.reach,
+    this.root = element("div", {}, element("h2", {}, fan ? "Alarm history of this fan" : "History of alarms"), this.reach,
       element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "History of alarms" },
         element("table", { class: "folding" }, element("thead", {}, element("tr", {}, ...heads)), this.body)), this.more);
     this.begin();
@@ -120,7 +120,7 @@ export class HistoryView {
     }
     if (before === null) this.newest = transitions[0]?.number ?? this.newest;
     const begins = found.begins_t_ns ? `Reaches back to ${clock(found.begins_t_ns)}.` : "";
-    this.reach.textContent = [begins, this.oldest === null ? "No alarm so far." : "",
+    this.reach.textContent = [begins, this.oldest === null ? "No alarms so far." : "",
       found.is_reading_recordings ? "Earlier alarms are being read from the recordings." : ""].filter(Boolean).join(" ");
     if (found.is_reading_recordings) {
       clearTimeout(this.timer);

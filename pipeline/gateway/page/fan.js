@@ -16,7 +16,7 @@ const POINTS = 1200;
 const MEANINGS = {
   J: "J, inertia, command s²/rad", alpha: "α, viscous friction, command s/rad", C_D: "C_D, drag, command s²/rad²",
   lag_s: "lag of the torque behind the command, s", lowest_command: "lowest command that has an effect",
-  friction: "friction, of the command", kick_command: "command with which the drive starts the rotor",
+  friction: "friction, in units of the command", kick_command: "command with which the drive starts the rotor",
 };
 
 export class FanView {
@@ -74,7 +74,7 @@ export class FanView {
     this.twin.replaceChildren(twin ? facts({ "name": twin.name, "kind": twin.kind, "in force since": clock(twin.since_t_ns) || "the start",
       ...Object.fromEntries(Object.entries(twin.parameters).map(([name, value]) =>
         [MEANINGS[name] ?? name, typeof value === "number" ? value.toPrecision(4) : String(value)])) })
-      : element("p", { class: "muted" }, "Its twin is not known yet."));
+      : element("p", { class: "muted" }, "The twin of this fan is not known yet."));
     this.wear.replaceChildren(wearTable(now.wear));
   }
 
@@ -83,7 +83,7 @@ export class FanView {
     const level = bytes(fleet.levels)[this.index], was = this.class;
     this.class = bytes(fleet.classes)[this.index];
     const now = this.site.now[this.class];
-    this.score.textContent = level === NO_LEVEL ? (now ? `no twin, torque balance and score while it is ${now}.` : "not judged.") : `score ${levelText(level)} of the limit.`;
+    this.score.textContent = level === NO_LEVEL ? (now ? `no twin, torque balance or score while the fan is ${now}.` : "not judged.") : `score ${levelText(level)} of the limit.`;
     if (was !== this.class && was >= 0 && this.site.classes[was] !== this.site.classes[this.class]) learn(() => this.learn());
   }
 
@@ -117,7 +117,7 @@ export class FanView {
     this.speedPlot = add("Speed", this.speedUnit, [{ label: "measured", color: "measured" },
       { label: "twin", color: "twin", dash: [6, 4] }, { label: "band of a healthy fan, twin ± 2σ", color: "band", isBand: true }]);
     this.commandPlot = add("Command", "command", [{ label: "command", color: "measured" }]);
-    this.balancePlot = add("Torque balance: command beyond that of a healthy fan", "command", [{ label: "torque balance", color: "measured" }]);
+    this.balancePlot = add("Torque balance: command in excess of what a healthy fan needs", "command", [{ label: "torque balance", color: "measured" }]);
     this.scorePlot = add("Score: an alarm is raised at 1", "of the limit", [{ label: "score", color: "measured" },
       { label: "limit", color: "limit", dash: [2, 4] }], [0, 1.2]);
     this.refresh();

@@ -55,11 +55,11 @@ export class FansView {
     });
     this.cells = this.fans.map((fan, index) => this.cell(fan, index));
     const legend = element("ul", { class: "legend" }, ...GROUPS.map((group) => element("li", {}, `${group.mark} ${group.title.toLowerCase()}`)),
-      element("li", {}, "bar: score as a share of its limit"));
-    const keys = element("p", { class: "muted keys" }, "Arrow keys move from fan to fan, Enter opens one, Esc comes back.");
+      element("li", {}, "bar: score relative to its limit"));
+    const keys = element("p", { class: "muted keys" }, "Arrow keys move between fans, Enter opens one, Esc goes back.");
     const form = element("form", { class: "filters", onsubmit: (event) => event.preventDefault() },
       element("label", { for: "tray" }, "Tray"), this.tray, element("label", { for: "state" }, "State"), this.state);
-    this.nothing = element("p", { class: "muted", hidden: true }, "No fan is so.");
+    this.nothing = element("p", { class: "muted", hidden: true }, "No fan matches this selection.");
     return element("div", {}, form, legend, keys, this.nothing, ...this.sections.map((section) => section.root));
   }
 

@@ -38,7 +38,7 @@ let wasConnected = false, wasLost = false;
 
 function showConnection(isThere) {
   const shown = document.getElementById("connection");
-  shown.textContent = isThere ? "● live" : "✖ no connection: what is shown is old";
+  shown.textContent = isThere ? "● live" : "✖ no connection: the data shown are old";
   shown.className = isThere ? "muted" : "lost";
   if (isThere && !wasConnected) learnState();
   if (isThere && wasLost) view?.begin?.();
@@ -154,7 +154,7 @@ async function start() {
     showUser();
     if (!me.may_read) {
       events.close();
-      content.replaceChildren(element("p", {}, me.has_login ? "Log in to see the fans." : "The proxy has not said who you are."));
+      content.replaceChildren(element("p", {}, me.has_login ? "Log in to see the fans." : "The proxy has not passed on your user name."));
       if (me.has_login) showLogin(start);
       return;
     }

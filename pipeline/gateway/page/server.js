@@ -38,7 +38,7 @@ export async function learnWhoIAm() {
 
 async function answered(response) {
   const body = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Refused(response.status, body.error || `the server answers ${response.status}`);
+  if (!response.ok) throw new Refused(response.status, body.error || `the server answered with status ${response.status}`);
   return body;
 }
 

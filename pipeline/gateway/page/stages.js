@@ -5,7 +5,7 @@ import { badge } from "./alarms.js";
 
 const WELL = ["ok", "stopped"];
 const HEADS = [["Stage"], ["State"], ["In, messages/s", "number"], ["Out, messages/s", "number"], ["Latency, ms: p50", "number"], ["p99", "number"],
-  ["Lost", "number"], ["Problem; notes"]];
+  ["Lost", "number"], ["Problems and notes"]];
 
 export class StagesView {
   constructor() {
@@ -28,6 +28,6 @@ export class StagesView {
       cell("State", WELL.includes(each.state) ? element("span", { class: "badge good" }, `● ${each.state}`) : badge("warning", each.state)),
       cell("In, messages/s", each.in_hz.toFixed(1), "number"), cell("Out, messages/s", each.out_hz.toFixed(1), "number"),
       cell("Latency p50, ms", latency(each, each.latency_p50_ms), "number"), cell("Latency p99, ms", latency(each, each.latency_p99_ms), "number"),
-      cell("Lost", each.lost ? `▲ ${each.lost}` : "0", each.lost ? "number lost" : "number"), cell("Problem; notes", about(each) || ""))));
+      cell("Lost", each.lost ? `▲ ${each.lost}` : "0", each.lost ? "number lost" : "number"), cell("Problems and notes", about(each) || ""))));
   }
 }

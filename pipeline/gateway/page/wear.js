@@ -6,8 +6,8 @@ const DAY_NS = 86400e9;
 const signed = (value, digits) => `${value < 0 ? "−" : "+"}${Number(Math.abs(value).toPrecision(digits))}`;
 
 export function wearTable(rows) {
-  if (!rows.length) return element("p", { class: "muted" }, "No data yet: a fan has its first point some time after commissioning.");
-  const heads = ["Parameter", "Change, 95 %", "Per day, 95 %", "Limit reached"].map((text) => element("th", { scope: "col" }, text));
+  if (!rows.length) return element("p", { class: "muted" }, "No data yet. The first values of a fan appear some time after commissioning.");
+  const heads = ["Parameter", "Change (95 % interval)", "Change per day (95 % interval)", "Limit reached"].map((text) => element("th", { scope: "col" }, text));
   return element("div", {}, element("p", { class: "muted" }, `Since commissioning, as of ${clock(rows[0].t_ns)}.`),
     element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Wear" },
       element("table", { class: "folding" }, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows.map(row)))));
@@ -21,7 +21,7 @@ function row(each) {
   const trend = each.per_day;
   return element("tr", {}, cell("Parameter", each.parameter),
     cell("Change", each.change === null ? "" : within(each.change, each.error === null ? null : 2 * each.error, "")),
-    cell("Per day", trend ? within(trend.value, (trend.high - trend.low) / 2, " per day") : "no trend yet"),
+    cell("Change per day", trend ? within(trend.value, (trend.high - trend.low) / 2, " per day") : "no trend yet"),
     cell("Limit reached", forecast(each)));
 }
 

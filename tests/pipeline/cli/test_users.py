@@ -52,7 +52,7 @@ def test_users_are_added_changed_listed_and_removed_and_only_the_owner_reads_the
 
 def test_what_is_no_user_is_refused_and_changes_nothing(config):
     assert "12 to 128" in str(fantwin("users", "add", "ann", "-c", config, typed="short\n").exception)
-    assert "is no name" in usage_error_of("users", "add", "../ann", "-c", config)
+    assert "is not a valid name" in usage_error_of("users", "add", "../ann", "-c", config)
     assert "viewer or operator" in usage_error_of("users", "add", "ann", "--role", "root", "-c", config)
     assert "no user 'ann'" in error_of("users", "remove", "ann", "-c", config)
     assert not (config.parent / "users.toml").exists()

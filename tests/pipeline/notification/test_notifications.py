@@ -82,7 +82,7 @@ def test_an_alarm_is_raised_worse_and_cleared_and_each_is_said_once_with_cause_a
     desk.hear(cleared(severity=Severity.ALARM))
     (over,) = desk.wait(10)
     assert (over.title, over.level) == ("Cleared: alarm, fan 2 of tray1 (hall)", Level.GOOD)
-    assert "It was: 90 rpm below the twin (limit 50) at 2026-09-21 14:13:20 UTC" in over.body
+    assert "Deviation: 90 rpm below the twin (limit 50) at 2026-09-21 14:13:20 UTC" in over.body
     assert desk.wait(20_000) == [], "what is over is not sent again"
 
 

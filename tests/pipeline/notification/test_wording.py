@@ -30,7 +30,7 @@ def test_where_the_cause_is_unclear_its_evidence_says_what_to_do():
     unclear = (NamedCause(CANNOT_TELL, 1.0, "cannot tell yet: move the command to 0.6 for ten seconds, and back"),)
     assert cause_line(unclear) == "Cause: cannot tell yet: move the command to 0.6 for ten seconds, and back"
     soon = (NamedCause(CANNOT_TELL, 1.0, f"cannot tell yet: {KNOWN_SOON}"),)
-    assert cause_line(soon) == "Cause: cannot tell yet: the page, or `fantwin alarms`, may know it by now"
+    assert cause_line(soon) == "Cause: cannot tell yet: the page or `fantwin alarms` may show it by now"
     assert advice(unclear) == ""
     assert cause_line(()) == "Cause: unknown"
 
