@@ -126,6 +126,6 @@ def test_the_clip_of_an_alarm_gives_no_rate_and_is_no_healthy_running(tmp_path):
         ("alarms", "--history", "--recordings", path),
         ("calibrate", DEMO / "twin.onnx", path, "--false-alarms-per-day", "24", "-o", tmp_path / "limited.onnx"),
     ):
-        result = fantwin(*command)
+        result = fantwin(*map(str, command))
         assert result.exit_code == 1
         assert str(result.exception).startswith(f"{path}: this is the clip of an alarm")
