@@ -70,7 +70,7 @@ def test_an_alarm_is_seen_acknowledged_shelved_and_cleared_in_two_browsers(chain
         cell.click()
         card = ann.locator(f'article[data-fan="{TRAY}/{FAULTY}"]')
         expect(card).to_contain_text("unacknowledged")
-        expect(ann.locator("canvas")).to_have_count(3)
+        expect(ann.locator("canvas")).to_have_count(4)
         vic.get_by_role("link", name="Alarms").click()
         shown = vic.locator(f'article[data-fan="{TRAY}/{FAULTY}"]')
         expect(shown).to_contain_text("vic may view but not act")
