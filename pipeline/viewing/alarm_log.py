@@ -10,7 +10,7 @@ from schemas.messages import Alarm
 from scoring.alarms.alarm_text import TRANSITIONS
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from scoring.detectors.table import row_of
-from scoring.diagnosis.shown_causes import with_share
+from scoring.diagnosis.shown_causes import CANNOT_TELL, with_share
 
 LINE_LENGTH = 64
 """a longer line is cut"""
@@ -47,7 +47,8 @@ def _what_happened(alarm: Alarm) -> str:
     if transition in (Transition.RAISED, Transition.SEVERITY):
         return f"{alarm.severity.words} {transition.words}, {exceeded(alarm)}"
     if transition == Transition.DIAGNOSED and alarm.causes:
-        return f"probably {with_share(alarm.causes[0])}"
+        first = alarm.causes[0]
+        return with_share(first) if first.cause == CANNOT_TELL else f"probably {with_share(first)}"
     if transition == Transition.REPUBLISHED:
         over = "no alarm" if alarm.severity == Severity.NONE else "back to normal"
         return f"{f'{alarm.severity.words} goes on' if alarm.active else over}, after a restart"

@@ -32,6 +32,7 @@ from schemas.health import Health
 from schemas.messages import Alarm, Diagnosis, Message, ModelCard, Score
 from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from scoring.diagnosis.shown_causes import CANNOT_TELL
 from stages.viewer import ViewerConfig, build
 from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
 
@@ -138,6 +139,11 @@ def play(core: Core, scores: Sequence[Score]) -> None:
             "fan 0: alarm severity, does not turn as commanded",
         ),
         ({"transition": Transition.DIAGNOSED, "causes": CAUSES}, "INFO", "fan 0: probably an external torque 64 %"),
+        (
+            {"transition": Transition.DIAGNOSED, "causes": (Diagnosis(cause=CANNOT_TELL, probability=0.38),)},
+            "INFO",
+            "fan 0: cannot tell 38 %",
+        ),
         (
             {"transition": Transition.REPUBLISHED, "severity": Severity.ALARM},
             "ERROR",
