@@ -12,7 +12,7 @@ from pipeline.config.models import Config
 from pipeline.viewing.loopback import LOOPBACK
 
 PICTURE = "page.png"
-SIZE = (1280, 1270)
+SIZE = (1280, 1560)
 AFTER_S = 2.5
 """of the alarm: its cause is known, and the plots show how it began"""
 _READY = (
