@@ -20,7 +20,7 @@ from playwright.sync_api import sync_playwright
 from pipeline.cli.watch.page_picture import installed_browser
 from pipeline.config.models import TrayConfig
 from pipeline.gateway.config import GatewayConfig
-from pipeline.runtime.stage import Context
+from pipeline.runtime.stage import Context, Core
 from pipeline.selftest.scratch_site import free_port
 from schemas.enums import FanState
 from schemas.envelope import Envelope
@@ -68,7 +68,7 @@ def main() -> None:
             core.close()
 
 
-def _feed(core, trays: tuple[TrayConfig, ...], stop: threading.Event) -> None:  # noqa: ANN001
+def _feed(core: Core, trays: tuple[TrayConfig, ...], stop: threading.Event) -> None:
     random = np.random.default_rng(1)
     level = random.uniform(0.05, 0.5, (len(trays), 1, FANS_OF_TRAY))
     state = np.full(level.shape, FanState.NORMAL, np.uint8)

@@ -86,7 +86,7 @@ class Api:
     """by tray, of Rerun's viewer for browsers; none where it is not served"""
     clip_folders: Sequence[Path] = ()
     """of the alarm clips of recorders on this host"""
-    _alarms: dict[bool, SharedAnswer] = field(default_factory=dict[bool, SharedAnswer], init=False)
+    _shared: dict[str, SharedAnswer] = field(default_factory=dict[str, SharedAnswer], init=False)
 
     @reads
     async def site(self, request: Request) -> Response:
@@ -125,9 +125,8 @@ class Api:
     async def alarms(self, request: Request) -> Response:
         """The current alarms; ?all=1 also those that are over."""
         everything = request.query_params.get("all", "") == "1"
-        if everything not in self._alarms:
-            self._alarms[everything] = SharedAnswer(partial(alarms_json, self.model, everything=everything))
-        return await self._alarms[everything].to(request)
+        name = "all alarms" if everything else "alarms"
+        return await self._answer(name, partial(alarms_json, self.model, everything=everything)).to(request)
 
     @reads
     async def alarm_history(self, request: Request) -> Response:
@@ -158,7 +157,7 @@ class Api:
     async def alarm_rate(self, request: Request) -> Response:
         """The rate of false alarms that really was beside the declared one, of each tray and of the site."""
         try:
-            return JSONResponse(await asyncio.to_thread(rates_json, self.model))
+            return await self._answer("rate", partial(rates_json, self.model)).to(request)
         except UserError as error:
             raise HTTPException(503, "the rate cannot be read: see the problem of the gateway") from error
 
@@ -282,6 +281,12 @@ class Api:
             "has_login": self.access.has_login,
             "csrf_token": visitor.session.csrf_token if visitor.session else "",
         }
+
+    def _answer(self, name: str, make: Callable[[], Any]) -> SharedAnswer:
+        """The one for all who ask for this."""
+        if name not in self._shared:
+            self._shared[name] = SharedAnswer(make)
+        return self._shared[name]
 
     def _kept_clips(self) -> list[tuple[Path, Clip]]:
         listed = [(folder, clip) for folder in self.clip_folders for clip in kept_clips(folder)]

@@ -89,25 +89,20 @@ class AlarmRates:
         """Take what has come to the store, and when fans were judged; a stretch that has grown replaces itself. What
         the disk has no room for is taken the next time."""
         try:
-            position = store.position(_READER)
-            new = store.after(position, _AT_ONCE)
-            self._file.execute("BEGIN")
-            for _, alarm in new:
-                self._add(alarm)
-            self._file.executemany(_GROW, map(astuple, stretches))
-            for table in ("alarm", "judged"):
-                self._file.execute(f"DELETE FROM {table} WHERE rowid <= (SELECT MAX(rowid) FROM {table}) - {MOST_KEPT}")
-            self._file.execute("COMMIT")
+            position, is_behind = store.position(_READER), True
+            while is_behind:
+                new = store.after(position, _AT_ONCE)
+                self._keep([alarm for _, alarm in new], stretches)
+                is_behind, stretches = len(new) == _AT_ONCE, ()
+                if new:
+                    position = new[-1][0]
+                    store.set_position(_READER, position)  # not kept: they are taken again, and nothing changes
         except (sqlite3.Error, UserError) as error:
             if self._file.in_transaction:
                 self._file.execute("ROLLBACK")
             self.problem = f"{self._path}: {error}: the rate of false alarms does not go on"
             return
         self.problem = ""
-        if new:
-            store.set_position(_READER, new[-1][0])  # not kept: they are taken again, and nothing changes
-            if len(new) == _AT_ONCE:
-                self.catch_up(store, ())
 
     def add_earlier(self, alarms: Sequence[Alarm]) -> None:
         """Take what operators said of alarms of before the gateway's first start. They count in no rate: for how long
@@ -169,6 +164,15 @@ class AlarmRates:
             unmarked=counts.get(Feedback.NONE, 0),
             declared_per_day=declared_per_day,
         )
+
+    def _keep(self, alarms: Sequence[Alarm], stretches: Sequence[JudgedStretch]) -> None:
+        self._file.execute("BEGIN")
+        for alarm in alarms:
+            self._add(alarm)
+        self._file.executemany(_GROW, map(astuple, stretches))
+        for table in ("alarm", "judged"):
+            self._file.execute(f"DELETE FROM {table} WHERE rowid <= (SELECT MAX(rowid) FROM {table}) - {MOST_KEPT}")
+        self._file.execute("COMMIT")
 
     def _add(self, alarm: Alarm) -> None:
         """Messages may come in any order: after a restart, those of the bus do."""

@@ -419,6 +419,13 @@ def test_a_fan_shows_its_wear_its_advice_and_where_rerun_is(tmp_path):
         gateway.close()
 
 
+def golden_twin() -> ModelCard:
+    """It declares 24 false alarms per fan and day."""
+    (card, *_) = (envelope.message for envelope in rare_messages(GOLDEN, "twin"))
+    assert isinstance(card, ModelCard)
+    return replace(card, header=Header("integrator", 0, TRAY))
+
+
 def marked(feedback: Feedback, sequence: int, reason: str = "") -> Alarm:
     transition = Transition.MARKED_TRUE if feedback == Feedback.TRUE_ALARM else Transition.MARKED_FALSE
     more = {"feedback": feedback, "feedback_by": "ann", "feedback_reason": reason, "comment": reason}
@@ -426,9 +433,7 @@ def marked(feedback: Feedback, sequence: int, reason: str = "") -> Alarm:
 
 
 def test_the_rate_of_false_alarms_is_over_the_judged_time_and_beside_the_declared_one(tmp_path, users):
-    (card, *_) = (envelope.message for envelope in rare_messages(GOLDEN, "twin"))
-    assert isinstance(card, ModelCard)
-    twin = replace(card, header=Header("integrator", 0, TRAY))
+    twin = golden_twin()
     for number in range(2):  # the second process continues with the file of the first
         gateway = RunningGateway(tmp_path, granted, users=users)
         try:

@@ -9,7 +9,7 @@ const OF_FAN = ["raised", "severity", "diagnosed"];  // these have the colour of
 const MARKS = { alarm: "✖", warning: "▲", none: "●" };
 const PAGE = 100;
 const SHOWN = 100;
-const RATE_EVERY_MS = 5000;
+const RATE_EVERY_MS = 60000, RATE_AFTER_MS = 3000;
 
 const name = (alarm) => `${alarm.tray}/${alarm.fan}`;
 const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.tray)}/${alarm.fan}` }, `${alarm.tray} fan ${alarm.fan}`);
@@ -56,17 +56,31 @@ export class AlarmsView {
     Object.assign(this, { alarms, viewerUrl, most: SHOWN, due: 0 });
     this.root = element("div");
     this.rate = element("p", { class: "muted", id: "alarm-rate" });
-    this.timer = setInterval(() => learn(() => this.showRate()), RATE_EVERY_MS);
-    learn(() => this.showRate());
+    this.showRate();
     this.draw();
   }
 
   close() {
-    clearInterval(this.timer);
+    clearTimeout(this.timer);
   }
 
   // How many alarms really were false, beside how many are declared.
-  async showRate() {
+  showRate() {
+    this.rateBy_ms = Infinity;
+    this.showRateWithin(RATE_EVERY_MS);
+    return learn(() => this.askRate());
+  }
+
+  // An alarm, or what was said of one, changes it.
+  showRateWithin(ms) {
+    const by_ms = performance.now() + ms;
+    if (by_ms >= this.rateBy_ms) return;
+    this.rateBy_ms = by_ms;
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.showRate(), ms);
+  }
+
+  async askRate() {
     const { site } = await ask("/alarm-rate");
     if (site.since_t_ns) this.rate.textContent = `Since ${clock(site.since_t_ns)}: ${site.text}.`;
   }
@@ -74,6 +88,7 @@ export class AlarmsView {
   // When many come at once, they are drawn together.
   update() {
     this.due ||= requestAnimationFrame(() => this.draw());
+    this.showRateWithin(RATE_AFTER_MS);
   }
 
   draw() {

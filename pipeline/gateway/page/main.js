@@ -154,6 +154,7 @@ async function start() {
     showUser();
     if (!me.may_read) {
       events.close();
+      view?.close?.();
       content.replaceChildren(element("p", {}, me.has_login ? "Log in to see the fans." : "The proxy has not passed on your user name."));
       if (me.has_login) showLogin(start);
       return;
