@@ -24,7 +24,6 @@ from scoring.detectors.detector import Detector, DetectorContext, Signal
 from scoring.detectors.motion import HealthyMotion, Motion
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
-from scoring.former_snapshot_keys import current_fan_scorer
 from scoring.gaps import Gaps
 from scoring.interval_scorer import IntervalScorer, detect
 from scoring.limits import Limits
@@ -48,33 +47,10 @@ class FanScorer:
         *,
         tachos: Sequence[Tacho] = INSTANTANEOUS,
         for_calibration: bool = False,
-        forgets_over_gaps: bool = True,
-        skips_transients: bool = True,
-        allows_for_counts: bool = True,
-        limits_motion: bool = True,
-        begins_still: bool = True,
-        keeps_shared: bool = True,
-        shares_at_first: bool = True,
-        compares_fast: bool = True,
     ) -> None:
-        """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits.
-
-        forgets_over_gaps: False only to decide as for recordings made before statistics started again after gaps.
-        skips_transients: False only to decide as for recordings made before fans that moved were not commissioned.
-        allows_for_counts: False only to decide as for recordings made before readings of a tacho that counts were
-        allowed to be unsteady while the fan changes its speed, and to repeat where a healthy fan would read the same.
-        limits_motion: False only to decide as for recordings made when limits widened with any motion of the readings.
-        begins_still: False only to decide as for recordings made when a single reading could be the first baseline.
-        keeps_shared: False only to decide as for recordings made when fans that were commissioned again, all of them,
-        shared nothing at first.
-        shares_at_first: False only to decide as for recordings made when nothing was shared before fans had baselines.
-        compares_fast: False only to decide as for recordings made when slow fans were compared with fast ones.
-        """
+        """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits."""
         self.limits = limits
-        self.residuals: dict[Signal, Residual] = {
-            source: Residual(fans, source, limits, shares_at_first=shares_at_first, compares_fast=compares_fast)
-            for source in RESIDUALS
-        }
+        self.residuals: dict[Signal, Residual] = {source: Residual(fans, source, limits) for source in RESIDUALS}
         contexts = {
             source: residual.context(fans, capped=not for_calibration) for source, residual in self.residuals.items()
         }
@@ -84,7 +60,6 @@ class FanScorer:
             smoothing_s=limits.timing.smoothing_s,
             capped=not for_calibration,
             tachos=of_each_fan,
-            allows_for_counts=allows_for_counts,
         )
         self._rows = rows()
         self.detectors: dict[str, Detector] = {
@@ -102,21 +77,20 @@ class FanScorer:
             for source in INPUTS
         }
         """the detectors of each input, and their places in the table"""
-        self._movement = Movement(fans) if skips_transients else None
-        self._keeps_shared = keeps_shared
+        self._movement = Movement(fans)
         self._intervals = IntervalScorer(
             fans,
             self.residuals,
             {source: self._detectors_of[source] for source in RESIDUALS},
             interval_ns=max(1, round(limits.timing.baseline_s * NS_PER_S)),
-            counts=np.array([allows_for_counts and tacho.held_s > 0.0 for tacho in of_each_fan]),
-            held_ns=np.array([tacho.held_s * NS_PER_S for tacho in of_each_fan]) if begins_still else None,
+            counts=np.array([tacho.held_s > 0.0 for tacho in of_each_fan]),
+            held_ns=np.array([tacho.held_s * NS_PER_S for tacho in of_each_fan]),
             movement=self._movement,
         )
         self._judges_rest = any(row.only_at_rest and row.name in self.detectors for row in self._rows)
         self._motion = Motion(fans)
-        self._healthy_motion = HealthyMotion(fans) if limits_motion else None
-        self._gaps = Gaps(len(INPUTS), fans) if forgets_over_gaps else None
+        self._healthy_motion = HealthyMotion(fans)
+        self._gaps = Gaps(len(INPUTS), fans)
         self._memories = self._memories_ns()
         self._shortest_memory_ns = min(memory_ns for _, _, memory_ns in self._memories)
         self.origin_t_ns: int | None = None
@@ -202,8 +176,9 @@ class FanScorer:
         return [
             self._intervals,
             self._motion,
-            *(self._healthy_motion.states if self._healthy_motion else ()),
-            *(state for state in (self._movement, self._gaps) if state),
+            *self._healthy_motion.states,
+            self._movement,
+            self._gaps,
             *self.detectors.values(),
             *(state for residual in self.residuals.values() for state in residual.states),
         ]
@@ -221,12 +196,11 @@ class FanScorer:
     def recommission(self, fans: Array) -> None:
         """Learn new baselines for some fans, (fans,) of bool."""
         for residual in self.residuals.values():
-            residual.restart(fans, keeps_shared=self._keeps_shared)
+            residual.restart(fans)
             residual.reset(fans)
         for detector in self.detectors.values():
             detector.reset(fans)
-        if self._movement:
-            self._movement.restart(fans)
+        self._movement.restart(fans)
         self._intervals.restart(fans)
 
     @property
@@ -288,14 +262,11 @@ class FanScorer:
         for source in RESIDUALS:
             forgotten.append((source, self.residuals[source].reset, self.residuals[source].memory_s))
         forgotten.append(("tacho", self._motion.reset, self._motion.memory_s))
-        if self._healthy_motion:
-            forgotten.append(("tacho", self._healthy_motion.reset, self._healthy_motion.memory_s))
+        forgotten.append(("tacho", self._healthy_motion.reset, self._healthy_motion.memory_s))
         return [(INPUTS.index(source), reset, round(memory_s * NS_PER_S)) for source, reset, memory_s in forgotten]
 
     def _missing_ns(self, block: Samples) -> Array:
         """(n, inputs, fans) how long each input was missing before each of its samples, ns."""
-        if self._gaps is None:
-            return np.zeros((len(block.t_ns), 1, 1))
         valid = np.array((block.speed_valid, block.balance_valid, block.alive)).swapaxes(0, 1)
         return self._gaps.update(block.t_ns, block.period_ns, valid)
 
@@ -310,15 +281,13 @@ class FanScorer:
         """What follows from samples without the baselines. scores: of these samples, not filled in yet."""
         speed_rad_s, period_s = samples.speed_rad_s, samples.period_ns / NS_PER_S
         motion_rad_s = self._motion.update(speed_rad_s, period_s)
-        transient_rad_s = np.abs(motion_rad_s)
-        if self._healthy_motion:
-            healthy_rad_s = self._healthy_motion.update(samples.command, samples.predicted_rad_s, speed_rad_s, period_s)
-            transient_rad_s = np.minimum(transient_rad_s, healthy_rad_s)
+        healthy_rad_s = self._healthy_motion.update(samples.command, samples.predicted_rad_s, speed_rad_s, period_s)
+        transient_rad_s = np.minimum(np.abs(motion_rad_s), healthy_rad_s)
         operating_rad_s = samples.operating_speed_rad_s(is_predicted=self.limits.over_predicted_speed)
         piece = Piece(
             samples=samples,
             transient_rad_s=transient_rad_s,
-            movement=self._movement.samples(motion_rad_s, speed_rad_s) if self._movement else None,
+            movement=self._movement.samples(motion_rad_s, speed_rad_s),
             residuals={
                 source: residual.samples(*samples.residual(source), operating_rad_s, transient_rad_s, period_s)
                 for source, residual in self.residuals.items()
@@ -349,9 +318,9 @@ class FanScorer:
             "origin_t_ns": self.origin_t_ns,
             **self._intervals.snapshot(),
             "motion": self._motion.snapshot(),
-            **({"healthy_motion": self._healthy_motion.snapshot()} if self._healthy_motion else {}),
-            **({"movement": self._movement.snapshot()} if self._movement else {}),
-            **({"gaps": self._gaps.snapshot()} if self._gaps else {}),
+            "healthy_motion": self._healthy_motion.snapshot(),
+            "movement": self._movement.snapshot(),
+            "gaps": self._gaps.snapshot(),
             "detectors": {name: detector.snapshot() for name, detector in self.detectors.items()},
             **{source: residual.snapshot() for source, residual in self.residuals.items()},
         }
@@ -359,14 +328,12 @@ class FanScorer:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a snapshot for as many fans; if this raises, nothing has changed.
 
-        A detector that is missing in the snapshot, as after an update that added it, starts from its initial state.
-
         Raises:
             ValueError, KeyError, TypeError: it is no snapshot of a FanScorer.
         """
         before = self.snapshot()
         try:
-            self._restore(state if "detectors" in state else current_fan_scorer(state))
+            self._restore(state)
         except (ValueError, LookupError, TypeError, AttributeError, OverflowError):
             self._restore(before)
             raise
@@ -374,17 +341,13 @@ class FanScorer:
     def _restore(self, state: Mapping[str, Any]) -> None:
         self._intervals.restore(state)
         self._motion.restore(state["motion"])
-        if self._healthy_motion and "healthy_motion" in state:
-            self._healthy_motion.restore(state["healthy_motion"])
-        if self._movement and "movement" in state:
-            self._movement.restore(state["movement"])
-        if self._gaps and "gaps" in state:
-            self._gaps.restore(state["gaps"])
+        self._healthy_motion.restore(state["healthy_motion"])
+        self._movement.restore(state["movement"])
+        self._gaps.restore(state["gaps"])
         for source, residual in self.residuals.items():
             residual.restore(state[source])
         for name, detector in self.detectors.items():
-            if name in state["detectors"]:
-                detector.restore(state["detectors"][name])
+            detector.restore(state["detectors"][name])
         origin_t_ns = state["origin_t_ns"]
         self.origin_t_ns = None if origin_t_ns is None else int(origin_t_ns)
 

@@ -39,12 +39,11 @@ class IntervalScorer(ColumnState):
         *,
         interval_ns: int,
         counts: Array,
-        held_ns: Array | None,
-        movement: Movement | None,
+        held_ns: Array,
+        movement: Movement,
     ) -> None:
         """detectors_of: of each residual. counts: (fans,) whose readings go up and down in steps as the speed changes.
-        held_ns: (fans,) how long readings are held; None: it does not matter. movement: of the fans, kept by the
-        caller; None: it does not matter.
+        held_ns: (fans,) how long readings are held. movement: of the fans, kept by the caller.
         """
         self._residuals = residuals
         self._detectors_of = detectors_of
@@ -103,10 +102,8 @@ class IntervalScorer(ColumnState):
 
     def _end_interval(self, period_ns: int) -> None:
         expected = self.interval_ns // period_ns
-        moving = self._movement.end_interval(self._commissioning) if self._movement else None
-        few_readings = None
-        if self._held_ns is not None:
-            few_readings = self.interval_ns / np.maximum(self._held_ns, period_ns) < MIN_STEADY_READINGS
+        moving = self._movement.end_interval(self._commissioning)
+        few_readings = self.interval_ns / np.maximum(self._held_ns, period_ns) < MIN_STEADY_READINGS
         for residual in self._residuals.values():
             residual.end_interval(expected, self._within_limit, self._below_half_limit, moving, few_readings)
         self._below_half_limit[:] = self._within_limit[:] = True
@@ -147,8 +144,7 @@ class IntervalScorer(ColumnState):
         for source, residual in self._residuals.items():
             residual.take(sampled[source], of[source])
             piece.scored[source].append(of[source])
-        if self._movement and moved is not None:
-            self._movement.take(moved, self._commissioning)
+        self._movement.take(moved, self._commissioning)
         return intervals.rows
 
     @property
@@ -182,14 +178,11 @@ class IntervalScorer(ColumnState):
         for detector, state in zip(detectors, states, strict=True):
             detector.restore(state)
 
-    def _sampled(
-        self, piece: Piece, begin: int, intervals: Intervals
-    ) -> tuple[dict[Signal, SampledResidual], Array | None]:
+    def _sampled(self, piece: Piece, begin: int, intervals: Intervals) -> tuple[dict[Signal, SampledResidual], Array]:
         """The residuals at these samples, and the sums of the fans' movement."""
-        rows, moved, moving = slice(begin, begin + intervals.rows), None, None
-        if self._movement and piece.movement is not None:
-            moved = self._movement.over(piece.movement[:, rows], intervals)
-            moving = self._movement.moving(moved, self._commissioning) if len(intervals) > 1 else None
+        rows = slice(begin, begin + intervals.rows)
+        moved = self._movement.over(piece.movement[:, rows], intervals)
+        moving = self._movement.moving(moved, self._commissioning) if len(intervals) > 1 else None
         return {
             source: residual.over(piece.residuals[source].rows(rows), intervals, moving)
             for source, residual in self._residuals.items()

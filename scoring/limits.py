@@ -15,6 +15,7 @@ from pydantic_core import PydanticCustomError
 from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.shared_offset import LEAST_FANS
 from scoring.detectors.detector import DetectorSettings, Signal
+from scoring.detectors.missing_readings import MissingReadingsSettings
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
 from scoring.detectors.tacho import TachoSettings
@@ -126,6 +127,10 @@ class Limits(_Entry):
         of_source = (self.detectors.get(row.name) for row in rows() if row.source == source)
         return next((settings for settings in of_source if isinstance(settings, kind)), None)
 
+    def with_detectors(self, **settings: DetectorSettings) -> Limits:
+        """The same with these detectors, by name."""
+        return self.model_copy(update={"detectors": {**self.detectors, **settings}})
+
     def times(self, factor: float) -> Limits:
         """The same with every limit `factor` times as far. The declared rate is not valid for them."""
         if factor == 1.0:
@@ -157,7 +162,7 @@ def _settings_of(name: str, kind: type[DetectorSettings], entry: Any) -> Detecto
 
 
 def uncalibrated(alarm_sigmas: float, timing: Timing) -> Limits:
-    """Limits of a twin that was not calibrated: alarm_sigmas on the smoothed speed residual, and nothing else."""
+    """Limits of a twin that was not calibrated: alarm_sigmas on the smoothed speed residual, and missing readings."""
     return Limits(
         # a low-pass does not reduce a nearly constant residual: its limit is always in sigma
         speed=HealthyResidual(autocorrelation_time_s=NEVER_S),
@@ -165,6 +170,7 @@ def uncalibrated(alarm_sigmas: float, timing: Timing) -> Limits:
         detectors={
             "speed_smoothed": SmoothedSettings(limit=alarm_sigmas),
             "sensor": TachoSettings(stuck_s=NEVER_S, missing_share=1.0),
+            "missing_readings": MissingReadingsSettings(),
         },
         timing=timing,
     )

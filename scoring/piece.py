@@ -31,8 +31,8 @@ class Piece:
     table: Sequence[DetectorRow]
     transient_rad_s: Array
     """(n, fans) see scoring.detectors.motion"""
-    movement: Array | None
-    """see Movement.samples; None where it does not count"""
+    movement: Array
+    """see Movement.samples"""
     residuals: dict[Signal, ResidualSamples]
     ratios: Array
     """(rows of the table, n, fans) every statistic in multiples of its limit; NaN where there is none"""

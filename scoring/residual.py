@@ -34,10 +34,7 @@ LARGEST_SIGMAS = 1e6  # so that sums and squares stay finite
 class Residual:
     """The speed residual or the torque balance, with the baseline of every fan."""
 
-    def __init__(
-        self, fans: int, source: Signal, limits: Limits, *, shares_at_first: bool, compares_fast: bool
-    ) -> None:
-        """shares_at_first: what fans share is found before they have baselines. compares_fast: see SharedOffset."""
+    def __init__(self, fans: int, source: Signal, limits: Limits) -> None:
         healthy = limits.residual(source)
         offsets = healthy.fan_offsets
         self._fan_offsets = np.array(offsets.offset_sigmas).T if offsets else np.zeros((1, fans))
@@ -60,11 +57,9 @@ class Residual:
                 interval_s=limits.timing.baseline_s,
                 adaptation_s=limits.timing.adaptation_s,
                 reach_sigmas=healthy.baseline.adaptation_limit_sigmas,
-                compares_fast=compares_fast,
             )
         self._sharing: SharedOffset | JointSharedOffset | None = self._shared
         """the same; while several trays are scored in one pass, that of each"""
-        self._shares_at_first = shares_at_first
         self._low_pass = LowPass(fans, self._smoothing_s)
 
     def share_as(self, of_trays: Sequence[Residual]) -> None:
@@ -117,12 +112,13 @@ class Residual:
         )
 
     def over(self, of: ResidualSamples, intervals: Intervals, moving: Array | None) -> SampledResidual:
-        """Samples of the present interval and later ones. moving: (intervals, fans) see Movement; None: no fan."""
+        """Samples of the present interval and later ones. moving: (intervals, fans) see Movement; None for a single
+        interval, which does not end here."""
         baseline, scaling, commissioned = self.baseline, of.scaling, self._commissioned
         learned = of.valid & (of.seen | baseline.is_commissioning)
         if self._sharing is None:
             return SampledResidual(of, intervals, None, np.zeros(of.valid.shape), of.residual, learned)
-        if self._shares_at_first and not commissioned.any():
+        if not commissioned.any():
             offset, known = of.residual, of.valid & of.seen
         else:
             offset, known = of.residual - baseline.commissioned * scaling, of.valid & commissioned & of.seen
@@ -152,7 +148,7 @@ class Residual:
             standardised=standardised.clip(-of.clip, of.clip),
             persistent=(standardised / persistent_std).clip(-of.clip, of.clip),
             shift=shift,
-            baseline=own + sampled.shared if self._sharing else own,  # a sum would make -0.0 of older recordings 0.0
+            baseline=own + sampled.shared if self._sharing else own,
             shared=sampled.shared,
             intervals=sampled.intervals,
             state=state,
@@ -209,11 +205,11 @@ class Residual:
         samples: int,
         within_limit: Array,
         below_half_limit: Array,
-        moving: Array | None,
-        few_readings: Array | None = None,
+        moving: Array,
+        few_readings: Array,
     ) -> None:
         """End the interval; see Baseline.end_interval."""
-        at_first = self._shares_at_first and not self.is_commissioned
+        at_first = not self.is_commissioned
         if self._sharing:
             is_known = self._sharing.is_known
             alone = self._sharing.end_interval(samples, self._commissioned, below_half_limit, moving, at_first=at_first)
@@ -234,11 +230,11 @@ class Residual:
         """(fans,) which fans have a baseline to be measured against."""
         return self.baseline.is_set & ~self.baseline.is_commissioning
 
-    def restart(self, fans: Array, *, keeps_shared: bool) -> None:
-        """Commission some fans again, (fans,) of bool. keeps_shared: see SharedOffset.restart."""
+    def restart(self, fans: Array) -> None:
+        """Commission some fans again, (fans,) of bool."""
         self.baseline.restart(fans)
         if self._shared:
-            self._shared.restart(fans, keeps_value=keeps_shared)
+            self._shared.restart(fans)
 
     @property
     def shared_offset(self) -> float:
@@ -308,7 +304,7 @@ class Residual:
         """Continue from a snapshot. Raises as ColumnState.restore does."""
         self.baseline.restore(state["baseline"])
         self._low_pass.restore(state["low_pass"])
-        if self._shared and "shared" in state:
+        if self._shared:
             self._shared.restore(state["shared"])
 
     def _clip(self, period_s: float) -> float:

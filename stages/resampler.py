@@ -44,7 +44,6 @@ from pipeline.devices.line_rate import (
     is_too_slow,
     leaves_gaps,
 )
-from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.sample_grid import SampleGrid
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from schemas.messages import Grid, Raw, StatedTacho
@@ -106,7 +105,6 @@ class ResamplerCore(Core):
         config: ResamplerConfig,
         *,
         tachos: Sequence[Tacho] = INSTANTANEOUS,
-        decision_rules: DecisionRules = CURRENT_RULES,
     ) -> None:
         """tachos: how the speed is measured, one for all fans or one for each."""
         self._fans = fans
@@ -115,8 +113,7 @@ class ResamplerCore(Core):
         """by the newest message"""
         self._other_tachos = ""
         self._config = config
-        self._decision_rules = decision_rules
-        self._line = LineRate(knows_losses=decision_rules >= DecisionRules.LOSSES_OF_LINE)
+        self._line = LineRate()
         self._line_hz: float | None = None
         """as found; None: not yet, or not asked for"""
         self._waiting: list[Raw] = []
@@ -234,8 +231,7 @@ class ResamplerCore(Core):
         self._line_hz = self._line.line_hz
         grid = self._start(grid_rate_hz(self._line_hz))
         waiting, self._waiting = self._waiting, []
-        if self._decision_rules >= DecisionRules.FIRST_DELAY:
-            waiting[0] = _received_earlier(waiting[0], self._line.first_lateness_ns)
+        waiting[0] = _received_earlier(waiting[0], self._line.first_lateness_ns)
         for item in waiting:
             yield from grid.step(item)
 
@@ -244,9 +240,7 @@ class ResamplerCore(Core):
         if self._line_hz is not None and is_too_slow(self._line_hz):
             config = config.model_copy(update={"gap_limit_s": config.gap_limit_s or 1.0 / rate_hz})
         self._timing = config.timing(rate_hz)
-        self._grid = SampleGrid(
-            self._tachos, self._timing, self._decision_rules, round(self._config.link_wait_s * NS_PER_S)
-        )
+        self._grid = SampleGrid(self._tachos, self._timing, round(self._config.link_wait_s * NS_PER_S))
         return self._grid
 
 
@@ -259,8 +253,7 @@ def _received_earlier(message: Raw, lateness_ns: int) -> Raw:
 
 def build(context: Context) -> BuiltStage:
     """The core of one tray."""
-    tray, rules = context.tray, context.decision_rules
-    return BuiltStage(ResamplerCore(tray.fans, context.config, tachos=tray.tachos, decision_rules=rules))
+    return BuiltStage(ResamplerCore(context.tray.fans, context.config, tachos=context.tray.tachos))
 
 
 STAGE = Stage(

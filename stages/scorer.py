@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, healthy_twin
 from pipeline.runtime.joint_tray_scorer import JointTrayScorer
 from pipeline.runtime.judged_share import JudgedShare
@@ -29,7 +28,7 @@ from pipeline.runtime.learned_scorer import LearnedTwinScorer
 from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.snapshot_store import Elsewhere, SnapshotStore
 from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError
-from pipeline.runtime.tray_scorer import DATA_LOST_AFTER_NS, TrayScorer
+from pipeline.runtime.tray_scorer import TrayScorer
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.blocks import select
 from schemas.enums import Transition
@@ -38,8 +37,8 @@ from schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Sco
 from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_text import AlarmText
+from scoring.alarms.fan_condition import DATA_LOST_AFTER_NS
 from scoring.alarms.unscored_monitor import UnscoredMonitor
-from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
 from scoring.snapshot_times import with_times_moved
 
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
@@ -51,7 +50,7 @@ SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "baselines, alarms and wear start from the beginning"
 OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
 ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
-FORMER_TWIN = (
+EARLIER_TWIN = (
     "the snapshot is of the twin before: baselines and alarms start from the beginning, wear continues; "
     f"{OPERATORS_KEPT}"
 )
@@ -76,7 +75,6 @@ class ScorerCore(Core):
         config: ScorerConfig,
         twin: HealthyTwin,
         snapshot_store: SnapshotStore | None = None,
-        decision_rules: DecisionRules = CURRENT_RULES,
         started_t_ns: int | None = None,
         continues: ScorerSnapshot | None = None,
         is_learned: bool = False,
@@ -88,7 +86,6 @@ class ScorerCore(Core):
         self._twin = twin
         self._config = config
         self._text = AlarmText(speed_unit, twin.command_unit)
-        self._decision_rules = decision_rules
         self._is_learned = is_learned
         self._unscored = UnscoredMonitor(fans, max(1, round(config.not_judged_s * NS_PER_S)))
         self._snapshot_store = snapshot_store
@@ -114,7 +111,7 @@ class ScorerCore(Core):
         """the snapshot is of later times than now: the first prediction shows whether all times have gone back"""
 
     def _start_new(self) -> None:
-        self.tray = TrayScorer(self._fans, self._text, self._config, self._twin, self._decision_rules)
+        self.tray = TrayScorer(self._fans, self._text, self._config, self._twin)
         self._last_t_ns = self._snapshot_t_ns = np.iinfo(np.int64).min
         self._input_producer = ""
         """who made the last prediction"""
@@ -129,7 +126,7 @@ class ScorerCore(Core):
         the wear is restored as well.
         """
         try:
-            state = current_keys(json.loads(snapshot.state_json), FORMER_SCORER_KEYS)
+            state = json.loads(snapshot.state_json)
             self.tray.alarms.restore(state["alarms"])
             input_producer = str(state["input_producer"])
         except RESTORE_ERRORS:
@@ -139,7 +136,7 @@ class ScorerCore(Core):
             return []
         if snapshot.twin_sha256 != self._twin.sha256:
             self._counts["snapshots_of_another_twin"] += 1
-            self._not_restored = FORMER_TWIN if self._is_learned and self._restore_wear(state) else ANOTHER_TWIN
+            self._not_restored = EARLIER_TWIN if self._is_learned and self._restore_wear(state) else ANOTHER_TWIN
         else:
             try:
                 self.tray.restore_baselines(state)
@@ -157,7 +154,7 @@ class ScorerCore(Core):
     def _restore_wear(self, state: Mapping[str, Any]) -> bool:
         """Continue the wear of the twin before; False if it cannot be read."""
         try:
-            self.tray.wear.restore_of_former_twin(state["wear"])
+            self.tray.wear.restore_of_earlier_twin(state["wear"])
         except RESTORE_ERRORS:
             return False
         return True
@@ -168,7 +165,7 @@ class ScorerCore(Core):
         _, *alarms = self.restore(snapshot)
         if not self._not_restored:
             return []
-        if self._not_restored in (ANOTHER_TWIN, FORMER_TWIN):  # as it should be
+        if self._not_restored in (ANOTHER_TWIN, EARLIER_TWIN):  # as it should be
             self._not_restored = ""
         return alarms
 
@@ -396,7 +393,6 @@ def build(context: Context) -> BuiltStage:
             context.config,
             healthy_twin(context, twin),
             store,
-            decision_rules=context.decision_rules,
             started_t_ns=context.started_t_ns,
             continues=continues,
             is_learned=tray.twin is None,

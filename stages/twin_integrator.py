@@ -34,7 +34,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.joint_tray_integrator import JointTrayIntegrator
 from pipeline.runtime.learned_integrator import LearnedTwinIntegrator
 from pipeline.runtime.old_samples import OldSamples
@@ -57,13 +56,11 @@ class TwinIntegratorCore(Core):
         config: TwinIntegratorConfig,
         started_t_ns: int,
         *,
-        decision_rules: DecisionRules = CURRENT_RULES,
         content: bytes = b"",
     ) -> None:
         """content: of the file of a learned twin, published with its card."""
         self._twin = twin
-        self.tray = TrayIntegrator(twin, config, decision_rules)
-        self._knows_breaks = decision_rules >= DecisionRules.BREAKS
+        self.tray = TrayIntegrator(twin, config)
         self._producer = ""  # of the newest grid
         self._card = [
             ModelCard(
@@ -160,7 +157,7 @@ class TwinIntegratorCore(Core):
         Each derives times from the clock of the device again. By tens of milliseconds they may differ, as if the speed
         had jumped.
         """
-        return self._knows_breaks and self._last_t_ns is not None and grid.header.producer != self._producer
+        return self._last_t_ns is not None and grid.header.producer != self._producer
 
 
 class JointIntegrators:
@@ -180,14 +177,13 @@ def build(context: Context) -> BuiltStage:
     Raises:
         StageError: the twin cannot be used.
     """
-    config, rules = context.config, context.decision_rules
     if context.tray.twin is None:
 
         def core_of(twin: TwinFile, first_t_ns: int, content: bytes) -> TwinIntegratorCore:
-            return TwinIntegratorCore(twin, config, first_t_ns, decision_rules=rules, content=content)
+            return TwinIntegratorCore(twin, context.config, first_t_ns, content=content)
 
         return BuiltStage(LearnedTwinIntegrator(context.tray, core_of))
-    return BuiltStage(TwinIntegratorCore(load_twin(context), config, context.started_t_ns, decision_rules=rules))
+    return BuiltStage(TwinIntegratorCore(load_twin(context), context.config, context.started_t_ns))
 
 
 def check(context: Context) -> list[str]:

@@ -83,10 +83,8 @@ def parse_config(
     path: Path,
     overrides: Iterable[str] = (),
     stages: Iterable[str] | None = None,
-    former_keys: Iterable[str] = (),
 ) -> Config:
-    """Check the text of a configuration; `path` names it in errors and is where relative paths start. The text may
-    also have `former_keys`, such as `resampler.block_size`; they are left out.
+    """Check the text of a configuration; `path` names it in errors and is where relative paths start.
 
     Raises:
         ConfigError: see `load_config`.
@@ -97,10 +95,6 @@ def parse_config(
             table = tomllib.loads(text)
         except ValueError as error:  # an integer of more than 4,300 digits is one, too
             raise ConfigError(f"{path}: not valid TOML: {error}") from error
-        for former in former_keys:
-            section, key = former.split(".")
-            if isinstance(table.get(section), dict):
-                table[section].pop(key, None)
         for override in overrides:
             _override(table, override)
         return _checked(table, text, path, overrides, stages)

@@ -48,9 +48,7 @@ class DeviceClock:
     late from one to the next. It belongs to the segment before the stall, however long that was.
     """
 
-    def __init__(self, *, knows_backlogs: bool = True) -> None:
-        """knows_backlogs: False only for times as in recordings of former versions."""
-        self._knows_backlogs = knows_backlogs
+    def __init__(self) -> None:
         self.segments = 0
         """Number of segments so far; 1 if nothing was interrupted."""
         self.drift = 0.0
@@ -81,7 +79,7 @@ class DeviceClock:
         if receive_t_ns - self._receive_t_ns > LONGEST_SILENCE_NS:
             late_ns = (receive_t_ns - t_ns + WRAP_TOLERANCE_NS) % WRAP_NS - WRAP_TOLERANCE_NS
             is_backlog = step_us > 0 and (follows or step_us * NS_PER_US <= JUMP_NS) and late_ns > WRAP_TOLERANCE_NS
-            if not (is_backlog and self._knows_backlogs):
+            if not is_backlog:
                 return self._begin(device_clock_us, receive_t_ns)
         if step_us <= 0:
             is_old = -step_us * NS_PER_US < JUMP_NS or receive_t_ns < self._receive_t_ns
@@ -145,7 +143,7 @@ class DeviceClock:
     def _is_shrinking(self, device_ns: int, lateness_ns: int) -> bool:
         """Whether late samples become less late, as those of a backlog do and those after a set clock do not."""
         since_ns, first_ns = device_ns - self._first_lateness[0], self._first_lateness[1]
-        return self._knows_backlogs and lateness_ns < first_ns - LATENESS_JITTER_NS - MAX_DRIFT * since_ns
+        return lateness_ns < first_ns - LATENESS_JITTER_NS - MAX_DRIFT * since_ns
 
 
 def line_below(points: Sequence[Point], at_ns: int, drift: float) -> tuple[float, float]:

@@ -187,9 +187,7 @@ class LineRate:
     The result depends on the samples only, and not on how they are divided into messages.
     """
 
-    def __init__(self, *, knows_losses: bool = True) -> None:
-        """knows_losses: False only for the rates of recordings of former versions."""
-        self._knows_losses = knows_losses
+    def __init__(self) -> None:
         self._times = SampleTimes(MAX_SAMPLES)
         self._seen = 0
         self._first_t_ns = self._last_t_ns = 0
@@ -234,4 +232,4 @@ class LineRate:
     @property
     def line_hz(self) -> float:
         """Samples a second that the device sends."""
-        return self._times.sent_hz if self._knows_losses else self._times.line_hz
+        return self._times.sent_hz

@@ -15,7 +15,7 @@ from pipeline.viewing.fleet import Fan
 from schemas.enums import Severity, Transition
 from schemas.messages import Alarm
 from scoring.alarms.alarm_flags import is_retained, is_silenced
-from scoring.alarms.current_alarms import CurrentAlarm, words_of
+from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from scoring.diagnosis.shown_causes import CANNOT_TELL, likely_causes, likely_evidence
 
@@ -163,7 +163,7 @@ def event_id(alarm: Alarm) -> bytes:
 def past_condition(alarm: Alarm) -> Condition:
     """The condition as it was after a transition of the history."""
     fan = Fan(alarm.header.tray, alarm.fan)
-    current = CurrentAlarm(alarm, words_of(alarm), tuple(alarm.causes), "", alarm.t_ns)
+    current = CurrentAlarm(alarm, alarm.message, tuple(alarm.causes), "", alarm.t_ns)
     return Condition(fan, current, alarm.comment, alarm.t_ns if alarm.comment else 0, alarm.operator_name)
 
 
@@ -207,7 +207,7 @@ def _fields(condition: Condition, now_ns: int) -> dict[str, Any]:
         "SourceName": str(fan),
         "Time": at,
         "ReceiveTime": Time(now_ns),
-        "Message": words_of(newest) if newest else "no alarm has been raised",
+        "Message": newest.message if newest else "no alarm has been raised",
         "Severity": SEVERITIES.get(newest.severity, 1) if newest else 1,
         "ConditionClassId": StandardNode("MaintenanceConditionClassType"),
         "ConditionClassName": "Maintenance",

@@ -21,7 +21,7 @@ from schemas.messages import Alarm, Array, ModelCard
 from schemas.twin_card import CardError, TwinCard
 from schemas.units import RAD_S_PER_UNIT
 from scoring.alarms.alarm_flags import is_listed
-from scoring.alarms.current_alarms import CurrentAlarm, words_of
+from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.calibration.observed_rate import together
 from scoring.diagnosis.shown_causes import (
     CANNOT_TELL,
@@ -191,7 +191,7 @@ def transition_json(number: int, alarm: Alarm, feedback: Feedback = Feedback.NON
         "transition": alarm.transition.name.lower(),
         "severity": alarm.severity.name.lower(),
         "active": alarm.active,
-        "message": words_of(alarm),
+        "message": alarm.message,
         "operator_name": alarm.operator_name,
         "comment": alarm.comment,
         "feedback": feedback.name.lower(),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pipeline.recordings.reading import read_metadata
 
-OF_A_RUN = ("site", "overrides", "decision_rules")
+OF_A_RUN = ("site", "overrides")
 """metadata that all parts of a recording have in common, as they have their attachments"""
 
 

@@ -21,7 +21,6 @@ def recording_metadata(context: Context) -> tuple[dict[str, str], dict[str, byte
         "made_by": f"fantwin {version('fantwin')}",
         "site": context.site,
         "trays": ",".join(tray.name for tray in context.trays),
-        "decision_rules": str(int(context.decision_rules)),
     }
     if context.overrides:
         metadata["overrides"] = json.dumps(context.overrides)

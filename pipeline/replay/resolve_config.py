@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from pipeline.config.loading import load_config, parse_config
 from pipeline.config.models import Config
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
-from pipeline.runtime.decision_rules import FORMER_DEFAULTS, FORMER_KEYS, DecisionRules
 from schemas.envelope import Envelope
 
 
@@ -49,55 +47,19 @@ def attached_config(
     """
     if CONFIGURATION not in metadata.attachments:
         return None
-    former = _former_defaults(file, metadata)
-    return _parsed(file, metadata, [*former, *_recorded_overrides(file, metadata), *overrides], stages)
-
-
-def recorded_rules(file: Path, metadata: RecordingMetadata) -> DecisionRules:
-    """The version of the rules that the recorded decisions were made by.
-
-    Raises:
-        RecordingError: it is of a newer version of fantwin.
-    """
-    version = metadata.metadata.get("decision_rules", str(int(DecisionRules.FIRST)))
-    try:
-        return DecisionRules(int(version))
-    except ValueError as error:
-        raise RecordingError(
-            f"{file}: its decisions were made by rules {version!r}, which this version does not know: update fantwin"
-        ) from error
-
-
-def _former_defaults(file: Path, metadata: RecordingMetadata) -> list[str]:
-    """Overrides that give an older recording the defaults it was recorded with, where its configuration says
-    nothing.
-    """
-    rules = recorded_rules(file, metadata)
-    try:
-        given = tomllib.loads(metadata.attachments[CONFIGURATION].decode(errors="replace"))
-    except ValueError:  # reported where it is parsed
-        return []
-    return [
-        f"{section}.{key}={value}"
-        for since, sections in FORMER_DEFAULTS.items()
-        if rules < since
-        for section, defaults in sections.items()
-        for key, value in defaults.items()
-        if key not in given.get(section, {})
-    ]
+    return _parsed(file, metadata, [*_recorded_overrides(file, metadata), *overrides], stages)
 
 
 def _parsed(file: Path, metadata: RecordingMetadata, overrides: Iterable[str], stages: Iterable[str]) -> Config:
     text = metadata.attachments[CONFIGURATION].decode(errors="replace")
-    return parse_config(text, Path(f"{file}:{CONFIGURATION}"), overrides, stages, FORMER_KEYS)
+    return parse_config(text, Path(f"{file}:{CONFIGURATION}"), overrides, stages)
 
 
 def _recorded_overrides(file: Path, metadata: RecordingMetadata) -> list[str]:
     try:
-        overrides = [str(override) for override in json.loads(metadata.metadata.get("overrides", "[]"))]
+        return [str(override) for override in json.loads(metadata.metadata.get("overrides", "[]"))]
     except (ValueError, TypeError) as error:
         raise RecordingError(f"{file}: its metadata are damaged: overrides are not a list") from error
-    return [override for override in overrides if override.partition("=")[0].strip() not in FORMER_KEYS]
 
 
 def trays_of(files: Iterable[Path]) -> set[str]:

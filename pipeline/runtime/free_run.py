@@ -55,11 +55,8 @@ class FreeRunInputs:
 class FreeRun(ColumnState):
     """The free runs of all fans: which are running, since when, and their state. All arrays are (fans,)."""
 
-    def __init__(self, twin: TwinFile, start_samples: int, *, small_steps: bool) -> None:
-        """start_samples: how many readings a start averages. small_steps: the twin goes on in steps about as long as
-        those it was trained with; False only to decide as before there were several in a sample.
-        """
-        self._small_steps = small_steps
+    def __init__(self, twin: TwinFile, start_samples: int) -> None:
+        """start_samples: how many readings a start averages."""
         self._twin = twin
         self._start_samples = start_samples
         fans = twin.fans
@@ -80,9 +77,9 @@ class FreeRun(ColumnState):
         """End all free runs; the next ones are on a grid of this period."""
         self.stop(np.ones_like(self.running))
         self._period_s = period_ns / NS_PER_S
-        trained_steps = round(min(self._period_s * self._twin.card.rate_hz, MOST_STEPS))
-        self._steps = max(1, trained_steps) if self._small_steps else 1
-        """of the twin in a sample"""
+        self._steps = max(1, round(min(self._period_s * self._twin.card.rate_hz, MOST_STEPS)))
+        """of the twin in a sample, each about as long as those it was trained with: on a slower grid, for example at
+        1 Hz, a single step could be unstable"""
         self._reading = ExpectedReading(self._twin.tachos, self._period_s)
 
     @property

@@ -9,15 +9,12 @@ from typing import Any
 
 from pydantic import Field, ValidationError
 
-from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context, StageConfig, StageError
 from pipeline.runtime.tray_twin import TrayTwin
 from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from scoring.detectors.missing_readings import MissingReadingsSettings
 from scoring.detectors.running_on import RunningOnSettings
 from scoring.detectors.standstill import StandstillSettings
-from scoring.detectors.tacho import TachoSettings
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.limits import Limits, Timing, uncalibrated
 from scoring.unseen_error import UnseenError
@@ -106,10 +103,7 @@ class HealthyTwin:
 
 
 def limits_in_force(
-    config: ScorerConfig,
-    calibration: Mapping[str, Any] | None,
-    standstill: Standstill | None = None,
-    decision_rules: DecisionRules = CURRENT_RULES,
+    config: ScorerConfig, calibration: Mapping[str, Any] | None, standstill: Standstill | None = None
 ) -> Limits:
     """The limits of a twin's card, or those of a twin without calibration, with the scorer's settings applied.
 
@@ -119,43 +113,20 @@ def limits_in_force(
         ValidationError: the calibration is not valid.
     """
     if calibration is None:
-        limits = _with_missing_readings(
-            uncalibrated(config.alarm_sigmas, config.timing(Timing())), MissingReadingsSettings(), decision_rules
-        )
-        return _with_standstill(limits, standstill, decision_rules).times(config.limit_factor)
-    limits = Limits.model_validate(calibration)
-    tacho = limits.settings_of("tacho", TachoSettings)
-    former = MissingReadingsSettings.of_former_card(tacho) if tacho else None
-    limits = _with_standstill(_with_missing_readings(limits, former, decision_rules), standstill, decision_rules)
+        limits = uncalibrated(config.alarm_sigmas, config.timing(Timing()))
+        return _with_standstill(limits, standstill).times(config.limit_factor)
+    limits = _with_standstill(Limits.model_validate(calibration), standstill)
     timing = config.timing(limits.timing)
     declared_rate = limits.declared_rate if timing == limits.timing else None  # it holds for the calibrated times
     return limits.model_copy(update={"timing": timing, "declared_rate": declared_rate}).times(config.limit_factor)
 
 
-def _with_missing_readings(
-    limits: Limits, default: MissingReadingsSettings | None, decision_rules: DecisionRules
-) -> Limits:
-    """Of a card that does not set them, with the default."""
-    detectors = {**limits.detectors}
-    if decision_rules < DecisionRules.ONE_ALARM:
-        detectors.pop("missing_readings", None)
-    elif default is not None:
-        detectors.setdefault("missing_readings", default)
-    return limits.model_copy(update={"detectors": detectors})
-
-
-def _with_standstill(limits: Limits, standstill: Standstill | None, decision_rules: DecisionRules) -> Limits:
+def _with_standstill(limits: Limits, standstill: Standstill | None) -> Limits:
     if standstill is None:
         return limits
-    if decision_rules < DecisionRules.AT_REST:
-        settings = {"standstill": StandstillSettings(healthy=standstill, with_stopped=True)}
-        return limits.model_copy(update={"detectors": {**limits.detectors, **settings}})
-    by_coast_only = decision_rules < DecisionRules.RUNNING_ON
-    settings = {
-        "standstill": StandstillSettings(healthy=standstill),
-        "running_on": RunningOnSettings(healthy=standstill, by_coast_only=by_coast_only),
-    }
-    return limits.model_copy(update={"detectors": {**limits.detectors, **settings}})
+    return limits.with_detectors(
+        standstill=StandstillSettings(healthy=standstill), running_on=RunningOnSettings(healthy=standstill)
+    )
 
 
 def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
@@ -166,7 +137,7 @@ def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
     """
     again, name = "calibrate it again: fantwin calibrate", context.tray.twin or twin.card.name
     try:
-        limits = limits_in_force(context.config, twin.card.calibration, twin.card.standstill, context.decision_rules)
+        limits = limits_in_force(context.config, twin.card.calibration, twin.card.standstill)
     except ValidationError as error:
         first = error.errors()[0]
         why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"

@@ -40,6 +40,6 @@ class JointTrayIntegrator:
         first, count = integrators[0], len(integrators)
 
         def build() -> TrayIntegrator:
-            return TrayIntegrator(first.twin.of_trays(count), first.config, first.decision_rules)
+            return TrayIntegrator(first.twin.of_trays(count), first.config)
 
         return self._kept.get((first.twin.sha256, first.twin.fans, count), build)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.runtime.latest_kept import LatestKept
-from pipeline.runtime.tray_scorer import TrayScorer, fan_scorer_of, unseen_error_of
+from pipeline.runtime.tray_scorer import TrayScorer
 from schemas.messages import Alarm, Prediction, Score
 from schemas.side_by_side import apart, side_by_side
 from scoring.fan_scorer import FanScorer
@@ -61,7 +61,7 @@ class JointTrayScorer:
         first, count = scorers[0], len(scorers)
 
         def build() -> _OfTrays:
-            twin, rules = first.twin.of_trays(count, first.fans), first.decision_rules
-            return _OfTrays(fan_scorer_of(count * first.fans, twin, rules), unseen_error_of(twin, rules))
+            twin = first.twin.of_trays(count, first.fans)
+            return _OfTrays(FanScorer(count * first.fans, twin.limits, tachos=twin.tachos), twin.unseen_error)
 
         return self._kept.get((first.twin.sha256, first.fans, count), build)

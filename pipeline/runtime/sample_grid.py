@@ -26,7 +26,6 @@ from pipeline.devices.interpolation import (
 from pipeline.devices.line_guard import LineGuard
 from pipeline.devices.line_rate import GridTiming
 from pipeline.runtime.clock import is_of_replay
-from pipeline.runtime.decision_rules import DecisionRules
 from schemas.auxiliary import AUXILIARY, auxiliary_columns
 from schemas.blocks import cut, join
 from schemas.enums import InvalidReason
@@ -57,7 +56,6 @@ class SampleGrid:
         self,
         tachos: Sequence[Tacho],
         timing: GridTiming,
-        decision_rules: DecisionRules,
         link_wait_ns: int = 0,
     ) -> None:
         """tachos: one for each fan; readings that a tacho shows until the next one are held. link_wait_ns: how long a
@@ -68,12 +66,9 @@ class SampleGrid:
         self._gap_limit_ns = timing.gap_limit_ns
         self._watermark_ns = timing.watermark_ns
         self._stale_for_ns = timing.stale_for_ns
-        knows_time = decision_rules >= DecisionRules.TIME_AND_GAPS
-        self._marks_restarts = decision_rules >= DecisionRules.BREAKS
-        self._marks_missing = decision_rules >= DecisionRules.ONE_ALARM
         self._restarts_t_ns: deque[int] = deque()  # of first samples after restarts whose grid samples are not made yet
-        self._clock = DeviceClock(knows_backlogs=knows_time)
-        self._guard = LineGuard(self._clock, self._period_ns) if knows_time else None
+        self._clock = DeviceClock()
+        self._guard = LineGuard(self._clock, self._period_ns)
         self._last_readings = LastReadings(fans, self._gap_limit_ns, self._is_held)
         # The last raw sample at or before the next grid time, and all later ones.
         nothing = np.zeros((0, fans))
@@ -100,7 +95,7 @@ class SampleGrid:
     def step(self, item: Raw) -> list[Grid]:
         """Add raw samples; returns the grid as far as it is determined."""
         self._counts["samples_in"] += len(item.host_receive_t_ns)
-        if self._guard is None or is_of_replay(item.header.producer) or self._is_repeated(item):
+        if is_of_replay(item.header.producer) or self._is_repeated(item):
             self._add(item, self._is_new(item))
             return self._published()
         before_ns = self._guard.advance_ns
@@ -130,15 +125,14 @@ class SampleGrid:
 
     def close(self) -> list[Grid]:
         """Publish the grid up to the newest raw sample."""
-        for message in self._guard.close() if self._guard else ():
+        for message in self._guard.close():
             self._add(message, is_new=True)
         self._silence_ns = 0  # a line that ended before its resampler is no problem of the last health
         return self.publish_until(self._newest_t_ns)
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/time.md explains each counter."""
-        of_guard = self._guard.counts if self._guard else {}
-        return {**self._counts, **of_guard, "clock_restarts": max(0, self._clock.segments - 1)}
+        return {**self._counts, **self._guard.counts, "clock_restarts": max(0, self._clock.segments - 1)}
 
     def problem(self) -> str:
         """No samples, or a host clock that was set back."""
@@ -151,7 +145,7 @@ class SampleGrid:
                 f"the host clock was set back by {self._set_back_ns / NS_PER_S:.0f} s, or a replay was restarted: "
                 "samples are refused until it has caught up; restart the stages"
             )
-        return self._guard.problem() if self._guard else ""
+        return self._guard.problem()
 
     def _add(self, item: Raw, is_new: bool) -> None:
         """Add the samples of a message of the line; is_new: neither repeated nor one of an ended session."""
@@ -228,11 +222,10 @@ class SampleGrid:
     def _is_accepted(self, t_ns: int, is_new: bool, *, after_restart: bool) -> bool:
         """Whether a sample is newer than all before; counts the reason if not."""
         behind_ns = self._newest_t_ns - t_ns
-        if after_restart and self._guard and self._newest_t_ns != NEVER_NS:
+        if after_restart and self._newest_t_ns != NEVER_NS:
             # Two segments of the device clock are not compared: a gap lies between, and nothing is interpolated.
             self._not_before_t_ns = self._newest_t_ns + self._gap_limit_ns + 1
-            if self._marks_restarts:
-                self._restarts_t_ns.append(max(t_ns, self._not_before_t_ns))
+            self._restarts_t_ns.append(max(t_ns, self._not_before_t_ns))
         if behind_ns < 0 and t_ns < self._not_before_t_ns:
             self._counts["dropped_after_clock_restart"] += 1
             return False
@@ -352,7 +345,7 @@ class SampleGrid:
             speed_rad_s=speed,
             valid=valid,
             invalid_reason=invalid_reason,
-            reading_missing=reading_missing if self._marks_missing else np.zeros(0, np.bool_),
+            reading_missing=reading_missing,
             **columns,
         )
         self._pending.append(grid)

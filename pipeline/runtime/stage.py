@@ -15,7 +15,6 @@ from pipeline.config.models import Config, Section, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.config.shards import own_file
 from pipeline.errors import UserError
-from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from schemas.envelope import Envelope
 from schemas.health import AcceptedSamples
 from schemas.messages import Message, ScorerSnapshot
@@ -175,8 +174,6 @@ class Context:
     """the keys set on the command line, `key=value`"""
     is_running: bool = False
     """for a check: this stage already runs on this host, and has taken itself what it needs"""
-    decision_rules: DecisionRules = CURRENT_RULES
-    """an older version only while an older recording is replayed"""
     reads: tuple[str, ...] | None = None
     """the topics that it reads as configured; None: all that its declaration names"""
 

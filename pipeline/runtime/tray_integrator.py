@@ -12,7 +12,6 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.runtime.conditions import ConditionTracker, Ratios
-from pipeline.runtime.decision_rules import DecisionRules
 from pipeline.runtime.free_run import FreeRun, FreeRunInputs
 from pipeline.runtime.stage import StageConfig
 from pipeline.runtime.starting_fans import StartingFans
@@ -93,9 +92,8 @@ class FanCounts(ColumnState):
 class TrayIntegrator:
     """The free runs and the torque balance of one tray's fans."""
 
-    def __init__(self, twin: TwinFile, config: TwinIntegratorConfig, decision_rules: DecisionRules) -> None:
-        self.twin, self.config, self.decision_rules = twin, config, decision_rules
-        self._knows_breaks = decision_rules >= DecisionRules.BREAKS
+    def __init__(self, twin: TwinFile, config: TwinIntegratorConfig) -> None:
+        self.twin, self.config = twin, config
         reach_s = max(tacho.reach_s for tacho in twin.tachos)
         self._warm_up_ns = round((config.warm_up_s + reach_s) * NS_PER_S)
         self._hold_limit_ns = round(config.hold_limit_s * NS_PER_S)
@@ -104,8 +102,7 @@ class TrayIntegrator:
         self._lowest_command, self._highest_command = twin.usable_commands
         self._standstill = twin.card.standstill
         self._off_below = twin.off_below if self._standstill is None else _off_below(twin, self._standstill)
-        small_steps = decision_rules >= DecisionRules.SMALL_STEPS
-        self._run = FreeRun(twin, config.start_samples, small_steps=small_steps)
+        self._run = FreeRun(twin, config.start_samples)
         self._starting: StartingFans | None = None
         if self._standstill is not None:
             self._starting = StartingFans(twin.fans, self._standstill, self._warm_up_ns, reach_s)
@@ -245,10 +242,9 @@ class TrayIntegrator:
         command, known_before_t_ns = self._run.hold(grid.t_ns, grid.command, known)
         gap_ns = grid.t_ns[:, np.newaxis] - known_before_t_ns - grid.period_ns
         overdue = gap_ns > self._hold_limit_ns
-        if self._knows_breaks:
-            moved = np.diff(command, axis=0, prepend=held_before[np.newaxis])
-            overdue |= known & (np.abs(moved) * gap_ns > self._largest_move * NS_PER_S)
-            overdue |= grid.invalid_reason == CLOCK_RESTARTED
+        moved = np.diff(command, axis=0, prepend=held_before[np.newaxis])
+        overdue |= known & (np.abs(moved) * gap_ns > self._largest_move * NS_PER_S)
+        overdue |= grid.invalid_reason == CLOCK_RESTARTED
         usable = known & grid.valid & np.isfinite(grid.speed_rad_s)
         stopped = np.zeros(usable.shape, np.bool_)
         if self._standstill is not None:

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.runtime.decision_rules import DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
 from schemas.messages import Alarm, Array, Prediction, Score
 from schemas.side_by_side import present_columns
@@ -31,99 +30,46 @@ from scoring.interval_scorer import HALF_LIMIT
 from scoring.samples import Samples, among, arrived, samples_of
 from scoring.score_message import score_of
 from scoring.scored_block import ScoredBlock
-from scoring.unseen_error import UnseenError
 from scoring.wear.followed import followed_fans, shared_by_all
 from scoring.wear.reference import healthy_fans
 from scoring.wear.wear_monitor import WearInputs, WearMonitor
-
-DATA_LOST_AFTER_NS = 2 * NS_PER_S  # an active alarm is not confirmed by data after so long without a score
-EARLIER_ALARMS = 32
-"""of a fan, on which operators may still give feedback"""
-
-
-def fan_scorer_of(fans: int, twin: HealthyTwin, decision_rules: DecisionRules) -> FanScorer:
-    """The statistics of so many fans, from the beginning."""
-    return FanScorer(
-        fans,
-        twin.limits,
-        tachos=twin.tachos,
-        forgets_over_gaps=decision_rules >= DecisionRules.TIME_AND_GAPS,
-        skips_transients=decision_rules >= DecisionRules.HOLDING,
-        allows_for_counts=decision_rules >= DecisionRules.ONE_ALARM,
-        limits_motion=decision_rules >= DecisionRules.HEALTHY_MOTION,
-        begins_still=decision_rules >= DecisionRules.FIRST_BASELINE,
-        keeps_shared=decision_rules >= DecisionRules.SHARED_STAYS,
-        shares_at_first=decision_rules >= DecisionRules.SHARED_AT_FIRST,
-        compares_fast=decision_rules >= DecisionRules.FAST_FANS,
-    )
-
-
-def unseen_error_of(twin: HealthyTwin, decision_rules: DecisionRules) -> UnseenError | None:
-    """How far the twin may be wrong where healthy runs do not show it; None: that does not count."""
-    return twin.unseen_error if decision_rules >= DecisionRules.UNSEEN else None
 
 
 class TrayScorer:
     """The scores, alarms and wear of one tray's fans."""
 
-    def __init__(
-        self, fans: int, text: AlarmText, config: ScorerConfig, twin: HealthyTwin, decision_rules: DecisionRules
-    ) -> None:
+    def __init__(self, fans: int, text: AlarmText, config: ScorerConfig, twin: HealthyTwin) -> None:
         """From the beginning: no fan is commissioned, and none has an alarm."""
-        self.fans, self.twin, self.decision_rules = fans, twin, decision_rules
-        judges_rest = decision_rules >= DecisionRules.AT_REST
-        self._holds = decision_rules >= DecisionRules.HOLDING
+        self.fans, self.twin = fans, twin
         self._text = text
         self._sigma_rad_s = np.ones(fans)
-        self.fan_scorer = fan_scorer_of(fans, twin, decision_rules)
-        advice = Advice(twin.command_unit) if self._holds else None
-        if judges_rest:
-            lowest_command = twin.standstill.turning_command if twin.standstill else 0.0
-            advice = Advice(twin.command_unit, lowest_command, twin.highest_command)
+        self.fan_scorer = FanScorer(fans, twin.limits, tachos=twin.tachos)
+        lowest_command = twin.standstill.turning_command if twin.standstill else 0.0
         self._diagnoser = Diagnoser(
             twin.balances,
-            advice,
+            Advice(twin.command_unit, lowest_command, twin.highest_command),
             twin.tachos,
             twin.standstill,
-            knows_readings=judges_rest,
-            knows_falls=decision_rules >= DecisionRules.FALLS,
-            plain_words=decision_rules >= DecisionRules.PLAIN_WORDS,
             knows_supply=twin.knows_supply,
         )
         healthy = healthy_fans(twin.balances, twin.limits.balance)
-        self.wear = WearMonitor(
-            healthy,
-            self._diagnoser,
-            config.wear_every_s,
-            twin.command_unit,
-            rounds_points=decision_rules >= DecisionRules.ROUNDED_WEAR,
-        )
+        self.wear = WearMonitor(healthy, self._diagnoser, config.wear_every_s, twin.command_unit)
         off_delay_s = config.least_off_delay_s(twin.tachos)
-        holding = holding_detectors(
-            self.fan_scorer.detectors,
-            off_delay_s,
-            judges_rest=judges_rest,
-            knows_speeds=decision_rules >= DecisionRules.HEALTHY_MOTION,
-            knows_standing=decision_rules >= DecisionRules.RUNNING_ON,
-        )
         settings = ConditionSettings(
             on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),
-            off_delay_ns=round(off_delay_s * NS_PER_S),
             return_ratio=1.0 - config.deadband,
             alarm_ratio=config.alarm_ratio,
             latching=config.latching,
             confirming=config.confirming,
-            data_lost_after_ns=DATA_LOST_AFTER_NS if decision_rules >= DecisionRules.TIME_AND_GAPS else None,
             settling_ns=self.fan_scorer.longest_memory_ns,
-            detectors=holding if self._holds else (),
-            earlier_alarms=EARLIER_ALARMS if decision_rules >= DecisionRules.FEEDBACK else 0,
+            detectors=holding_detectors(self.fan_scorer.detectors, off_delay_s),
         )
         self.alarms = AlarmManager(fans, settings, self._diagnoser, text)
 
     def score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
         """The score of a block of new samples, and the messages on alarms."""
-        samples = samples_of(item, unseen_error_of(self.twin, self.decision_rules))
-        scored, stretches = self.fan_scorer.stretches(samples, (lambda: self.alarms.is_quiet) if self._holds else None)
+        samples = samples_of(item, self.twin.unseen_error)
+        scored, stretches = self.fan_scorer.stretches(samples, lambda: self.alarms.is_quiet)
         state, events = self.decide(item, scored, stretches)
         score = score_of(item, scored, state, samples.speed_unseen)
         return score, self.finish(item, samples, scored, state, events, score)
@@ -188,17 +134,14 @@ class TrayScorer:
             ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError: it cannot be read. Then
                 a part may have been restored.
         """
-        if "wear" in state:
-            self.wear.restore(state["wear"])
+        self.wear.restore(state["wear"])
         self.fan_scorer.restore(state["scorer"])
 
     def _limits_at(
         self, item: Prediction, samples: Samples, scored: ScoredBlock, row: int, statistic: int
-    ) -> tuple[Array | float, Array | float]:
-        """How far both residuals may be from their baselines, by the alarm's statistic; (fans,) or for all, sigma."""
+    ) -> tuple[Array, Array]:
+        """(fans,) how far both residuals may be from their baselines, by the alarm's statistic, sigma."""
         period_s = item.period_ns / NS_PER_S
-        if not self._holds:
-            return self.fan_scorer.limit_sigmas("speed", period_s), self.fan_scorer.limit_sigmas("balance", period_s)
         limits, limit_at = self.fan_scorer.limits, self.fan_scorer.limit_at
         speed = samples.operating_speed_rad_s(is_predicted=limits.over_predicted_speed)[row]
         of_speed, of_balance = scored.speed_learned_scale[row], scored.balance_learned_scale[row]
@@ -224,9 +167,8 @@ class TrayScorer:
             state[rows], happened = self.alarms.update(
                 item.t_ns[rows], item.period_ns, ratio, judged, scored.ratios[rows], speed[rows]
             )
-            if self._holds:
-                in_alarm = among(state[rows], ALARM, RETURNING).any(axis=0)
-                self.fan_scorer.learn_nothing(was_active | self.alarms.active | in_alarm)
+            in_alarm = among(state[rows], ALARM, RETURNING).any(axis=0)
+            self.fan_scorer.learn_nothing(was_active | self.alarms.active | in_alarm)
             events += [replace(event, row=event.row + rows.start) for event in happened]
         return state, events
 

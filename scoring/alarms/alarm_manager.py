@@ -20,7 +20,6 @@ from scoring.alarms.tray_conditions import AlarmEvent, TrayConditions
 from scoring.detectors.table import row_of
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.diagnosis.shown_causes import is_of_standstill
-from scoring.former_snapshot_keys import FORMER_ALARM_KEYS, current_keys
 
 PERSISTING_SHARE = (
     0.5  # a fault persists while the torque balance is at least this share of its value in the last message
@@ -72,8 +71,8 @@ class AlarmManager:
         period_ns: int,
         score: Array,
         valid: Array,
-        ratios: Array | None = None,
-        speed_rad_s: Array | None = None,
+        ratios: Array,
+        speed_rad_s: Array,
     ) -> tuple[Array, list[AlarmEvent]]:
         """Process a block; see TrayConditions.update. Returns the states (n, fans) and the events."""
         result = self._conditions.update(t_ns, period_ns, score, valid, ratios, speed_rad_s)
@@ -224,13 +223,12 @@ class AlarmManager:
             "answered": self._answered,
         }
 
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
+    def restore(self, stored: Mapping[str, Any]) -> None:
         """Continue from a snapshot of the same number of fans.
 
         Raises:
             ValueError, KeyError, TypeError, AttributeError: it is not such a snapshot.
         """
-        stored = current_keys(snapshot, FORMER_ALARM_KEYS)
         self._conditions.restore(stored["conditions"])
         self._diagnoser.restore(stored["diagnoser"])
         self._last_emitted = {int(fan): _from_json(alarm) for fan, alarm in stored["last_emitted"].items()}
@@ -308,7 +306,7 @@ def _state_fields(state: AlarmState) -> dict[str, Any]:
 
 
 def _to_json(alarm: Alarm) -> dict[str, Any]:
-    """Without feedback if there is none, as in snapshots of before there was any."""
+    """Without feedback if there is none, as of most alarms."""
     return {
         name: value for name, value in asdict(alarm).items() if name != "header" and (value or name not in _OF_FEEDBACK)
     }

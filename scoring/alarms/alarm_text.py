@@ -1,7 +1,7 @@
 """An alarm message as one line for people.
 
-The lines are part of a recording, and a replay that verifies it compares them: a changed wording makes recordings of
-earlier versions differ. Only the line of a republished alarm, which says no more than its flags do, is not compared.
+The lines are part of a recording, and a replay that verifies it compares them. Only the line of a republished alarm,
+which says no more than its flags do, is not compared.
 """
 
 from __future__ import annotations

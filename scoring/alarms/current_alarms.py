@@ -15,7 +15,6 @@ from schemas.enums import Feedback, Severity, Transition
 from schemas.messages import Alarm, Diagnosis
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_presented, is_retained, is_silenced
-from scoring.alarms.alarm_text import CONTINUES
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
 _DESCRIBES_THE_FAN = {
@@ -51,7 +50,7 @@ class CurrentAlarm:
         alarm = self.newest
         word = alarm.severity.name if alarm.active else alarm.transition.name.lower().replace("_", " ")
         silenced = " (silenced)" if alarm.active and is_silenced(alarm) else ""
-        return f"{word}{silenced}  {alarm.header.tray}  {words_of(alarm)}"
+        return f"{word}{silenced}  {alarm.header.tray}  {alarm.message}"
 
     def states(self) -> list[str]:
         """The states the alarm is in, for people."""
@@ -104,19 +103,6 @@ class CurrentAlarm:
         }
 
 
-def words_of(alarm: Alarm) -> str:
-    """The message of an alarm, for people. That of a republished one is written here, because older versions worded it
-    otherwise. If it is over, it says what holds it on the list, with local times."""
-    if alarm.transition != Transition.REPUBLISHED:
-        return alarm.message
-    if alarm.active:
-        return f"fan {alarm.fan}: {CONTINUES}"
-    over = {"cleared", "acknowledged", "never raised"}
-    holds = ", ".join(state for state in CurrentAlarm(alarm, "", (), "").states() if state not in over)
-    before = "no alarm" if alarm.severity == Severity.NONE else "back to normal"
-    return f"fan {alarm.fan}: {before}{f', {holds}' if holds else ''}"
-
-
 def current_alarms(messages: Iterable[Alarm]) -> list[CurrentAlarm]:
     """The alarm of each fan with a message, by tray and fan. messages: in the order received."""
     by_fan: dict[tuple[str, int], list[Alarm]] = {}
@@ -148,7 +134,7 @@ def _current(messages: Sequence[Alarm]) -> CurrentAlarm:
     newest, describing, with_causes, acknowledging = _parts(messages)
     return CurrentAlarm(
         newest,
-        message=words_of(describing) if describing else "",
+        message=describing.message if describing else "",
         causes=with_causes.causes if with_causes else (),
         acknowledged_by=acknowledging.operator_name if acknowledging and newest.acknowledged else "",
         message_t_ns=describing.t_ns if describing and describing.transition != Transition.REPUBLISHED else 0,

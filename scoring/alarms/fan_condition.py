@@ -18,7 +18,6 @@ import numpy as np
 from schemas.enums import Action, FanState, Feedback, Severity, Transition
 from schemas.units import NS_PER_S
 from scoring.alarms.return_rule import AlarmReturn, HoldingDetector, ReturnEvidence
-from scoring.former_snapshot_keys import FORMER_CONDITION_KEYS, current_keys
 
 NORMAL, SUSPECT, ALARM, RETURNING = map(int, (FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING))
 UNTIL_IT_CLEARS_T_NS = 2**63 - 1
@@ -31,12 +30,17 @@ GIVES_FEEDBACK = {
 }
 
 
+DATA_LOST_AFTER_NS = 2 * NS_PER_S
+EARLIER_ALARMS = 32
+
+
 @dataclass(frozen=True)
 class ConditionSettings:
     """When an alarm is raised and cleared, and what operators must do with it. Ratios are multiples of the limit."""
 
     on_delay_ns: int
-    off_delay_ns: int
+    detectors: tuple[HoldingDetector, ...]
+    """those that exceeded their limit decide on the return, see scoring.alarms.return_rule"""
     return_ratio: float = 0.75
     """an active alarm begins to return below this"""
     alarm_ratio: float = 1.5
@@ -45,16 +49,12 @@ class ConditionSettings:
     """a cleared alarm stays until it is reset"""
     confirming: bool = False
     """an acknowledged alarm must also be confirmed"""
-    data_lost_after_ns: int | None = None
-    """after a longer time without a valid sample an active alarm is stale; None: never, as in recordings of former
-    versions"""
+    data_lost_after_ns: int = DATA_LOST_AFTER_NS
+    """after a longer time without a valid sample an active alarm is stale"""
     settling_ns: int = 0
     """time of valid samples after a gap, from which on low ratios count: statistics have started again"""
-    detectors: tuple[HoldingDetector, ...] = ()
-    """of which those that exceeded decide on the return, see scoring.alarms.return_rule; empty: the largest ratio of
-    all decides, after off_delay_ns, as in recordings of former versions"""
-    earlier_alarms: int = 0
-    """of each fan, whose onsets are kept for feedback; 0 in recordings of former versions"""
+    earlier_alarms: int = EARLIER_ALARMS
+    """of each fan, whose onsets are kept for feedback"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,19 +93,18 @@ class FanCondition:
         self.fan_state = NORMAL
         self.alarm_state = AlarmState()
         self._excursion_t_ns = 0  # first sample of the excursion; meaningless when NORMAL
-        self._held_ns = 0  # time since SUSPECT or RETURNING began
+        self._held_ns = 0  # time since SUSPECT began
         self._settled_ns = 0  # time of valid samples since the gap, while the alarm is stale
         self._return = AlarmReturn(settings.detectors, settings.return_ratio)
         self._earlier_onsets_t_ns: tuple[int, ...] = ()
         """of the alarms before this one, oldest first"""
 
     def update(
-        self, t_ns: int, period_ns: int, ratio: float, evidence: ReturnEvidence | None = None
+        self, t_ns: int, period_ns: int, ratio: float, evidence: ReturnEvidence
     ) -> Sequence[tuple[Transition, AlarmState]]:
         """Process one valid sample and return the transitions, in order.
 
-        ratio: the statistic closest to its limit, as a multiple of that limit. evidence: of each detector, where they
-        decide on the return.
+        ratio: the statistic closest to its limit, as a multiple of that limit. evidence: of each detector.
         """
         if self.alarm_state.active:
             return self._update_active(period_ns, ratio, evidence)
@@ -120,9 +119,8 @@ class FanCondition:
             return ()
         self.fan_state = ALARM
         self._keep_onset()
-        if evidence is not None:
-            self._return.begin()
-            self._return.update(period_ns, evidence)
+        self._return.begin()
+        self._return.update(period_ns, evidence)
         self.alarm_state = replace(
             self.alarm_state,
             active=True,
@@ -229,7 +227,7 @@ class FanCondition:
         del alarm["active"]  # follows from the fan state
         alarm["severity"] = int(self.alarm_state.severity)
         alarm["feedback"] = int(self.alarm_state.feedback)
-        if not alarm["feedback"]:  # as in snapshots of before there was feedback
+        if not alarm["feedback"]:  # most alarms have none: it would be a third of the state of a healthy fan
             del alarm["feedback"], alarm["feedback_by"], alarm["feedback_reason"]
         earlier = {"earlier_onsets_t_ns": list(self._earlier_onsets_t_ns)} if self._earlier_onsets_t_ns else {}
         return {
@@ -237,28 +235,27 @@ class FanCondition:
             "excursion_t_ns": self._excursion_t_ns,
             "held_ns": self._held_ns,
             "settled_ns": self._settled_ns,
-            **({"holds": self._return.snapshot()} if self._settings.detectors else {}),
+            "holds": self._return.snapshot(),
             **earlier,
             **alarm,
         }
 
     @classmethod
-    def restore(cls, settings: ConditionSettings, snapshot: Mapping[str, Any]) -> Self:
+    def restore(cls, settings: ConditionSettings, stored: Mapping[str, Any]) -> Self:
         """The condition of a snapshot.
 
         Raises:
             KeyError, TypeError, ValueError, OverflowError: it is not a snapshot of a condition.
         """
-        stored = current_keys(snapshot, FORMER_CONDITION_KEYS)
         condition = cls(settings)
         condition.fan_state = int(FanState.known(stored["state"]))
         if condition.fan_state not in (NORMAL, SUSPECT, ALARM, RETURNING):
             raise ValueError(stored["state"])
         condition._excursion_t_ns = _time(stored["excursion_t_ns"])
         condition._held_ns = _time(stored["held_ns"])
-        condition._settled_ns = _time(stored.get("settled_ns", 0))
+        condition._settled_ns = _time(stored["settled_ns"])
         condition._earlier_onsets_t_ns = tuple(map(_time, stored.get("earlier_onsets_t_ns", ())))
-        condition._return = AlarmReturn.restore(settings.detectors, settings.return_ratio, stored.get("holds"))
+        condition._return = AlarmReturn.restore(settings.detectors, settings.return_ratio, stored["holds"])
         condition.alarm_state = AlarmState(
             active=condition.fan_state in (ALARM, RETURNING),
             severity=Severity.known(stored["severity"]),
@@ -269,7 +266,7 @@ class FanCondition:
             latched=bool(stored["latched"]),
             suppressed=bool(stored["suppressed"]),
             out_of_service=bool(stored["out_of_service"]),
-            stale=bool(stored.get("stale", False)),
+            stale=bool(stored["stale"]),
             acknowledged_by=str(stored["acknowledged_by"]),
             comment=str(stored["comment"]),
             feedback=Feedback.known(stored.get("feedback", 0)),
@@ -284,8 +281,8 @@ class FanCondition:
 
     def _keep_onset(self) -> None:
         """The present occurrence becomes an earlier one."""
-        if most := self._settings.earlier_alarms:
-            self._earlier_onsets_t_ns = (*self._earlier_onsets_t_ns, *self._own_onset())[-most:]
+        known = (*self._earlier_onsets_t_ns, *self._own_onset())
+        self._earlier_onsets_t_ns = known[-self._settings.earlier_alarms :]
 
     def _take_feedback(
         self, action: Action, operator_name: str, reason: str, onset_t_ns: int
@@ -305,7 +302,7 @@ class FanCondition:
         return transition, ""
 
     def _update_active(
-        self, period_ns: int, ratio: float, evidence: ReturnEvidence | None
+        self, period_ns: int, ratio: float, evidence: ReturnEvidence
     ) -> Sequence[tuple[Transition, AlarmState]]:
         if not self.alarm_state.stale:
             return self._update_judged(period_ns, ratio, evidence)
@@ -317,9 +314,9 @@ class FanCondition:
         return (restored, *self._update_judged(period_ns, ratio, evidence))
 
     def _update_judged(
-        self, period_ns: int, ratio: float, evidence: ReturnEvidence | None
+        self, period_ns: int, ratio: float, evidence: ReturnEvidence
     ) -> Sequence[tuple[Transition, AlarmState]]:
-        is_below, is_over = self._returned(period_ns, ratio, evidence)
+        is_below, is_over = self._return.update(period_ns, evidence)
         if not is_below:
             self.fan_state = ALARM
             severity = self._severity(ratio)
@@ -336,15 +333,6 @@ class FanCondition:
         if self.alarm_state.shelved_until_t_ns != UNTIL_IT_CLEARS_T_NS:
             return (cleared,)
         return cleared, self.unshelve()
-
-    def _returned(self, period_ns: int, ratio: float, evidence: ReturnEvidence | None) -> tuple[bool, bool]:
-        """Whether the sample belongs to a return, and whether the return is complete."""
-        if evidence is not None:
-            return self._return.update(period_ns, evidence)
-        if not ratio < self._settings.return_ratio:
-            return False, False
-        self._held_ns = 0 if self.fan_state == ALARM else self._held_ns + period_ns
-        return True, self._held_ns >= self._settings.off_delay_ns
 
     def _severity(self, ratio: float) -> Severity:
         return Severity.ALARM if ratio >= self._settings.alarm_ratio else Severity.WARNING

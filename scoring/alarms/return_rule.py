@@ -44,10 +44,8 @@ class HoldingDetector:
     off_delay_ns: int
     grows_with_speed: bool
     """whether the same fault is larger at a higher speed: of a residual, not of the tacho"""
-    is_certain: bool = True
-    """whether it is in use and a fan that turns shows its return; False: it holds no alarm that it did not raise"""
     return_share: float = RETURN_SHARE
-    """of the time for which it held the alarm, so long it must have returned; 0 in recordings of former versions"""
+    """share of the time for which it held the alarm, for which it must have returned"""
     is_sum: bool = False
     """whether its statistic is a sum, which falls only as fast as it may"""
     standing_ns: int = 0
@@ -55,8 +53,7 @@ class HoldingDetector:
     least_off_delay_ns: int = 0
     """of all detectors"""
     elsewhere_ns: int = ELSEWHERE_NS
-    """for so long it must have returned at other speeds than those at which it came; 0 in recordings of former
-    versions, where all speeds are alike"""
+    """how long it must have returned at other speeds than those at which it came"""
 
 
 @dataclass(frozen=True)
@@ -157,8 +154,7 @@ class AlarmReturn:
             began_in_one = any(youngest <= hold.age_ns <= oldest for youngest, oldest in standings_ns)
             is_of_standing = detector.grows_with_speed and began_in_one
             shows = not detector.grows_with_speed or is_of_standing or hold.shows_at(speed, self._return_ratio)
-            knows_speeds = detector.grows_with_speed and detector.elsewhere_ns > 0
-            is_near = is_of_standing or is_hidden_nowhere or not knows_speeds or hold.is_near(speed)
+            is_near = is_of_standing or is_hidden_nowhere or not detector.grows_with_speed or hold.is_near(speed)
             return_ratio = 1.0 if is_of_standing and detector.is_sum else self._return_ratio
             if ratio > 1.0:
                 hold.exceed(ratio)
@@ -185,11 +181,7 @@ class AlarmReturn:
         seen = [
             (each, self._holds[each.name]) for each in self._detectors if each.standing_ns and each.name in self._holds
         ]
-        return [
-            (hold.age_ns - hold.held_ns - TOGETHER_NS, hold.age_ns + each.standing_ns)
-            for each, hold in seen
-            if hold.largest > 0.0  # not of a snapshot that does not tell
-        ]
+        return [(hold.age_ns - hold.held_ns - TOGETHER_NS, hold.age_ns + each.standing_ns) for each, hold in seen]
 
     def begin_delays_again(self) -> None:
         """After a gap the off-delays start again."""
@@ -201,28 +193,18 @@ class AlarmReturn:
         for hold in self._holds.values():
             hold.show_at_any_speed()
 
-    def hold_by_all(self) -> None:
-        """Every detector that may holds the alarm: of one that a former version raised, it is not known which did."""
-        self._holds = {detector.name: _Hold() for detector in self._detectors if detector.is_certain}
-        self.forget_sizes()
-
     def snapshot(self) -> dict[str, Any]:
         """The state, as JSON values."""
         return {name: asdict(hold) for name, hold in self._holds.items()}
 
     @classmethod
-    def restore(
-        cls, detectors: Sequence[HoldingDetector], return_ratio: float, stored: Mapping[str, Any] | None
-    ) -> Self:
-        """The state of a snapshot; None: of a former version, of which every detector holds the alarm.
+    def restore(cls, detectors: Sequence[HoldingDetector], return_ratio: float, stored: Mapping[str, Any]) -> Self:
+        """The state of a snapshot.
 
         Raises:
             KeyError, TypeError, ValueError: it is no such snapshot.
         """
         restored = cls(detectors, return_ratio)
-        if stored is None:
-            restored.hold_by_all()
-            return restored
         used = {detector.name for detector in detectors}
         restored._holds = {
             str(name): _Hold(
@@ -230,12 +212,12 @@ class AlarmReturn:
                 below_ns=int(hold["below_ns"]),
                 peak_rad_s=float(hold["peak_rad_s"]),
                 peak_age_ns=int(hold["peak_age_ns"]),
-                age_ns=int(hold.get("age_ns", 0)),
-                held_ns=int(hold.get("held_ns", 0)),
-                elsewhere_ns=int(hold.get("elsewhere_ns", 0)),
-                largest=float(hold.get("largest", 0.0)),
-                slowest_rad_s=float(hold.get("slowest_rad_s", 0.0)),
-                fastest_rad_s=float(hold.get("fastest_rad_s", LARGEST)),
+                age_ns=int(hold["age_ns"]),
+                held_ns=int(hold["held_ns"]),
+                elsewhere_ns=int(hold["elsewhere_ns"]),
+                largest=float(hold["largest"]),
+                slowest_rad_s=float(hold["slowest_rad_s"]),
+                fastest_rad_s=float(hold["fastest_rad_s"]),
             )
             for name, hold in stored.items()
             if name in used

@@ -66,14 +66,13 @@ class TrayConditions:
         period_ns: int,
         ratio: Array,
         valid: Array,
-        ratios: Array | None = None,
-        speed_rad_s: Array | None = None,
+        ratios: Array,
+        speed_rad_s: Array,
     ) -> BlockResult:
         """Process a block. t_ns: (n,), rising; ratio, valid: (n, fans), see `Condition.update`.
 
-        ratios (n, detectors, fans) and speed_rad_s (n, fans): see ReturnEvidence; where detectors decide on the return.
+        ratios (n, detectors, fans) and speed_rad_s (n, fans): see ReturnEvidence.
         """
-        by_detector = bool(self._settings.detectors)
         state = np.where(valid, np.uint8(NORMAL), np.uint8(UNKNOWN))
         events: list[AlarmEvent] = []
         too_short = 0
@@ -82,11 +81,8 @@ class TrayConditions:
         for fan in np.flatnonzero(busy | unshelved).tolist():
             condition = self._conditions[fan]
             rows = np.flatnonzero(valid[:, fan]) if busy[fan] else np.zeros(0, np.intp)
-            evidence: dict[int, ReturnEvidence] = {}
-            if by_detector and len(rows):
-                assert ratios is not None and speed_rad_s is not None
-                samples = zip(ratios[rows, :, fan].tolist(), speed_rad_s[rows, fan].tolist(), strict=True)
-                evidence = dict(zip(rows.tolist(), (ReturnEvidence(*sample) for sample in samples), strict=True))
+            samples = zip(ratios[rows, :, fan].tolist(), speed_rad_s[rows, fan].tolist(), strict=True)
+            evidence = dict(zip(rows.tolist(), (ReturnEvidence(*sample) for sample in samples), strict=True))
             steps = [(row, _SAMPLE) for row in rows.tolist()]
             if busy[fan]:
                 steps += [(row, _DATA_LOST) for row in self._data_lost_rows(fan, t_ns, rows)]
@@ -99,7 +95,7 @@ class TrayConditions:
                 elif step == _UNSHELVE:
                     transitions = (condition.unshelve(),)
                 else:
-                    transitions = condition.update(int(t_ns[row]), period_ns, float(ratio[row, fan]), evidence.get(row))
+                    transitions = condition.update(int(t_ns[row]), period_ns, float(ratio[row, fan]), evidence[row])
                     state[row, fan] = condition.fan_state
                 events += [AlarmEvent(row, fan, *transition) for transition in transitions]
                 too_short += before == SUSPECT and condition.fan_state == NORMAL
@@ -112,7 +108,7 @@ class TrayConditions:
     def _data_lost_rows(self, fan: int, t_ns: Array, rows: Array) -> list[int]:
         """At which rows a fan has been without a valid sample for too long; rows: those with one."""
         limit_ns = self._settings.data_lost_after_ns
-        if limit_ns is None or self._last_valid_t_ns[fan] == NEVER_NS:
+        if self._last_valid_t_ns[fan] == NEVER_NS:
             return []
         if t_ns[-1] - self._last_valid_t_ns[fan] <= limit_ns:
             return []
@@ -184,7 +180,7 @@ class TrayConditions:
         """
         try:
             conditions = [FanCondition.restore(self._settings, each) for each in snapshot["fans"]]
-            last_valid_t_ns = np.array(snapshot.get("last_valid_t_ns", [NEVER_NS] * len(conditions)), np.int64)
+            last_valid_t_ns = np.array(snapshot["last_valid_t_ns"], np.int64)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise ValueError(f"not a snapshot of alarm conditions: {error!r}") from error
         if not len(conditions) == len(last_valid_t_ns) == len(self._conditions):

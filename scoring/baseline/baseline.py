@@ -224,15 +224,16 @@ class Baseline(ColumnState):
         samples: int,
         within_limit: Array,
         below_half_limit: Array,
-        moving: Array | None = None,
-        few_readings: Array | None = None,
+        moving: Array,
+        few_readings: Array,
     ) -> None:
         """End the present interval of so many samples.
 
         within_limit, below_half_limit: (fans,) whether every statistic stayed there during the interval. moving:
         (fans,) whether the fan moved, so that only its first baseline may come from the interval
-        (scoring.baseline.movement); None: no fan. few_readings: (fans,) whether an interval has too few to show that it
-        is steady; None: no fan.
+        (scoring.baseline.movement). few_readings: (fans,) whether an interval has too few readings to show that it is
+        steady. The first baseline of such a fan comes from an interval in which it does not move: one of a fan that
+        speeds up would hold an alarm that never returns.
         """
         counts, is_set, commissioning = np.maximum(self._counts, 1), self.is_set, self.is_commissioning
         product, information, square = self._sums / counts / FIXED_POINT_ONE
@@ -243,13 +244,11 @@ class Baseline(ColumnState):
             explained = product * product / np.maximum(information, MIN_INFORMATION)
             deviation = np.sqrt(np.maximum(square - explained, 0.0))
             unsteady = seen & ~is_set & (deviation > MAX_STEADY_STD * self._residual_std)
-            if few_readings is not None and moving is not None:
-                unsteady |= few_readings & seen & ~is_set & (moving | (self.unsteady_intervals == 0))
+            unsteady |= few_readings & seen & ~is_set & (moving | (self.unsteady_intervals == 0))
             unsteady &= self.unsteady_intervals < MAX_UNSTEADY_INTERVALS
             self.unsteady_intervals += unsteady
             good &= ~unsteady
-        if moving is not None:
-            good &= ~(moving & commissioning & is_set)
+        good &= ~(moving & commissioning & is_set)
         self._learn(mean, information, good)
         self.intervals += good
         self._sums[:] = self._counts[:] = 0

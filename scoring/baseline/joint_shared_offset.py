@@ -62,18 +62,14 @@ class JointSharedOffset:
                 column[-1, fans] for column in (of.products, of.squares, of.counts)
             )
 
-    def end_interval(
-        self, samples: int, commissioned: Array, learns: Array, moving: Array | None, *, at_first: bool
-    ) -> Array:
+    def end_interval(self, samples: int, commissioned: Array, learns: Array, moving: Array, *, at_first: bool) -> Array:
         """See SharedOffset.end_interval."""
         assert not at_first
         alone = np.zeros(len(commissioned), np.bool_)
         products, squares, counts = (
             np.array([getattr(each, name) for each in self._of_trays]) for name in ("products", "squares", "counts")
         )
-        known = (counts >= MIN_VALID_SHARE * samples) & (squares > 0)
-        if moving is not None:
-            known &= ~moving.reshape(known.shape)
+        known = (counts >= MIN_VALID_SHARE * samples) & (squares > 0) & ~moving.reshape(counts.shape)
         is_compared = known.sum(axis=1) >= LEAST_FANS
         first = self._of_trays[0]
         at_commissioning = np.array([each.commissioned for each in self._of_trays])
@@ -89,8 +85,7 @@ class JointSharedOffset:
                 each.value[:] = each.compared[:] = moved[number]
                 each.products[:] = each.squares[:] = each.counts[:] = 0
             else:
-                of_tray = moving if moving is None else moving[fans]
-                alone[fans] = each.end_interval(samples, commissioned[fans], learns[fans], of_tray, at_first=False)
+                alone[fans] = each.end_interval(samples, commissioned[fans], learns[fans], moving[fans], at_first=False)
         return alone
 
     def _each(self) -> Sequence[tuple[SharedOffset, slice]]:

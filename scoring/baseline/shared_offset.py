@@ -18,8 +18,7 @@ again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -78,11 +77,9 @@ class SharedOffset(ColumnState):
         interval_s: float,
         adaptation_s: float,
         reach_sigmas: float,
-        compares_fast: bool = True,
     ) -> None:
         """limit: of the offset, for each rad/s. residual_std: of the healthy residual, sigma. interval_s: length of an
-        interval. adaptation_s, reach_sigmas: how slowly, and how far, the baseline of a fan may move. compares_fast:
-        False only to decide as for recordings made when slow fans were compared with fast ones.
+        interval. adaptation_s, reach_sigmas: how slowly, and how far, the baseline of a fan may move.
 
         Offsets at low speed are drawn towards zero, or what was shared when all fans were commissioned again (ridge
         regression): errors of the twin there, as large as half of its residual, must not become large offsets at high
@@ -92,7 +89,6 @@ class SharedOffset(ColumnState):
         self.ridge = (residual_std / limit) ** 2
         self.gain, self._gain_alone = (-np.expm1(-interval_s / time_s) for time_s in (SMOOTHING_S, adaptation_s))
         self._reach_sigmas = reach_sigmas
-        self._compares_fast = compares_fast
         self._most_searched = SEARCHED_S / interval_s
         self.value = np.zeros(1)
         self.compared = np.zeros(1)
@@ -139,7 +135,8 @@ class SharedOffset(ColumnState):
         """What is shared in the present interval and later ones, if each but the last ends as `end_interval` ends it.
 
         offset: (n, fans) from the commissioned baseline, sigma. speed_sigmas: (n, fans) the speed over sigma, with its
-        sign. commissioned: (fans,). moving: (intervals, fans); None: no fan. See `end_interval`.
+        sign. commissioned: (fans,). moving: (intervals, fans), see `end_interval`; None for a single interval, which
+        does not end here.
         """
         products, squares, counts = sums(offset, speed_sigmas, valid, intervals)
         products[0] += self.products
@@ -160,11 +157,9 @@ class SharedOffset(ColumnState):
         """(intervals, 5) the state in each, see _State; and up to which these hold: until the end of the first interval
         in which a fan turned alone, itself counted."""
         state = self.now
-        if len(counts) == 1:
+        if moving is None:
             return np.array([state]), 1
-        known = (counts >= MIN_VALID_SHARE * expected) & (squares > 0)
-        if moving is not None:
-            known &= ~moving
+        known = (counts >= MIN_VALID_SHARE * expected) & (squares > 0) & ~moving
         turning = known.sum(axis=1)
         is_compared = turning >= LEAST_FANS
         alone = (turning > 0) & ~is_compared & (commissioned.sum() >= LEAST_FANS)
@@ -223,19 +218,15 @@ class SharedOffset(ColumnState):
         self._set(_State(*of.states[-1]))
         self.products[:], self.squares[:], self.counts[:] = of.products[-1], of.squares[-1], of.counts[-1]
 
-    def end_interval(
-        self, samples: int, commissioned: Array, learns: Array, moving: Array | None, *, at_first: bool
-    ) -> Array:
+    def end_interval(self, samples: int, commissioned: Array, learns: Array, moving: Array, *, at_first: bool) -> Array:
         """End the present interval of so many samples. at_first: no fan has a baseline yet, and offsets are residuals.
 
         commissioned: (fans,) which fans have a baseline to be measured against. learns: (fans,) whether a fan's
-        baseline may learn from the interval. moving: (fans,) whether the fan moved; None: no fan.
+        baseline may learn from the interval. moving: (fans,) whether the fan moved.
 
         Returns (fans,) which fan turned alone, so that its baseline is to learn nothing.
         """
-        known = (self.counts >= MIN_VALID_SHARE * samples) & (self.squares > 0)
-        if moving is not None:
-            known &= ~moving
+        known = (self.counts >= MIN_VALID_SHARE * samples) & (self.squares > 0) & ~moving
         is_compared = known.sum() >= LEAST_FANS
         alone = known & (not is_compared) & (commissioned.sum() >= LEAST_FANS)
         fast = self.fast(known, self.squares, self.counts)
@@ -260,7 +251,7 @@ class SharedOffset(ColumnState):
 
     def is_becoming_known(self, state: _State) -> bool:
         """Whether it is still being found what fans shared when they were commissioned."""
-        if not self._compares_fast or self.is_known or self._begun_information[0] >= WELL_KNOWN:
+        if self.is_known or self._begun_information[0] >= WELL_KNOWN:
             return False
         return state.informed < ENOUGH_INFORMATION and state.searched < self._most_searched
 
@@ -283,31 +274,22 @@ class SharedOffset(ColumnState):
         self._informed[:] = self._searched[:] = 0.0
         self._first[:] = 0
 
-    def restart(self, fans: Array, *, keeps_value: bool) -> None:
+    def restart(self, fans: Array) -> None:
         """Some fans, (fans,) of bool, are commissioned again.
 
-        keeps_value: also where these are all fans. What they share is a share of the speed; baselines that are learned
-        without it take it as an offset, which is wrong at all other speeds.
+        The value stays, also where these are all fans. What they share is a share of the speed; baselines that are
+        learned with it still in the residual would take it as an offset, which is wrong at all other speeds.
         """
         self.products[fans] = self.squares[fans] = self.counts[fans] = 0
         if not fans.all():
             return
-        if not keeps_value:
-            self.value[:] = self.compared[:] = 0.0
         self.commissioned[:] = self.compared[:] = self.value
         self._begun[:] = self.value
         self._first[:] = 0
         self._informed[:] = self._searched[:] = self._begun_information[:] = 0.0
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """See ColumnState. Earlier snapshots do not say what was shared at first, or how well that is known."""
-        known = {"informed": [0.0], "searched": [0.0], "begun": [0.0], "begun_information": [1.0]}
-        super().restore({"commissioned": [0.0], "first": [0], **known, **state})
-
     def fast(self, known: Array, squares: Array, counts: Array) -> Array:
         """(..., fans) those of the known ones that are not much slower than the second fastest of them."""
-        if not self._compares_fast:
-            return known
         mean_square = np.where(known, squares / np.maximum(counts, 1), 0.0)
         second = np.partition(mean_square, -LEAST_FANS, axis=-1)[..., -LEAST_FANS, np.newaxis]
         return known & (mean_square >= MIN_RELATIVE_SPEED**2 * second)

@@ -128,8 +128,6 @@ class DetectorContext:
     """mean over speeds of the standard deviation of the healthy residual, sigma"""
     tachos: tuple[Tacho, ...] = ()
     """of each fan; only for detectors of the tacho"""
-    allows_for_counts: bool = True
-    """see FanScorer"""
     capped: bool = True
     """False: statistics may grow without bound, for calibration to see how far"""
 
@@ -217,5 +215,3 @@ class DetectorRow:
     """above its limit it is reported before all others, however far they exceed theirs: it says what is wrong"""
     only_at_rest: bool = False
     """it has a ratio only while the command stops the fan"""
-    came_later: bool = False
-    """recordings of before DecisionRules.ONE_ALARM do not have it"""

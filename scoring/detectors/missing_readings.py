@@ -25,7 +25,7 @@ from schemas.messages import Alarm, Array
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.cusum import ONE, UNCAPPED, bounded_sums
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, DetectorSettings, LimitRule, Signal
-from scoring.detectors.tacho import LOOSE_S, MIN_MISSING_SHARE, MISSING_MARGIN, Tacho, TachoSettings
+from scoring.detectors.tacho import LOOSE_S, Tacho
 
 FAULT_SHARE, FAULT_FACTOR, MAX_FAULT_SHARE = 0.15, 3.0, 0.95
 """share of readings that a loose wire costs: the first, or so many times the healthy one; and at most"""
@@ -55,13 +55,6 @@ class MissingReadingsSettings(DetectorSettings):
         """More than the largest share of healthy runs."""
         share = MARGIN * observed.get("missing_share", 0.0)
         return cls(healthy_share=min(max(share, MIN_HEALTHY_SHARE), MAX_HEALTHY_SHARE))
-
-    @classmethod
-    def of_former_card(cls, tacho: TachoSettings) -> MissingReadingsSettings:
-        """For a card that has only the limit of the low-passed share: a line that needed a wide one misses many."""
-        if tacho.missing_share <= MIN_MISSING_SHARE:
-            return cls()
-        return cls(healthy_share=min(tacho.missing_share / MISSING_MARGIN, MAX_HEALTHY_SHARE))
 
     def scaled(self, factor: float) -> MissingReadingsSettings:
         """See DetectorSettings."""

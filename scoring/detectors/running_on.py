@@ -12,11 +12,7 @@ Readings lag, so what is seen within the reach of the tacho and a second is not 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
-from pydantic import Field
 
 from schemas.messages import Alarm, Array
 from schemas.standstill import SLOWED_SHARE
@@ -24,7 +20,7 @@ from schemas.units import NS_PER_S
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
 from scoring.detectors.durations import Durations
-from scoring.detectors.healthy_times import HealthyTimes, coast_limit_s, lag_s, slowing_limit_s, start_limit_s
+from scoring.detectors.healthy_times import HealthyTimes, coast_limit_s, lag_s, slowing_limit_s
 
 CERTAIN = 2.0  # ratios above 1 are multiplied by it: a fan that does not do as commanded is an alarm, not a warning
 OFF_DELAY_S = 2.0
@@ -36,10 +32,6 @@ LONG_AGO_NS = 1 << 60  # when a stop was that nobody has seen: the speed that it
 class RunningOnSettings(HealthyTimes):
     """From the card of the twin."""
 
-    by_coast_only: bool = Field(
-        default=False, description="whether only the first of the three counts, as in earlier recordings"
-    )
-
 
 class RunningOn(Detector):
     """How long a fan has turned although it is stopped, in multiples of what is healthy; NaN unless it is stopped."""
@@ -48,12 +40,10 @@ class RunningOn(Detector):
 
     def __init__(self, settings: RunningOnSettings, context: DetectorContext) -> None:
         self._healthy = healthy = settings.healthy
-        self._by_coast_only = settings.by_coast_only
         reach_s = np.array([tacho.reach_s for tacho in context.tachos])
         self._lag_s = settings.factor * lag_s(reach_s)
         self._coast_limit_s = settings.factor * coast_limit_s(healthy, reach_s)
         self._slowing_limit_s = np.minimum(settings.factor * slowing_limit_s(healthy, reach_s), self._coast_limit_s)
-        self._memory_s = settings.factor * float(np.max(start_limit_s(healthy, reach_s))) * settings.by_coast_only
         self._lasted_ns = np.zeros((4, context.fans), np.int64)
         """for how long the fan has turned although it is stopped, has been stopped, at rest, and at rest for the lag"""
         self._lasted_ns[1] = LONG_AGO_NS
@@ -73,8 +63,6 @@ class RunningOn(Detector):
         stands = np.isfinite(speed) & ~turns
         count = Durations(block.valid, block.period_ns)
         ran_on = count.of(stops & turns, ~stops | stands, self._lasted_ns[0])
-        if self._by_coast_only:
-            return ran_on / self._coast_limit_s / NS_PER_S
         lag_ns = self._lag_s * NS_PER_S
         stopped = count.of(stops, ~stops, self._lasted_ns[1])
         at_rest = count.of(stops & stands, ~stops | turns, self._lasted_ns[2])
@@ -102,7 +90,7 @@ class RunningOn(Detector):
     @property
     def memory_s(self) -> float:
         """In a gap the fan may have been started and stopped again."""
-        return self._memory_s
+        return 0.0
 
     @property
     def off_delay_s(self) -> float:
@@ -112,17 +100,8 @@ class RunningOn(Detector):
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
         ran_on, stopped, at_rest, rested = self._lasted_ns
-        former = {"ran_on_ns": ran_on}
-        if self._by_coast_only:
-            return former
-        of_rest = {"stopped_ns": stopped, "at_rest_ns": at_rest, "rested_ns": rested}
-        return {**former, **of_rest, "peak_rad_s": self._peak_rad_s}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """See ColumnState. It starts again from a snapshot of a former version, which does not know when a fan was
-        stopped."""
-        if self._by_coast_only or "peak_rad_s" in state:
-            super().restore(state)
+        times = {"ran_on_ns": ran_on, "stopped_ns": stopped, "at_rest_ns": at_rest, "rested_ns": rested}
+        return {**times, "peak_rad_s": self._peak_rad_s}
 
     @classmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:

@@ -13,7 +13,6 @@ commanded.
 from __future__ import annotations
 
 import numpy as np
-from pydantic import Field
 
 from schemas.messages import Alarm, Array
 from schemas.units import NS_PER_S
@@ -21,7 +20,7 @@ from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
 from scoring.detectors.durations import Durations
 from scoring.detectors.healthy_times import HealthyTimes, lapse_limit_s, start_limit_s
-from scoring.detectors.running_on import CERTAIN, OFF_DELAY_S, RunningOn, RunningOnSettings
+from scoring.detectors.running_on import CERTAIN, OFF_DELAY_S, RunningOn
 
 MISSING_S = 2.0  # beyond the reach of the tacho
 UNKNOWN_STARTED_S = 5.0  # beyond the reach: the length of a start, if none was seen
@@ -29,11 +28,6 @@ UNKNOWN_STARTED_S = 5.0  # beyond the reach: the length of a start, if none was 
 
 class StandstillSettings(HealthyTimes):
     """From the card of the twin."""
-
-    with_stopped: bool = Field(
-        default=False,
-        description="whether it judges stopped fans, too, and has a ratio everywhere, as in earlier recordings",
-    )
 
 
 class StandstillDetector(Detector):
@@ -49,8 +43,6 @@ class StandstillDetector(Detector):
         self._lapse_limit_s = settings.factor * lapse_limit_s(healthy)
         self._start_limit_s = settings.factor * start_limit_s(healthy, reach_s)
         self._missing_limit_s: Array = settings.factor * (reach_s + MISSING_S)
-        of_stopped = RunningOnSettings(healthy=healthy, factor=settings.factor, by_coast_only=True)
-        self._of_stopped = RunningOn(of_stopped, context) if settings.with_stopped else None
         self._lasted_ns = np.zeros((4, context.fans), np.int64)
         """for how long the fan has been driven, turned, stood, and given no reading"""
 
@@ -67,16 +59,11 @@ class StandstillDetector(Detector):
         )
         limit_s = np.where(turned > 0, self._lapse_limit_s, self._start_limit_s)
         ratio = np.maximum(stood / limit_s, silent / self._missing_limit_s) / NS_PER_S
-        if self._of_stopped is not None:
-            ratio = np.maximum(ratio, self._of_stopped.ratio(block))
-            return np.where(ratio > 1.0, CERTAIN * ratio, ratio)
         return np.where(ratio > 1.0, CERTAIN * ratio, np.where(drives & turns, 0.0, np.nan))
 
     def reset(self, fans: Array) -> None:
         """See Detector."""
         self._lasted_ns[:, fans] = 0
-        if self._of_stopped is not None:
-            self._of_stopped.reset(fans)
 
     @property
     def memory_s(self) -> float:
@@ -91,8 +78,7 @@ class StandstillDetector(Detector):
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
         names = ("driven_ns", "turned_ns", "stood_ns", "silent_ns")
-        of_stopped = self._of_stopped.columns() if self._of_stopped else {}
-        return {**dict(zip(names, self._lasted_ns, strict=True)), **of_stopped}
+        return dict(zip(names, self._lasted_ns, strict=True))
 
     @classmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:

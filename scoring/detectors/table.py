@@ -20,7 +20,7 @@ DETECTORS = (
     DetectorRow("balance_drift", Statistic.BALANCE_DRIFT, "balance", Drift),
     DetectorRow("balance_variance_growth", Statistic.BALANCE_VARIANCE_GROWTH, "balance", VarianceGrowth),
     DetectorRow("sensor", Statistic.SENSOR, "tacho", Tacho),
-    DetectorRow("missing_readings", Statistic.SENSOR, "tacho", MissingReadings, came_later=True),
+    DetectorRow("missing_readings", Statistic.SENSOR, "tacho", MissingReadings),
     DetectorRow("standstill", Statistic.STANDSTILL, "tacho", StandstillDetector, comes_first=True),
     DetectorRow("running_on", Statistic.STANDSTILL, "tacho", RunningOn, comes_first=True, only_at_rest=True),
 )

@@ -88,7 +88,6 @@ class Tacho(Detector):
         """(fans,) what a healthy fan would have read when the reading began to repeat"""
         self._holds = np.array([tacho.kind != "instantaneous" for tacho in context.tachos])
         self._resolution_rad_s = np.array([tacho.resolution_rad_s for tacho in context.tachos])
-        self._must_be_away = context.allows_for_counts
         self._missing = LowPass(context.fans, MISSING_TIME_CONSTANT_S)
         self._longest_s = self._largest_share = 0.0
 
@@ -116,8 +115,7 @@ class Tacho(Detector):
             first = np.take_along_axis(predicted_rad_s, np.maximum(changed - 1, 0), axis=0)
             first = np.where(changed == 0, self._healthy_rad_s, first)
             elsewhere = moved(predicted_rad_s, first, self._resolution_rad_s)
-            if self._must_be_away:
-                elsewhere &= moved(predicted_rad_s, speed_rad_s, self._resolution_rad_s, AWAY)
+            elsewhere &= moved(predicted_rad_s, speed_rad_s, self._resolution_rad_s, AWAY)
             counted = same & (~self._holds | elsewhere)
             self._healthy_rad_s = first[-1].copy()
         total = np.cumsum(counted, axis=0) * period_ns

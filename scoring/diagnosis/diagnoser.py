@@ -26,7 +26,6 @@ WINDOW_S = 95.0
 AGAIN_AFTER_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # after the raise; the last window still contains some health
 MAX_SAMPLES = 1 << 16  # of a fan's window; at very high rates the window is shorter than WINDOW_S
 MAX_VALUE = 1e9  # larger speeds and commands count as missing: their powers would overflow
-FORMER_MIN_PROBABILITY = 0.005
 NEWS = 0.1  # a change of a probability that is worth a message
 
 
@@ -58,27 +57,17 @@ class Diagnoser:
     def __init__(
         self,
         healthy: Sequence[HealthyBalance],
-        advice: Advice | None = ADVICE,
+        advice: Advice = ADVICE,
         tachos: Sequence[Tacho] = INSTANTANEOUS,
         standstill: Standstill | None = None,
         *,
-        knows_readings: bool = True,
-        knows_falls: bool = True,
-        plain_words: bool = True,
         knows_supply: bool = False,
     ) -> None:
-        """advice: None only to diagnose as for recordings made before there was any; see `diagnose`. standstill: None
-        where the detector of it is not used. knows_readings: False only to diagnose as for recordings made before
-        causes accounted for what a tacho resolves; knows_falls: before a fan that slows down was compared with one that
-        comes to rest; plain_words and knows_supply: see `diagnose`.
-        """
+        """advice, knows_supply: see `diagnose`. standstill: None where the detector of it is not used."""
         self._healthy = healthy
         self._advice = advice
         self._tachos = tacho_of_each_fan(tachos, len(healthy))
         self._standstill = standstill
-        self._knows_readings = knows_readings
-        self._knows_falls = knows_falls
-        self._plain_words = plain_words
         self._knows_supply = knows_supply
         self._blocks: deque[_Block] = deque()
         self._period_ns = 0
@@ -158,19 +147,13 @@ class Diagnoser:
         window = self.window(fan, t_ns, self._onset_t_ns.get(fan, t_ns))
         if window is None:
             return ()
-        tacho = self._tachos[fan] if self._knows_readings else None
         causes = diagnose(
-            window,
-            self._healthy[fan],
-            self._advice,
-            tacho,
-            plain_words=self._plain_words,
-            knows_supply=self._knows_supply,
+            window, self._healthy[fan], self._advice, self._tachos[fan], knows_supply=self._knows_supply
         ).causes
-        if self._knows_falls and self._standstill is not None:
+        if self._standstill is not None:
             rest = coming_to_rest(window, self._standstill, self._healthy[fan], self._tachos[fan])
             causes = rest.beside(causes) if rest else causes
-        least = FORMER_MIN_PROBABILITY if self._advice is None else min(MIN_PROBABILITY, causes[0].probability)
+        least = min(MIN_PROBABILITY, causes[0].probability)
         return tuple(_message(cause) for cause in causes if cause.probability >= least)
 
     def says_more(self, causes: Sequence[CauseMessage], than: Sequence[CauseMessage]) -> bool:
@@ -179,9 +162,9 @@ class Diagnoser:
         A fan that did not turn and turns again has recovered: causes found from then on are of the fault's end.
         """
         stood, stands = (bool(each) and is_of_standstill(each[0]) for each in (than, causes))
-        if self._knows_readings and stood and not stands:
+        if stood and not stands:
             return False
-        if self._advice is None or stands != stood or [each.cause for each in causes] != [each.cause for each in than]:
+        if stands != stood or [each.cause for each in causes] != [each.cause for each in than]:
             return True
         return any(abs(new.probability - old.probability) >= NEWS for new, old in zip(causes, than, strict=True))
 
@@ -190,9 +173,7 @@ class Diagnoser:
         window = self.window(fan, t_ns, self._onset_t_ns.get(fan, t_ns))
         if window is None or self._standstill is None:
             return ()
-        causes = standstill_causes(
-            window, self._standstill, self._healthy[fan], self._tachos[fan], by_course=self._knows_readings
-        )
+        causes = standstill_causes(window, self._standstill, self._healthy[fan], self._tachos[fan])
         return tuple(_message(cause) for cause in causes if cause.probability >= MIN_PROBABILITY)
 
     def snapshot(self) -> dict[str, Any]:

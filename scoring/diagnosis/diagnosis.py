@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.tacho import Tacho
+from schemas.tacho import INSTANTANEOUS, Tacho
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.current_evidence import GainOfCurrent, gain_of_current
 from scoring.diagnosis.hypotheses import CAUSES, Comparison, Explanation, FaultHypothesis, log_sum
@@ -86,19 +86,15 @@ class Diagnosis:
 def diagnose(
     window: Window,
     healthy: HealthyBalance,
-    advice: Advice | None = ADVICE,
-    tacho: Tacho | None = None,
+    advice: Advice = ADVICE,
+    tacho: Tacho = INSTANTANEOUS[0],
     *,
-    plain_words: bool = True,
     knows_supply: bool = False,
 ) -> Diagnosis:
     """Diagnose one fan from its last seconds, some before the onset of the fault and all since.
 
-    advice: on what would show the cause, where it is unclear; None only to diagnose as for recordings made before there
-    was any. Missing readings then counted from the onset of the alarm, not from the first of them. tacho: None where
-    each sample is a reading of its own, and for recordings made before it was accounted for. plain_words: False only
-    for recordings made when sentences had the names of causes that messages have. knows_supply: the command is that at
-    the supply voltage as it was measured, so that a weak supply is no cause of less drive.
+    advice: on what would show the cause, where it is unclear. knows_supply: the command is that at the supply voltage
+    as it was measured, so that a weak supply is no cause of less drive.
 
     About three seconds of health before the onset are enough; the samples after it decide. The diagnosis can be
     repeated as samples arrive. It takes milliseconds.
@@ -106,13 +102,13 @@ def diagnose(
     heard = np.isfinite(window.command)  # where the command is missing too, the line was silent and not the sensor
     speed, onset = window.speed_rad_s[heard], int(np.count_nonzero(heard[: window.onset]))
     regression = RegressionWindow(window, healthy)
-    if tacho is None or tacho.kind == "instantaneous":
+    if tacho.kind == "instantaneous":
         stuck, repeats = stuck_log_ratio(speed, onset)
     else:
         expected = np.broadcast_to(window.expected_rad_s, window.speed_rad_s.shape)[heard]
         stuck, repeats = stuck_log_ratio_of_readings(speed, expected, onset, tacho, window.period_s)
     lacks = ~np.isfinite(speed) if window.reading_missing is None else window.reading_missing[heard]
-    dropout_onset = onset if advice is None else _first_missing(lacks, onset, window.period_s)
+    dropout_onset = _first_missing(lacks, onset, window.period_s)
     if window.reading_missing is not None:
         dropout_onset = _most_probable_onset(lacks, dropout_onset, onset)
     dropout, missing = dropout_log_ratio(lacks, dropout_onset)
@@ -144,9 +140,9 @@ def diagnose(
         found, sentence = evidence[GAIN_DOWN]
         evidence[GAIN_DOWN] = found, f"{sentence}, beyond the supply voltage, which is measured"
     evidence[STUCK] = _of_stuck(repeats, window.period_s)
-    evidence[DROPOUT] = _of_dropout(missing, 0.0 if advice is None else (len(speed) - dropout_onset) * window.period_s)
-    unclear = _clarity(names, weight, healthy_share, regression.speeds_after if enough else None, plain_words)
-    if advice is not None and unclear.startswith(CANNOT_TELL_YET):
+    evidence[DROPOUT] = _of_dropout(missing, (len(speed) - dropout_onset) * window.period_s)
+    unclear = _clarity(names, weight, healthy_share, regression.speeds_after if enough else None)
+    if unclear.startswith(CANNOT_TELL_YET):
         unclear = advice.added_to(unclear, window, healthy)
     evidence[CANNOT_TELL] = None, unclear
     ranked = [
@@ -204,20 +200,17 @@ def _most_probable_onset(lacks: NDArray[np.bool_], first: int, onset: int) -> in
 
 
 def _of_dropout(missing: float, seconds: float) -> tuple[Evidence | None, str]:
-    """seconds: over which the share was counted; 0 leaves it out."""
+    """seconds: over which the share was counted."""
     if not missing:
         return None, "no reading is missing"
     found = Evidence("missing readings", missing, missing, missing, "share")
-    over = f" of the last {seconds:.2g} s" if seconds else ""
-    return found, f"{100 * missing:.0f} % of the readings{over} are missing"
+    return found, f"{100 * missing:.0f} % of the readings of the last {seconds:.2g} s are missing"
 
 
-def _clarity(
-    names: list[str], weight: Array, healthy_share: float, speeds_after: Array | None, plain_words: bool
-) -> str:
+def _clarity(names: list[str], weight: Array, healthy_share: float, speeds_after: Array | None) -> str:
     """Why the cause is unclear, or that it is clear."""
     first, second = np.argsort(-weight[:-1])[:2]
-    one, other = (short_name(names[each]) if plain_words else names[each] for each in (first, second))
+    one, other = (short_name(names[each]) for each in (first, second))
     if weight[-1] < weight[first] * CLEAR_RATIO:
         return f"little doubt: {one} is more than twice as probable as all others together"
     if speeds_after is None:
@@ -226,6 +219,5 @@ def _clarity(
         return f"{CANNOT_TELL_YET}: the torque balance is that of a healthy fan"
     low, high = np.quantile(speeds_after, (0.05, 0.95))
     if high - low < STEADY_SHARE * high:
-        still = "the speed has changed too little since the alarm began"
-        return f"{CANNOT_TELL_YET}: {still if plain_words else 'the command is not moving'}"
+        return f"{CANNOT_TELL_YET}: the speed has changed too little since the alarm began"
     return f"{CANNOT_TELL_YET}: {one} and {other} explain it alike"

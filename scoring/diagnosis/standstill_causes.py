@@ -30,7 +30,6 @@ FELL_AT_ONCE = {BLOCKED: 0.4, NO_POWER: 0.04, NO_TACHO: 0.2}
 """prior probabilities of the faults after which the reading falls at once; no power: the connector is off"""
 COASTED = 0.36
 """that of no power with the tacho alive"""
-FORMER_FELL_AT_ONCE, FORMER_COASTED = {BLOCKED: 0.5, NO_POWER: 0.05, NO_TACHO: 0.2}, 0.25
 NEVER_TURNED = {BLOCKED: 0.4, NO_POWER: 0.4, NO_TACHO: 0.2}
 NO_READING = {NO_TACHO: 0.8, NO_POWER: 0.15, BLOCKED: 0.05}
 RAN_ON = {STILL_DRIVEN: 0.7, WINDMILLING: 0.3}
@@ -53,22 +52,15 @@ SAMPLES_OF_AN_ERROR = 4
 LOSS_STD = 0.25
 """prior standard deviation of the share of its speed that a fan loses if it slows down"""
 UNCLEAR = f"{CANNOT_TELL_YET}: it slows down, and more is known when it stands or turns evenly"
-BLUR_S = 0.15  # of the time of a fall, beside the tacho
-COAST_SPREAD = 0.3  # standard deviation of a coast, relative to its expected time
-MIN_COAST_S = 0.1
 LEVEL_S = 10.0  # before the longest fall: readings of a healthy fan
 RECENT_S = 1.0  # beyond the reach of the tacho
 GRID = 200  # speeds at which the balance is inverted
 
 
 def standstill_causes(
-    window: Window, healthy: Standstill, balance: HealthyBalance, tacho: Tacho, *, by_course: bool = True
+    window: Window, healthy: Standstill, balance: HealthyBalance, tacho: Tacho
 ) -> tuple[RankedCause, ...]:
-    """The causes, most probable first, from a fan's last seconds up to the present; the onset is not used.
-
-    by_course: False only to diagnose as for recordings made before the course of the readings was compared, and not
-    only the duration of their fall.
-    """
+    """The causes, most probable first, from a fan's last seconds up to the present; the onset is not used."""
     window = window.as_given
     commands = window.command[np.isfinite(window.command)]
     command = float(commands[-1]) if len(commands) else math.nan
@@ -87,12 +79,12 @@ def standstill_causes(
         return ranked(NO_READING, f"gives no reading although commanded to {command:.3g}{supply}")
     if not len(turning) or not _was_driven(window, int(turning[-1]), healthy, tacho):
         return ranked(NEVER_TURNED)
-    fell_at_once, coasted = (FELL_AT_ONCE, COASTED) if by_course else (FORMER_FELL_AT_ONCE, FORMER_COASTED)
     if healthy.coast_time_constant_s is None:
-        return ranked(_sums(fell_at_once, coasted))
-    likelihoods = (_by_course if by_course else _by_duration)(window, int(turning[-1]), healthy, balance, tacho)
-    likely = {cause: prior * likelihoods[0] for cause, prior in fell_at_once.items()}
-    return ranked(_sums(likely, coasted * likelihoods[1]))
+        return ranked(_sums(FELL_AT_ONCE, COASTED))
+    fall = _Fall.of(window, int(turning[-1]), healthy, balance, tacho)
+    at_once, coasting = (fall.likelihood(constants_s) + LEAST_LIKELIHOOD for constants_s in fall.constants_s)
+    likely = {cause: prior * at_once for cause, prior in FELL_AT_ONCE.items()}
+    return ranked(_sums(likely, COASTED * coasting))
 
 
 @dataclass(frozen=True)
@@ -227,15 +219,6 @@ class _Fall:
         return _readings_of_a_fall(self.at_s, fall_s, constant_s, self.tacho, phase_s)
 
 
-def _by_course(
-    window: Window, last_turning: int, healthy: Standstill, balance: HealthyBalance, tacho: Tacho
-) -> tuple[float, float]:
-    """Likelihoods that the fan stopped at once, and that it coasted, by the course of its readings."""
-    fall = _Fall.of(window, last_turning, healthy, balance, tacho)
-    at_once, coasting = (fall.likelihood(constants_s) + LEAST_LIKELIHOOD for constants_s in fall.constants_s)
-    return at_once, coasting
-
-
 def _readings_of_a_fall(at_s: Array, fall_s: Array, constant_s: Array, tacho: Tacho, phase_s: Array) -> Array:
     """(..., n) readings of a fan that turned at a speed of 1 and comes to rest with a time constant; broadcast."""
 
@@ -248,22 +231,6 @@ def _readings_of_a_fall(at_s: Array, fall_s: Array, constant_s: Array, tacho: Ta
         return np.exp(-np.maximum(shown_s - fall_s, 0.0) / constant_s)
     end_s = phase_s + np.floor((shown_s - phase_s) / tacho.held_s) * tacho.held_s
     return (turned(end_s) - turned(end_s - tacho.window_s)) / tacho.window_s
-
-
-def _by_duration(
-    window: Window, last_turning: int, healthy: Standstill, balance: HealthyBalance, tacho: Tacho
-) -> tuple[float, float]:
-    """As `_by_course`, by how long the reading took to fall to that of a fan at rest."""
-    share, level = _shares(window, last_turning, healthy, balance, tacho)
-    high = np.flatnonzero(share[: last_turning + 1] >= FALLING_SHARE * level)
-    row = int(high[-1]) if len(high) else 0
-    fall_s = (last_turning - row) * window.period_s
-    from_rad_s = float(np.nanmax(np.abs(window.speed_rad_s[row : last_turning + 1])))
-    log = math.log(max(from_rad_s / healthy.standing_below_rad_s, 1.0))
-    coast_s = max((healthy.coast_time_constant_s or 0.0) * log, MIN_COAST_S)
-    blur_s = tacho.held_s / 2 + window.period_s + BLUR_S
-    at_once = _normal(fall_s, tacho.held_s / 2, blur_s)
-    return at_once, _normal(fall_s, coast_s + tacho.held_s / 2, math.hypot(blur_s, COAST_SPREAD * coast_s))
 
 
 def _was_driven(window: Window, last_turning: int, healthy: Standstill, tacho: Tacho) -> bool:
@@ -301,10 +268,6 @@ def _steady_speed(command: Array, balance: HealthyBalance, speed_rad_s: Array) -
 def _mass(lowest: float, mean: Array | float, width: Array | float) -> Array:
     """Probability that a normally distributed share is from the lowest to 1."""
     return ndtr((1.0 - mean) / width) - ndtr((lowest - mean) / width)
-
-
-def _normal(value: float, mean: float, deviation: float) -> float:
-    return math.exp(-0.5 * ((value - mean) / deviation) ** 2) / deviation + 1e-6
 
 
 def _sums(causes: Mapping[str, float], no_power: float) -> dict[str, float]:

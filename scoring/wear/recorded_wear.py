@@ -6,7 +6,6 @@ import json
 from typing import Any
 
 from schemas.messages import ScorerSnapshot
-from scoring.former_snapshot_keys import FORMER_PARAMETER_KEYS, current_keys
 
 _SHOWN = ("unit", "change", "per_day", "days", "limit", "reached_t_ns", "unknown_reason")
 
@@ -15,9 +14,6 @@ def wear_in(snapshot: ScorerSnapshot) -> dict[str, Any] | None:
     """The state of the wear monitor in a snapshot; None in one of a scorer that did not monitor wear yet."""
     try:
         wear = json.loads(snapshot.state_json)["wear"]
-        for fan in wear["fans"]:
-            for name, parameter in fan["parameters"].items():
-                fan["parameters"][name] = current_keys(parameter, FORMER_PARAMETER_KEYS)
         wear_rows("", 0, wear)
     except (ValueError, KeyError, TypeError, AttributeError):
         return None

@@ -99,11 +99,8 @@ class WearSeries:
         """The last value; 0 if there is none."""
         return self._value[-1] if self._value else 0.0
 
-    def add(self, t_ns: int, value: float, std_error: float, *, is_rounded: bool = True) -> None:
-        """Add a point. It is ignored if not finite, not newer than the last, or without a positive std_error.
-
-        is_rounded: as stored points are; False: they keep all digits, as before.
-        """
+    def add(self, t_ns: int, value: float, std_error: float) -> None:
+        """Add a point. It is ignored if not finite, not newer than the last, or without a positive std_error."""
         if not (np.isfinite(value) and np.isfinite(std_error) and std_error > 0.0):
             return
         if self._t_ns and t_ns <= self._t_ns[-1]:
@@ -115,12 +112,12 @@ class WearSeries:
             )
         else:
             if len(self._t_ns) == CAPACITY:
-                self._halve(is_rounded=is_rounded)
+                self._halve()
             self._t_ns.append(t_ns)
             self._value.append(value)
             self._std_error.append(std_error)
             self._points_in_last = 1
-        if is_rounded and self._points_in_last == self._points_per_stored:
+        if self._points_in_last == self._points_per_stored:
             self._t_ns[-1], self._value[-1], self._std_error[-1] = _rounded(
                 (self._t_ns[-1], self._value[-1], self._std_error[-1])
             )
@@ -186,11 +183,9 @@ class WearSeries:
         series._points_per_stored, series._points_in_last = (int(count) for count in snapshot["count"])
         return series
 
-    def _halve(self, *, is_rounded: bool) -> None:
+    def _halve(self) -> None:
         points = list(zip(self._t_ns, self._value, self._std_error, strict=True))
-        pairs = [_merged(first, second) for first, second in zip(points[::2], points[1::2], strict=True)]
-        if is_rounded:
-            pairs = [_rounded(pair) for pair in pairs]
+        pairs = [_rounded(_merged(first, second)) for first, second in zip(points[::2], points[1::2], strict=True)]
         self._t_ns, self._value, self._std_error = (list(column) for column in zip(*pairs, strict=True))
         self._points_per_stored *= 2
 

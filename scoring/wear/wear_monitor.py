@@ -20,7 +20,6 @@ import numpy as np
 from schemas.messages import Array
 from schemas.units import NS_PER_S
 from scoring.diagnosis.diagnoser import Diagnoser
-from scoring.former_snapshot_keys import FORMER_WEAR_KEYS, current_keys
 from scoring.wear.reference import HealthyFan, WearReference
 from scoring.wear.reidentification import parameter_shifts
 from scoring.wear.slow_change import slow_changes
@@ -81,16 +80,13 @@ class WearMonitor:
         diagnoser: Diagnoser,
         every_s: float,
         command_unit: str,
-        *,
-        rounds_points: bool = True,
     ) -> None:
         """healthy: each fan by the present twin. diagnoser: holds the last seconds. every_s: interval between the
-        points of a fan. rounds_points: as scoring.wear.trend says; False: by former rules."""
+        points of a fan."""
         self._healthy = healthy
         self._diagnoser = diagnoser
         self._every_ns = round(every_s * NS_PER_S)
         self._unit = command_unit
-        self._rounds_points = rounds_points
         self._period_turns = max(ATTEMPT_PERIOD_TURNS, math.ceil(len(healthy) / FANS_OF_TURN))
         self._last_turn = 0
         self._disturbed_t_ns = np.full(len(healthy), NEVER_NS)
@@ -199,7 +195,7 @@ class WearMonitor:
             fan.keep_reference_unless_of(healthy)
         self._last_turn, self._disturbed_t_ns, self._fans = last_turn, disturbed_t_ns, fans
 
-    def restore_of_former_twin(self, snapshot: Mapping[str, Any]) -> None:
+    def restore_of_earlier_twin(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a snapshot of the twin before: drag, friction and gain go on, the balance starts again.
 
         A fan without a reference in the snapshot starts again as a whole. Nothing has changed if this raises.
@@ -210,13 +206,11 @@ class WearMonitor:
         self._disturbed_t_ns, self._fans = disturbed_t_ns, [fan.with_next_twin() for fan in fans]
 
     def _read(self, snapshot: Mapping[str, Any]) -> tuple[int, Array, list[_FanWear]]:
-        stored = current_keys(snapshot, FORMER_WEAR_KEYS)
-        fans = [_FanWear.restore(fan) for fan in stored["fans"]]
-        disturbed_t_ns = np.array(stored.get("disturbed_t_ns", self._disturbed_t_ns), np.int64)  # the first had none
+        fans = [_FanWear.restore(fan) for fan in snapshot["fans"]]
+        disturbed_t_ns = np.array(snapshot["disturbed_t_ns"], np.int64)
         if len(fans) != len(self._fans) or disturbed_t_ns.shape != self._disturbed_t_ns.shape:
             raise ValueError("wear of another number of fans")
-        former = int(stored.get("last_attempt", 0)) * ATTEMPT_PERIOD_TURNS  # of all fans at once
-        return int(stored.get("last_turn", former)), disturbed_t_ns, fans
+        return int(snapshot["last_turn"]), disturbed_t_ns, fans
 
     def _see_disturbances(self, t_ns: Array, disturbed: Array) -> None:
         """Keep the time of the last disturbed sample of each fan; (n,) and (n, fans), n may be 0."""
@@ -231,7 +225,7 @@ class WearMonitor:
         if window is None:
             return False
         wear, present = self._fans[fan], WearReference(self._healthy[fan], commissioned)
-        reference = wear.reference if wear.reference and wear.reference.of_former_twin else present
+        reference = wear.reference if wear.reference and wear.reference.of_earlier_twin else present
         drifts = parameter_shifts(reference.applied_to(window), reference.healthy.balance)
         if not drifts:
             return False
@@ -241,7 +235,7 @@ class WearMonitor:
             points["balance"] = window.fan_offset - shared - own_offset, window.fan_offset_std_error
         for parameter, (change, std_error) in points.items():
             if max(abs(change), std_error) < MAX_CHANGE:
-                wear.series[parameter].add(at_ns, change, std_error, is_rounded=self._rounds_points)
+                wear.series[parameter].add(at_ns, change, std_error)
         wear.reference = reference
         return True
 
@@ -254,7 +248,7 @@ class _FanWear:
         self.t_ns = 0
         self.limit: float | None = None
         self.reference: WearReference | None = None
-        """of the last point; None before the first one, and in snapshots of earlier versions"""
+        """of the last point; None before the first one"""
         self.series = {parameter: WearSeries() for parameter in UNITS}
         self.wear: dict[str, ParameterWear] = {}
 
@@ -267,13 +261,13 @@ class _FanWear:
     def keep_reference_unless_of(self, present: HealthyFan) -> None:
         """Keep the reference of a twin that was calibrated again since."""
         if self.reference and self.reference.healthy.snapshot() != present.snapshot():
-            self.reference = replace(self.reference, of_former_twin=True)
+            self.reference = replace(self.reference, of_earlier_twin=True)
 
     def with_next_twin(self) -> _FanWear:
         """The wear of the fan when another twin takes over. Its points count from the first sample again."""
         following = _FanWear()
         if self.reference is not None:
-            following.reference = replace(self.reference, of_former_twin=True)
+            following.reference = replace(self.reference, of_earlier_twin=True)
             following.series |= {name: series for name, series in self.series.items() if name != "balance"}
             following.evaluate(self.t_ns, np.inf)
         return following
@@ -320,7 +314,7 @@ class _FanWear:
         for parameter in UNITS:
             series = {name: np.asarray(column) for name, column in snapshot["parameters"][parameter]["series"].items()}
             fan.series[parameter] = WearSeries.restore(series)
-        if snapshot.get("reference") is not None:
+        if snapshot["reference"] is not None:
             fan.reference = WearReference.restore(snapshot["reference"])
         t_ns = int(snapshot["t_ns"])
         if t_ns > 0:

@@ -446,12 +446,10 @@ def test_limits_widen_while_a_healthy_fan_moves_and_not_while_a_fault_does() -> 
     commanded = replace(faulty, command=np.where(falling < 0.0, 0.5, 1.0) * still.command)
     row = [one.name for one in rows()].index("speed_smoothed")
 
-    def ratio(samples: Samples, *, limits_motion: bool = True) -> float:
-        scorer = FanScorer(FANS, limits, limits_motion=limits_motion)
-        return float(scorer.update(samples).ratios[2100, row].min())
+    def ratio(samples: Samples) -> float:
+        return float(FanScorer(FANS, limits).update(samples).ratios[2100, row].min())
 
     not_widened = ratio(replace(faulty, speed_rad_s=still.speed_rad_s))
     assert ratio(faulty) == not_widened
     assert ratio(predicted) < 0.5 * not_widened
     assert ratio(commanded) < 0.5 * not_widened
-    assert ratio(faulty, limits_motion=False) < 0.5 * not_widened

@@ -112,25 +112,9 @@ def test_a_restored_scorer_continues_with_the_same_bits(row: int, whole: tuple[F
     assert second.snapshot() == of_whole.snapshot()
 
 
-def test_a_snapshot_of_a_card_without_a_shared_part_is_continued() -> None:
-    former = {"shared_limit": 0.0}
-    card = limits()
-    older = card.model_copy(
-        update={"speed": card.speed.model_copy(update=former), "balance": card.balance.model_copy(update=former)}
-    )
-    first, second, samples = FanScorer(FANS, older), FanScorer(FANS, card), tray()
-    first.update(rows_of(samples, slice(0, 11 * PER_S)))
-    state = first.snapshot()
-    assert "shared" not in state["speed"]
-    second.restore(state)
-    second.update(rows_of(samples, slice(11 * PER_S, 24 * PER_S)))
-    assert second.snapshot()["speed"]["shared"]["value"][0] < -0.005
-
-
-@pytest.mark.parametrize("shares_at_first", [True, False])
-def test_fans_that_are_all_slower_than_their_twin_are_healthy_at_all_speeds(shares_at_first: bool) -> None:
+def test_fans_that_are_all_slower_than_their_twin_are_healthy_at_all_speeds() -> None:
     """They begin at a low speed, where that is half a sigma: as with a new twin of the time before a filter change."""
-    scorer = FanScorer(FANS, limits(), shares_at_first=shares_at_first, compares_fast=shares_at_first)
+    scorer = FanScorer(FANS, limits())
     speed_rad_s = np.repeat(np.tile([50.0, 200.0], 2), 12 * PER_S)[:, np.newaxis] * np.ones(FANS)
     residual = 0.2 * autoregressive(len(speed_rad_s), FANS, 0.0, 1) + WEATHER * speed_rad_s / SIGMA_RAD_S
     made = samples_of(residual, np.zeros(residual.shape), period_ns=PERIOD_NS)
@@ -138,14 +122,13 @@ def test_fans_that_are_all_slower_than_their_twin_are_healthy_at_all_speeds(shar
     made = replace(made, speed_sigma_rad_s=np.full(residual.shape, SIGMA_RAD_S))
     scored = scorer.update(made)
     off = np.abs(scored.speed_smoothed[13 * PER_S : 23 * PER_S].mean(axis=0))
-    assert (off < 0.15).all() if shares_at_first else (off > 0.3).all()
+    assert (off < 0.15).all()
     shared = scorer.snapshot()["speed"]["shared"]
-    assert (abs(shared["commissioned"][0]) > 0.005) == shares_at_first, "the limit is from what was shared at first"
+    assert abs(shared["commissioned"][0]) > 0.005, "the limit is from what was shared at first"
 
 
-@pytest.mark.parametrize("keeps_shared", [True, False])
-def test_fans_that_all_became_slower_and_are_commissioned_again_are_healthy_at_all_speeds(keeps_shared: bool) -> None:
-    scorer = FanScorer(FANS, limits(), keeps_shared=keeps_shared, shares_at_first=False, compares_fast=False)
+def test_fans_that_all_became_slower_and_are_commissioned_again_are_healthy_at_all_speeds() -> None:
+    scorer = FanScorer(FANS, limits())
     speed_rad_s = np.repeat(np.tile([50.0, 200.0], 5), 12 * PER_S)[:, np.newaxis] * np.ones(FANS)  # for 12 s each
     residual = 0.2 * autoregressive(len(speed_rad_s), FANS, 0.0, 1)
     residual[24 * PER_S :] += WEATHER * speed_rad_s[24 * PER_S :] / SIGMA_RAD_S
@@ -157,7 +140,7 @@ def test_fans_that_all_became_slower_and_are_commissioned_again_are_healthy_at_a
     scored = scorer.update(rows_of(made, slice(73 * PER_S, len(speed_rad_s))))
     at_high_speed = slice(13 * PER_S, 23 * PER_S)
     off = np.abs(scored.speed_smoothed[at_high_speed].mean(axis=0))
-    assert (off < 0.1).all() if keeps_shared else (off > 0.1).all()
+    assert (off < 0.1).all()
 
 
 def test_the_baseline_of_a_fan_that_turns_alone_learns_nothing_and_all_start_again_together() -> None:
@@ -173,7 +156,3 @@ def test_the_baseline_of_a_fan_that_turns_alone_learns_nothing_and_all_start_aga
     shared = scorer.snapshot()["speed"]["shared"]["value"]
     scorer.recommission(np.ones(FANS, np.bool_))
     assert scorer.snapshot()["speed"]["shared"]["value"] == shared
-    former = FanScorer(FANS, limits(), keeps_shared=False, shares_at_first=False, compares_fast=False)
-    former.update(rows_of(samples, slice(0, 30 * PER_S)))
-    former.recommission(np.ones(FANS, np.bool_))
-    assert former.snapshot()["speed"]["shared"]["value"] == [0.0]

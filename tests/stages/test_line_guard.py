@@ -9,7 +9,6 @@ from itertools import chain, groupby, islice
 import numpy as np
 import pytest
 
-from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import join
 from schemas.enums import InvalidReason
 from schemas.header import Header
@@ -55,8 +54,8 @@ def after_stall(from_s: float, until_s: float, received_s: float | None = None) 
         yield replace(message, host_receive_t_ns=np.array([received_t_ns], np.int64))
 
 
-def core_of(rules: DecisionRules = max(DecisionRules)) -> ResamplerCore:
-    return ResamplerCore(1, FIXED, decision_rules=rules)
+def core_of() -> ResamplerCore:
+    return ResamplerCore(1, FIXED)
 
 
 def grid_of(core: ResamplerCore, *parts: Iterable[Raw]) -> Grid:

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import join
 from schemas.enums import InvalidReason, TachoKind
 from schemas.header import Header
@@ -233,13 +232,6 @@ def test_a_missing_reading_of_one_fan_is_interpolated_and_the_others_are_untouch
     np.testing.assert_allclose(grid.speed_rad_s, [[0, 10], [1, 20], [2, 30], [3, 40]])
     assert grid.valid.all()
     assert grid.reading_missing.tolist() == [[False, False], [False, True], [False, True], [False, False]]
-
-
-def test_the_grid_of_an_earlier_recording_does_not_tell_which_readings_were_missing() -> None:
-    core = ResamplerCore(1, FIXED, decision_rules=DecisionRules.AT_REST)
-    grid = joined([*core.step(raw(at(0.0, 0.01, 0.02), np.array([1.0, NAN, 2.0]))), *core.close()])
-    assert grid.valid.all()
-    assert not len(grid.reading_missing)
 
 
 def test_a_reading_missing_for_longer_than_the_limit_is_marked_as_missing() -> None:

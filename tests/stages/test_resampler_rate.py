@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pipeline.devices.line_rate import RATES_HZ, grid_rate_hz
-from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import join
 from schemas.enums import InvalidReason
 from schemas.header import Header
@@ -143,13 +142,6 @@ def test_a_line_whose_first_samples_are_refused_gets_the_grid_that_it_sends(
     messages = samples(refused_at_first(line_hz, how), clock=clock)
     grid, core = grid_of(messages)
     assert (grid.period_ns, core.problem()) == (NS_PER_S // line_hz, "")
-
-
-def test_a_recording_of_before_losses_of_the_line_were_known_keeps_its_grid() -> None:
-    core = ResamplerCore(1, ResamplerConfig(), decision_rules=DecisionRules.ONE_ALARM)
-    messages = samples(refused_at_first(10, "half of them"), clock=False)
-    grid = join([grid for message in messages for grid in core.step(message)])
-    assert grid.period_ns == NS_PER_S // 5
 
 
 @pytest.mark.parametrize("uneven", ["by chance", "read every 40 ms"])

@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.config.models import TrayConfig
-from pipeline.runtime.decision_rules import DecisionRules
 from pipeline.runtime.healthy_twin import ScorerConfig, limits_in_force
 from pipeline.runtime.stage import Context, StageError
 from schemas.blocks import cut
@@ -430,10 +429,9 @@ def parts(whole: Prediction, marks: Iterable[int]) -> list[Prediction]:
     baseline_s=st.sampled_from([0.01, 0.1, 0.33]),
     change_s=st.sampled_from([0.0, 0.1]),
     calibration=st.sampled_from([None, CALIBRATION, LIVELY]),
-    rules=st.sampled_from([DecisionRules.BREAKS, DecisionRules.HOLDING]),
 )
 def test_blocks_of_any_size_are_judged_the_same_to_the_bit(
-    seed, samples, sizes, smoothing_s, delays_s, baseline_s, change_s, calibration, rules
+    seed, samples, sizes, smoothing_s, delays_s, baseline_s, change_s, calibration
 ) -> None:
     whole = eventful_prediction(seed, samples, change_s)
     ends = [0, *takewhile(lambda end: end < samples, accumulate(cycle(sizes))), samples]
@@ -448,7 +446,6 @@ def test_blocks_of_any_size_are_judged_the_same_to_the_bit(
                 on_delay_s=on_delay_s,
                 off_delay_s=off_delay_s,
                 not_judged_s=0.1,
-                decision_rules=rules,
             ),
             parts(whole, marks),
         )
@@ -458,7 +455,6 @@ def test_blocks_of_any_size_are_judged_the_same_to_the_bit(
 
 
 def test_the_synthetic_predictions_raise_and_clear_alarms_and_are_diagnosed() -> None:
-    rules = DecisionRules.BREAKS  # since then alarms return after longer than these samples last
     core = core_of(
         3,
         calibration=LIVELY,
@@ -466,7 +462,6 @@ def test_the_synthetic_predictions_raise_and_clear_alarms_and_are_diagnosed() ->
         on_delay_s=0.03,
         off_delay_s=0.05,
         deadband=0.25,
-        decision_rules=rules,
     )
     with np.errstate(all="ignore"):
         _, alarms = feed(core, [eventful_prediction(seed=1, samples=2000, change_s=0.0)])

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
-from pipeline.runtime.tray_scorer import EARLIER_ALARMS
 from schemas.enums import Action, Feedback, Transition
 from schemas.messages import Alarm
 from schemas.units import NS_PER_S
+from scoring.alarms.fan_condition import EARLIER_ALARMS
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import commissioned, core_of, feed, prediction_of, request_of, snapshot_of
 
@@ -126,12 +125,3 @@ def test_with_another_twin_alarms_of_before_can_still_be_marked() -> None:
     successor.tray.alarms.discard_all(onsets[1] + NS_PER_S, keep_silenced=True)
     answer = asked(successor, Action.TRUE_ALARM)
     assert (answer.marked_onset_t_ns, answer.feedback) == (onsets[1], Feedback.NONE)
-
-
-@pytest.mark.parametrize(("rules", "is_kept"), [(DecisionRules.SMALL_STEPS, False), (CURRENT_RULES, True)])
-def test_snapshots_of_earlier_recordings_are_made_as_they_were(rules: DecisionRules, is_kept: bool) -> None:
-    core = scorer(decision_rules=rules)
-    excursions(core, 2)
-    state = snapshot_of(core).state_json
-    assert ("earlier_onsets_t_ns" in state) == is_kept
-    assert "feedback" not in state and "marked" not in state

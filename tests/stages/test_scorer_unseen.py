@@ -1,11 +1,10 @@
-"""stages.scorer: where its twin may be wrong the band is wider; recordings of before are decided as they were."""
+"""stages.scorer: where its twin may be wrong the band is wider."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
 from schemas.model_uncertainty import ModelUncertainty
 from scoring.unseen_error import UnseenError
@@ -22,13 +21,13 @@ def test_people_are_told_that_a_twin_is_not_calibrated(is_calibrated: bool) -> N
     assert (NOT_CALIBRATED in ScorerCore(1, "rad/s", ScorerConfig(), twin).notes()) != is_calibrated
 
 
-@pytest.mark.parametrize(("rules", "is_wider"), [(CURRENT_RULES, True), (DecisionRules.FIRST_BASELINE, False)])
-def test_the_unseen_error_widens_band_and_limits(rules: DecisionRules, is_wider: bool) -> None:
-    unseen_error = UnseenError(EVERYWHERE, None, np.array([0.05]), np.array([0.0002]), command_width=100.0)
+@pytest.mark.parametrize("is_wider", [True, False])
+def test_the_unseen_error_widens_band_and_limits(is_wider: bool) -> None:
+    everywhere = UnseenError(EVERYWHERE, None, np.array([0.05]), np.array([0.0002]), command_width=100.0)
     settings = ScorerConfig()
-    limits = limits_in_force(settings, CALIBRATION, None, rules)
-    twin = HealthyTwin("twin", limits, [balance_of_a_fan()], "%", unseen_error=unseen_error)
-    core = ScorerCore(1, "rad/s", settings, twin, None, rules)
+    limits = limits_in_force(settings, CALIBRATION)
+    twin = HealthyTwin("twin", limits, [balance_of_a_fan()], "%", unseen_error=everywhere if is_wider else None)
+    core = ScorerCore(1, "rad/s", settings, twin)
     noise = np.random.default_rng(1).normal(0.0, SIGMA, 4000)
     noise[2000:] += 20.0
     scores, alarms = feed(core, [prediction_of(noise)])

@@ -17,6 +17,7 @@ from scoring.alarms.tray_conditions import TrayConditions
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits
 from scoring.samples import Samples
+from tests.support.score_alone import by_score, scores_alone
 
 STEP_NS = 10_000_000
 BLOCK = 512
@@ -80,12 +81,12 @@ class Raised:
 def alarms_of(limits: Limits, blocks: Iterable[Samples], fans: int, scorer: FanScorer | None = None) -> list[Raised]:
     """Alarms that a scorer would raise, a new one unless it is given."""
     scorer = scorer or FanScorer(fans, limits)
-    settings = ConditionSettings(round(limits.timing.on_delay_s * NS_PER_S), NS_PER_S)
+    settings = ConditionSettings(round(limits.timing.on_delay_s * NS_PER_S), by_score(NS_PER_S))
     conditions = TrayConditions(fans, settings)
     raised: list[Raised] = []
     for block in blocks:
         scored = scorer.update(block)
-        result = conditions.update(block.t_ns, block.period_ns, scored.score, np.isfinite(scored.score))
+        result = conditions.update(*scores_alone(block.t_ns, block.period_ns, scored.score))
         raised += [
             Raised(
                 change.fan,

@@ -18,7 +18,6 @@ from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.consumed import ConsumedReports
-from pipeline.runtime.decision_rules import CURRENT_RULES
 from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import join
@@ -81,7 +80,6 @@ class Stages:
         self.tray = tray.name
         self.now_ns = started_t_ns
         metadata = {
-            "decision_rules": str(int(CURRENT_RULES)),
             "site": config.site,
             "trays": tray.name,
             "started_t_ns": str(started_t_ns),

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
 from pipeline.runtime.snapshot_store import SnapshotStore
 from schemas.enums import Action, InvalidReason
@@ -74,15 +73,14 @@ def core_of(
     calibration: Mapping[str, Any] | None = None,
     sha256: str = "twin",
     snapshot_store: SnapshotStore | None = None,
-    decision_rules: DecisionRules = CURRENT_RULES,
     tachos: tuple[Tacho, ...] = INSTANTANEOUS,
     **config: Any,
 ) -> ScorerCore:
     """Without a calibration: limits on the speed residual alone, 2 SIGMA."""
     settings = ScorerConfig.model_validate(config)
-    limits = limits_in_force(settings, calibration, None, decision_rules)
+    limits = limits_in_force(settings, calibration)
     twin = HealthyTwin(sha256, limits, [balance_of_a_fan()] * fans, "%", tachos=tachos)
-    return ScorerCore(fans, unit, settings, twin, snapshot_store, decision_rules)
+    return ScorerCore(fans, unit, settings, twin, snapshot_store)
 
 
 def prediction_of(

@@ -29,7 +29,7 @@ from schemas.messages import Alarm, Diagnosis, newest_t_ns
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
-from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, words_of
+from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms
 from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
 from scoring.wear.slow_change import is_of_slow_change
 
@@ -200,7 +200,7 @@ def _transition_line(alarm: Alarm) -> Text:
         style=_STYLES.get(alarm.severity, "bold red") if alarm.active else "",
     )
     return Text.assemble(
-        f"{clock(alarm.t_ns)}  {name_of(alarm)}  {alarm.severity.name:7}  ", word, f"{why}  {words_of(alarm)}"
+        f"{clock(alarm.t_ns)}  {name_of(alarm)}  {alarm.severity.name:7}  ", word, f"{why}  {alarm.message}"
     )
 
 

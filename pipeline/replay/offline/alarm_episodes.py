@@ -8,7 +8,6 @@ from typing import Any
 
 from schemas.enums import Feedback
 from schemas.messages import Alarm, Diagnosis
-from scoring.alarms.current_alarms import words_of
 from scoring.alarms.fan_condition import GIVES_FEEDBACK
 
 _GIVES = dict(GIVES_FEEDBACK.values())
@@ -147,7 +146,7 @@ def _episode(messages: list[Alarm], cleared_ns: int | None, marks: Mapping[_Name
         severity=max(alarm.severity for alarm in messages).name.lower(),
         residual_rad_s=_known(first.residual_rad_s),
         torque_balance_command=_known(first.torque_balance_command),
-        message=words_of(first),
+        message=first.message,
         causes=next((alarm.causes for alarm in reversed(messages) if alarm.causes), ()),
         feedback=feedback,
         feedback_by=by,

@@ -18,7 +18,6 @@ from pipeline.replay.offline.plan import Limit, Session
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.messages import ScorerSnapshot
-from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
 
 REGRESSED = ("wear", "causes")
 """entries whose numbers come from linear regressions: they may differ by CAUSE_TOLERANCE"""
@@ -109,7 +108,7 @@ def first_difference(made: ScorerSnapshot, recorded: ScorerSnapshot) -> Differen
     if made.state_json == recorded.state_json:
         return None
     try:
-        one, other = (current_keys(json.loads(each.state_json), FORMER_SCORER_KEYS) for each in (made, recorded))
+        one, other = (json.loads(each.state_json) for each in (made, recorded))
     except (ValueError, TypeError, AttributeError):
         return Difference("state_json", is_of_form=True)
     return min(_differences(one, other, ()), key=lambda difference: difference.is_of_form, default=None)

@@ -23,10 +23,9 @@ from pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
 from pipeline.replay.offline.plan_reader import PlanReader
 from pipeline.replay.offline.raw_blocks import RawBlocks
-from pipeline.replay.resolve_config import attached_config, recorded_rules
+from pipeline.replay.resolve_config import attached_config
 from pipeline.replay.stage_chain import StageChain, decision_chain
 from pipeline.runtime.consumed import CONSUMED
-from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
@@ -53,8 +52,6 @@ class ReplayInput:
     first_sample_t_ns: int
     """of all trays: when it was received"""
     stages: StageChain
-    decision_rules: DecisionRules
-    """those of the recording; with another configuration or twin those of today"""
     start_s: float = 0.0
     end_s: float = math.inf
     """the part that is replayed, in seconds since the tray's first raw sample"""
@@ -152,7 +149,6 @@ class ReplayInput:
                 started_t_ns=self.started_t_ns,
                 configuration_text=self.config.text,
                 overrides=self.config.overrides,
-                decision_rules=self.decision_rules,
             )
             for stage in self.stages.stages
         ]
@@ -216,7 +212,6 @@ def open_replay_input(
             is_as_recorded=is_as_recorded,
             is_same_grid=attached is not None and base.sections["resampler"] == attached.sections["resampler"],
             stages=stages,
-            decision_rules=recorded_rules(ordered[0], metadata) if is_as_recorded else CURRENT_RULES,
             start_s=start_s,
             end_s=end_s,
             trays_of={path: found.trays for path, found in each.items()},
@@ -226,8 +221,7 @@ def open_replay_input(
 def _refuse_another_run(first: Path, metadata: RecordingMetadata, path: Path, other: RecordingMetadata) -> None:
     """The parts of one recording, and the recordings of the shards of one run, have one site, one configuration and one
     twin for each tray."""
-    keys = ("site", "site"), ("version of the rules", "decision_rules")
-    differ = [what for what, key in keys if metadata.metadata.get(key) != other.metadata.get(key)]
+    differ = ["site"] if metadata.metadata.get("site") != other.metadata.get("site") else []
     if _deciding_overrides(metadata) != _deciding_overrides(other):
         differ.append("keys set on the command line")
     names = {*metadata.attachments, *other.attachments}

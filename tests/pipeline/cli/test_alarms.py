@@ -35,6 +35,7 @@ from scoring.wear.followed import shared_by_all
 from scoring.wear.slow_change import WEAR_HINT
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
+from tests.support.score_alone import by_score, scores_alone
 from tests.support.score_data import one_sample
 
 FANS = 8
@@ -48,7 +49,7 @@ class AlarmOnRequestScorer(Core):
     """The conditions of a tray whose ratios a test sets; answers requests as a scorer does."""
 
     def __init__(self) -> None:
-        self.conditions = TrayConditions(FANS, ConditionSettings(0, 0, earlier_alarms=4))
+        self.conditions = TrayConditions(FANS, ConditionSettings(0, by_score(0), earlier_alarms=4))
         self.ratio: dict[int, float] = {}
         self.deaf = False
         self.not_judged: tuple[InvalidReason, ...] = ()
@@ -61,7 +62,7 @@ class AlarmOnRequestScorer(Core):
     def tick(self, now_ns: int) -> Sequence[Message]:
         self._now_ns = now_ns
         ratio = np.array([[self.ratio.get(fan, 0.0) for fan in range(FANS)]])
-        result = self.conditions.update(np.array([now_ns]), 1, ratio, ratio >= 0)
+        result = self.conditions.update(*scores_alone(np.array([now_ns]), 1, ratio))
         alarms = [self._alarm(c.fan, c.transition, c.alarm_state, "too slow") for c in result.events]
         return [one_sample(FANS, *self.not_judged), *alarms]
 

@@ -21,7 +21,6 @@ from pipeline.runtime.stage import BuiltStage, Core, Stage
 from schemas.header import Header
 from schemas.messages import Message, ScorerSnapshot
 from schemas.topics import tray_key
-from scoring.former_snapshot_keys import FORMER_PARAMETER_KEYS
 from tests.scoring.wear.test_wear_monitor import (
     DAY_NS,
     GROWTH_PER_DAY,
@@ -132,16 +131,6 @@ def test_a_tray_without_points_is_one_line(tmp_path, notes):
         assert error.startswith(
             f"no data yet for any fan of {TRAY}: a fan has its first point some time after commissioning"
         )
-
-
-@pytest.mark.parametrize("former", sorted(FORMER_PARAMETER_KEYS))
-def test_recordings_of_earlier_versions_are_shown_in_the_same_way(tmp_path, notes, former):
-    state = json.loads(notes[-1].state_json)
-    for fan in state["wear"]["fans"]:
-        for parameter in fan["parameters"].values():
-            parameter[former] = parameter.pop("unknown_reason")
-    earlier = recording(tmp_path / "earlier.mcap", [replace(notes[-1], state_json=json.dumps(state))])
-    assert rows(earlier) == rows(recording(tmp_path / "r.mcap", notes[-1:]))
 
 
 @pytest.mark.parametrize("state", ["{}", "no json", '{"wear": 3}', '{"wear": {"fans": [{}]}}'])

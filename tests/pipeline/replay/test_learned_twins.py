@@ -158,6 +158,6 @@ def test_wear_goes_on_in_a_replay_as_it_did_when_a_twin_took_over(tmp_path: Path
     )
     assert of_replayed == of_recorded
     fan = of_recorded["fans"][1]
-    assert fan["reference"]["of_former_twin"]
+    assert fan["reference"]["of_earlier_twin"]
     friction = fan["parameters"]["friction"]["series"]["value"]
     assert len(friction) == 2 and abs(friction[1] - friction[0]) < 0.5

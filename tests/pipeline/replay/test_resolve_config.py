@@ -12,7 +12,6 @@ from pipeline.recordings.reading import read_metadata
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from pipeline.replay.resolve_config import attached_config, resolve_config, trays_of
-from pipeline.runtime.healthy_twin import ScorerConfig
 from schemas.topics import tray_key
 from stages.resampler import ResamplerConfig
 from tests.support.replay_data import START_NS, raw_of
@@ -71,41 +70,12 @@ def test_trays_are_those_that_any_part_names(tmp_path):
     assert trays_of([*parts, recording(tmp_path / "c.mcap", {})]) == {"a", "b", "c"}
 
 
-@pytest.mark.parametrize(
-    ("rules", "rate_hz", "gap_limit_s"), [(None, 100.0, 0.35), ("3", 100.0, 0.35), ("4", None, 0.35)]
-)
-def test_an_older_recording_keeps_the_grid_it_was_recorded_with(tmp_path, rules, rate_hz, gap_limit_s):
-    toml = f"{TOML}[resampler]\ngap_limit_s = {gap_limit_s}\n"
-    metadata = {"trays": "tray1"} | ({"decision_rules": rules} if rules else {})
+def test_recorded_overrides_apply_where_a_recording_is_scored_again(tmp_path):
+    toml = f"{TOML}[resampler]\nrate_hz = 20\n"
+    metadata = {"trays": "tray1", "overrides": json.dumps(["resampler.watermark_s=0.7", "resampler.rate_hz=10"])}
     path = recording(tmp_path / "r.mcap", metadata, {"configuration.toml": toml.encode()})
-    found = attached_config(path, read_metadata(path), ("resampler",), ["resampler.watermark_s=0.7"])
+    found = attached_config(path, read_metadata(path), ("resampler",), ["resampler.gap_limit_s=0.2"])
     assert found
     section = found.sections["resampler"]
     assert isinstance(section, ResamplerConfig)
-    assert (section.rate_hz, section.gap_limit_s, section.watermark_s) == (rate_hz, gap_limit_s, 0.7)
-    assert section.stale_for_s == (5.0 if rate_hz else None)
-
-
-def test_a_recorded_setting_of_before_is_left_out_and_one_that_is_given_now_is_refused(tmp_path):
-    toml = f"{TOML}[resampler]\nrate_hz = 20\nblock_size = 10\n"
-    metadata = {"trays": "tray1", "overrides": json.dumps(["resampler.block_size=4", "resampler.watermark_s=0.7"])}
-    path = recording(tmp_path / "r.mcap", metadata, {"configuration.toml": toml.encode()})
-    found = attached_config(path, read_metadata(path), ("resampler",))
-    assert found
-    section = found.sections["resampler"]
-    assert isinstance(section, ResamplerConfig)
-    assert (section.rate_hz, section.watermark_s) == (20.0, 0.7)
-    with pytest.raises(ConfigError, match="block_size"):
-        attached_config(path, read_metadata(path), ("resampler",), ["resampler.block_size=4"])
-
-
-@pytest.mark.parametrize(("rules", "off_delay_s", "deadband"), [("7", 1.0, 0.3), ("8", None, 0.3)])
-def test_alarms_of_an_older_recording_return_as_they_did(tmp_path, rules, off_delay_s, deadband):
-    toml = f"{TOML}[scorer]\ndeadband = 0.3\n"
-    metadata = {"trays": "tray1", "decision_rules": rules}
-    path = recording(tmp_path / "r.mcap", metadata, {"configuration.toml": toml.encode()})
-    found = attached_config(path, read_metadata(path), ("scorer",))
-    assert found
-    section = found.sections["scorer"]
-    assert isinstance(section, ScorerConfig)
-    assert (section.off_delay_s, section.deadband) == (off_delay_s, deadband)
+    assert (section.rate_hz, section.watermark_s, section.gap_limit_s) == (10.0, 0.7, 0.2)

@@ -20,7 +20,6 @@ from scoring.alarms.tray_conditions import TrayConditions
 STEP_NS = 10
 SETTINGS = ConditionSettings(
     on_delay_ns=0,
-    off_delay_ns=0,
     detectors=(
         HoldingDetector("speed_smoothed", 20, grows_with_speed=True, elsewhere_ns=1000),
         HoldingDetector("speed_drift", 100, grows_with_speed=True, elsewhere_ns=1000),
@@ -127,19 +126,6 @@ def test_a_residual_that_begins_long_after_a_standstill_is_another_fault() -> No
     assert fan.play([CALM] * 90, speed=SLOW) == []
 
 
-def test_an_alarm_of_a_snapshot_that_does_not_tell_is_none_of_a_standstill() -> None:
-    running_on = replace(SETTINGS.detectors[2], off_delay_ns=30, standing_ns=TOGETHER_NS)
-    drift = replace(SETTINGS.detectors[1], is_sum=True)
-    former = Fan()
-    former.play([(UP, LOW, LOW)])
-    stored = former.conditions.snapshot()
-    for fan in stored["fans"]:
-        fan.pop("holds")
-    fan = Fan(replace(SETTINGS, detectors=(SETTINGS.detectors[0], drift, running_on)))
-    fan.conditions.restore(stored)
-    assert fan.play([(LOW, MID, LOW)] * 20) == []
-
-
 def one_long_sample(ratios: Sample, period_ns: int) -> tuple[Any, ...]:
     score = np.full((1, 1), max(ratios))
     return (
@@ -189,14 +175,6 @@ def test_after_commissioning_every_speed_counts_again() -> None:
     fan.play([(UP, LOW, LOW)])
     fan.conditions.request(Action.COMMISSION, [0], 0)
     assert fan.play([CALM] * 3, SLOW) == [(3, Transition.CLEARED)]
-
-
-def test_an_alarm_of_a_former_snapshot_is_held_by_every_detector() -> None:
-    former = TrayConditions(1, ConditionSettings(0, 0))
-    former.update(np.array([0]), STEP_NS, np.array([[UP]]), np.array([[True]]))
-    fan = Fan()
-    fan.conditions.restore(json.loads(json.dumps(former.snapshot())))
-    assert fan.play([CALM] * 50) == [(30, Transition.CLEARED)], "after the longest off-delay"
 
 
 ratio = st.sampled_from([LOW, LOW, LOW, MID, UP, 3.0, NONE])

@@ -17,6 +17,7 @@ from schemas.enums import Action, FanState, Severity, Transition
 from scoring.alarms.alarm_flags import is_retained, is_silenced
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, ConditionSettings
 from scoring.alarms.tray_conditions import BlockResult, TrayConditions
+from tests.support.score_alone import by_score, scores_alone
 
 STEP_NS = 10
 NORMAL, SUSPECT, ALARM, RETURNING = FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING
@@ -25,7 +26,7 @@ UP, MID, LOW, HIGH = 1.2, 0.8, 0.1, 1.6  # beyond the limit, between it and the 
 
 
 def conditions_of(fans: int = 1, on_delay_ns: int = 50, off_delay_ns: int = 100, **more: Any) -> TrayConditions:
-    return TrayConditions(fans, ConditionSettings(on_delay_ns, off_delay_ns, **more))
+    return TrayConditions(fans, ConditionSettings(on_delay_ns, by_score(off_delay_ns), **more))
 
 
 def at_once(**more: Any) -> TrayConditions:
@@ -38,7 +39,7 @@ def take(
     ratio = np.array(ratios, float)[:, None]
     mask = np.ones(ratio.shape, np.bool_) if valid is None else np.array(valid)[:, None]
     t_ns = first_t_ns + STEP_NS * np.arange(len(ratio))
-    return conditions.update(t_ns, STEP_NS, np.where(mask, ratio, np.nan), mask)
+    return conditions.update(*scores_alone(t_ns, STEP_NS, np.where(mask, ratio, np.nan)))
 
 
 def happened(result: BlockResult) -> list[tuple[int, Transition]]:
@@ -298,7 +299,7 @@ HISTORIES = st.fixed_dictionaries(
 SETTINGS = st.builds(
     ConditionSettings,
     on_delay_ns=st.sampled_from([0, 20]),
-    off_delay_ns=st.sampled_from([0, 20]),
+    detectors=st.sampled_from([by_score(0), by_score(20)]),
     latching=st.booleans(),
     confirming=st.booleans(),
 )
@@ -316,7 +317,10 @@ def played(
             action, fan, duration_ns = history["requests"][first]
             answers += conditions.request(action, [fan], STEP_NS * (first - 1), duration_ns, "Ann")
         rows = slice(first, last)
-        result = conditions.update(STEP_NS * np.arange(first, last), STEP_NS, ratio[rows], valid[rows])
+        t_ns, period_ns, score, _, ratios, speed_rad_s = scores_alone(
+            STEP_NS * np.arange(first, last), STEP_NS, ratio[rows]
+        )
+        result = conditions.update(t_ns, period_ns, score, valid[rows], ratios, speed_rad_s)
         states.append(result.state)
         changes += [(first + c.row, c.fan, c.transition, c.alarm_state) for c in result.events]
         too_short += result.too_short
@@ -373,7 +377,7 @@ def test_an_invalid_snapshot_is_refused_and_changes_nothing(kept):
     assert conditions.snapshot() == before
 
 
-@pytest.mark.parametrize(("field", "value"), [("lasted_ns", 2**70), ("severity", 9), ("onset_t_ns", None)])
+@pytest.mark.parametrize(("field", "value"), [("held_ns", 2**70), ("severity", 9), ("onset_t_ns", None)])
 def test_a_snapshot_with_a_value_that_cannot_be_is_refused(field, value):
     kept = at_once().snapshot()
     kept["fans"][0][field] = value

@@ -11,6 +11,7 @@ from tests.support.one_interval import one_interval
 
 SAMPLES = 100
 GOOD = np.array([True, True])
+STILL = MANY_READINGS = np.array([False, False])
 SETTINGS = BaselineSettings(commissioning_limit_sigmas=3.0, adaptation_limit_sigmas=0.5)
 ADAPTATION_INTERVALS = 60.0
 
@@ -30,14 +31,14 @@ def feed(baseline: Baseline, level: float, intervals: int, good: np.ndarray = GO
     """good: whether each fan is within its limits, and also below half of them."""
     for _ in range(intervals):
         add(baseline, np.full((SAMPLES, 2), level), np.ones((SAMPLES, 2), np.bool_))
-        baseline.end_interval(SAMPLES, good, good)
+        baseline.end_interval(SAMPLES, good, good, STILL, MANY_READINGS)
 
 
 def test_the_first_good_interval_gives_the_baseline() -> None:
     baseline = baseline_of()
     assert not baseline.is_set.any()
     add(baseline, np.full((SAMPLES, 2), 1.5), np.ones((SAMPLES, 2), np.bool_) & np.array([True, False]))
-    baseline.end_interval(SAMPLES, GOOD, GOOD)
+    baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     np.testing.assert_array_equal(baseline.is_set, [True, False])
     np.testing.assert_allclose(baseline.value, [1.5, 0.0])
 
@@ -81,7 +82,7 @@ def test_an_interval_with_too_few_samples_is_ignored(valid_share: float) -> None
     valid = np.zeros((SAMPLES, 2), np.bool_)
     valid[: round(valid_share * SAMPLES)] = True
     add(baseline, np.full((SAMPLES, 2), 1.0), valid)
-    baseline.end_interval(SAMPLES, GOOD, GOOD)
+    baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     assert not baseline.is_set.any()
 
 
@@ -137,7 +138,7 @@ def test_a_sum_does_not_depend_on_how_it_was_cut() -> None:
     for row in range(SAMPLES):
         add(cut, x[row : row + 1], valid[row : row + 1])
     for baseline in (whole, cut):
-        baseline.end_interval(SAMPLES, GOOD, GOOD)
+        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     np.testing.assert_array_equal(whole.value, cut.value)
 
 
@@ -150,7 +151,7 @@ def test_unsteady_intervals_are_skipped_but_not_for_ever() -> None:
     for number in range(MAX_UNSTEADY_INTERVALS + 1):
         assert not baseline.is_set.any(), number
         add(baseline, swing, np.ones((SAMPLES, 2), np.bool_))
-        baseline.end_interval(SAMPLES, GOOD, GOOD)
+        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     assert baseline.is_set.all()
 
 
@@ -174,7 +175,7 @@ def test_once_commissioned_it_learns_only_below_half_of_the_limits() -> None:
     baseline = baseline_of()
     feed(baseline, 0.0, COMMISSIONING_INTERVALS)
     add(baseline, np.full((SAMPLES, 2), 1.0), np.ones((SAMPLES, 2), np.bool_))
-    baseline.end_interval(SAMPLES, GOOD, np.array([False, True]))
+    baseline.end_interval(SAMPLES, GOOD, np.array([False, True]), STILL, MANY_READINGS)
     assert baseline.value[0] == 0.0
     assert baseline.value[1] > 0.0
 
@@ -195,7 +196,7 @@ def test_an_offset_that_changes_with_the_speed_is_found_while_the_speed_changes(
     baseline = baseline_of(SCALED, ridge=0.0, rms_sigmas=0.0)
     for seed in range(COMMISSIONING_INTERVALS):
         add(baseline, *_with(EVERY, scaled(np.linspace(0.3, 1.5, SAMPLES), seed, 0.2)))
-        baseline.end_interval(SAMPLES, GOOD, GOOD)
+        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     np.testing.assert_allclose(baseline.value, 2.0, atol=0.05)
 
 
@@ -203,7 +204,7 @@ def test_a_fan_too_slow_to_show_its_offset_gets_a_baseline_near_zero() -> None:
     baseline = baseline_of(SCALED)
     for seed in range(5 * COMMISSIONING_INTERVALS):
         add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, 0.02), seed, 1.0)))
-        baseline.end_interval(SAMPLES, GOOD, GOOD)
+        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
         assert baseline.is_set.all()
         assert np.abs(baseline.value).max() < 0.5
 
@@ -213,7 +214,7 @@ def test_an_offset_is_certain_at_the_scaling_where_it_was_learned() -> None:
     for level, unknown in ((0.2, 3.0 * 0.5 * 0.8), (1.0, 0.0)):
         for seed in range(COMMISSIONING_INTERVALS):
             add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, level), seed, 0.2)))
-            baseline.end_interval(SAMPLES, GOOD, GOOD)
+            baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
         np.testing.assert_allclose(
             baseline.offset_uncertainty(np.ones((1, 2)), baseline.learned_scale), unknown, atol=1e-6
         )
@@ -224,10 +225,10 @@ def test_intervals_with_more_information_replace_those_with_little() -> None:
     baseline = baseline_of(SCALED)
     for seed in range(COMMISSIONING_INTERVALS):
         add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, 0.02), seed, 1.0)))
-        baseline.end_interval(SAMPLES, GOOD, GOOD)
+        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     for seed in range(2):
         add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, 1.0), seed, 0.2)))
-        baseline.end_interval(SAMPLES, GOOD, GOOD)
+        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     assert not baseline.is_commissioning.any()
     np.testing.assert_allclose(baseline.value, 2.0 * 1.0 / 1.25, rtol=0.05)
 
@@ -241,11 +242,11 @@ def test_a_moment_at_a_higher_speed_does_not_undo_the_adaptation() -> None:
     baseline = baseline_of(SCALED, adaptation_limit_sigmas=4.5, ridge=0.01, rms_sigmas=0.1)
     for level in np.linspace(0.0, 4.0, 600):
         add(baseline, np.full((SAMPLES, 2), level), EVERY, np.ones((SAMPLES, 2)))
-        baseline.end_interval(SAMPLES, GOOD, GOOD)
+        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     followed, commissioned = baseline.value.copy(), baseline.commissioned.copy()
     assert followed.min() > 3.0
     add(baseline, np.full((SAMPLES, 2), 1.5 * 4.0), EVERY, np.full((SAMPLES, 2), 1.5))
-    baseline.end_interval(SAMPLES, GOOD, GOOD)
+    baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     assert (baseline.value > followed).all()
     assert (np.abs(baseline.commissioned - commissioned) <= 3.0 * 0.1 * 0.5).all()
 
@@ -255,6 +256,6 @@ def test_a_worn_fan_is_held_at_its_limit_at_a_higher_speed_too() -> None:
     for level, scaling in ((0.0, 1.0), (3.0, 1.0), (3.0 * 1.25, 1.25)):
         for _ in range(300):
             add(baseline, np.full((SAMPLES, 2), level), EVERY, np.full((SAMPLES, 2), scaling))
-            baseline.end_interval(SAMPLES, GOOD, GOOD)
+            baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     assert baseline.is_at_limit.all()
     assert (baseline.value <= 1.0 + 3.0 * 0.1 * 0.25 + 1e-6).all()

@@ -8,7 +8,6 @@ import pytest
 from schemas.messages import Array
 from scoring.detectors.detector import DetectorContext, DetectorInput
 from scoring.detectors.missing_readings import MissingReadings, MissingReadingsSettings
-from scoring.detectors.tacho import TachoSettings
 
 HZ, PERIOD_NS = 10, 100_000_000
 HOUR = 3600 * HZ
@@ -111,11 +110,3 @@ def test_a_limit_twice_as_far_is_found_later() -> None:
     missing = by_chance(0.35, 100 * HZ, 20, 9)
     near, far = (ratios(detector_of(each, 20), missing) for each in (settings, settings.scaled(2.0)))
     assert ((far > 1.0).argmax(axis=0) > (near > 1.0).argmax(axis=0)).all()
-
-
-@pytest.mark.parametrize(("missing_share", "healthy_share"), [(0.25, 0.02), (0.6, 0.2), (1.0, 0.3)])
-def test_a_card_of_before_has_the_default_or_a_share_that_its_line_needed(
-    missing_share: float, healthy_share: float
-) -> None:
-    settings = MissingReadingsSettings.of_former_card(TachoSettings(missing_share=missing_share))
-    assert settings.healthy_share == pytest.approx(healthy_share)

@@ -10,7 +10,6 @@ from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS, Tacho
 from scoring.detectors.detector import DetectorContext, DetectorInput
 from scoring.detectors.running_on import RunningOn, RunningOnSettings
-from scoring.detectors.standstill import StandstillDetector, StandstillSettings
 
 PERIOD_NS = 100_000_000
 COUNT = Tacho(kind="count", window_s=1.0)
@@ -23,8 +22,8 @@ def context(tacho: Tacho = INSTANTANEOUS[0]) -> DetectorContext:
     return DetectorContext(fans=1, smoothing_s=0.2, tachos=(tacho,))
 
 
-def detector(tacho: Tacho = INSTANTANEOUS[0], *, by_coast_only: bool = False) -> RunningOn:
-    return RunningOn(RunningOnSettings(healthy=HEALTHY, by_coast_only=by_coast_only), context(tacho))
+def detector(tacho: Tacho = INSTANTANEOUS[0]) -> RunningOn:
+    return RunningOn(RunningOnSettings(healthy=HEALTHY), context(tacho))
 
 
 def stopped(of: RunningOn, speed_rad_s: Array) -> Array:
@@ -96,25 +95,7 @@ def test_after_a_rest_it_may_not_turn_for_longer_than_the_lag() -> None:
     assert exceeded_s(ratios(detector(), speed)) == pytest.approx(4.0, abs=0.11)
 
 
-def test_former_recordings_are_decided_by_the_coast_alone() -> None:
-    former, standstill = (
-        detector(by_coast_only=True),
-        StandstillDetector(StandstillSettings(healthy=HEALTHY), context()),
-    )
-    ratio = ratios(former, np.full(200, 200.0))
-    assert exceeded_s(ratio) == pytest.approx(12.0, abs=0.11)
-    ran_on_ns = np.arange(1, 201) * PERIOD_NS
-    np.testing.assert_array_equal(ratio, ran_on_ns / 12.0 / 1e9)
-    assert former.memory_s == standstill.memory_s > detector().memory_s
-    assert set(former.snapshot()) == {"ran_on_ns"}
-    both = StandstillDetector(StandstillSettings(healthy=HEALTHY, with_stopped=True), context())
-    assert set(both.snapshot()) == {"driven_ns", "turned_ns", "stood_ns", "silent_ns", "ran_on_ns"}
-
-
-def test_a_snapshot_of_a_former_version_does_not_tell_when_the_fan_was_stopped() -> None:
-    of = detector()
-    of.restore({"ran_on_ns": [25 * 10**9]})
-    assert ratios(of, 200.0 * np.exp(-np.arange(30) / 15.0)).max() < 1.0
+def test_it_continues_from_a_snapshot() -> None:
     continued, whole = detector(), detector()
     speed = np.full(40, 200.0)
     first = stopped(whole, speed[:7])

@@ -153,11 +153,3 @@ def test_where_the_readings_do_not_tell_neither_is_ruled_out() -> None:
     window = Window(PERIOD_S, np.full(200, PLATEAU), speed, onset=190)
     found = probabilities(standstill_causes(window, HEALTHY, BALANCE, Tacho(kind="count", window_s=1.0)))
     assert 0.2 < found["no_power"] < found["blocked"] < 0.55
-
-
-def test_a_recording_of_before_keeps_its_causes() -> None:
-    speed = np.where(np.arange(200) < 190, 31.0, 0.0)
-    window = Window(PERIOD_S, np.full(200, PLATEAU), speed, onset=190)
-    tacho = Tacho(kind="count", window_s=1.0)
-    found = probabilities(standstill_causes(window, HEALTHY, BALANCE, tacho, by_course=False))
-    assert found == pytest.approx({"blocked": 0.622, "no_tacho": 0.249, "no_power": 0.129}, abs=0.001)

@@ -44,7 +44,7 @@ def test_it_expects_the_balance_that_the_scorer_expects(fan: int, fan_offsets: F
     limits = Limits.model_validate(CALIBRATION).model_copy(update={"balance": residual})
     by_fan = np.tile(SPEED_RAD_S[:, np.newaxis], (1, FANS))
     nothing = np.zeros(by_fan.shape)
-    scored = Residual(FANS, "balance", limits, shares_at_first=True, compares_fast=True).samples(
+    scored = Residual(FANS, "balance", limits).samples(
         nothing, nothing + SIGMA_COMMAND, nothing == 0.0, nothing, by_fan, nothing, 0.01
     )
     applied = reference_of(fan, residual).applied_to(window_at(SPEED_RAD_S))
@@ -59,7 +59,7 @@ def test_an_unknown_speed_has_no_expected_balance() -> None:
 
 
 def test_a_snapshot_of_it_is_json_and_loses_nothing() -> None:
-    reference = replace(reference_of(1), of_former_twin=True)
+    reference = replace(reference_of(1), of_earlier_twin=True)
     stored = json.loads(json.dumps(reference.snapshot(), allow_nan=False))
     assert WearReference.restore(stored).snapshot() == reference.snapshot()
 

@@ -19,7 +19,7 @@ from schemas.messages import Alarm, Prediction, ScorerSnapshot
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.torque_balance import BalanceModel, TorqueBalance
 from scoring.wear.slow_change import WEAR_HINT
-from scoring.wear.wear_monitor import ATTEMPT_PERIOD_TURNS, FANS_OF_TURN, WearInputs, WearMonitor
+from scoring.wear.wear_monitor import FANS_OF_TURN, WearInputs, WearMonitor
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
     CALIBRATION,
@@ -224,29 +224,6 @@ def test_a_restart_forgets_nothing_of_it(after_eight_days) -> None:
     assert successor.problem() == core.problem()
     assert list(live_through(successor, 8.25, from_day=8)) == []
     assert worn(WORN, "friction", successor)["series"]["t_ns"][-1] > worn(WORN, "friction", core)["series"]["t_ns"][-1]
-
-
-def test_a_snapshot_from_before_wear_was_monitored_is_restored() -> None:
-    before = core()
-    list(live_through(before, 0.2))
-    memory = snapshot_of(before)
-    state = json.loads(memory.state_json)
-    del state["wear"]
-    successor = core()
-    successor.restore(replace(memory, state_json=json.dumps(state)))
-    assert "snapshots_not_understood" not in successor.counters()
-    assert wear_of(snapshot_of(successor)) == wear_of(snapshot_of(core_after_one_sample()))
-
-
-def test_a_snapshot_from_before_disturbances_and_turns_were_stored_is_restored(after_eight_days) -> None:
-    memory = snapshot_of(after_eight_days[0])
-    state = json.loads(memory.state_json)
-    del state["wear"]["disturbed_t_ns"]
-    state["wear"]["last_attempt"] = state["wear"].pop("last_turn") // ATTEMPT_PERIOD_TURNS
-    successor = core()
-    successor.restore(replace(memory, state_json=json.dumps(state)))
-    last_turn = state["wear"]["last_attempt"] * ATTEMPT_PERIOD_TURNS
-    assert wear_of(snapshot_of(successor)) == wear_of(memory) | {"last_turn": last_turn}
 
 
 def core_after_one_sample() -> ScorerCore:
