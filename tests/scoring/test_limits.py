@@ -41,7 +41,7 @@ def test_without_a_calibration_the_limit_is_in_sigma_of_the_speed_at_every_rate(
     limits = uncalibrated(2.0, Timing())
     memory_s = limits.speed.autocorrelation_time_s
     assert smoothed_deviation(limits.timing.smoothing_s, memory_s, period_s) == pytest.approx(1.0, rel=1e-6)
-    assert limits.detectors.keys() == {"speed_smoothed", "sensor"}
+    assert limits.detectors.keys() == {"speed_smoothed", "sensor", "missing_readings"}
     assert limits.detectors["speed_smoothed"] == SmoothedSettings(limit=2.0)
 
 

@@ -27,6 +27,6 @@ def _parameters(worn: bool, t_ns: int) -> dict[str, dict[str, object]]:
         series = WearSeries()
         for point in range(POINTS):
             at_ns = t_ns - round((POINTS - 1 - point) * DAYS_OF_WEAR * NS_PER_DAY / POINTS)
-            series.add(at_ns, change * worn * point / (POINTS - 1), 0.01 * abs(change) + 1e-5, is_rounded=False)
+            series.add(at_ns, change * worn * point / (POINTS - 1), 0.01 * abs(change) + 1e-5)
         parameters[name] = {"series": {key: column.tolist() for key, column in series.snapshot().items()}}
     return parameters

@@ -118,7 +118,8 @@ def test_a_time_of_another_day_has_its_date():
 def test_a_message_has_its_time_unless_it_only_says_that_the_alarm_continues():
     at = one(alarm(t_ns=7, message="fan 0: too slow"), alarm(Transition.ACKNOWLEDGED, 9))
     assert at.about() == f"at {clock(7)}: too slow"
-    assert one(alarm(Transition.REPUBLISHED, 7)).about() == "the alarm continues from before the restart"
+    continues = "the alarm continues from before the restart"
+    assert one(alarm(Transition.REPUBLISHED, 7, message=f"fan 0: {continues}")).about() == continues
 
 
 def test_a_machine_gets_it_all_as_json():
@@ -127,22 +128,3 @@ def test_a_machine_gets_it_all_as_json():
     assert shown["causes"] == [{"cause": "drag_up", "probability": 0.8, "evidence": ""}]
     assert (shown["severity"], shown["retained"], shown["presented"]) == ("warning", True, False)
     assert shown["shelved_until_t_ns"] == 7
-
-
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        ({"active": True}, "fan 0: the alarm continues from before the restart"),
-        ({"active": False}, "fan 0: back to normal, unacknowledged"),
-        ({"active": False, "acknowledged": True, "latched": True}, "fan 0: back to normal, latched"),
-        ({"active": False, "acknowledged": True}, "fan 0: back to normal"),
-        (
-            {"active": False, "acknowledged": True, "severity": Severity.NONE, "suppressed": True},
-            "fan 0: no alarm, suppressed",
-        ),
-    ],
-)
-def test_a_republished_alarm_of_an_older_version_has_the_words_of_this_one(more, words):
-    current = one(alarm(Transition.REPUBLISHED, **{"message": "fan 0: still stands"} | more))
-    assert current.message == words
-    assert current.line().endswith(f"  a  {words}")

@@ -136,17 +136,6 @@ def test_its_alarm_survives_a_restart() -> None:
     assert "snapshots_not_understood" not in successor.counters()
 
 
-def test_a_snapshot_from_before_it_was_added_is_restored_and_it_starts_new() -> None:
-    speed, balance = autoregressive(300, 2, 0.0, 1), autoregressive(300, 2, 0.0, 2)
-    before = FanScorer(2, Limits.model_validate(CALIBRATION))
-    before.update(samples_of(speed, balance))
-    detectors = CALIBRATION["detectors"] | {"balance_peak": {"limit": 3.0}}
-    after = FanScorer(2, Limits.model_validate(CALIBRATION | {"detectors": detectors}))
-    after.restore(before.snapshot())
-    assert after.snapshot()["detectors"]["balance_peak"] == {"peak": [0.0, 0.0]}
-    assert after.snapshot()["balance"] == before.snapshot()["balance"]
-
-
 def healthy() -> Iterator[HealthyRun]:
     for run in range(2):
         speed, balance = (autoregressive(6000, 5, 0.0, 10 * run + seed) for seed in (1, 2))

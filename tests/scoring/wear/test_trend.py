@@ -128,19 +128,20 @@ def test_a_restored_series_continues_without_a_difference() -> None:
 
 @pytest.mark.parametrize("error", [3.3e-7, 0.01, 0.99, 1.0, 250.0])
 def test_complete_points_are_kept_to_the_second_and_to_a_hundredth_of_their_error(error: float) -> None:
-    points, exact = WearSeries(), WearSeries()
-    rng = np.random.default_rng(3)
-    for k in range(CAPACITY + 31):  # the last one is still incomplete
-        t_ns, value = START_NS + k * NS_PER_DAY + int(rng.integers(NS_PER_S)), 3.0 + error * rng.normal()
-        points.add(t_ns, value, error * 1.2345678)
-        exact.add(t_ns, value, error * 1.2345678, is_rounded=False)
-    rounded, all_digits = points.snapshot(), exact.snapshot()
-    assert rounded["count"].tolist() == all_digits["count"].tolist() == [2, 1]
+    points, rng, number = WearSeries(), np.random.default_rng(3), CAPACITY + 31  # the last one is still incomplete
+    t_ns = START_NS + np.arange(number) * NS_PER_DAY + rng.integers(NS_PER_S, size=number)
+    value, std_error = 3.0 + error * rng.normal(size=number), error * 1.2345678
+    for at_ns, each in zip(t_ns.tolist(), value.tolist(), strict=True):
+        points.add(at_ns, each, std_error)
+    rounded = points.snapshot()
+    assert rounded["count"].tolist() == [2, 1]
+    exact_t_ns, exact = (np.append(each[:-1].reshape(-1, 2).mean(axis=1), each[-1]) for each in (t_ns, value))
+    exact_error = np.append(np.full(number // 2, std_error / np.sqrt(2.0)), std_error)
     assert not (rounded["t_ns"][:-1] % NS_PER_S).any() and rounded["t_ns"][-1] % NS_PER_S
-    assert np.abs(rounded["t_ns"] - all_digits["t_ns"]).max() < 2 * NS_PER_S
-    assert np.abs((rounded["value"] - all_digits["value"]) / all_digits["std_error"]).max() < 0.012
+    assert np.abs(rounded["t_ns"] - exact_t_ns).max() < 2 * NS_PER_S
+    assert np.abs((rounded["value"] - exact) / exact_error).max() < 0.012
     assert all(float(f"{value:.3g}") == value for value in rounded["std_error"][:-1])
-    assert rounded["std_error"] == pytest.approx(all_digits["std_error"], rel=0.01)
+    assert rounded["std_error"] == pytest.approx(exact_error, rel=0.01)
 
 
 def test_few_digits_do_not_stop_a_point_that_is_the_mean_of_thousands() -> None:
