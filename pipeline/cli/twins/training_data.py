@@ -19,7 +19,6 @@ from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT
 from pipeline.devices.tacho_evidence import tacho_hints
 from pipeline.errors import UsageError, UserError
-from pipeline.extras import how_to_install
 from pipeline.recordings.checksum import sha256_of
 from pipeline.recordings.remote import matching, recording_path
 from pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
@@ -288,17 +287,13 @@ def counting_tachos(windows_s: Sequence[float]) -> tuple[Tacho, ...]:
 
 @contextmanager
 def twin_errors() -> Iterator[None]:
-    """Turns errors of the twin package into a UserError of one line, and so the lack of PyTorch."""
+    """Turns errors of the twin package into a UserError of one line."""
     from twin.errors import TwinError  # noqa: PLC0415
 
     try:
         yield
     except TwinError as error:
         raise UserError(str(error)) from error
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise UserError(f"--trainer adam needs PyTorch: {how_to_install('torch')}") from error
 
 
 def data_cards(data: TrainingData) -> list[DataCard]:
