@@ -80,8 +80,10 @@ def with_free_port(host: ThisHost, trays: Collection[str] | None) -> ThisHost:
 
 def page_addresses(config: Config, trays: Collection[str] | None = None) -> list[str]:
     """The addresses of the operators' page on this host, one for each shard of the gateway; none without it."""
-    section: Any = config.sections.get(GATEWAY)
-    scheme = "https" if section is not None and section.certificate else "http"
+    if GATEWAY not in config.sections:
+        return []
+    section: Any = config.sections[GATEWAY]
+    scheme = "https" if section.certificate else "http"
     return [f"{scheme}://{section.host}:{section.port + shard.number - 1}/" for shard in _pages(config, trays)]
 
 
