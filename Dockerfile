@@ -1,8 +1,8 @@
 # One image for every stage; which stage a container runs is its command.
 FROM python:3.11-slim-bookworm
 WORKDIR /app
-COPY requirements.lock ./
-RUN pip install --no-cache-dir --require-hashes -r requirements.lock
+COPY requirements-image.lock ./
+RUN pip install --no-cache-dir --require-hashes -r requirements-image.lock
 COPY pyproject.toml README.md LICENSE ./
 COPY fantwin_client fantwin_client
 COPY schemas schemas

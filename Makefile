@@ -60,8 +60,10 @@ twin: $(VENV)/.development
 	sh pipeline/demo/train_twin.sh $(BIN)/fantwin
 
 lock: $(VENV)/.development
-	$(COMPILE) --extra view --extra gateway --output-file requirements.lock
-	$(COMPILE) --extra view --extra gateway --extra dev --constraint requirements.lock --output-file requirements-dev.lock
+	$(COMPILE) --output-file requirements.lock
+	$(COMPILE) --extra view --extra devices --extra outputs --constraint requirements.lock \
+		--output-file requirements-image.lock
+	$(COMPILE) --extra dev --constraint requirements-image.lock --output-file requirements-dev.lock
 	@echo "torch; sys_platform == 'none'" > $(VENV)/without-torch.txt
 	$(COMPILE) --extra bench --constraint requirements-dev.lock --override $(VENV)/without-torch.txt \
 		--output-file requirements-bench.lock
@@ -95,10 +97,10 @@ $(VENV)/.runtime: requirements.lock pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 $(VENV)/.development: requirements-dev.lock pyproject.toml | $(VENV)/.runtime
-	@echo "installing what tests and training need into $(VENV), PyTorch among it (once)"
+	@echo "installing what the tests need into $(VENV), the viewer and PyTorch among it (once)"
 	@$(PIP) install --require-hashes -r requirements-dev.lock
 	@$(PIP) install $(TORCH)
-	@$(PIP) install --editable '.[view,train,dev]'
+	@$(PIP) install --editable '.[dev]'
 	@touch $@
 
 $(VENV)/.benches: requirements-bench.lock | $(VENV)/.development

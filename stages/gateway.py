@@ -15,9 +15,8 @@ from pathlib import Path
 
 from pipeline.config.registry import RECORDER
 from pipeline.errors import refusals
-from pipeline.gateway.config import NEEDED, GatewayConfig
+from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.live_feed import LiveFeed
-from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.presenting.alarm_rates import AlarmRates
 from pipeline.presenting.alarm_store import HISTORY, AlarmStore
 from pipeline.presenting.fan_history import curves_of
@@ -28,13 +27,12 @@ from pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stage
 from pipeline.presenting.site_core import SiteCore
 from pipeline.presenting.site_model import SiteModel
 from pipeline.recordings.clips.clip import clip_folder
-from pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Stage
 from pipeline.viewing.fleet import Fan
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Message
 from schemas.units import NS_PER_S
 
-NOT_INSTALLED = f"the gateway needs its extra: take [gateway] out of the configuration, or {how_to_install('gateway')}"
 FLEET_PERIOD_NS = NS_PER_S
 STAGES_PERIOD_NS = 2 * NS_PER_S
 ALL_FOLLOWED = 64
@@ -143,7 +141,7 @@ class _Running(Server):
         recorded: RecordedAlarms,
         clip_folders: Sequence[Path],
     ) -> None:
-        from pipeline.gateway.access import Access  # noqa: PLC0415  the extra may not be installed
+        from pipeline.gateway.access import Access  # noqa: PLC0415  slow to import
         from pipeline.gateway.api import Api  # noqa: PLC0415
         from pipeline.gateway.app import application  # noqa: PLC0415
         from pipeline.gateway.server import WebServer, check_certificate, listen  # noqa: PLC0415
@@ -173,10 +171,8 @@ def build(context: Context) -> BuiltStage:
     """Open the history and listen.
 
     Raises:
-        StageError: the extra is not installed, the port is taken, or a file cannot be read or written.
+        StageError: the port is taken, or a file cannot be read or written.
     """
-    if not all(map(is_installed, NEEDED)):
-        raise StageError(NOT_INSTALLED)
     path = context.own_file(Path(HISTORY))
     store = AlarmStore(path)
     if context.started_t_ns:
@@ -193,10 +189,8 @@ def build(context: Context) -> BuiltStage:
 
 
 def check(context: Context) -> list[str]:
-    """Report a missing extra, a port that another program has taken, and files that cannot be read."""
-    if not all(map(is_installed, NEEDED)):
-        return [NOT_INSTALLED]
-    from pipeline.gateway.server import check_certificate, check_files, listen  # noqa: PLC0415  the extra may not be installed
+    """Report a port that another program has taken, and files that cannot be read."""
+    from pipeline.gateway.server import check_certificate, check_files, listen  # noqa: PLC0415  slow to import
     from pipeline.presenting.users import read_users  # noqa: PLC0415
 
     config: GatewayConfig = context.config
@@ -206,7 +200,7 @@ def check(context: Context) -> list[str]:
         attempts.append(partial(check_files, context.resolve(config.certificate), context.resolve(config.key)))
     if config.users:
         attempts.append(partial(read_users, context.resolve(config.users)))
-    if not context.is_running:
+    if not context.is_running and "port" in config.model_fields_set:
         attempts.append(lambda: listen(config.host, config.port + context.shard_number - 1).close())
     return refusals(*attempts)
 

@@ -22,7 +22,7 @@ from pydantic import Field
 from pipeline.errors import UserError
 from pipeline.learning.fan_alarms import FanAlarms
 from pipeline.learning.healthy_history import HealthyHistory, recorded_raws
-from pipeline.learning.learning_process import Learning, LearningProcess, missing_extra
+from pipeline.learning.learning_process import Learning, LearningProcess
 from pipeline.learning.learning_schedule import LearningSchedule, Work
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder, overlap
@@ -155,7 +155,6 @@ class LearnerCore(Core):
         """Why nothing is learned, or that a version waits for the operator."""
         offered = self._listed.waiting
         problems = [
-            self._learning.obstacle,
             *self._problems.values(),
             *(f"learning: {why}" for why in self._schedule.failures),
             self._history.problem,
@@ -166,7 +165,7 @@ class LearnerCore(Core):
 
     @property
     def _may_start(self) -> bool:
-        return self._learning.is_free and not self._learning.obstacle and self._is_list_read
+        return self._learning.is_free and self._is_list_read
 
     @property
     def _last(self) -> Version | None:
@@ -355,8 +354,6 @@ def build(context: Context) -> BuiltStage:
 
 def check(context: Context) -> list[str]:
     """What would keep it from learning."""
-    if context.tray.twin is None and (missing := missing_extra()):
-        return [missing]
     with suppress(UserError):
         TwinVersions(learning_folder(context.run_folder, context.tray.name), context.tray.name).all()
         return []

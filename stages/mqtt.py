@@ -21,10 +21,11 @@ from pipeline.broker.outbox import Outbox, Outgoing
 from pipeline.broker.requests import Requests
 from pipeline.broker.topics import Topics, do_overlap
 from pipeline.broker.transition_queue import TransitionQueue
-from pipeline.devices.broker_client import connection_problems, new_client, require_paho
+from pipeline.devices.broker_client import connection_problems, new_client
 from pipeline.devices.mqtt_config import FAN
 from pipeline.devices.mqtt_config import MqttConfig as MqttSourceConfig
 from pipeline.errors import UserError
+from pipeline.extras import require
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.shown import stages_json, transition_json
@@ -235,7 +236,7 @@ def build(context: Context) -> BuiltStage:
         StageError: the extra is not installed, a file cannot be read or written, or topics overlap.
     """
     config: MqttConfig = context.config
-    require_paho("stage mqtt")
+    require("stage mqtt", "outputs", "paho")
     if overlapping := overlaps(context):
         raise StageError(overlapping[0])
     topics = Topics(config.prefix, context.site, context.instance)
@@ -275,7 +276,7 @@ def check(context: Context) -> list[str]:
     """Report a missing extra, overlapping topics, files that cannot be read, and a broker that does not answer."""
     config: MqttConfig = context.config
     try:
-        require_paho("stage mqtt")
+        require("stage mqtt", "outputs", "paho")
         client = new_client(config, context.folder, "stage mqtt", "mqtt")
     except UserError as error:
         return [str(error)]

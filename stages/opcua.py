@@ -13,22 +13,20 @@ from functools import partial
 from pathlib import Path
 
 from pipeline.errors import refusals
+from pipeline.extras import missing_extra, require
 from pipeline.opcua.conditions import Condition, ConditionBook
 from pipeline.opcua.config import OpcuaConfig
-from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.site_core import SiteCore
 from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Stage
 from pipeline.viewing.fleet import Fan
 from schemas.enums import Transition
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Message
 from schemas.units import NS_PER_S
 
-NEEDED = ("asyncua", "argon2")
-NOT_INSTALLED = f"OPC UA needs its extra: take [opcua] out of the configuration, or {how_to_install('opcua')}"
 SILENCE_PERIOD_NS = NS_PER_S
 HISTORY = Path("opcua-alarms.sqlite")
 CERTIFICATE, KEY = Path("opcua-certificate.der"), Path("opcua-key.pem")
@@ -157,8 +155,7 @@ def build(context: Context) -> BuiltStage:
     Raises:
         StageError: the extra is not installed, the port is taken, or a file cannot be read or written.
     """
-    if not all(map(is_installed, NEEDED)):
-        raise StageError(NOT_INSTALLED)
+    require("stage opcua", "outputs", "asyncua")
     model = SiteModel(context.site, context.trays, AlarmStore(context.own_file(HISTORY)))
     book, desk = ConditionBook(), RequestDesk(context.producer)
     return BuiltStage(OpcuaCore(model, book, desk, _Running(context, model, book, desk)))
@@ -166,8 +163,8 @@ def build(context: Context) -> BuiltStage:
 
 def check(context: Context) -> list[str]:
     """Report a missing extra, a port that another program has taken, and files that cannot be read."""
-    if not all(map(is_installed, NEEDED)):
-        return [NOT_INSTALLED]
+    if problem := missing_extra("stage opcua", "outputs", "asyncua"):
+        return [problem]
     from pipeline.opcua.certificate import check_certificate, check_port  # noqa: PLC0415  the extra may not be installed
     from pipeline.presenting.users import read_users  # noqa: PLC0415
 

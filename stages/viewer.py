@@ -16,7 +16,6 @@ It may drop messages: the runner keeps a bounded queue in front of it and counts
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
@@ -24,13 +23,12 @@ from typing import Literal
 from pydantic import Field
 
 from pipeline.config.models import TrayConfig, nearest
-from pipeline.optional_dependencies import how_to_install
+from pipeline.extras import missing_extra, require
 from pipeline.runtime.stage import BuiltStage, Context, Stage, StageConfig, StageError
 from pipeline.viewing.fleet import Fan
 from pipeline.viewing.loopback import check_free
 
 READS = ("score", "alarm", "twin", "health", "snapshot")
-NO_RERUN = f"the viewer needs the extra `view`: take viewer out of launcher.stages, or {how_to_install('view')}"
 
 
 class ViewerConfig(StageConfig):
@@ -98,15 +96,9 @@ def build(context: Context) -> BuiltStage:
     Raises:
         StageError: Rerun is not installed, a port is taken, the file cannot be written, or `show` names no fan.
     """
-    try:
-        from pipeline.viewing.view_of_site import (  # noqa: PLC0415  the extra `view` may not be installed
-            ViewOptions,
-            view_of_site,
-        )
-    except ModuleNotFoundError as error:
-        if error.name != "rerun":
-            raise
-        raise StageError(NO_RERUN) from error
+    require("stage viewer", "view", "rerun")
+    from pipeline.viewing.view_of_site import ViewOptions, view_of_site  # noqa: PLC0415  an extra
+
     config: ViewerConfig = context.config
     ports = _ports(context)
     options = ViewOptions(
@@ -141,7 +133,7 @@ def _ports(context: Context) -> dict[str, int]:
 def check(context: Context) -> list[str]:
     """Report a missing extra, fans to show that do not exist, and ports that another program has taken."""
     config: ViewerConfig = context.config
-    problems = [] if importlib.util.find_spec("rerun") else [NO_RERUN]
+    problems = list(filter(None, [missing_extra("stage viewer", "view", "rerun")]))
     try:
         shown_fans(config.show, context.trays)
     except StageError as error:

@@ -89,7 +89,6 @@ class LearningAtOnce:
 
     seconds = None
     is_free = True
-    obstacle = ""
 
     def start(self, *, only_if_changed: bool) -> str:
         """Make the next version."""

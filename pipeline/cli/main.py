@@ -18,43 +18,123 @@ PANELS = {
     "simulation": "Simulated tray",
 }
 """folder -> heading of its commands in `fantwin --help`"""
-COMMANDS = {
-    "demo": "watch.demo",
-    "commission": "watch.commission",
-    "up": "watch.up",
-    "run": "watch.run",
-    "status": "watch.status",
-    "alarms": "watch.alarms",
-    "wear": "watch.wear",
-    "command": "watch.command",
-    "sweep": "watch.sweep",
-    "discover": "watch.discover",
-    "doctor": "watch.doctor",
-    "selftest": "watch.selftest",
-    "router": "watch.router",
-    "certs": "watch.certs",
-    "users": "watch.users",
-    "notify": "watch.notify",
-    "replay": "recordings.replay",
-    "info": "recordings.info",
-    "recover": "recordings.recover",
-    "import": "recordings.import_table",
-    "export": "recordings.export",
-    "view": "recordings.view",
-    "plot": "recordings.plot",
-    "picture": "recordings.picture",
-    "identify": "twins.identify",
-    "train": "twins.train",
-    "place": "twins.place",
-    "calibrate": "twins.calibrate",
-    "evaluate": "twins.evaluate",
-    "compare": "twins.compare",
-    "report": "twins.report",
-    "learn": "twins.learn",
-    "twins": "twins.twins",
-    "simulate": "simulation.simulate",
+COMMANDS: dict[str, tuple[str, str]] = {
+    "demo": (
+        "watch.demo",
+        "Run a simulated tray of eight fans through the whole pipeline; cover one inlet, disturb one rotor.",
+    ),
+    "commission": (
+        "watch.commission",
+        "Record healthy fans, train their twins, set alarm limits, add the twins to the configuration, start "
+        "`fantwin up`.",
+    ),
+    "up": ("watch.up", "Start all stages, restart those that die, stop all in order on Ctrl-C."),
+    "run": ("watch.run", "Run one stage alone, until Ctrl-C."),
+    "status": ("watch.status", "Show stages, rates, latency, losses and alarms of a running site."),
+    "alarms": (
+        "watch.alarms",
+        "List the current alarms; acknowledge, shelve or suppress the alarm of a fan, or say whether it was true "
+        "(docs/reference/alarms.md).",
+    ),
+    "wear": (
+        "watch.wear",
+        "Show how each fan has changed since commissioning, how fast, and when its limit will be reached\n"
+        "(docs/explanation/wear.md).",
+    ),
+    "command": ("watch.command", "Send a command to one fan, and wait until acquisition has sent it to the device."),
+    "sweep": (
+        "watch.sweep",
+        "Move the commands of all fans over their range while `fantwin up` records: levels up and down, long and "
+        "short.",
+    ),
+    "discover": (
+        "watch.discover",
+        "List the fans and serial ports of this computer, with a configuration to paste for each, and what is missing.",
+    ),
+    "doctor": (
+        "watch.doctor",
+        "Check the installation, and a configuration: fantwin.toml in this folder unless another is given.",
+    ),
+    "selftest": (
+        "watch.selftest",
+        "Kill, freeze and flood the stages of a simulated site, and check that fantwin keeps its promises.",
+    ),
+    "router": ("watch.router", 'Run a Zenoh router until Ctrl-C, for stages with bus.mode = "client".'),
+    "certs": (
+        "watch.certs",
+        "Make and show certificates of a site: who may do what on its bus (docs/how-to/security.md).",
+    ),
+    "users": (
+        "watch.users",
+        "List the users who may log in to the operators' page and over OPC UA; add or remove one.",
+    ),
+    "notify": ("watch.notify", "Send a test message to the targets of the notifier, and say which ones accepted it."),
+    "replay": (
+        "recordings.replay",
+        "Publish a recording on the bus in recorded time, for the viewer or the stages; or score recordings again "
+        "offline.",
+    ),
+    "info": (
+        "recordings.info",
+        "Show what a recording contains: time, trays, twins, messages and losses of each topic, problems of stages.",
+    ),
+    "recover": (
+        "recordings.recover",
+        "Repair a truncated or damaged recording, and list what it contains and what is missing.",
+    ),
+    "import": (
+        "recordings.import_table",
+        "Turn a measured table or a log into a recording, the data format of training, evaluation and replay.",
+    ),
+    "export": (
+        "recordings.export",
+        "Export a recording as tables: one per topic and tray, with a row per sample and fan.",
+    ),
+    "view": ("recordings.view", "Turn a recording into a view file that shows what the stage `viewer` shows live."),
+    "plot": ("recordings.plot", "Plot measured speed, prediction, band, alarms and states of a recording."),
+    "picture": (
+        "recordings.picture",
+        "Draw a view file as a picture with a headless Rerun viewer (needs a Vulkan driver).",
+    ),
+    "identify": (
+        "twins.identify",
+        "Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.",
+    ),
+    "train": ("twins.train", "Train a twin of healthy fans and write it, with its card, as an ONNX file."),
+    "place": (
+        "twins.place",
+        "Make a twin of more fans of a type, from a few minutes of each and the twin of other fans of the type.",
+    ),
+    "calibrate": (
+        "twins.calibrate",
+        "Set the alarm limits of a twin from healthy recordings, and write them into its card.",
+    ),
+    "evaluate": (
+        "twins.evaluate",
+        "Compare the free run of a twin with the measured speeds of recordings, in the recordings' own units.",
+    ),
+    "compare": (
+        "twins.compare",
+        "Train physical, NARX, neural ODE and both hybrids on the same recordings and print them side by side.",
+    ),
+    "report": (
+        "twins.report",
+        "Compare the free run of a twin with recordings, and write the result as one self-contained HTML page.",
+    ),
+    "learn": (
+        "twins.learn",
+        "Make the next version of a learned twin from the tray's healthy history, as `fantwin up` does by itself.",
+    ),
+    "twins": (
+        "twins.twins",
+        "List the versions of a learned twin, put one in force, or mark a time span as faulty (not used for learning).",
+    ),
+    "simulate": (
+        "simulation.simulate",
+        "Simulate a tray of fans on a serial port that any program can open, or as the fans of a computer.",
+    ),
 }
-"""command -> its module in this folder; the module's function of the same name is the command"""
+"""command -> its module in this folder, whose function of the same name is the command; the first line of its help"""
 VARIADIC: dict[str, tuple[str, ...]] = {
     "train": ("--validate",),
     "place": ("--validate",),
@@ -94,9 +174,15 @@ def _group(
 
 def _register(names: Iterable[str]) -> None:
     for name in names:
-        folder, module = COMMANDS[name].split(".")
+        folder, module = COMMANDS[name][0].split(".")
         function = getattr(import_module(f"pipeline.cli.{folder}.{module}"), module)
         app.command(name, rich_help_panel=PANELS[folder])(function)
+
+
+def _list_commands() -> None:
+    """All commands for `--help` and for a mistyped name, without importing any."""
+    for name, (module, about) in COMMANDS.items():
+        app.command(name, help=about, rich_help_panel=PANELS[module.split(".")[0]])(lambda: None)
 
 
 def expand_variadic(words: Sequence[str]) -> list[str]:
@@ -121,8 +207,11 @@ def expand_variadic(words: Sequence[str]) -> list[str]:
 def main() -> None:
     """Entry point: runs a command, turns a `UserError` and a lack of memory into one line and an exit code."""
     words = expand_variadic(sys.argv[1:])
-    named = [word for word in words[:1] if word in COMMANDS]
-    _register(named or COMMANDS)  # a stage's process imports its own command only
+    named = next((word for word in words if word != "--"), "")
+    if named in COMMANDS:
+        _register([named])  # a stage's process imports its own command only
+    else:
+        _list_commands()
     try:
         app(words)
     except UserError as error:

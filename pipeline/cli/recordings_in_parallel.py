@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 from pipeline.cli.processes import ENDED_FROM_OUTSIDE, end_processes, in_processes
 from pipeline.cli.progress import recordings_progress
 from pipeline.errors import UsageError, UserError
-from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.extras import require
 from pipeline.recordings.remote import local_copies
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ JobsOption: TypeAlias = Annotated[
 ]
 SchedulerOption: TypeAlias = Annotated[
     str | None,
-    typer.Option(metavar="tcp://HOST:PORT", help="Work on the cluster of this Dask scheduler (extra `cluster`)."),
+    typer.Option(metavar="tcp://HOST:PORT", help="Work on the cluster of this Dask scheduler (extra `remote`)."),
 ]
 SkipBadOption: TypeAlias = Annotated[
     bool,
@@ -201,8 +201,7 @@ def _connected(scheduler: str) -> Iterator[Client]:
     Raises:
         UserError: there is none, or the extra is missing.
     """
-    if not is_installed("distributed"):
-        raise UserError(f"--scheduler needs the extra `cluster`; {how_to_install('cluster')}")
+    require("--scheduler", "remote", "distributed")
     from distributed import Client  # noqa: PLC0415  an extra
 
     for name in ("asyncio", "distributed", "distributed.client"):

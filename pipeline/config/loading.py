@@ -148,15 +148,16 @@ def _require_trays_for_shards(launcher: LauncherConfig, trays: int, path: Path) 
 
 def enabled_stages(launcher: LauncherConfig, table: Mapping[str, Any]) -> tuple[str, ...]:
     """The stages that a configuration enables, in the order of the data flow. `launcher.stages` overrides the rows'
-    `enabled_by`; `table` is the whole configuration."""
-    if launcher.stages is not None:
-        return tuple(name for name in STAGES if name in launcher.stages)
+    `enabled_by`, and `launcher.without` both; `table` is the whole configuration."""
     learns = any("twin" not in tray for tray in table["tray"])
-    return tuple(
-        name
-        for name, row in STAGES.items()
-        if row.enabled_by == "default" or name in table or (row.enabled_by == "tray without twin" and learns)
-    )
+    enabled = launcher.stages
+    if enabled is None:
+        enabled = tuple(
+            name
+            for name, row in STAGES.items()
+            if row.enabled_by == "default" or name in table or (row.enabled_by == "tray without twin" and learns)
+        )
+    return tuple(name for name in STAGES if name in enabled and name not in launcher.without)
 
 
 def _override(table: dict[str, Any], override: str) -> None:

@@ -171,6 +171,9 @@ class LauncherConfig(Section):
     stages: tuple[str, ...] | None = Field(
         default=None, description="which stages run, in any order; without it, all that the configuration enables"
     )
+    without: tuple[str, ...] = Field(
+        default=(), description='stages that do not run although they are enabled, as ["gateway"]: no operators\' page'
+    )
     shards: int | dict[str, int] | None = Field(
         default=None,
         description="as how many processes each stage runs, which share its trays: one number for all stages but the "
@@ -186,7 +189,7 @@ class LauncherConfig(Section):
         default=10.0, gt=0, description="how long a stage may take to stop before it is killed"
     )
 
-    @field_validator("stages")
+    @field_validator("stages", "without")
     @classmethod
     def _known(cls, value: tuple[str, ...] | None) -> tuple[str, ...] | None:
         _require_stages(value or ())

@@ -22,6 +22,8 @@ class StageRow:
         declaration: import string of its `pipeline.runtime.stage.Stage`, `module:attribute`.
         enabled_by: what enables it where `launcher.stages` is not given. "default": always; "section": a section
             `[name]` in the configuration; "tray without twin": a tray that names no twin.
+        extra: of the installation; where it is missing, `fantwin up` leaves out the stage, unless `launcher.stages`
+            names it.
         scope: one process for the site, or one for each tray, where `launcher.shards` says nothing of it. Only stages
             with a process for each tray may have a device.
         has_common_shards: a `launcher.shards` that is one number for all stages applies to it.
@@ -34,6 +36,7 @@ class StageRow:
     name: str
     declaration: str
     enabled_by: Literal["default", "section", "tray without twin"] = "section"
+    extra: str = ""
     scope: Literal["site", "tray"] = "site"
     has_common_shards: bool = True
     may_drop: bool = False
@@ -58,6 +61,7 @@ class StageRow:
 LEARNER = "learner"
 """the stage that gives a tray its twin"""
 RECORDER = "recorder"
+GATEWAY = "gateway"
 STAGES: dict[str, StageRow] = {
     row.name: row
     for row in (
@@ -106,14 +110,16 @@ STAGES: dict[str, StageRow] = {
             "viewer",
             "stages.viewer:STAGE",
             enabled_by="default",
+            extra="view",
             has_common_shards=False,
             may_drop=True,
             reads=("score", "alarm", "twin", "health", "snapshot"),
             writes=(),
         ),
         StageRow(
-            "gateway",
+            GATEWAY,
             "stages.gateway:STAGE",
+            enabled_by="default",
             has_common_shards=False,
             may_drop=True,
             reads=("score", "alarm", "twin", "snapshot", "health"),

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from pipeline.devices.broker_settings import BrokerSettings
 from pipeline.devices.secret_file import read_secret, secret_of_environment
 from pipeline.errors import UserError
-from pipeline.optional_dependencies import how_to_install, is_installed
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -19,16 +18,6 @@ RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 1, 10
 ANSWER_S = 5.0
 """for a check"""
 NOT_REACHED = "the broker cannot be reached; check host and port, and whether it runs"
-
-
-def require_paho(what: str) -> None:
-    """what: who needs it, such as `source mqtt`.
-
-    Raises:
-        UserError: the extra is not installed.
-    """
-    if not is_installed("paho"):
-        raise UserError(f"{what} needs paho-mqtt; {how_to_install('mqtt')}")
 
 
 def refusal(reason: object) -> str:

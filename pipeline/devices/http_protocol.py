@@ -1,4 +1,4 @@
-"""Connections of the HTTP source that do not wait for ever for a request. Needs the extra `http`."""
+"""Connections of the HTTP source that do not wait for ever for a request."""
 
 from __future__ import annotations
 

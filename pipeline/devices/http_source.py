@@ -27,8 +27,6 @@ from pipeline.devices.json_samples import (
 from pipeline.devices.receipt_times import ReceiptTimes
 from pipeline.devices.sample_source import LinkDown, LinkUp, ReadingBatch, Rejected, SourceContext, SourceEvent
 from pipeline.devices.secret_file import read_secret
-from pipeline.errors import UserError
-from pipeline.optional_dependencies import how_to_install, is_installed
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -54,10 +52,8 @@ class HttpSource:
         """Nothing listens yet.
 
         Raises:
-            UserError: the extra is not installed, or the token cannot be read.
+            UserError: the token cannot be read.
         """
-        if not (is_installed("starlette") and is_installed("uvicorn")):
-            raise UserError(f"source http needs starlette and uvicorn; {how_to_install('http')}")
         self._config = config
         self._context = context
         self._token = read_secret(context.folder / config.token_file) if config.token_file else ""
@@ -115,7 +111,7 @@ class HttpSource:
 
     def app(self) -> Starlette:
         """What answers the requests."""
-        from starlette.applications import Starlette  # noqa: PLC0415  an extra
+        from starlette.applications import Starlette  # noqa: PLC0415  slow to import
         from starlette.routing import Route  # noqa: PLC0415
 
         path = f"/v1/trays/{self._context.tray}"
@@ -245,9 +241,9 @@ class HttpSource:
                     return
 
     def _serve_on(self, listening: socket.socket) -> None:
-        import uvicorn  # noqa: PLC0415  an extra
+        import uvicorn  # noqa: PLC0415  slow to import
 
-        from pipeline.devices.http_protocol import LimitedProtocol  # noqa: PLC0415  needs the extra
+        from pipeline.devices.http_protocol import LimitedProtocol  # noqa: PLC0415
 
         logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
         folder, certificate, key = self._context.folder, self._config.certificate, self._config.key
@@ -291,6 +287,6 @@ class HttpSource:
 
 
 def _answer(status: int, values: dict[str, Any], headers: dict[str, str] | None = None) -> Response:
-    from starlette.responses import JSONResponse  # noqa: PLC0415  an extra
+    from starlette.responses import JSONResponse  # noqa: PLC0415  slow to import
 
     return JSONResponse(values, status, headers)

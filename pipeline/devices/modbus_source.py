@@ -19,7 +19,7 @@ from pipeline.devices.modbus_config import ModbusConfig, ModbusFan, Register
 from pipeline.devices.polling import DeviceError, PollingSource
 from pipeline.devices.sample_source import Reading, SourceContext
 from pipeline.errors import UserError
-from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.extras import require
 from schemas.units import RAD_S_PER_UNIT
 
 if TYPE_CHECKING:
@@ -59,8 +59,7 @@ class ModbusDevice:
     """A `PolledDevice`."""
 
     def __init__(self, config: ModbusConfig, context: SourceContext) -> None:
-        if not is_installed("pymodbus"):
-            raise UserError(f"a modbus source needs the extra `modbus`; {how_to_install('modbus')}")
+        require("source modbus", "devices", "pymodbus")
         if context.fans != len(config.fan):
             raise UserError(
                 f"fans = {context.fans}, and there are {len(config.fan)} [[tray.source.fan]]: name each fan"

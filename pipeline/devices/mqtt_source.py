@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from pipeline.devices.broker_client import NOT_REACHED, connection_problems, new_client, refusal, require_paho
+from pipeline.devices.broker_client import NOT_REACHED, connection_problems, new_client, refusal
 from pipeline.devices.fan_values import FanValues
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.devices.json_samples import JsonSamplesError, batches_of, parse_samples
@@ -28,6 +28,7 @@ from pipeline.devices.sample_source import (
     SourceContext,
     SourceEvent,
 )
+from pipeline.extras import require
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client, MQTTMessage
@@ -47,7 +48,7 @@ class MqttSource:
         Raises:
             UserError: the extra is not installed, or a password or certificate cannot be read.
         """
-        require_paho("source mqtt")
+        require("source mqtt", "devices", "paho")
         self._config = config
         self._deliver: Callable[[SourceEvent], None] = lambda _event: None
         self._receipts = ReceiptTimes()

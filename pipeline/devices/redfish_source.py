@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.devices.polling import DeviceError, PollingSource
 from pipeline.devices.redfish_config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
 from pipeline.devices.sample_source import Reading, Rejected, SourceContext
-from pipeline.errors import UserError
-from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.extras import require
 from schemas.units import RAD_S_PER_UNIT
 
 if TYPE_CHECKING:
@@ -41,8 +40,7 @@ class RedfishDevice:
     is_writable = False
 
     def __init__(self, config: RedfishConfig, context: SourceContext) -> None:
-        if not is_installed("sushy"):
-            raise UserError(f"a redfish source needs the extra `redfish`; {how_to_install('redfish')}")
+        require("source redfish", "devices", "sushy")
         self._config = config
         self._fans = context.fans
         self._folder = context.folder

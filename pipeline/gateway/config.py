@@ -11,8 +11,6 @@ from pipeline.devices.host_address import is_of_this_host_only
 from pipeline.runtime.stage import StageConfig
 
 _OWN_HOSTS = ("localhost", "127.0.0.1", "[::1]")
-NEEDED = ("starlette", "uvicorn", "prometheus_client", "argon2")
-"""the modules of the extra `gateway`"""
 
 
 class GatewayConfig(StageConfig):
@@ -22,7 +20,13 @@ class GatewayConfig(StageConfig):
     """
 
     host: str = Field(default="127.0.0.1", description="address to listen on")
-    port: int = Field(default=8080, ge=1, le=65535, description="port; shard K uses the K-th from here on")
+    port: int = Field(
+        default=8080,
+        ge=1,
+        le=65535,
+        description="port; if it is not set and 8080 is taken, `fantwin up` takes the next free one; shard K uses "
+        "the K-th from here on",
+    )
     certificate: Path | None = Field(default=None, description="PEM file: serve https with this certificate")
     key: Path | None = Field(default=None, description="PEM file: its private key")
     users: Path | None = Field(

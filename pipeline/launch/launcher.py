@@ -101,8 +101,10 @@ class Launcher:
         overrides: Sequence[str],
         say: Callable[[str], None],
         trays: Collection[str] | None = None,
+        when_started: Sequence[str] = (),
     ) -> None:
-        """`say` is called with one line for each event. trays: of this host, see `process_list`.
+        """`say` is called with one line for each event. trays: of this host, see `process_list`. when_started: lines to
+        say when all stages have started.
 
         Raises:
             UserError: no process has its first tray among them.
@@ -111,6 +113,7 @@ class Launcher:
         self._path: Path = config.path
         self._overrides = tuple(overrides)
         self._say = say
+        self._when_started = when_started
         rows = process_list(config, trays)
         if not rows:
             raise UserError(f"{config.path}: no process has tray {', '.join(trays or ())} first: see launcher.shards")
@@ -138,6 +141,8 @@ class Launcher:
             self._watcher = SiteWatcher(bus, self._config.site, roles_of(self._config))
             try:
                 self._start_all(stop)
+                for line in self._when_started if self._is_started else ():
+                    self._say(line)
                 self._report = SiteReport(self._config.bus.endpoint, self._say, HOST_CLOCK.now_ns())
                 while not stop.wait(_POLL_S):
                     self._check_processes()

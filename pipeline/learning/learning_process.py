@@ -11,18 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.optional_dependencies import how_to_install, is_installed
-
 _TURN = threading.Lock()
 """one tray learns at a time, to limit memory and processor use"""
 STOP_S = 2.0
-
-
-def missing_extra() -> str:
-    """That the extra `train` is not installed, and how to install it; empty if it is."""
-    if is_installed("torch"):
-        return ""
-    return f"no twin can be learned without the extra `train`; {how_to_install('train')}"
 
 
 class Learning(Protocol):
@@ -31,11 +22,6 @@ class Learning(Protocol):
     @property
     def is_free(self) -> bool:
         """Whether no tray of this process is learning."""
-        ...
-
-    @property
-    def obstacle(self) -> str:
-        """Why no version can be made here at all, and what to do; empty if one can."""
         ...
 
     def start(self, *, only_if_changed: bool) -> str:
@@ -71,11 +57,6 @@ class LearningProcess:
     def is_free(self) -> bool:
         """Whether no tray of this process is learning."""
         return not _TURN.locked()
-
-    @property
-    def obstacle(self) -> str:
-        """Why no version can be made here at all, and what to do; empty if one can."""
-        return missing_extra()
 
     def start(self, *, only_if_changed: bool) -> str:
         """Begin, if it is free; returns what went wrong, or nothing. only_if_changed: see `fantwin learn --check`."""

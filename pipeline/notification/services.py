@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING
 from pipeline.errors import UserError
 from pipeline.notification.sending import Failure
 from pipeline.notification.wording import Level, Text
-from pipeline.optional_dependencies import how_to_install, is_installed
 
 if TYPE_CHECKING:
     from apprise import AppriseAsset, NotifyBase
 
-NOT_INSTALLED = f"the notifier needs its extra: take [notifier] out of the configuration, or {how_to_install('notify')}"
 MAIL_PAUSE_S = 1.0
 """apprise would wait 5.5 s between mails"""
 _KNOWN_REASONS = re.compile(
@@ -35,11 +33,6 @@ _OF_FAILURES = ("WARNING", "ERROR", "CRITICAL")
 _REFUSAL = re.compile(r"(?<!\d)5\d\d, b'|error=4(?!01|03|04|08|29)\d\d")
 """the answer of a server that does not want this message; not those that it gives to any"""
 _UNCERTAIN = re.compile(r"timed out|closed|reset")
-
-
-def is_there() -> bool:
-    """Whether the extra is installed."""
-    return is_installed("apprise")
 
 
 class Service:

@@ -8,11 +8,12 @@ from pathlib import Path
 
 from pipeline.devices.secret_file import read_secret, secret_of_environment
 from pipeline.errors import UserError
+from pipeline.extras import require
 from pipeline.notification.alertmanager import Alertmanager, AlertSender, test_alert
 from pipeline.notification.config import NotifierConfig, TargetConfig
 from pipeline.notification.outbox import Outbox
 from pipeline.notification.sending import Failure, Sender
-from pipeline.notification.services import NOT_INSTALLED, Service, is_there
+from pipeline.notification.services import Service
 from pipeline.notification.wording import Place, test_text
 
 Resolve = Callable[[Path], Path]
@@ -39,8 +40,7 @@ def connection_of(target: TargetConfig, resolve: Resolve) -> Service | Alertmana
     try:
         if target.kind == "alertmanager":
             return Alertmanager(url_of(target, resolve))
-        if not is_there():
-            raise UserError(NOT_INSTALLED)
+        require(target.kind, "outputs", "apprise")
         return Service(url_of(target, resolve))
     except UserError as error:
         raise UserError(f"target {target.name}: {error}") from error

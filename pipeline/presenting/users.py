@@ -81,7 +81,7 @@ class Users:
 
     def is_password(self, user: User | None, password: str) -> bool:
         """Whether it is that of a user; for nobody it takes as long. In any thread."""
-        from argon2.exceptions import Argon2Error, InvalidHashError  # noqa: PLC0415  an extra
+        from argon2.exceptions import Argon2Error, InvalidHashError  # noqa: PLC0415  slow to import
 
         try:
             given = password if len(password) <= LONGEST_PASSWORD else ""
@@ -103,7 +103,7 @@ class Users:
 
 def hasher() -> PasswordHasher:
     """What hashes passwords."""
-    from argon2 import PasswordHasher  # noqa: PLC0415  an extra
+    from argon2 import PasswordHasher  # noqa: PLC0415  slow to import
 
     return PasswordHasher()
 

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipeline.errors import UsageError
-from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.extras import missing_extra
 from pipeline.recordings.records import RecordingError
 
 _MAY_BE_SECRET = re.compile(r"://[^/@]*:[^/@]*@|https?://[^/@]*@|\?")
@@ -41,8 +41,8 @@ def recording_path(text: str) -> Path:
             f"{text.partition('://')[0]}://...: names of recordings are printed and written into cards, so a URL "
             "may hold no password and no `?`: give credentials as the tools of the store take them"
         )
-    if not is_installed("fsspec"):
-        raise UsageError(f"{text}: recordings at URLs need the extra `remote`; {how_to_install('remote')}")
+    if problem := missing_extra(f"{text}: a recording at a URL", "remote", "fsspec"):
+        raise UsageError(problem)
     return RemotePath(text)
 
 

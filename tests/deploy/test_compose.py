@@ -11,14 +11,14 @@ from typing import Any
 
 import yaml
 
-from pipeline.config.registry import STAGES
+from pipeline.config.loading import load_config
 from pipeline.runtime.stage import load_stage
 from tests.support.fantwin_words import parsed
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = (ROOT / "compose.yaml").read_text(encoding="utf-8")
 SERVICES: dict[str, dict[str, Any]] = yaml.safe_load(COMPOSE)["services"]
-ENABLED = [name for name, row in STAGES.items() if row.enabled_by == "default"]
+ENABLED = load_config(ROOT / "pipeline/demo/compose.toml").stages
 
 
 def needs(service: str) -> set[str]:

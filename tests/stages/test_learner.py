@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.learning.learning_process import LearningProcess
 from pipeline.learning.versions import Check
 from schemas.enums import Action, FanState
 from schemas.messages import Message, Request
@@ -35,29 +34,6 @@ def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path
         "tray1-1 is in force; at 1,000 rpm it finds a drop of 40 rpm within a minute; declared: 1 false alarm per "
         "fan and day; next version after 10 min more of healthy running"
     )
-
-
-def test_what_keeps_any_version_from_being_made_is_a_problem_from_the_start_and_samples_are_kept(
-    tmp_path: Path,
-) -> None:
-    learner = Learner(tmp_path)
-    learner.learning.obstacle = "no twin can be learned without the extra `train`"
-    assert learner.core.problem() == "no twin can be learned without the extra `train`"
-    learner.run(1000)
-    assert learner.learning.starts == []
-    assert learner.core.problem() == "no twin can be learned without the extra `train`"
-    assert learner.history.seconds > 900.0
-    learner.learning.obstacle = ""
-    learner.run(20)
-    assert learner.put_in_force == ["tray1-1"]
-    assert learner.core.problem() == ""
-
-
-def test_without_the_extra_train_no_version_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    learning = LearningProcess(tmp_path / "fantwin.toml", (), "tray1", tmp_path / "learn.log")
-    assert learning.obstacle == ""
-    monkeypatch.setattr("pipeline.learning.learning_process.is_installed", lambda _module: False)
-    assert learning.obstacle.startswith("no twin can be learned without the extra `train`; in the checkout: ")
 
 
 def test_later_versions_come_when_the_history_has_doubled(tmp_path: Path) -> None:

@@ -338,21 +338,6 @@ def test_scores_that_do_not_fit_the_configuration_are_counted_and_reported() -> 
     assert "fans" in core.problem()
 
 
-def test_without_the_extra_the_stage_loads_and_build_names_the_package(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    for name in ("rerun_sink", "view_of_site"):
-        monkeypatch.delitem(sys.modules, f"pipeline.viewing.{name}", raising=False)
-    with pytest.raises(StageError, match=r"pip install -e '\.\[view\]'"):
-        build(context(tmp_path))
-
-
-def test_importing_the_stage_does_not_import_rerun() -> None:
-    code = "import sys, stages.viewer; sys.exit('rerun' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
 def test_what_the_source_measures_beside_is_drawn_from_its_first_sample_on(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=4)
     half = len(scores) // 2

@@ -11,7 +11,7 @@ from pipeline.errors import UsageError, UserError
 
 def fantwin(name: str, *arguments: object, typed: str | None = None) -> Result:
     """Run a command; the result has its exit code, standard output and exception. typed: what it reads."""
-    module = COMMANDS[name]
+    module, _ = COMMANDS[name]
     app = typer.Typer(pretty_exceptions_enable=False)
     app.command(name)(getattr(import_module(f"pipeline.cli.{module}"), module.rpartition(".")[2]))
     return CliRunner().invoke(app, [str(argument) for argument in arguments], input=typed)

@@ -25,7 +25,6 @@ class FakeLearning:
 
     def __init__(self, versions: TwinVersions) -> None:
         self.versions = versions
-        self.obstacle = ""
         self.fails_with = ""
         self.checks_fail_with = ""
         self.outcome = "taken"

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Self
@@ -19,7 +18,7 @@ from rich.console import Console
 from pipeline.cli.options import JsonOption
 from pipeline.cli.twins.training_data import make_folder
 from pipeline.errors import UsageError, UserError
-from pipeline.optional_dependencies import how_to_install
+from pipeline.extras import require
 from pipeline.recordings.arrays import Block, read_topics
 from pipeline.recordings.left_out import left_out_hint
 from pipeline.recordings.order import in_order
@@ -34,7 +33,7 @@ _PART = ".part"
 
 def export(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts.")],
-    to: Annotated[Form, typer.Option("--to", help="Format of the tables; parquet needs the extra `parquet`.")],
+    to: Annotated[Form, typer.Option("--to", help="Format of the tables; parquet needs the extra `logs`.")],
     topic: Annotated[
         list[str] | None,
         typer.Option(
@@ -56,8 +55,8 @@ def export(
 
     Example: fantwin export runs/demo/recording.mcap --to csv --topic score --topic alarm -o tables
     """
-    if to == "parquet" and find_spec("pyarrow") is None:
-        raise UserError(f"--to parquet needs the extra `parquet`: use --to csv; or {how_to_install('parquet')}")
+    if to == "parquet":
+        require("--to parquet (--to csv does not)", "logs", "pyarrow")
     parts = in_order(recordings)
     topics = list(dict.fromkeys(map(current_name, topic or _default_topics(parts))))
     arrays = read_topics(parts, topics, tray)

@@ -10,8 +10,7 @@ import typer
 from rich.console import Console
 
 from pipeline.cli.options import JsonOption, ViewLayout, fan_numbers
-from pipeline.errors import UserError
-from pipeline.optional_dependencies import how_to_install
+from pipeline.extras import require
 
 
 def picture(
@@ -33,12 +32,9 @@ def picture(
 
     Example: fantwin picture runs/demo/view.rrd --fans 2,5 --at 25 -o view.png
     """
-    try:
-        from pipeline.viewing.rerun_picture import draw_picture  # noqa: PLC0415  the extra `view` may not be installed
-    except ModuleNotFoundError as error:
-        if error.name not in ("rerun", "PIL"):
-            raise
-        raise UserError(f"pictures need the extra `view`; {how_to_install('view')}") from error
+    require("a picture of a view", "view")
+    from pipeline.viewing.rerun_picture import draw_picture  # noqa: PLC0415  an extra
+
     with Console(stderr=True).status(f"drawing {view_file}"):
         drawn = draw_picture(
             view_file, tray=tray, fans=fan_numbers(fans), at_s=at, window_s=window, view=view, layout=layout.value

@@ -10,8 +10,8 @@ import typer
 from rich.console import Console
 
 from pipeline.cli.options import JsonOption, fan_numbers
-from pipeline.errors import UsageError, UserError
-from pipeline.optional_dependencies import how_to_install
+from pipeline.errors import UsageError
+from pipeline.extras import require
 
 
 def plot(
@@ -31,12 +31,9 @@ def plot(
 
     Example: fantwin plot runs/demo/recording.mcap --truth runs/demo/truth.json -o bands.png
     """
-    try:
-        from pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  the extra `view` may not be installed
-    except ModuleNotFoundError as error:
-        if error.name != "matplotlib":
-            raise
-        raise UserError(f"plots need the extra `view`; {how_to_install('view')}") from error
+    require("a plot", "report", "matplotlib")
+    from pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  an extra
+
     if unit not in ("rpm", "rad/s", None):
         raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
     with Console(stderr=True).status(f"drawing {output}"):

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from pipeline.cli.options import JsonOption, ViewLayout
 from pipeline.errors import UsageError, UserError
-from pipeline.optional_dependencies import how_to_install
+from pipeline.extras import require
 
 
 def view(
@@ -33,13 +33,10 @@ def view(
 
     Example: fantwin view runs/demo/recording.mcap --layout alarms -o alarms.rrd
     """
-    try:
-        from pipeline.viewing.recorded_view import recorded_site, write_view  # noqa: PLC0415  the extra `view`
-        from pipeline.viewing.view_of_site import ViewOptions  # noqa: PLC0415
-    except ModuleNotFoundError as error:
-        if error.name != "rerun":
-            raise
-        raise UserError(f"views need the extra `view`; {how_to_install('view')}") from error
+    require("a view", "view")
+    from pipeline.viewing.recorded_view import recorded_site, write_view  # noqa: PLC0415  an extra
+    from pipeline.viewing.view_of_site import ViewOptions  # noqa: PLC0415
+
     if output.suffix != ".rrd":
         raise UsageError(f"{output}: name a file that ends in .rrd with -o")
     if output.exists() and not force:

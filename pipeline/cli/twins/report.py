@@ -27,6 +27,7 @@ from pipeline.cli.twins.training_data import (
     twin_errors,
 )
 from pipeline.errors import UserError
+from pipeline.extras import require
 
 
 def report(
@@ -49,6 +50,7 @@ def report(
 
     Example: fantwin report TWIN.onnx held-out.mcap -o report.html
     """
+    require("a report", "report")
     with twin_errors():
         from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415  the command line loads twin only when it is needed
         from twin.report.assessment import assess, level_of  # noqa: PLC0415

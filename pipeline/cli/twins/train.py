@@ -36,6 +36,8 @@ from pipeline.cli.twins.training_data import (
     show_hints,
     twin_errors,
 )
+from pipeline.errors import UserError
+from pipeline.extras import how_to_install, is_installed
 
 if TYPE_CHECKING:
     from schemas.reference_conditions import ReferenceConditions
@@ -85,7 +87,7 @@ def train(
     ignore: IgnoreOption = None,
     name: Annotated[str | None, typer.Option(help="Name of the twin. Default: the name of the file.")] = None,
     seed: Annotated[int, typer.Option(help="The same seed and recordings give the same twin.")] = 0,
-    trainer: Annotated[Trainer, typer.Option(help="adam is the published one.")] = "levenberg-marquardt",
+    trainer: Annotated[Trainer, typer.Option(help="adam, the published one, needs PyTorch.")] = "levenberg-marquardt",
     iterations: Annotated[
         int | None, typer.Option(min=1, help="Maximum iterations of each network. Default: depends on the trainer.")
     ] = None,
@@ -125,6 +127,8 @@ def train(
 
     Example: fantwin train healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap --model hybrid -o TWIN.onnx
     """
+    if trainer == "adam" and not is_installed("torch"):
+        raise UserError(f"--trainer adam needs PyTorch: {how_to_install('torch')}")
     not_written = "no twin was written; --iterations N ends after N iterations of each network and writes one"
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible(not_written), twin_errors():

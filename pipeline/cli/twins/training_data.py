@@ -19,7 +19,6 @@ from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT
 from pipeline.devices.tacho_evidence import tacho_hints
 from pipeline.errors import UsageError, UserError
-from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.checksum import sha256_of
 from pipeline.recordings.remote import matching, recording_path
 from pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
@@ -80,7 +79,6 @@ TACHO_CONSEQUENCE = (
 )
 MANY_OUTLIERS = 0.001
 _NUMBER = r"\d[\d.]*(?:e[+-]\d+)?"
-_EXTRA_MODULES = ("jinja2", "matplotlib", "onnx", "scipy", "torch")
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,18 +287,13 @@ def counting_tachos(windows_s: Sequence[float]) -> tuple[Tacho, ...]:
 
 @contextmanager
 def twin_errors() -> Iterator[None]:
-    """Turns errors of the twin package, and a missing extra, into a UserError of one line."""
-    try:
-        from twin.errors import TwinError  # noqa: PLC0415
+    """Turns errors of the twin package into a UserError of one line."""
+    from twin.errors import TwinError  # noqa: PLC0415
 
-        try:
-            yield
-        except TwinError as error:
-            raise UserError(str(error)) from error
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.split(".")[0] not in _EXTRA_MODULES:
-            raise
-        raise UserError(f"this needs the extra `train` ({error.name}); {how_to_install('train')}") from error
+    try:
+        yield
+    except TwinError as error:
+        raise UserError(str(error)) from error
 
 
 def data_cards(data: TrainingData) -> list[DataCard]:

@@ -8,7 +8,6 @@ import shlex
 import signal
 import threading
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +16,7 @@ import typer
 from pipeline.bus.endpoint import accepts_connections
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.progress import EXIT_INTERRUPTED
-from pipeline.cli.twins.training_data import check_writable, twin_errors
+from pipeline.cli.twins.training_data import check_writable
 from pipeline.cli.watch.child_commands import Commands, Stopped
 from pipeline.cli.watch.commanding import require_commandable
 from pipeline.cli.watch.commissioning import Commissioning, Plan, TrayWork
@@ -185,8 +184,6 @@ def _refuse_what_cannot_end_well(settings: Config, works: Sequence[TrayWork]) ->
     if accepts_connections(settings.bus.endpoint) and (running := running_sessions(settings)):
         names = ", ".join(dict.fromkeys(session.name for session in running))
         raise UserError(f"site {settings.site!r} runs already ({names}): stop it first")
-    with twin_errors():
-        import_module("twin.build")  # the extra may not be installed
 
 
 def _sweep_words(low: float | None, high: float | None, safe: float | None) -> list[str]:

@@ -25,11 +25,10 @@ from pipeline.cli.options import JsonOption
 from pipeline.cli.watch.demo_page import PICTURE, DemoPage
 from pipeline.cli.watch.demo_report import Summary, summarise
 from pipeline.cli.watch.demo_screen import DemoScreen
-from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.errors import UserError
-from pipeline.gateway.config import NEEDED
-from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.extras import missing_extra
+from pipeline.launch.this_host import load_for_this_host
 from pipeline.runtime.signals import stop_on_signals
 from pipeline.runtime.snapshot_store import FORMER_SUFFIX
 from pipeline.selftest.scratch_site import FANTWIN, free_port
@@ -45,9 +44,21 @@ FAULTS = (
 SHOWN_FAN = 5
 """in the picture of the page, while it is in alarm"""
 OUTPUTS = (
-    *("recording*.mcap*", "view*.rrd", "bands.png", PICTURE, "summary.json", "truth.json", "up.log", "tray"),
+    *(
+        "recording*.mcap*",
+        "view*.rrd",
+        "bands.png",
+        PICTURE,
+        "summary.json",
+        "truth.json",
+        "up.log",
+        "tray.log",
+        "tray",
+    ),
     *("*.snapshot", f"*{FORMER_SUFFIX}", "alarms.sqlite*", "clips/*"),
 )
+ERROR_PREFIX = "fantwin: "
+"""of the line in which a command says why it failed"""
 _START_TIMEOUT_S = 60.0
 _STOP_TIMEOUT_S = 60.0
 
@@ -71,12 +82,12 @@ def demo(
         f"run_folder={json.dumps(str(out))}",
         f"tray.0.port={json.dumps(str(out / 'tray'))}",
         f"bus.endpoint='tcp/127.0.0.1:{free_port()}'",
+        f"gateway.port={free_port()}",
     ]
-    if all(map(is_installed, NEEDED)):
-        overrides.append(f"gateway.port={free_port()}")
-    else:
-        console.print(f"without the operators' page: it needs the extra gateway; {how_to_install('gateway')}")
-    config = load_config(DEMO_FOLDER / "demo.toml", overrides)
+    here = load_for_this_host(DEMO_FOLDER / "demo.toml", overrides)
+    config, overrides = here.config, list(here.overrides)
+    for line in here.left_out:
+        console.print(line, markup=False, soft_wrap=True)
     started_s = time.monotonic()
     lost = _run(config, overrides, out, seed, console)
     summary = summarise(out / "truth.json", sorted(out.glob("recording*.mcap")), lost)
@@ -122,7 +133,8 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
     up = ["up", "-c", str(config.path), "--json", *(word for override in overrides for word in ("--set", override))]
     with (
         (out / "up.log").open("w", encoding="utf-8") as log,
-        _child(simulate, stdout=log, stderr=log) as device,
+        (out / "tray.log").open("w", encoding="utf-8") as tray_log,
+        _child(simulate, stdout=tray_log, stderr=tray_log) as device,
         _child(up, stdout=subprocess.PIPE, stderr=log) as pipeline,
         join_bus(config, listens=False) as bus,
     ):
@@ -141,10 +153,10 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
             raise UserError(f"the pipeline did not stop within {_STOP_TIMEOUT_S:g} s; see {out / 'up.log'}") from error
     if stop.is_set():
         raise UserError(f"stopped before the end of the schedule; what was recorded is in {out}")
-    if device.returncode or pipeline.returncode not in (0, 3):
-        raise UserError(
-            f"the pipeline did not run to its end: {_last_line(out / 'up.log')} (full log: {out / 'up.log'})"
-        )
+    if pipeline.returncode not in (0, 3):
+        raise _unfinished("pipeline", out / "up.log")
+    if device.returncode:
+        raise _unfinished("simulated tray", out / "tray.log")
     return {name: count for name, count in json.loads(answer)["lost"].items() if count}
 
 
@@ -205,15 +217,26 @@ def _watch(
 
 
 def _draw(out: Path, console: Console) -> None:
-    from pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  matplotlib is slow to import
+    if problem := missing_extra("bands.png is left out: it", "report", "matplotlib"):
+        console.print(problem, markup=False, soft_wrap=True)
+        return
+    from pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  an extra
 
     with console.status("drawing bands.png"):
         plot_recording(sorted(out.glob("recording*.mcap")), out / "bands.png", truth=out / "truth.json")
 
 
-def _last_line(path: Path) -> str:
-    lines = path.read_text(encoding="utf-8").strip().splitlines()
-    return lines[-1] if lines else "no output"
+def _unfinished(what: str, log: Path) -> UserError:
+    return UserError(f"the {what} did not run to its end: {_reason(log)} (full log: {log})")
+
+
+def _reason(log: Path) -> str:
+    """Why a command failed: its error, or else what it said last of a stage that failed, or else its last line."""
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no output"]
+    for mark in (ERROR_PREFIX, "ended with status", "cannot start", "not arrive", "never ready", "killed"):
+        if found := [line for line in lines if mark in line]:
+            return found[-1].removeprefix(ERROR_PREFIX)
+    return lines[-1]
 
 
 def _print_report(summary: Summary, out: Path, took_s: float, console: Console) -> None:
@@ -237,11 +260,14 @@ def _print_report(summary: Summary, out: Path, took_s: float, console: Console) 
         soft_wrap=True,
     )
     shown, programs = (Path(os.path.relpath(path)) for path in (out, Path(sys.executable).parent))
-    page = f" and {shown / PICTURE} (operators' page)" if (out / PICTURE).exists() else ""
+    about = {"bands.png": "", PICTURE: " (operators' page)"}
+    pictures = " and ".join(f"{shown / name}{words}" for name, words in about.items() if (out / name).exists())
+    view = f"interactive: {programs / 'rerun'} {shown / 'view.rrd'}" if (out / "view.rrd").exists() else ""
     for line in (
         f"results: {shown / 'summary.json'} and {shown / 'recording.mcap'}",
-        f"pictures: {shown / 'bands.png'}{page}; interactive: {programs / 'rerun'} {shown / 'view.rrd'}",
+        "; ".join(filter(None, (pictures and f"pictures: {pictures}", view))),
     ):
-        console.print(line, markup=False, soft_wrap=True)  # to be copied
+        if line:
+            console.print(line, markup=False, soft_wrap=True)  # to be copied
     for problem in summary.problems:
         console.print(f"[bold red]PROBLEM:[/bold red] {problem}")

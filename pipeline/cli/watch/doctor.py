@@ -26,18 +26,18 @@ from pipeline.bus.session import join_bus
 from pipeline.cli.exposure import exposure_problem, is_exposed
 from pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from pipeline.cli.watch.line_check import check_line
-from pipeline.config.loading import load_config
 from pipeline.config.models import Config, ConfigError
 from pipeline.config.registry import STAGES
 from pipeline.config.roles import READERS, role_names
+from pipeline.extras import how_to_install
 from pipeline.launch.processes import process_list
-from pipeline.optional_dependencies import how_to_install
+from pipeline.launch.this_host import load_for_this_host
 from pipeline.runtime.second_owner import GOSSIP_S
 from pipeline.runtime.sessions import Session
 from pipeline.runtime.stage import Context, load_stage
 from schemas.topics import sessions_key
 
-_DEVELOPMENT_EXTRAS = {"dev", "bench"}  # used by tests and benches only
+_NOT_LISTED = {"all", "dev", "bench"}  # of others, or used by tests and benches only
 _NOT_GRANTED = "the router does not grant the rights of its role: restart the router with this configuration"
 _MIN_FREE_BYTES = 1 << 30
 _LOOKS = 4
@@ -95,12 +95,14 @@ def _findings(
         return
     config = config or DEFAULT_CONFIG
     try:
-        settings = load_config(config, overrides or ())
+        here = load_for_this_host(config, overrides or ())
+        settings = here.config
         lines = {settings.tray(name).name for name in trays} or {tray.name for tray in settings.trays}
     except ConfigError as error:
         yield False, str(error)
         return
     yield True, f"{config}: site {settings.site!r}, trays {', '.join(tray.name for tray in settings.trays)}"
+    yield from ((True, line) for line in here.left_out)
     yield from _check_run_folder(settings.run_folder)
     running: list[Session] = []
     yield from _check_bus(settings, running)
@@ -113,7 +115,7 @@ def _check_packages() -> Iterator[tuple[bool, str]]:
     try:
         requirements = requires("fantwin") or []
     except PackageNotFoundError:
-        yield False, f"fantwin is not installed; {how_to_install()}"
+        yield False, f"fantwin is not installed; {how_to_install('fantwin')}"
         return
     extras: dict[str, list[str]] = {}
     for requirement in requirements:
@@ -124,13 +126,15 @@ def _check_packages() -> Iterator[tuple[bool, str]]:
             installed = _version(name)
             yield (
                 bool(installed),
-                f"{name} {installed}" if installed else f"{name} is not installed; {how_to_install()}",
+                f"{name} {installed}" if installed else f"{name} is not installed; {how_to_install('fantwin')}",
             )
     for extra, names in extras.items():
-        if extra in _DEVELOPMENT_EXTRAS:
+        if extra in _NOT_LISTED:
             continue
         missing = [name for name in names if not _version(name)]
-        state = f"not installed ({', '.join(missing)}); {how_to_install(extra)}" if missing else "installed"
+        state = (
+            f"not installed ({', '.join(missing)}); {how_to_install(f'fantwin[{extra}]')}" if missing else "installed"
+        )
         yield True, f"extra {extra!r}: {state}"
 
 

@@ -13,12 +13,12 @@ import typer
 
 from pipeline.cli.exposure import InsecureOption, checked_exposure
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.loading import load_config
 from pipeline.config.shards import chosen_trays
 from pipeline.errors import UserError
 from pipeline.launch.event_log import EventLog
 from pipeline.launch.launcher import Launcher, Outcome
 from pipeline.launch.refused_input import refused_lines
+from pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port
 from pipeline.runtime.signals import ignore_hangup, set_when_stdin_closes, stop_on_signals
 
 
@@ -39,6 +39,7 @@ def up(
     """Start all stages, restart those that die, stop all in order on Ctrl-C.
 
     Events are written to standard error. The site keeps running when the terminal is closed; SIGTERM stops it, too.
+    The operators' page is served on this host; its address is printed.
     For a tray without `twin` in the configuration, a twin is learned in the background (docs/how-to/learned-twins.md).
 
     Exit codes: 0 stopped in order, nothing lost; 1 could not start, a stage failed or was killed at the end, or all
@@ -53,10 +54,13 @@ def up(
     ignore_hangup()
     if until_stdin_closes:
         set_when_stdin_closes(stop)
-    settings = load_config(config, overrides or ())
-    of_host = chosen_trays(settings, trays, shard)
+    loaded = load_for_this_host(config, overrides or ())
+    of_host = chosen_trays(loaded.config, trays, shard)
+    here = with_free_port(loaded, of_host)
+    settings = here.config
     log = EventLog(sys.stderr.fileno())
-    launcher = Launcher(settings, overrides or (), log.say, of_host)
+    pages = [f"operators' page: {address}" for address in page_addresses(settings, of_host)]
+    launcher = Launcher(settings, here.overrides, log.say, of_host, when_started=(*pages, *here.left_out))
     try:
         with checked_exposure(settings.bus, log.say, insecure=insecure):
             outcome = launcher.run(stop)

@@ -16,7 +16,6 @@ from pipeline.config.loading import load_config
 from pipeline.errors import UsageError, UserError
 from pipeline.gateway.config import GatewayConfig
 from pipeline.opcua.config import OpcuaConfig
-from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.presenting.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
 
 
@@ -45,8 +44,6 @@ def users(
     Example: fantwin users remove ann
     """
     settings = load_config(config, overrides or (), stages=("gateway", "opcua"))
-    if not is_installed("argon2"):
-        raise UserError(f"users need the extra `gateway`: {how_to_install('gateway')}")
     gateway, opcua = settings.sections["gateway"], settings.sections["opcua"]
     assert isinstance(gateway, GatewayConfig)
     assert isinstance(opcua, OpcuaConfig)

@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.extras import missing_extra
 from pipeline.recordings.logs.log_file import LogError, LogFile
 
 _START_BYTES = 64
@@ -74,8 +74,8 @@ def open_log(path: Path, kind: LogFormat, number: int = 1) -> LogFile:
     Raises:
         LogError: it cannot be read, or what reads it is not installed.
     """
-    if not is_installed(kind.needs):
-        raise LogError(f"{path}: a {kind.title} needs {kind.needs}; {how_to_install('logs')}")
+    if problem := missing_extra(f"{path}: a {kind.title}", "logs", kind.needs):
+        raise LogError(problem)
     module, _, name = kind.reader.partition(":")
     log: LogFile = getattr(import_module(module), name)(path, number)
     if not log.names:

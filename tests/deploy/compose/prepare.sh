@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # What bringing compose.yaml up needs, fetched once into a folder: packages of the system, a stand-in for the base image
-# of the Dockerfile (nothing is pulled from a registry), the wheels of requirements.lock, podman-compose.
+# of the Dockerfile (nothing is pulled from a registry), the wheels of requirements-image.lock, podman-compose.
 # Where something is not possible it says so in one line, and ends with exit code 77.
 #   prepare.sh FOLDER PYTHON
 set -euo pipefail
 folder=$1 python=$2
-lock=$(realpath "$(dirname "$0")/../../../requirements.lock")
+lock=$(realpath "$(dirname "$0")/../../../requirements-image.lock")
 
 cannot() { echo "compose.yaml is not brought up here: $*"; exit 77; }
 
@@ -38,7 +38,7 @@ if ! cmp -s "$lock" "$folder/wheels.lock"; then
     rm -rf "$folder/wheels"
     "$python" -m pip --disable-pip-version-check -q download --require-hashes -r "$lock" -d "$folder/wheels" >&2 &&
         "$python" -m pip --disable-pip-version-check -q download 'setuptools>=77' wheel -d "$folder/wheels" >&2 ||
-        cannot "the wheels of requirements.lock cannot be downloaded"
+        cannot "the wheels of requirements-image.lock cannot be downloaded"
     cp "$lock" "$folder/wheels.lock"
 fi
 printf '[global]\nno-index = true\nfind-links = /wheels\ndisable-pip-version-check = true\n' > "$folder/pip.conf"

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config.registry import STAGES
+from pipeline.config.loading import load_config
 from tests.support import compose_site as site
 from tests.support.fantwin_command import fantwin
 
 FOLDER = site.folder()
 pytestmark = pytest.mark.skipif(FOLDER is None, reason="containers: `make compose-test` brings compose.yaml up")
-ENABLED = [name for name, row in STAGES.items() if row.enabled_by == "default"]
+ENABLED = load_config(Path(__file__).parents[3] / "pipeline/demo/compose.toml").stages
 FAULT = "--fault inlet:fan=2,start=3,size=1.8"
 OWN_CERTIFICATES = """cd /tmp
 cat > own.toml <<END

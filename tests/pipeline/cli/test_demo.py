@@ -129,6 +129,35 @@ def test_a_pipeline_that_does_not_stop_is_one_line_and_is_killed(tmp_path, endpo
     assert not is_running(int((tmp_path / "up").read_text()))
 
 
+FAILING = """
+import sys, time
+if sys.argv[2] == "simulate":
+    time.sleep(60)
+sys.stderr.write(sys.argv[1])
+sys.exit(1)
+"""
+
+
+@pytest.mark.parametrize(
+    ("log", "reason"),
+    [
+        (
+            "scorer: started\nfantwin: stage recorder cannot write [here]\nrecorded: nothing\n",
+            "stage recorder cannot write",
+        ),
+        ("scorer: ended with status 1: no memory\nstopped; lost: nothing\n", "scorer: ended with status 1: no memory"),
+        ("Killed\n", "Killed"),
+        ("", "no output"),
+    ],
+)
+def test_the_reason_of_a_failure_is_in_the_terminal(tmp_path, endpoint, monkeypatch, log, reason):
+    monkeypatch.setattr("pipeline.cli.watch.demo.FANTWIN", (sys.executable, "-c", FAILING, log))
+    overrides = [f"bus.endpoint='{endpoint}'", f"tray.0.port='{tmp_path / 'tray'}'"]
+    config = load_config(DEMO_FOLDER / "demo.toml", overrides)
+    with pytest.raises(UserError, match=f"^the pipeline did not run to its end: {reason}.*full log: .*up.log"):
+        _run(config, overrides, tmp_path, 7, Console(file=io.StringIO()))
+
+
 @pytest.mark.parametrize("program", ["false", "cat", "no-such-program"])
 def test_a_browser_that_takes_no_picture_is_one_line_and_ends(program, tmp_path, monkeypatch):
     monkeypatch.setattr("pipeline.cli.watch.page_picture.LIMIT_S", 1.0)

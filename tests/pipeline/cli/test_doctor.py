@@ -20,6 +20,7 @@ from pipeline.cli.watch import doctor as module
 from pipeline.cli.watch.doctor import _of_roles_together, doctor
 from pipeline.config.models import BusConfig
 from pipeline.config.shards import Shard
+from pipeline.extras import how_to_install
 from pipeline.runtime.sessions import Session
 from tests.support.fantwin_command import fantwin
 from tests.support.running_chain import DEMO
@@ -162,21 +163,21 @@ def test_each_package_that_fantwin_needs_is_a_problem_when_it_is_missing(capsys,
     monkeypatch.setattr(module, "_version", lambda name: "" if name == missing else versions(name))
     code, found = examine(capsys)
     assert code == 1
-    assert found["problems"] == [f"{missing} is not installed; in the checkout: .venv/bin/pip install -e '.'"]
+    assert found["problems"] == [f"{missing} is not installed; {how_to_install('fantwin')}"]
 
 
 def test_a_package_of_an_extra_that_is_missing_is_no_problem(capsys, monkeypatch):
     versions = module._version
-    monkeypatch.setattr(module, "_version", lambda name: "" if name == "torch" else versions(name))
+    monkeypatch.setattr(module, "_version", lambda name: "" if name == "sushy" else versions(name))
     code, found = examine(capsys)
     assert (code, found["problems"]) == (0, [])
-    assert "extra 'train': not installed (torch); in the checkout: .venv/bin/pip install -e '.[train]'" in found["good"]
+    assert f"extra 'devices': not installed (sushy); {how_to_install('fantwin[devices]')}" in found["good"]
 
 
 def test_the_extras_that_add_features_are_listed_and_those_of_developers_are_not(capsys):
     _, found = examine(capsys)
     listed = {line.split("'")[1] for line in found["good"] if line.startswith("extra ")}
-    assert listed == set(PROJECT["optional-dependencies"]) - {"dev", "bench"}
+    assert listed == set(PROJECT["optional-dependencies"]) - {"all", "dev", "bench"}
 
 
 def test_running_from_files_without_an_installation_is_a_problem(capsys, monkeypatch):
@@ -186,7 +187,7 @@ def test_running_from_files_without_an_installation_is_a_problem(capsys, monkeyp
     monkeypatch.setattr(module, "requires", not_installed)
     code, found = examine(capsys)
     assert code == 1
-    assert found["problems"] == ["fantwin is not installed; in the checkout: .venv/bin/pip install -e '.'"]
+    assert found["problems"] == [f"fantwin is not installed; {how_to_install('fantwin')}"]
 
 
 def test_little_disk_is_a_problem(capsys, tmp_path, port, monkeypatch):

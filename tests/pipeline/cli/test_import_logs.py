@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.logs import formats
 from pipeline.recordings.reading import read_recording
 from pipeline.recordings.runs import read_runs
 from schemas.fields import Array
@@ -163,11 +162,6 @@ def test_a_mistake_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
     assert "no ROS 2 bag that can be read" in error_of("import", tmp_path / "bag", "--list")
     assert "cannot be read: No such file" in error_of("import", tmp_path / "none.ulg", "--list")
     assert list(tmp_path.glob("*.mcap")) == []
-
-
-def test_without_the_extra_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(formats, "is_installed", lambda _module: False)
-    assert "a ULog needs pyulog; in the checkout: " in error_of("import", ulog(tmp_path), "--list")
 
 
 def test_a_log_can_be_described_and_identified(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """`fantwin identify`, `train` and `evaluate` on recordings, from the command line to the ONNX file."""
 
-import builtins
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -315,21 +314,3 @@ def test_a_command_that_never_changes_is_a_one_line_error(tmp_path):
     still = Run("still", run.t_s, np.full_like(run.command, 50.0), run.speed_rad_s)
     path = record(tmp_path / "still.mcap", still)
     assert "command" in error_of("identify", path)
-
-
-@pytest.mark.parametrize("command", ["identify", "train", "evaluate"])
-def test_a_missing_extra_is_reported_with_what_to_install(folder, twin, monkeypatch, command):
-    real_import = builtins.__import__
-
-    def without_the_extra(name: str, *arguments, **options):
-        if name.startswith("twin."):
-            raise ModuleNotFoundError("No module named 'onnx'", name="onnx")
-        return real_import(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", without_the_extra)
-    arguments = {
-        "identify": (folder / "healthy.mcap",),
-        "train": (folder / "healthy.mcap", "-o", folder / "t.onnx"),
-        "evaluate": (twin, folder / "healthy.mcap"),
-    }[command]
-    assert error_of(command, *arguments).endswith(".venv/bin/pip install -e '.[train]'")

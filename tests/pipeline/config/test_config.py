@@ -30,7 +30,7 @@ def test_a_good_file_gives_every_enabled_stage_its_section():
     assert config.site == "lab"
     assert config.tray("a").fans == 8
     assert config.sections["scorer"].model_dump()["on_delay_s"] == 0.25
-    of_all = {"acquisition", "resampler", "twin_integrator", "scorer", "recorder", "viewer"}
+    of_all = {"acquisition", "resampler", "twin_integrator", "scorer", "recorder", "viewer", "gateway"}
     assert set(config.sections) == of_all | {"learner"}, "the tray names no twin"
     assert set(parse(GOOD.replace("fans = 8", 'fans = 8\ntwin = "a.onnx"')).sections) == of_all
     assert config.run_folder == Path("conf/runs")

@@ -228,12 +228,6 @@ def test_https(tmp_path: Path) -> None:
         connection.close()
 
 
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_source, "is_installed", lambda _module: False)
-    with pytest.raises(UserError, match=r"source http needs starlette and uvicorn; in the checkout: .*\[http\]"):
-        source_of()
-
-
 @pytest.fixture
 def raws(endpoint: str) -> Iterator[Raws]:
     with raws_of(endpoint) as raws:

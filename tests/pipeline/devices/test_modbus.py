@@ -11,12 +11,10 @@ import pytest
 
 from pipeline.config.loading import parse_config
 from pipeline.config.models import ConfigError
-from pipeline.devices import modbus_source
 from pipeline.devices.modbus_config import ModbusConfig
 from pipeline.devices.modbus_source import ModbusDevice, ModbusSource
 from pipeline.devices.polling import DeviceError
 from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceContext, SourceEvent
-from pipeline.errors import UserError
 from schemas.tacho import Tacho
 from simulation.tray import SimulatedTray, TraySettings
 from tests.support.modbus_server import (
@@ -235,9 +233,3 @@ def test_the_registers_say_what_is_measured_where_the_averaging_time_is_known() 
         with pytest.raises(ConfigError, match=words) as caught:
             parse_config((tray % ("", fan)).replace(*change), Path("fantwin.toml"))
         assert "\n" not in str(caught.value)
-
-
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modbus_source, "is_installed", lambda _module: False)
-    with pytest.raises(UserError, match=r"needs the extra `modbus`; in the checkout: .*\[modbus\]"):
-        ModbusSource(config(502), SourceContext(1, "rpm", Path()))

@@ -267,12 +267,6 @@ def test_a_broker_that_is_not_there_is_one_line() -> None:
         assert events == [LinkDown("the broker cannot be reached; check host and port, and whether it runs")]
 
 
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(broker_client, "is_installed", lambda _module: False)
-    with pytest.raises(UserError, match=r"source mqtt needs paho-mqtt; in the checkout: .*\[mqtt\]"):
-        source_of(1883)
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import UserError
 from pipeline.recordings.reading import RecordingError, read_metadata
 from pipeline.recordings.remote import RemotePath, local_copies, matching, recording_path
 from tests.support.fan_data import published_run
@@ -65,12 +64,6 @@ def test_wildcards_stand_for_what_is_there_in_order(at_url: str, tmp_path: Path)
 def test_a_url_with_a_secret_is_refused_without_showing_it(url: str) -> None:
     error = error_of("identify", url)
     assert "may hold no password" in error and "pass@" not in error and "signature" not in error
-
-
-def test_without_the_extra_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.recordings.remote.is_installed", lambda _module: False)
-    with pytest.raises(UserError, match=r"need the extra `remote`; in the checkout: .*\[remote\]"):
-        recording_path("s3://bucket/day.mcap")
 
 
 @pytest.fixture

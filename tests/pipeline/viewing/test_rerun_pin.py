@@ -18,7 +18,7 @@ def test_the_pin_the_locks_and_what_is_installed_are_the_same_release() -> None:
     (pin,) = (each for each in extras["view"] if each.startswith("rerun-sdk"))
     pinned = re.fullmatch(r"rerun-sdk==(\d+\.\d+)\.\*", pin)
     assert pinned is not None, pin
-    for lock in ("requirements.lock", "requirements-dev.lock"):
+    for lock in ("requirements-image.lock", "requirements-dev.lock"):
         (locked,) = re.findall(r"^rerun-sdk==(\d+\.\d+)\.", (ROOT / lock).read_text(encoding="utf-8"), re.MULTILINE)
         assert locked == pinned[1], lock
     try:

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import astuple, replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -457,19 +455,6 @@ def test_invalid_input_is_a_one_line_error(folder, tmp_path):
     assert "name a file that ends in .html" in error_of("report", twin, held_out, "-o", tmp_path)
     (tmp_path / "folder.html").mkdir()
     assert "cannot be written" in error_of("report", twin, held_out, "-o", tmp_path / "folder.html")
-
-
-@pytest.mark.parametrize(("command", "missing"), [("report", "jinja2"), ("report", "matplotlib"), ("compare", "onnx")])
-def test_a_missing_extra_is_reported_with_what_to_install(folder, tmp_path, command, missing):
-    code = f"import sys; sys.modules[{missing!r}] = None; from pipeline.cli.main import main; main()"
-    given = [folder / "healthy.onnx"] * (command == "report") + [folder / "held-out.mcap"]
-    done = subprocess.run(
-        [sys.executable, "-c", code, command, *given], capture_output=True, text=True, check=False, cwd=tmp_path
-    )
-    assert done.returncode == 1
-    assert done.stderr.strip().endswith(".venv/bin/pip install -e '.[train]'")
-    assert done.stderr.count("\n") == 1
-    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("width_px", [390, 1280])

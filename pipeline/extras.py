@@ -1,0 +1,102 @@
+"""Extras of the installation: the modules of each, whether they are installed, and the command that installs them.
+
+The command fits the way fantwin itself was installed: from a checkout, by pip or uv, or as a tool of pipx or uv.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from importlib.metadata import PackageNotFoundError, distribution
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from pipeline.errors import UserError
+
+EXTRAS: dict[str, tuple[str, ...]] = {
+    "view": ("rerun", "PIL"),
+    "report": ("matplotlib", "jinja2"),
+    "devices": ("paho", "pymodbus", "sushy"),
+    "outputs": ("apprise", "asyncua", "paho"),
+    "logs": ("orangebox", "pyarrow", "pyulog", "rosbags"),
+    "remote": ("distributed", "fsspec", "s3fs"),
+}
+"""extra of pyproject.toml -> the modules that the code imports of it"""
+
+
+def is_installed(module: str) -> bool:
+    """Whether a module is there, without importing it."""
+    try:
+        return find_spec(module) is not None
+    except ValueError:  # an entry None of sys.modules
+        return False
+
+
+def missing_extra(what: str, extra: str, *modules: str) -> str:
+    """One line that says that `what` needs an extra and how to install it; empty if it is installed.
+
+    modules: those that are needed of the extra; without them, all.
+    """
+    if all(map(is_installed, modules or EXTRAS[extra])):
+        return ""
+    return f"{what} needs the extra `{extra}`: {how_to_install(f'fantwin[{extra}]')}"
+
+
+def require(what: str, extra: str, *modules: str) -> None:
+    """The same as an error.
+
+    Raises:
+        UserError: the extra is not installed.
+    """
+    if problem := missing_extra(what, extra, *modules):
+        raise UserError(problem)
+
+
+def how_to_install(requirement: str) -> str:
+    """The command that adds a requirement, such as `torch` or `fantwin[view]`, to this installation."""
+    origin = _origin()
+    if origin.get("dir_info", {}).get("editable"):
+        checkout = Path(unquote(urlsplit(origin["url"]).path))
+        own = requirement.startswith("fantwin")
+        what = f"-e {_quoted('.' + requirement.removeprefix('fantwin'))}" if own else _quoted(requirement)
+        return f"in {checkout}: {_pip(checkout)} {what}"
+    environment = Path(sys.prefix)
+    if (environment / "pipx_metadata.json").exists():
+        return f"pipx runpip {environment.name} install {_quoted(requirement)}"
+    if (environment / "uv-receipt.toml").exists():
+        return _uv_tool(requirement, origin.get("url", ""))
+    return f"{_pip()} {_quoted(requirement)}"
+
+
+def _origin() -> dict[str, Any]:
+    """What the installer noted about where fantwin came from (PEP 610); as for a checkout if it is not installed."""
+    try:
+        noted = distribution("fantwin").read_text("direct_url.json")
+    except PackageNotFoundError:
+        return {"url": Path(__file__).parents[1].as_uri(), "dir_info": {"editable": True}}
+    return json.loads(noted) if noted else {}
+
+
+def _pip(folder: Path | None = None) -> str:
+    """`pip install` of this environment, as short as it can be typed in `folder`; without pip, that of uv."""
+    program = Path(sys.prefix) / "bin" / "pip"
+    if not is_installed("pip"):
+        return f"uv pip install --python {sys.executable}"
+    if folder is not None and program.is_relative_to(folder):
+        return f"{program.relative_to(folder)} install"
+    is_active = os.environ.get("VIRTUAL_ENV") == sys.prefix
+    return "pip install" if is_active else f"{program} install"
+
+
+def _uv_tool(requirement: str, url: str) -> str:
+    """uv replaces a tool as a whole: its own requirement is named again, with where it came from."""
+    if requirement.startswith("fantwin"):
+        return f"uv tool install {_quoted(requirement + (f' @ {url}' if url else ''))}"
+    return f"uv tool install {_quoted('fantwin' + (f' @ {url}' if url else ''))} --with {_quoted(requirement)}"
+
+
+def _quoted(requirement: str) -> str:
+    return f"'{requirement}'" if any(each in requirement for each in "[ ") else requirement

@@ -1,0 +1,107 @@
+"""The configuration as `fantwin up` runs it on this host: without stages whose extra is missing, and with a free port.
+
+What is chosen is added to the overrides, so that each stage and the recording know it, too.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Collection, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.config.loading import load_config
+from pipeline.config.models import Config
+from pipeline.config.registry import GATEWAY, STAGES
+from pipeline.config.shards import Shard
+from pipeline.extras import missing_extra
+from pipeline.launch.processes import process_list
+
+_PORTS = 1000
+"""tried, from the configured one on"""
+
+
+@dataclass(frozen=True)
+class ThisHost:
+    """What runs here.
+
+    Attributes:
+        overrides: those given, and what was chosen.
+        left_out: a line for each stage that is left out.
+    """
+
+    config: Config
+    overrides: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def load_for_this_host(path: Path, overrides: Sequence[str] = ()) -> ThisHost:
+    """Load a configuration without the stages whose extra is missing, unless `launcher.stages` names them.
+
+    Raises:
+        ConfigError: see `load_config`.
+    """
+    config = load_config(path, overrides)
+    names_stages = config.launcher.stages is not None
+    missing = {} if names_stages else {name: _missing(name) for name in config.stages}
+    lines = tuple(filter(None, missing.values()))
+    if not lines:
+        return ThisHost(config, tuple(overrides), ())
+    without = [*config.launcher.without, *(name for name, line in missing.items() if line)]
+    chosen = (*overrides, f"launcher.without={json.dumps(without)}")
+    return ThisHost(load_config(path, chosen), chosen, lines)
+
+
+def _missing(stage: str) -> str:
+    extra = STAGES[stage].extra
+    return missing_extra(f"stage {stage} is left out: it", extra) if extra else ""
+
+
+def with_free_port(host: ThisHost, trays: Collection[str] | None) -> ThisHost:
+    """The same with a port of the operators' page that is free, where the configuration sets none.
+
+    trays: of this host, see `process_list`.
+    """
+    section: Any = host.config.sections.get(GATEWAY)
+    shards = _pages(host.config, trays)
+    if not shards or "port" in section.model_fields_set:
+        return host
+    numbers = [shard.number - 1 for shard in shards]
+    ports = range(section.port, section.port + _PORTS)
+    port = next((port for port in ports if _are_free(section.host, [port + n for n in numbers])), section.port)
+    if port == section.port:
+        return host
+    overrides = (*host.overrides, f"{GATEWAY}.port={port}")
+    return ThisHost(load_config(host.config.path, overrides), overrides, host.left_out)
+
+
+def page_addresses(config: Config, trays: Collection[str] | None = None) -> list[str]:
+    """The addresses of the operators' page on this host, one for each shard of the gateway; none without it."""
+    if GATEWAY not in config.sections:
+        return []
+    section: Any = config.sections[GATEWAY]
+    scheme = "https" if section.certificate else "http"
+    return [f"{scheme}://{section.host}:{section.port + shard.number - 1}/" for shard in _pages(config, trays)]
+
+
+def _pages(config: Config, trays: Collection[str] | None) -> list[Shard]:
+    return [row.shard for row in process_list(config, trays) if row.stage == GATEWAY]
+
+
+def _are_free(host: str, ports: Sequence[int]) -> bool:
+    with ExitStack() as opened:
+        try:
+            for port in ports:
+                family, kind, protocol, _, address = socket.getaddrinfo(
+                    host.strip("[]"), port, type=socket.SOCK_STREAM
+                )[0]
+                probe = opened.enter_context(socket.socket(family, kind, protocol))
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+                probe.listen()
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,91 @@
+"""What `fantwin up` runs on this host: without what is not installed, and with a page on a port that is free."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline import extras
+from pipeline.config.models import ConfigError
+from pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port
+
+TRAYS = "".join(f'[[tray]]\nname = "{name}"\nfans = 1\nport = "x"\ntwin = "t.onnx"\n' for name in "ab")
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    (tmp_path / "fantwin.toml").write_text(TRAYS)
+    return tmp_path / "fantwin.toml"
+
+
+@pytest.fixture
+def two_ports() -> Iterator[tuple[int, socket.socket]]:
+    """A port that is taken, with the socket that has it; the next one is free."""
+    while True:
+        with socket.socket() as taken, socket.socket() as following:
+            taken.bind(("127.0.0.1", 0))
+            taken.listen()
+            port = taken.getsockname()[1]
+            try:
+                following.bind(("127.0.0.1", port + 1))
+            except OSError:
+                continue
+            following.close()
+            yield port, taken
+            return
+
+
+def test_without_rerun_the_viewer_is_left_out_with_one_line_unless_it_is_named(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "viewer" in load_for_this_host(path).config.stages
+    monkeypatch.setattr(extras, "is_installed", lambda module: module != "rerun")
+    host = load_for_this_host(path, ['launcher.without=["recorder"]'])
+    assert host.config.stages == ("acquisition", "resampler", "twin_integrator", "scorer", "gateway")
+    (line,) = host.left_out
+    assert line.startswith("stage viewer is left out: it needs the extra `view`: ")
+    assert load_for_this_host(path, host.overrides).left_out == (), "a stage and a replay of the recording see the same"
+    named = load_for_this_host(path, ['launcher.stages=["scorer", "viewer"]'])
+    assert (named.config.stages, named.left_out) == (("scorer", "viewer"), ())
+    with pytest.raises(ConfigError, match="unknown stage 'viwer'; did you mean 'viewer'"):
+        load_for_this_host(path, ['launcher.without=["viwer"]'])
+
+
+def test_the_page_takes_the_next_free_port_where_none_is_set(
+    path: Path, two_ports: tuple[int, socket.socket], default_port: Callable[[int], None]
+) -> None:
+    port, _ = two_ports
+    default_port(port)
+    host = with_free_port(load_for_this_host(path), None)
+    assert page_addresses(host.config) == [f"http://127.0.0.1:{port + 1}/"]
+    set_by_hand = with_free_port(load_for_this_host(path, [f"gateway.port={port}"]), None)
+    assert page_addresses(set_by_hand.config) == [f"http://127.0.0.1:{port}/"], "it is refused when the stage starts"
+
+
+def test_all_shards_of_the_page_need_a_free_port_and_those_of_other_hosts_do_not(
+    path: Path, two_ports: tuple[int, socket.socket], default_port: Callable[[int], None]
+) -> None:
+    port, _ = two_ports
+    default_port(port - 1)
+    shards = load_for_this_host(path, ["launcher.shards={gateway=2}"])
+    both = page_addresses(with_free_port(shards, None).config)
+    assert len(both) == 2 and f"http://127.0.0.1:{port}/" not in both
+    assert page_addresses(with_free_port(shards, ["b"]).config, ["b"])[0] != f"http://127.0.0.1:{port}/"
+    none = load_for_this_host(path, ['launcher.without=["gateway"]'])
+    assert (with_free_port(none, None), page_addresses(none.config)) == (none, [])
+
+
+@pytest.fixture
+def default_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
+    from pipeline.gateway.config import GatewayConfig  # noqa: PLC0415
+
+    def change(port: int) -> None:
+        monkeypatch.setattr(GatewayConfig.model_fields["port"], "default", port)
+        GatewayConfig.model_rebuild(force=True)
+
+    yield change
+    monkeypatch.undo()
+    GatewayConfig.model_rebuild(force=True)

@@ -1,0 +1,236 @@
+"""Extras: what each brings, that nothing else needs them, and the printed hint that says how to install one."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from importlib.abc import MetaPathFinder
+from importlib.metadata import packages_distributions
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline import extras
+from pipeline.cli import main as command_line
+from pipeline.extras import EXTRAS, how_to_install
+from tests.support.running_chain import DEMO
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PRODUCT = ("fantwin_client", "schemas", "scoring", "pipeline", "simulation", "stages", "twin")
+PARTS = {"h11": "uvicorn", "markupsafe": "jinja2", "pydantic_core": "pydantic"}
+"""modules that a package exposes in its own interface, and which come with it"""
+OPTIONAL = {*(module for modules in EXTRAS.values() for module in modules), "torch"}
+FEATURES = set(PROJECT["optional-dependencies"]) - {"all", "dev", "bench"}
+
+
+class NotInstalled(MetaPathFinder):
+    """Finds none of the optional modules, as where they are not installed."""
+
+    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> None:
+        if fullname.partition(".")[0] in OPTIONAL:
+            raise ModuleNotFoundError(f"No module named {fullname!r}", name=fullname)
+
+
+def names(requirements: list[str]) -> set[str]:
+    return {re.split("[<>=!~;[]", each)[0].strip() for each in requirements}
+
+
+def packages_of(modules: set[str]) -> set[str]:
+    known = packages_distributions()
+    return {known[PARTS.get(module, module)][0].lower().replace("_", "-") for module in modules}
+
+
+def imported() -> dict[str, set[str]]:
+    """The modules of others that the product imports, each with the files that import it."""
+    found: dict[str, set[str]] = {}
+    for path in (path for folder in PRODUCT for path in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                full = [node.module or ""] if not node.level else []
+            else:
+                full = [each.name for each in node.names] if isinstance(node, ast.Import) else []
+            for module in {each.partition(".")[0] for each in full} - {*sys.stdlib_module_names, *PRODUCT}:
+                found.setdefault(module, set()).add(path.relative_to(ROOT).as_posix())
+    return found
+
+
+def test_each_extra_has_the_packages_of_its_modules_and_all_has_every_extra():
+    listed = PROJECT["optional-dependencies"]
+    assert set(EXTRAS) == FEATURES
+    for extra, modules in EXTRAS.items():
+        assert names(listed[extra]) == packages_of(set(modules)), extra
+    (everything,) = listed["all"]
+    assert set(everything.removeprefix("fantwin[").removesuffix("]").split(",")) == FEATURES
+
+
+def test_every_package_that_is_imported_is_required_and_every_required_one_is_imported():
+    found = imported()
+    assert found.pop("torch") == {"twin/fitting/torch_reference.py"}
+    required = {module for module in found if PARTS.get(module, module) not in OPTIONAL}
+    assert packages_of(required) == names(PROJECT["dependencies"])
+
+
+def test_all_commands_stages_and_sources_load_where_no_extra_is_installed():
+    code = """
+import sys
+from tests.pipeline.test_extras import NotInstalled
+sys.meta_path.insert(0, NotInstalled())
+from pipeline.cli import main
+main._register(main.COMMANDS)
+from pipeline.config.registry import STAGES
+for row in STAGES.values():
+    row.load()
+from pipeline.devices.source_kinds import SOURCE_KINDS, _load
+for row in SOURCE_KINDS.values():
+    _load(row.config), _load(row.source)
+import pipeline.gateway.app, pipeline.gateway.server, pipeline.presenting.users
+import twin.build, twin.comparison, twin.report.assessment, twin.export.onnx_twin
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture
+def without_extras(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    is_installed = extras.is_installed
+    monkeypatch.setattr(extras, "is_installed", lambda module: module not in OPTIONAL and is_installed(module))
+    monkeypatch.chdir(tmp_path)
+    registered = list(command_line.app.registered_commands)
+    yield
+    command_line.app.registered_commands[:] = registered
+
+
+def printed_by(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The lines that a command prints, on standard output and standard error, when it fails."""
+    monkeypatch.setattr(sys, "argv", ["fantwin", *command.split()])
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    printed = capsys.readouterr()
+    assert ended.value.code in (1, 2), printed.err
+    return [*printed.out.splitlines(), *printed.err.splitlines()]
+
+
+@pytest.mark.usefixtures("without_extras")
+@pytest.mark.parametrize(
+    ("command", "requirement"),
+    [
+        ("export r.mcap --to parquet", "fantwin[logs]"),
+        ("import log.ulg --list", "fantwin[logs]"),
+        ("picture view.rrd", "fantwin[view]"),
+        ("view r.mcap -o view.rrd", "fantwin[view]"),
+        ("plot r.mcap", "fantwin[report]"),
+        (f"report {DEMO / 'twin.onnx'} r.mcap", "fantwin[report]"),
+        ("identify s3://bucket/day.mcap", "fantwin[remote]"),
+        ("identify r.mcap r.mcap --scheduler tcp://127.0.0.1:1", "fantwin[remote]"),
+        ("train r.mcap -o t.onnx --trainer adam", "torch"),
+    ],
+)
+def test_a_command_without_its_extra_prints_one_line_with_what_to_type(
+    command: str, requirement: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("log.ulg").write_bytes(b"ULog\x01\x12\x35")
+    (line,) = printed_by(command, capsys, monkeypatch)
+    assert line.startswith("fantwin: ")
+    assert line.endswith(f": {how_to_install(requirement)}")
+    assert requirement.removeprefix("fantwin") in line
+
+
+CONFIGURATION = """
+run_folder = "{folder}"
+bus = {{ endpoint = "tcp/127.0.0.1:1" }}
+{launcher}
+[[tray]]
+name = "broker"
+fans = 1
+source = {{ kind = "mqtt", host = "127.0.0.1", topic = "a" }}
+[[tray]]
+name = "drive"
+fans = 1
+source = {{ kind = "modbus", host = "127.0.0.1", fan = [{{ speed = {{ address = 0 }}, command = {{ address = 1 }} }}] }}
+[[tray]]
+name = "server"
+fans = 1
+source = {{ kind = "redfish", url = "https://127.0.0.1" }}
+[opcua]
+[mqtt]
+host = "127.0.0.1"
+[notifier]
+target = [{{ name = "mail", url_file = "url" }}]
+"""
+NAMED = '[launcher]\nstages = ["acquisition", "viewer", "opcua", "mqtt", "notifier"]\n'
+
+
+@pytest.mark.usefixtures("without_extras")
+def test_doctor_prints_what_each_source_and_stage_lacks(capsys, monkeypatch):
+    Path("fantwin.toml").write_text(CONFIGURATION.format(folder=Path.cwd(), launcher=NAMED))
+    lines = printed_by("doctor --listen-s 0", capsys, monkeypatch)
+    for what, extra in {
+        **{f"source {kind}": "devices" for kind in ("mqtt", "modbus", "redfish")},
+        **{f"stage {stage}": "outputs" for stage in ("opcua", "mqtt")},
+        "target mail: apprise": "outputs",
+        "stage viewer": "view",
+    }.items():
+        hint = f"{what} needs the extra `{extra}`: {how_to_install(f'fantwin[{extra}]')}"
+        assert [line for line in lines if line.startswith("FIX") and line.endswith(hint)], what
+
+
+CHECKOUT = {"url": "file:///home/me/fantwin%20one", "dir_info": {"editable": True}}
+THERE = "in /home/me/fantwin one"
+WHEEL = {"url": "file:///tmp/fantwin-1-py3-none-any.whl", "archive_info": {}}
+
+
+@pytest.mark.parametrize(
+    ("environment", "origin", "active", "has_pip", "requirement", "command"),
+    [
+        (
+            "/home/me/fantwin one/.venv",
+            CHECKOUT,
+            False,
+            True,
+            "fantwin[view]",
+            f"{THERE}: .venv/bin/pip install -e '.[view]'",
+        ),
+        ("/venv", CHECKOUT, False, True, "torch", f"{THERE}: /venv/bin/pip install torch"),
+        ("/venv", WHEEL, True, True, "fantwin[view]", "pip install 'fantwin[view]'"),
+        ("/venv", {}, True, True, "fantwin[view]", "pip install 'fantwin[view]'"),
+        ("/venv", {}, False, True, "fantwin[view]", "/venv/bin/pip install 'fantwin[view]'"),
+        ("/venv", {}, False, False, "fantwin[view]", f"uv pip install --python {sys.executable} 'fantwin[view]'"),
+        ("PIPX", WHEEL, False, False, "fantwin[view]", "pipx runpip fantwin install 'fantwin[view]'"),
+        ("UV", {}, False, False, "fantwin[view]", "uv tool install 'fantwin[view]'"),
+        ("UV", WHEEL, False, False, "fantwin[view]", f"uv tool install 'fantwin[view] @ {WHEEL['url']}'"),
+        ("UV", {}, False, False, "torch", "uv tool install fantwin --with torch"),
+    ],
+)
+def test_the_command_fits_the_way_fantwin_was_installed(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    environment: str,
+    origin: dict[str, Any],
+    active: bool,
+    has_pip: bool,
+    requirement: str,
+    command: str,
+) -> None:
+    marker = {"PIPX": "pipx_metadata.json", "UV": "uv-receipt.toml"}.get(environment)
+    if marker:
+        environment = str(tmp_path / "fantwin")
+        (tmp_path / "fantwin").mkdir()
+        (tmp_path / "fantwin" / marker).touch()
+
+    class Installed:
+        def read_text(self, name: str) -> str | None:
+            assert name == "direct_url.json"
+            return json.dumps(origin) if origin else None
+
+    monkeypatch.setattr(extras, "distribution", lambda _: Installed())
+    monkeypatch.setattr(extras, "is_installed", lambda _: has_pip)
+    monkeypatch.setattr(sys, "prefix", environment)
+    monkeypatch.setenv("VIRTUAL_ENV", environment if active else "")
+    assert how_to_install(requirement) == command
