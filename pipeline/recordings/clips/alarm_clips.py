@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from pipeline.recordings.clips.clip import NOT_A_LIST, clips_in, list_path
+from pipeline.recordings.clips.clip import NOT_A_LIST, Clip, clips_in, list_path
 from pipeline.recordings.clips.cutting import LEAD_NS
 from pipeline.recordings.clips.tracker import LONGEST_NS, RETRY_NS, ClipTracker
 from pipeline.recordings.clips.worker import ClipMaker
@@ -69,6 +69,10 @@ class AlarmClips:
         """The end of the first clip that may be deleted; None: there is none."""
         clip = self._tracker.oldest_acknowledged
         return clip.until_ns if clip else None
+
+    def unacknowledged_before(self, t_ns: float) -> list[Clip]:
+        """The clips from before this time that wait until their alarms are acknowledged."""
+        return [clip for clip in self._tracker.clips if clip.until_ns < t_ns and not clip.is_acknowledged]
 
     def delete_oldest_acknowledged(self) -> str | None:
         """Delete the first clip that may be deleted, and give its name; None if there is none."""
