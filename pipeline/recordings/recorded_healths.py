@@ -23,7 +23,7 @@ class _Session:
 
 
 class RecordedHealths:
-    """Records the first and the last health of a session, one each HEALTH_S, and each that reports something new: another
+    """Takes the first and the last health of a session, one each HEALTH_S, and each that reports something new: another
     status or problem, more losses."""
 
     def __init__(self) -> None:

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.recordings.clips.clip import CLIPS
 from pipeline.recordings.rare_messages import last_message_ns
 from pipeline.recordings.reading import RecordingError, read_metadata
 from pipeline.recordings.records import ACTIVE_SUFFIX
-from pipeline.recordings.run_recordings import RECORDING_KEY
+from pipeline.recordings.run_recordings import CLIPS, RECORDING_KEY
 
 SUFFIX = ".mcap"
 
