@@ -132,7 +132,8 @@ class Recorder(Core):
             if not self._healths.is_due(item, item.message):
                 return ()
             self._is_urgent |= bool(item.message.problem)
-        self._is_urgent |= item.topic in URGENT
+        elif item.topic in URGENT:
+            self._is_urgent = True
         self._record(item)
         if self._clips and item.topic == "alarm":
             self._clips.add(item)
@@ -245,7 +246,8 @@ class Recorder(Core):
 
     def _is_flush_due(self) -> bool:
         """Whether a message would be unflushed for too long at the next tick; not at every tick behind a backlog."""
-        is_soon = self._is_urgent or self._unflushed_bytes >= FLUSH_BYTES
+        is_clip_running = self._clips is not None and self._clips.is_running
+        is_soon = self._is_urgent or is_clip_running or self._unflushed_bytes >= FLUSH_BYTES
         flush_ns = self._soon_ns if is_soon else self._flush_ns
         return (
             self._unflushed_ns is not None

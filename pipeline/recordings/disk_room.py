@@ -10,12 +10,14 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
+from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.recordings.clips.alarm_clips import AlarmClips
+from pipeline.recordings.disk import Disk
 from pipeline.recordings.open_part import PartsFolder
 from pipeline.recordings.recorder_config import PARTS_WITHIN_LIMITS, RecorderConfig
-from pipeline.recordings.stored_recordings import Stored, StoredPart
+from pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
 from schemas.units import NS_PER_S
 
 DAY_NS = 86_400 * NS_PER_S
@@ -98,12 +100,7 @@ class DiskRoom:
         """What recordings take of what they may, for people; empty before the first look."""
         if not self._limit_bytes:
             return []
-        used, limit = self._stored.finished_bytes + self._stored.open_bytes, self._limit_bytes
-        line = f"recordings: {in_bytes(used)} of {in_bytes(limit)}"
-        days = (self._now_ns - self._stored.parts[0].last_ns) / DAY_NS if self._stored.parts else 0.0
-        if self._config.keep_days:
-            line += f", {max(0.0, days):.1f} of {self._config.keep_days:g} days"
-        return [line, *filter(None, [self._beyond])]
+        return [usage(self._stored, self._limit_bytes, self._config, self._now_ns), *filter(None, [self._beyond])]
 
     def _is_too_much(self) -> bool:
         stored = self._stored
@@ -150,6 +147,22 @@ class DiskRoom:
             self._beyond = f"{self._too_much()}, and nothing may be deleted: acknowledge alarms, or allow more"
         if self._beyond and not before:
             _LOG.warning("%s", self._beyond)
+
+
+def usage(stored: Stored, limit_bytes: int, config: RecorderConfig, now_ns: int) -> str:
+    """What recordings take of what they may, in words."""
+    line = f"recordings: {in_bytes(stored.finished_bytes + stored.open_bytes)} of {in_bytes(limit_bytes)}"
+    if not config.keep_days:
+        return line
+    days = (now_ns - stored.parts[0].last_ns) / DAY_NS if stored.parts else 0.0
+    return f"{line}, {max(0.0, days):.1f} of {config.keep_days:g} days"
+
+
+def usage_of(folder: Path, config: RecorderConfig, now_ns: int) -> str:
+    """The same of a folder, which need not exist. OSError or DiskError if it cannot be read."""
+    existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    stored = StoredRecordings(folder).look() if existing == folder else Stored()
+    return usage(stored, round(Disk(existing).size_bytes() * config.keep_share_of_disk), config, now_ns)
 
 
 def in_bytes(size: float) -> str:

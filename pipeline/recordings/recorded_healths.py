@@ -9,7 +9,7 @@ from schemas.envelope import Envelope
 from schemas.health import Health
 from schemas.units import NS_PER_S
 
-HEALTH_S = 600
+HEALTH_S = 3600
 """at least one in this time is recorded of each session"""
 _NUMBERS = re.compile(r"[\d.,]+")
 

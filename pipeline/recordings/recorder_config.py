@@ -37,10 +37,11 @@ class RecorderConfig(StageConfig):
         "SHARD.NAME.mcap",
     )
     flush_interval_s: float = Field(
-        default=60.0,
+        default=120.0,
         gt=0,
         description="a crash of the machine loses at most this much; what fills "
-        f"{FLUSH_BYTES >> 10} KiB earlier, or is an alarm, a request or a problem, is flushed after {FLUSH_S:g} s",
+        f"{FLUSH_BYTES >> 10} KiB earlier, or is an alarm, a request or a problem, or is "
+        f"needed for a clip, is flushed after {FLUSH_S:g} s",
     )
     part_bytes: int = Field(default=100_000_000, ge=0, description="a new part begins at this size; 0: never")
     part_s: float = Field(default=0.0, ge=0, description="a new part begins after this time; 0: never")

@@ -88,6 +88,11 @@ class AlarmClips:
         since_ns = self._tracker.needed_since_ns
         return since_ns is not None and since_ns - LEAD_NS <= last_ns
 
+    @property
+    def is_running(self) -> bool:
+        """Whether a clip is still to be cut."""
+        return self._tracker.needed_since_ns is not None
+
     def part_deleted(self) -> None:
         """A part that due clips need was deleted, because the disk was full."""
         self._tracker.part_deleted()
