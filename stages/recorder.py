@@ -159,11 +159,10 @@ class Recorder(Core):
             else:
                 self._resume()
         if now_ns - self._limited_ns >= LIMITS_CHECK_NS:
-            self._attempt(self._keep_limits)
+            self._keep_limits()
         if self._part and self._is_full(self._part):
             self._attempt(self._end_part)
-            if not self._problem:
-                self._attempt(self._keep_limits)
+            self._keep_limits()
             if not self._problem:
                 self._attempt(lambda: self._begin({}))
         if self._clips:
@@ -261,7 +260,8 @@ class Recorder(Core):
 
     def _keep_limits(self) -> None:
         self._limited_ns = self._now_ns
-        self._room.keep_limits(self._now_ns)
+        with suppress(DiskError):  # the disk is gone: the next look at the free space says so
+            self._room.keep_limits(self._now_ns)
 
     def _end_part(self, *, has_ended: bool = False) -> None:
         """Finish the open part. It is closed even if this raises RecordingError."""
