@@ -4,7 +4,8 @@ Reads   every topic marked as recorded in schemas/topics.py, of all trays, and t
         of samples those of `topics`, in a large site only raw samples
 Writes  nothing on the bus; a recording of one or more parts, docs/reference/recordings.md
 Units   as in the messages: their bytes are not changed
-Timing  a message survives a crash, also of the machine, at most `flush_interval_s` after its receipt
+Timing  a message survives a crash, also of the machine, at most `flush_interval_s` after its receipt; earlier where
+        much is received, or something happens. Of healths those are recorded that report something new
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from pipeline.recordings.metadata import recording_metadata
 from pipeline.recordings.open_part import OpenPart, PartsFolder
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import LEFT_OUT_KEY, RecordingError
-from pipeline.recordings.recorder_config import FLUSH_S, RecorderConfig, flush_interval_s, recorded_topics
+from pipeline.recordings.recorded_healths import RecordedHealths
+from pipeline.recordings.recorder_config import CLIPS_SHARE, FLUSH_BYTES, FLUSH_S, RecorderConfig, recorded_topics
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from schemas.envelope import Envelope
@@ -45,6 +47,12 @@ TICK_NS = 50_000_000
 """about the time between ticks"""
 DISK_CHECK_NS = NS_PER_S
 """how often the free space is checked"""
+LIMITS_CHECK_NS = 10 * NS_PER_S
+"""how often the limits of days and bytes are checked; and before each part"""
+URGENT = ("alarm", "request", "twin")
+"""topics whose messages are on the disk within FLUSH_S"""
+CLIP_SETTLED_S = 2.0
+"""after the end of a clip, for what comes late; it then waits until all of that is on the disk"""
 ROOM_TO_RESUME = 1 << 20
 """bytes that must be free beyond the minimum to resume, so that recording does not pause again at once"""
 KEEPS = STAGES[RECORDER].keeps
@@ -65,18 +73,18 @@ class Recorder(Core):
         config: RecorderConfig,
         now_ns: int,
         left_out: Collection[str] = (),
-        flush_s: float = FLUSH_S,
         clips: AlarmClips | None = None,
     ) -> None:
         """Begin the first part, at `now_ns`. If the disk is full or gone, wait for it. left_out: topics that are not
-        recorded on purpose. flush_s: how often it flushes. clips: of alarms; None: no clips are kept.
+        recorded on purpose. clips: of alarms; None: no clips are kept.
 
         Raises:
             RecordingError: nothing can be recorded there.
         """
         self._parts = parts
         self._config = config
-        self._flush_ns = round(flush_s * NS_PER_S)
+        self._flush_ns = round(config.flush_interval_s * NS_PER_S)
+        self._soon_ns = min(self._flush_ns, round(FLUSH_S * NS_PER_S))
         self._clips = clips
         self._room = DiskRoom(parts, config, clips)
         self._part: OpenPart | None = None
@@ -89,13 +97,19 @@ class Recorder(Core):
         self._counts: Counter[str] = Counter(lost_unwritten=0)
         self._held = HeldMessages()
         self._interference = Interference()
+        self._healths = RecordedHealths()
         self._lost_in_pause = 0
         self._problem = self._paused_because = ""
         self._now_ns = self._paused_ns = self._began_ns = self._checked_ns = now_ns
+        self._limited_ns = now_ns - LIMITS_CHECK_NS
         self._flushed_ns = 0
         self._unflushed_ns: int | None = None
         """time of receipt of the oldest message that may not be on the disk yet"""
+        self._unflushed_bytes = 0
+        self._is_urgent = False
+        """something has happened that is to be on the disk soon"""
         try:
+            self._keep_limits()
             shortage = self._room.shortage(0)
             if not shortage:
                 self._begin({})
@@ -115,6 +129,11 @@ class Recorder(Core):
             return ()
         if isinstance(item.message, Health):
             self._count_duplicated(item.message)
+            if not self._healths.is_due(item, item.message):
+                return ()
+            self._is_urgent |= bool(item.message.problem)
+        elif item.topic in URGENT:
+            self._is_urgent = True
         self._record(item)
         if self._clips and item.topic == "alarm":
             self._clips.add(item)
@@ -123,7 +142,7 @@ class Recorder(Core):
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Flush, begin a new part and check the disk when each is due."""
         if now_ns < self._now_ns - DISK_CHECK_NS:  # the host's clock was set back: restart all intervals
-            self._checked_ns = self._began_ns = now_ns
+            self._checked_ns = self._began_ns = self._limited_ns = now_ns
             self._paused_ns = min(self._paused_ns, now_ns)
             self._interference.clock_set_back(now_ns)
             self._flushed_ns = now_ns - self._flush_ns
@@ -131,6 +150,7 @@ class Recorder(Core):
         self._now_ns = now_ns
         if self._part and self._is_flush_due():
             self._unflushed_ns, self._flushed_ns = None, now_ns
+            self._unflushed_bytes, self._is_urgent = 0, False
             self._attempt(self._part.flush)
         if now_ns - self._checked_ns >= DISK_CHECK_NS:
             self._checked_ns = now_ns
@@ -138,8 +158,11 @@ class Recorder(Core):
                 self._check_disk()
             else:
                 self._resume()
+        if now_ns - self._limited_ns >= LIMITS_CHECK_NS:
+            self._keep_limits()
         if self._part and self._is_full(self._part):
             self._attempt(self._end_part)
+            self._keep_limits()
             if not self._problem:
                 self._attempt(lambda: self._begin({}))
         if self._clips:
@@ -176,9 +199,10 @@ class Recorder(Core):
         return {**written, **self._counts, **self._room.counts, **self._interference.counts, **of_clips}
 
     def notes(self) -> Sequence[str]:
-        """Which topics are left out on purpose."""
+        """What recordings take of what they may, and which topics are left out on purpose."""
         left_out = ", ".join(self._ledger.left_out)
-        return [f"not recorded: {left_out} (recorder.topics)"] if left_out else []
+        of_topics = [f"not recorded: {left_out} (recorder.topics)"] if left_out else []
+        return [*self._room.notes(), *of_topics]
 
     def unsaved(self) -> Sequence[Envelope]:
         """Messages that are not flushed to the disk yet."""
@@ -198,6 +222,7 @@ class Recorder(Core):
             return
         if self._unflushed_ns is None:
             self._unflushed_ns = min(envelope.received_t_ns, self._now_ns)
+        self._unflushed_bytes += len(envelope.payload)
         part = self._part
         self._attempt(lambda: part.add(envelope))
 
@@ -220,24 +245,31 @@ class Recorder(Core):
 
     def _is_flush_due(self) -> bool:
         """Whether a message would be unflushed for too long at the next tick; not at every tick behind a backlog."""
+        is_clip_running = self._clips is not None and self._clips.is_running
+        is_soon = self._is_urgent or is_clip_running or self._unflushed_bytes >= FLUSH_BYTES
+        flush_ns = self._soon_ns if is_soon else self._flush_ns
         return (
             self._unflushed_ns is not None
-            and self._now_ns - self._unflushed_ns >= self._flush_ns - TICK_NS
-            and self._now_ns - self._flushed_ns >= self._flush_ns / 4
+            and self._now_ns - self._unflushed_ns >= flush_ns - TICK_NS
+            and self._now_ns - self._flushed_ns >= flush_ns / 4
         )
 
     def _is_full(self, part: OpenPart) -> bool:
-        config = self._config
-        return bool(
-            (config.part_bytes and part.size >= config.part_bytes)
-            or (config.part_s and self._now_ns - self._began_ns >= config.part_s * NS_PER_S)
-        )
+        room = self._room
+        return part.size >= room.part_bytes or self._now_ns - self._began_ns >= room.part_s * NS_PER_S
+
+    def _keep_limits(self) -> None:
+        self._limited_ns = self._now_ns
+        with suppress(DiskError):  # the disk is gone: the next look at the free space says so
+            self._room.keep_limits(self._now_ns)
 
     def _end_part(self, *, has_ended: bool = False) -> None:
         """Finish the open part. It is closed even if this raises RecordingError."""
         if self._part is None:
             return
         try:
+            for health in self._healths.take_waiting():
+                self._part.add(health)
             self._part.finish(has_ended=has_ended)
         finally:
             self._release_part()
@@ -249,6 +281,7 @@ class Recorder(Core):
             self._lost_in_pause += self._part.lost
             self._ledger = self._ledger.as_lost() if self._part.lost else self._ledger.for_next_part()
             unwritten, self._part, self._unflushed_ns = self._part.pending, None, None
+            self._unflushed_bytes, self._is_urgent = 0, False
             self._hold(unwritten)
 
     def _hold(self, unwritten: Sequence[Envelope]) -> None:
@@ -322,8 +355,7 @@ def build(context: Context) -> BuiltStage:
     """
     config: RecorderConfig = context.config
     metadata, attachments = recording_metadata(context)
-    flush_s = flush_interval_s(config, context.trays)
-    metadata["flush_interval_s"] = f"{flush_s:g}"
+    metadata["flush_interval_s"] = f"{config.flush_interval_s:g}"
     reads = STAGE.reads if context.reads is None else context.reads
     left_out = tuple(name for name in STAGE.reads if name not in reads)
     if left_out:
@@ -349,15 +381,16 @@ def build(context: Context) -> BuiltStage:
             )
         own = {tray_key(context.site, tray.name, topic) for tray in context.trays for topic in KEEPS}
         kept = {key: last for topic in KEEPS for key, last in parts.last_messages(topic).items() if key in own}
-        clips = _clips_of(parts, config, flush_s) if config.clips else None
-        return BuiltStage(Recorder(parts, config, context.started_t_ns, left_out, flush_s, clips), kept=kept)
+        clips = _clips_of(parts, config) if config.clips else None
+        return BuiltStage(Recorder(parts, config, context.started_t_ns, left_out, clips), kept=kept)
     except RecordingError as error:
         raise StageError(f"{error} (recorder.file)") from error
 
 
-def _clips_of(parts: RecordingParts, config: RecorderConfig, flush_s: float) -> AlarmClips:
-    tracker = tracker_of(parts.path, config.clip_before_s, config.clip_after_s, config.clip_bytes, flush_s + 1.0)
-    worker = ClipWorker(parts.path, config.min_free_bytes, parts.free_bytes, others_make_room=config.delete_oldest)
+def _clips_of(parts: RecordingParts, config: RecorderConfig) -> AlarmClips:
+    most_bytes = round(parts.disk_bytes() * config.keep_share_of_disk * CLIPS_SHARE)
+    tracker = tracker_of(parts.path, config.clip_before_s, config.clip_after_s, most_bytes, CLIP_SETTLED_S)
+    worker = ClipWorker(parts.path, config.min_free_bytes, parts.free_bytes)
     clips = AlarmClips(tracker, worker)
     if parts.last_part:
         clips.continue_after(parts.last_part)

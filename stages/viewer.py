@@ -35,9 +35,11 @@ class ViewerConfig(StageConfig):
     """Section `[viewer]`."""
 
     file: str = Field(
-        default="view.rrd",
-        description='file in run_folder for the view; an older file is kept, and view-2.rrd is written; "": no file',
+        default="",
+        description='file in run_folder for the view, such as "view.rrd"; an older file is kept, and view-2.rrd is '
+        'written; "": no file, `fantwin view` makes one from a recording',
     )
+    file_bytes: int = Field(default=1_000_000_000, ge=1_000_000, description="the file of the view ends at this size")
     serve: bool = Field(default=True, description="serve live viewers on this host (127.0.0.1)")
     grpc_port: int = Field(
         default=9876,
@@ -109,6 +111,7 @@ def build(context: Context) -> BuiltStage:
         alarm_plots=config.alarm_plots,
         alarm_plot_hold_s=config.alarm_plot_hold_s,
         memory_limit=config.memory_limit,
+        file_bytes=config.file_bytes,
     )
     core = view_of_site(
         context.site,
@@ -134,6 +137,8 @@ def check(context: Context) -> list[str]:
     """Report a missing extra, fans to show that do not exist, and ports that another program has taken."""
     config: ViewerConfig = context.config
     problems = list(filter(None, [missing_extra("stage viewer", "view", "rerun")]))
+    if not (config.file or config.serve):
+        problems.append("viewer.serve = false and no viewer.file: nothing would be shown; set one of them")
     try:
         shown_fans(config.show, context.trays)
     except StageError as error:
@@ -154,7 +159,7 @@ def topics_read(config: ViewerConfig, trays: Sequence[TrayConfig]) -> tuple[str,
 
 STAGE = Stage(
     name="viewer",
-    about="shows measured speed, twin, band, alarms and states live in Rerun, and keeps them in a file",
+    about="shows measured speed, twin, band, alarms and states live in Rerun, and in a file if one is asked for",
     reads=READS,
     writes=(),
     config=ViewerConfig,

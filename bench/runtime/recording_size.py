@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from pipeline.config.loading import parse_config
 from pipeline.recordings.reading import read_recording
-from pipeline.recordings.recorder_config import FLEET_FLUSH_S, FLUSH_S, MOST_FANS_RECORDED_WHOLE, SAMPLES
+from pipeline.recordings.recorder_config import FLUSH_BYTES, FLUSH_S, SAMPLES, RecorderConfig
 from pipeline.recordings.writing import RecordingWriter
 from schemas.envelope import Envelope
 from schemas.messages import ScorerSnapshot
@@ -74,11 +74,8 @@ def fast_rows(twin: Path, folder: Path) -> list[dict[str, Any]]:
         run = rough_run(3, seconds, fans, fan_variation=0.0).run
         for block_s in BLOCKS_S:
             whole = list(read_recording(site_recording(run, block_s, twin, folder)))
-            flush_s = FLUSH_S if fans <= MOST_FANS_RECORDED_WHOLE else FLEET_FLUSH_S
             sizes = {
-                name: bytes_of_each(
-                    [each for each in whole if each.topic in topics], run.samples * fans, folder, flush_s
-                )
+                name: bytes_of_each([each for each in whole if each.topic in topics], run.samples * fans, folder)
                 for name, topics in recorded.items()
             }
             rows.append({"fans": fans, "message, s": block_s, **sizes})
@@ -99,7 +96,7 @@ def slow_rows(folder: Path) -> list[dict[str, Any]]:
                     (each for first in range(0, site.fans, fans) for each in tray_of(site, first, fans, rate_hz)),
                     key=lambda envelope: envelope.received_t_ns,
                 )
-                found[name] = bytes_of_each(messages, site.samples * site.fans, folder, FLEET_FLUSH_S)
+                found[name] = bytes_of_each(messages, site.samples * site.fans, folder)
             rows.append({"rate, Hz": rate_hz, "fans of a tray": fans, "trays": SLOW_FANS // fans, **found})
     return rows
 
@@ -159,23 +156,25 @@ def snapshots_with_wear(recorded: Sequence[Envelope], points: int) -> list[Envel
     return found
 
 
-def bytes_of_each(envelopes: Sequence[Envelope], things: int, folder: Path, flush_s: float = FLUSH_S) -> float:
+def bytes_of_each(envelopes: Sequence[Envelope], things: int, folder: Path) -> float:
     """Bytes of a file for each of the things in these messages, by what the second half of the messages adds to it."""
     half = len(envelopes) // 2
-    added = size(envelopes, folder, flush_s) - size(envelopes[:half], folder, flush_s)
+    added = size(envelopes, folder) - size(envelopes[:half], folder)
     return added / (things * (1.0 - half / len(envelopes)))
 
 
-def size(envelopes: Sequence[Envelope], folder: Path, flush_s: float) -> int:
+def size(envelopes: Sequence[Envelope], folder: Path) -> int:
     """Bytes of a file with these messages."""
     path = folder / "size.mcap"
-    flushed_ns = START_NS
+    flushed_ns, unflushed_bytes = START_NS, 0
     with RecordingWriter(path, {}, overwrite=True) as writer:
         for envelope in envelopes:
-            if envelope.received_t_ns - flushed_ns >= flush_s * NS_PER_S:
+            after_s = FLUSH_S if unflushed_bytes >= FLUSH_BYTES else RecorderConfig().flush_interval_s
+            if envelope.received_t_ns - flushed_ns >= after_s * NS_PER_S:
                 writer.flush()
-                flushed_ns = envelope.received_t_ns
+                flushed_ns, unflushed_bytes = envelope.received_t_ns, 0
             writer.add(envelope)
+            unflushed_bytes += len(envelope.payload)
     return path.stat().st_size
 
 

@@ -183,10 +183,18 @@ class Disk:
         Raises:
             DiskError: the disk is not there.
         """
+        found = self._state()
+        return found.f_bavail * found.f_frsize
+
+    def size_bytes(self) -> int:
+        """Size of its file system. Raises DiskError as `free_bytes` does."""
+        found = self._state()
+        return found.f_blocks * found.f_frsize
+
+    def _state(self) -> os.statvfs_result:
         try:
             if not self.is_mounted():
                 raise DiskError(f"{self._mounted_at}: the disk is no longer mounted; mount it again")
-            found = os.statvfs(self._mounted_at)
+            return os.statvfs(self._mounted_at)
         except OSError as error:
             raise DiskError(f"{self._mounted_at}: the disk cannot be used: {error.strerror}; mount it again") from error
-        return found.f_bavail * found.f_frsize

@@ -5,20 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from pipeline.recordings.index import PartIndex
 from pipeline.recordings.sequence_ledger import SequenceLedger
+from pipeline.recordings.stored_recordings import Stored, StoredPart
 from schemas.envelope import Envelope
 from schemas.streams import StreamId
-
-
-class OldPart(NamedTuple):
-    """A finished part."""
-
-    name: str
-    last_ns: int
-    """when its last message was received"""
 
 
 class OpenPart(Protocol):
@@ -49,5 +42,6 @@ class PartsFolder(Protocol):
     def before(self) -> Mapping[StreamId, int]: ...  # noqa: D102
     def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> OpenPart: ...  # noqa: D102
     def free_bytes(self) -> int: ...  # noqa: D102
-    def oldest_part(self) -> OldPart | None: ...  # noqa: D102
-    def delete_oldest(self) -> str | None: ...  # noqa: D102
+    def disk_bytes(self) -> int: ...  # noqa: D102
+    def stored(self) -> Stored: ...  # noqa: D102
+    def delete(self, part: StoredPart) -> bool: ...  # noqa: D102

@@ -7,7 +7,7 @@ is repaired, and the next part continues it.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import islice
@@ -15,8 +15,7 @@ from pathlib import Path
 
 from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
-from pipeline.recordings.open_part import OldPart
-from pipeline.recordings.rare_messages import last_message_ns, last_messages
+from pipeline.recordings.rare_messages import last_messages
 from pipeline.recordings.reading import RecordingError, read_metadata
 from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.repair import (
@@ -28,6 +27,7 @@ from pipeline.recordings.repair import (
 )
 from pipeline.recordings.run_recordings import RECORDING_KEY
 from pipeline.recordings.sequence_ledger import SequenceLedger
+from pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
 from pipeline.recordings.writing import RecordingWriter
 
 PARTS_SEARCHED = 3
@@ -81,6 +81,7 @@ class RecordingParts:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._disk = Disk(path.parent)
+            self._stored = StoredRecordings(path.parent)
             self._repair()
             self._number = max((number for number, _ in part_files(self.path)), default=0)
         except OSError as error:
@@ -142,24 +143,24 @@ class RecordingParts:
         """
         return self._disk.free_bytes()
 
-    def oldest_part(self) -> OldPart | None:
-        """The oldest finished part; None if there is none."""
-        path = next(self._finished(), None)
-        return None if path is None else OldPart(path.name, last_message_ns(path))
+    def disk_bytes(self) -> int:
+        """Size of the disk. Raises DiskError as `free_bytes` does."""
+        return self._disk.size_bytes()
 
-    def delete_oldest(self) -> str | None:
-        """Delete the oldest finished part and give its name; None if there is none."""
-        for path in self._finished():
-            with suppress(OSError):
-                path.unlink()
-                return path.name
-        return None
+    def stored(self) -> Stored:
+        """What recordings and clips there are in the folder; nothing if it cannot be read."""
+        try:
+            return self._stored.look()
+        except OSError:
+            return Stored()
 
-    def _finished(self) -> Iterator[Path]:
-        """The finished parts of this recording, the oldest first."""
-        for _, path in sorted(part_files(self.path)):
-            if path.suffix == self.path.suffix and self._is_ours(path):
-                yield path
+    def delete(self, part: StoredPart) -> bool:
+        """Delete a finished part; False: it cannot be deleted."""
+        try:
+            part.path.unlink(missing_ok=True)
+        except OSError:
+            return False
+        return True
 
     def _is_ours(self, path: Path) -> bool:
         try:

@@ -11,56 +11,65 @@ from pipeline.config.models import TrayConfig, nearest
 from pipeline.runtime.stage import StageConfig
 from schemas.topics import BY_NAME, TOPICS
 
-MOST_FANS_RECORDED_WHOLE = 64
-"""of a site, without `topics`: a larger site makes gigabytes an hour of what a replay makes again"""
-FLUSH_S, FLEET_FLUSH_S = 1.0, 5.0
-"""up to MOST_FANS_RECORDED_WHOLE fans, and above: at 1 Hz a chunk of one second holds nothing that repeats"""
+FLUSH_S, FLUSH_BYTES = 1.0, 64 << 10
+"""what waits in memory is flushed after this time if it is more than this, or if something has happened"""
+PARTS_WITHIN_LIMITS = 8
+"""a new part begins after this share of each limit, because only whole parts are deleted"""
 RECORDED = tuple(topic.name for topic in TOPICS if topic.recorded)
 SAMPLES = tuple(name for name in RECORDED if BY_NAME[name].has_samples)
 """the topics that may be left out"""
 RAW = "raw"
+CLIPS_SHARE = 0.5
+"""of what recordings and clips may take: more is not kept of clips whose alarms wait to be acknowledged"""
 
 
 class RecorderConfig(StageConfig):
     """Section `[recorder]`."""
 
-    topics: tuple[str, ...] | None = Field(
-        default=None,
-        description=f"which topics of samples are recorded, of {', '.join(SAMPLES)}; all others always are. Without it "
-        f"all of them up to {MOST_FANS_RECORDED_WHOLE} fans of the site, and {RAW} above that",
+    topics: tuple[str, ...] = Field(
+        default=(RAW,),
+        description=f"which topics of samples are recorded, of {', '.join(SAMPLES)}; all others always are. From {RAW} "
+        "`fantwin view`, `plot` and `replay --offline` make the rest again",
     )
     file: Path = Field(
         default=Path("recording.mcap"),
         description="relative to run_folder; its parts are NAME.mcap, NAME-2.mcap and so on, of a shard "
         "SHARD.NAME.mcap",
     )
-    flush_interval_s: float | None = Field(
-        default=None,
+    flush_interval_s: float = Field(
+        default=120.0,
         gt=0,
-        description=f"a crash loses at most this much; without it {FLUSH_S:g}, and {FLEET_FLUSH_S:g} where a recorder "
-        f"has more than {MOST_FANS_RECORDED_WHOLE} fans",
+        description="a crash of the machine loses at most this much; what fills "
+        f"{FLUSH_BYTES >> 10} KiB earlier, or is an alarm, a request or a problem, or is "
+        f"needed for a clip, is flushed after {FLUSH_S:g} s",
     )
     part_bytes: int = Field(default=100_000_000, ge=0, description="a new part begins at this size; 0: never")
     part_s: float = Field(default=0.0, ge=0, description="a new part begins after this time; 0: never")
-    min_free_bytes: int = Field(default=100_000_000, ge=0, description="free space to leave on the disk")
-    delete_oldest: bool = Field(
-        default=False, description="make room by deleting the oldest parts of this recording, instead of pausing"
+    keep_days: float = Field(
+        default=14.0, ge=0, description="recordings are deleted when they are older; 0: they are kept for any time"
+    )
+    keep_share_of_disk: float = Field(
+        default=0.10,
+        gt=0,
+        le=1,
+        description="most space for all recordings of the folder with their clips, as a share of the disk; beyond it "
+        "the oldest are deleted",
+    )
+    min_free_bytes: int = Field(
+        default=100_000_000,
+        ge=0,
+        description="free space to leave on the disk: below it the oldest recordings are deleted, and without any, "
+        "recording pauses",
     )
 
     clips: bool = Field(default=True, description="keep a clip of each alarm, in the folder clips beside the recording")
     clip_before_s: float = Field(default=60.0, ge=0, le=600, description="how long before the alarm a clip begins")
     clip_after_s: float = Field(default=60.0, ge=0, le=600, description="how long after the alarm a clip ends")
-    clip_bytes: int = Field(
-        default=1_000_000_000,
-        ge=0,
-        description="most space for all clips together; beyond it the oldest clips are deleted, but only those whose "
-        "alarms are acknowledged; 0: no limit",
-    )
 
     @field_validator("topics")
     @classmethod
-    def _known(cls, value: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        for name in value or ():
+    def _known(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for name in value:
             if name not in RECORDED:
                 raise ValueError(f"unknown topic {name!r}{nearest(name, SAMPLES)}")
             if name not in SAMPLES:
@@ -83,15 +92,6 @@ class RecorderConfig(StageConfig):
 
 
 def recorded_topics(config: RecorderConfig, trays: Sequence[TrayConfig]) -> tuple[str, ...]:
-    """The topics that are recorded of a site with these trays."""
-    samples = config.topics
-    if samples is None:
-        samples = SAMPLES if sum(tray.fans for tray in trays) <= MOST_FANS_RECORDED_WHOLE else (RAW,)
-    return tuple(name for name in RECORDED if name in samples or name not in SAMPLES)
-
-
-def flush_interval_s(config: RecorderConfig, trays: Sequence[TrayConfig]) -> float:
-    """How often a recorder that has these trays flushes to the disk."""
-    if config.flush_interval_s is not None:
-        return config.flush_interval_s
-    return FLUSH_S if sum(tray.fans for tray in trays) <= MOST_FANS_RECORDED_WHOLE else FLEET_FLUSH_S
+    """The topics that are recorded."""
+    del trays
+    return tuple(name for name in RECORDED if name in config.topics or name not in SAMPLES)

@@ -12,6 +12,9 @@ from pipeline.recordings.records import ACTIVE_SUFFIX
 RECORDING_KEY = "recording"
 """in the metadata of what a recorder writes: the name of its first part"""
 
+CLIPS = "clips"
+"""the folder of clips, beside the recording"""
+
 
 def recorded_files(paths: Iterable[Path], *, with_unfinished: bool = False) -> list[Path]:
     """The files, and in the place of a folder the parts of all recordings that recorders have finished there.

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, fields, replace
 
 from schemas.health import Health
 from schemas.streams import StreamId, StreamState, output_streams
-from schemas.topics import topic_of
+from schemas.topics import HEALTH, topic_of
 
 LEDGER_NAME = "fantwin.ledger"
 """the metadata record, after the last message, that holds a finished ledger"""
@@ -55,6 +55,8 @@ class SequenceLedger:
         self._streams = {
             stream: StreamState(sequence) for stream, sequence in (before or {}).items() if self._is_recorded(stream[0])
         }
+        self._thinned = set(filter(_is_thinned, self._streams))
+        """streams of which not every message is recorded, so that a gap is no loss"""
         self._published: dict[StreamId, int] = {}
 
     @property
@@ -67,6 +69,8 @@ class SequenceLedger:
         """Count a recorded message. The card of a twin is repeated at the start of each part and counts once."""
         stream = (key, producer)
         state = self._streams.get(stream) or self._state(stream)
+        if stream in self._thinned and state.next_sequence is not None:
+            state.next_sequence = max(sequence, state.next_sequence)
         if key.endswith("/twin") and state.is_duplicate(sequence):
             return
         counts = self.counts.get(stream)
@@ -95,6 +99,8 @@ class SequenceLedger:
         """A received message will not be recorded: it is missing as soon as a later one is recorded, or at the end."""
         stream = (key, producer)
         state = self._state(stream)
+        if stream in self._thinned:
+            return
         if state.next_sequence is None:
             state.skip_to(sequence)
         self._published[stream] = max(sequence + 1, self._published.get(stream, 0))
@@ -149,6 +155,8 @@ class SequenceLedger:
         state = self._streams.get(stream)
         if state is None:
             state = self._streams[stream] = StreamState()
+            if _is_thinned(stream):
+                self._thinned.add(stream)
         return state
 
 
@@ -230,6 +238,14 @@ def sum_by_key(streams: Iterable[tuple[StreamId, StreamCounts]]) -> dict[str, St
             total.first_ns = min(counts.first_ns, total.first_ns if total.first_ns is not None else counts.first_ns)
             total.last_ns = max(counts.last_ns, total.last_ns or 0)
     return dict(sorted(found.items()))
+
+
+def _is_thinned(stream: StreamId) -> bool:
+    """Whether it is of healths, of which a recorder takes those that say something new."""
+    try:
+        return topic_of(stream[0]).name == HEALTH
+    except KeyError:
+        return False
 
 
 def _stream(name: str) -> StreamId:

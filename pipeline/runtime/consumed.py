@@ -24,7 +24,8 @@ from schemas.topics import BY_NAME
 from schemas.units import NS_PER_S
 
 CONSUMED = "consumed"
-PERIOD_NS = 10 * NS_PER_S
+PERIOD_NS = 120 * NS_PER_S
+"""about as long as a recorder takes to flush a slow line"""
 
 
 @dataclass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import subprocess
 import sys
 import threading
@@ -49,10 +50,10 @@ def rerun_program() -> Path:
     return folder / "Rerun.app/Contents/MacOS/Rerun" if sys.platform == "darwin" else folder / "rerun"
 
 
-def _open_view(file: Path) -> ViewFile:
+def _open_view(file: Path, limit_bytes: float) -> ViewFile:
     path = unused_path(file)
     try:
-        return ViewFile(path)
+        return ViewFile(path, limit_bytes)
     except OSError as error:
         raise StageError(f"{path}: cannot write the view: {error.strerror}; change viewer.file") from error
 
@@ -91,10 +92,12 @@ class RerunSink:
         grpc_port: int | None,
         web_port: int | None,
         memory_limit: str,
+        file_bytes: float = math.inf,
     ) -> None:
         """Open `file`, a data server at `grpc_port` and a page for browsers at `web_port`; None leaves one out.
 
-        layout: which of the layouts is shown. fleet: None shows every fan with its band.
+        file_bytes: the size at which the file ends. layout: which of the layouts is shown. fleet: None shows every fan
+        with its band.
 
         Raises:
             StageError: the file cannot be written, or a port is taken.
@@ -111,7 +114,7 @@ class RerunSink:
         self._wear = RerunWear(self._recording)
         self._layout_name: LayoutName = layout
         self._late = False
-        self._file = _open_view(file) if file is not None else None
+        self._file = _open_view(file, file_bytes) if file is not None else None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
         if self._file is not None:
             # Without a footer, memory does not grow with the file, and the file can be opened after a crash.

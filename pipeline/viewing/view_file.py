@@ -4,6 +4,7 @@ when the disk refuses a write, and every later flush then waits without end.
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import select
@@ -28,11 +29,12 @@ class ViewFile:
     make it unreadable. Whoever writes into the pipe never waits for the disk.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Open an existing file for writing. OSError if that is refused."""
+    def __init__(self, path: Path, limit_bytes: float = math.inf) -> None:
+        """Open an existing file for writing, which ends before it exceeds the limit. OSError if that is refused."""
         self.problem = ""
         """why nothing is written any more; empty if all is well"""
         self._path = path
+        self._room_bytes = limit_bytes
         self._file = path.open("r+b", buffering=0)
         self._read_end, self._write_end = os.pipe()
         self.pipe = Path(f"/dev/fd/{self._write_end}")
@@ -84,6 +86,9 @@ class ViewFile:
         with self._file:
             while piece := self._waiting.get():
                 rest = memoryview(piece)
+                self._room_bytes -= len(piece)
+                if self._room_bytes < 0:
+                    self._stop("it has the size of viewer.file_bytes", "`fantwin view` shows a recording")
                 while rest and not self.problem:
                     try:
                         rest = rest[self._file.write(rest) :]
@@ -91,8 +96,7 @@ class ViewFile:
                         self._stop(error.strerror or str(error))
                 self._waiting.task_done()
 
-    def _stop(self, reason: str) -> None:
+    def _stop(self, reason: str, todo: str = "make room and restart the viewer") -> None:
         self.problem = self.problem or (
-            f"{self._path}: the view is not written any more: {reason}; what is in the file can be opened; make "
-            "room and restart the viewer"
+            f"{self._path}: the view is not written any more: {reason}; what is in the file can be opened; {todo}"
         )

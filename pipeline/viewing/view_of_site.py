@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,8 @@ class ViewOptions:
     alarm_plots: int = 8
     alarm_plot_hold_s: float = 60.0
     memory_limit: str = "256MB"
+    file_bytes: float = math.inf
+    """at which the file ends; the section has a limit"""
 
 
 def view_of_site(
@@ -62,6 +65,7 @@ def view_of_site(
         grpc_port=grpc_port,
         web_port=web_port,
         memory_limit=options.memory_limit,
+        file_bytes=options.file_bytes,
     )
     fleet = None
     if is_fleet:

@@ -9,8 +9,9 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -24,9 +25,10 @@ from pipeline.config.models import ConfigError, TrayConfig
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.disk import DiskError
 from pipeline.recordings.index import PartIndex
-from pipeline.recordings.open_part import OldPart
 from pipeline.recordings.reading import read_metadata, read_recording
+from pipeline.recordings.scan import scan
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
+from pipeline.recordings.stored_recordings import Stored, StoredPart
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.stage import Context, StageError
 from schemas.codec import encode
@@ -44,11 +46,15 @@ NOW_NS = 10 * SECOND_NS
 RAW_KEY = tray_key("plant", "tray1", "raw")
 
 
+def flushing_each_second(config: Mapping[str, Any]) -> RecorderConfig:
+    return RecorderConfig(**{"flush_interval_s": 1.0, **config})
+
+
 def context(folder: Path, tray: TrayConfig | None = None, **config) -> Context:
     return Context(
         site="plant",
         trays=(tray or TrayConfig(name="tray1", fans=2, speed_unit="rpm"),),
-        config=RecorderConfig(**config),
+        config=flushing_each_second(config),
         folder=folder,
         run_folder=folder / "runs",
         started_t_ns=1_800_000_000_250_000_000,
@@ -132,8 +138,8 @@ class Disk:
         self.free = 1 << 40
         self.room = 1 << 40
         self.refuses = False
-        self.oldest: list[str] = []
-        self.oldest_ns = 0
+        self.disk = 1 << 44
+        self.old: list[StoredPart] = []
         self.freed_by_each = 0
         self.gone = ""
 
@@ -148,18 +154,28 @@ class Disk:
             raise DiskError(self.gone)
         return self.free
 
-    def oldest_part(self) -> OldPart | None:
-        return OldPart(self.oldest[0], self.oldest_ns) if self.oldest else None
+    def disk_bytes(self) -> int:
+        return self.disk
 
-    def delete_oldest(self) -> str | None:
-        if not self.oldest:
-            return None
+    def stored(self) -> Stored:
+        return Stored(tuple(self.old), len(self.old) * self.freed_by_each)
+
+    def delete(self, part: StoredPart) -> bool:
         self.free += self.freed_by_each
-        return self.oldest.pop(0)
+        self.old.remove(part)
+        return True
+
+    @property
+    def old_names(self) -> list[str]:
+        return [part.path.name for part in self.old]
+
+
+def old_parts(*names: str, last_ns: int = NOW_NS) -> list[StoredPart]:
+    return [StoredPart(last_ns, number, Path(name)) for number, name in enumerate(names)]
 
 
 def recorder(disk: Disk, **config) -> Recorder:
-    return Recorder(disk, RecorderConfig(**config), NOW_NS)
+    return Recorder(disk, flushing_each_second(config), NOW_NS)
 
 
 def sequences(part: Part) -> list[int]:
@@ -469,26 +485,27 @@ def test_a_recorder_that_starts_on_a_full_disk_waits():
     assert sequences(disk.parts[0]) == [0, 1, 2]
 
 
-def test_the_oldest_parts_are_deleted_one_at_a_time_if_allowed(caplog):
+def test_on_a_full_disk_the_oldest_parts_are_deleted_one_at_a_time(caplog):
     disk = Disk()
-    disk.oldest, disk.freed_by_each = ["r.mcap", "r-2.mcap", "r-3.mcap"], 10_000_000
-    core = recorder(disk, min_free_bytes=50_000_000, delete_oldest=True)
+    disk.old, disk.freed_by_each = old_parts("r.mcap", "r-2.mcap", "r-3.mcap"), 10_000_000
+    core = recorder(disk, min_free_bytes=50_000_000)
     disk.free = 35_000_000
     with caplog.at_level(logging.WARNING):
         for second in range(1, 6):
             core.tick(NOW_NS + second * SECOND_NS)
-    assert disk.oldest == ["r-3.mcap"]
+    assert disk.old_names == ["r-3.mcap"]
     assert core.counters()["parts_deleted"] == 2
-    assert "r-2.mcap: the oldest part was deleted" in caplog.text
+    assert "r-2.mcap, the oldest part, was deleted: the disk runs short" in caplog.text
     assert core.problem() == ""
 
 
 def test_when_there_is_nothing_left_to_delete_it_pauses():
     disk = Disk()
-    core = recorder(disk, delete_oldest=True)
+    disk.old = old_parts("r.mcap")
+    core = recorder(disk)
     disk.free = 1
     core.tick(NOW_NS + SECOND_NS)
-    assert core.problem().startswith("NOTHING IS RECORDED")
+    assert core.problem().startswith("NOTHING IS RECORDED") and disk.old, "the last part is kept"
 
 
 def test_a_new_part_begins_at_the_size_limit():
@@ -582,28 +599,90 @@ def chosen(fans: int, *lines: str) -> set[str]:
     return set(topics) & set(SAMPLES)
 
 
-def test_a_large_site_records_raw_samples_and_leaves_out_what_follows_from_them():
-    assert chosen(32) == set(SAMPLES)
-    assert chosen(33) == {"raw"}
+def test_raw_samples_are_recorded_and_what_follows_from_them_is_left_out():
+    assert chosen(1) == {"raw"}
 
 
-@pytest.mark.parametrize(
-    ("fans", "lines", "flush_s"), [(32, "", 1.0), (33, "", 5.0), (33, "flush_interval_s = 0.5", 0.5)]
-)
-def test_a_recorder_of_many_fans_flushes_less_often(tmp_path, fans, lines, flush_s):
-    trays = "".join(f'[[tray]]\nname = "{name}"\nfans = {fans}\n' for name in ("a", "b"))
-    config = parse_config(trays + "[recorder]\n" + lines, tmp_path / "c.toml", (), ("recorder",))
-    of_site = {"trays": config.trays, "config": config.sections["recorder"], "started_t_ns": NOW_NS}
-    core = STAGE.build(replace(context(tmp_path), **of_site)).core
-    path = next(tmp_path.rglob("recording.mcap.active"))
-    core.step(envelope(raw(0), "raw", NOW_NS))
-    before = path.stat().st_size
-    core.tick(NOW_NS + round((flush_s - 0.1) * SECOND_NS))
-    assert path.stat().st_size == before
-    core.tick(NOW_NS + round(flush_s * SECOND_NS))
-    assert path.stat().st_size > before
+def test_a_slow_line_is_flushed_every_two_minutes_and_what_happens_on_it_at_once():
+    disk = Disk()
+    core = Recorder(disk, RecorderConfig(), NOW_NS)
+    flushed_at: list[int] = []
+    for second in range(1, 181):
+        now_ns = NOW_NS + second * SECOND_NS
+        core.step(envelope(raw(second), "raw", now_ns))
+        if second == 150:
+            core.step(envelope(card(0), "twin", now_ns))
+        before = disk.parts[0].flushes
+        core.tick(now_ns)
+        flushed_at += [second] * (disk.parts[0].flushes - before)
+    assert flushed_at == [121, 150]
+
+
+def test_what_fills_memory_is_flushed_each_second():
+    disk = Disk()
+    core = Recorder(disk, RecorderConfig(), NOW_NS)
+    for tick in range(200):
+        for number in range(4):
+            core.step(envelope(raw(4 * tick + number, samples=50), "raw", NOW_NS + tick * TICK_NS))
+        core.tick(NOW_NS + tick * TICK_NS)
+        assert sum(len(each.payload) for each in disk.parts[0].pending) < 2 * 24 * 4 * 50 * 20
+    assert disk.parts[0].flushes >= 9
+
+
+def test_of_healths_those_that_report_something_new_are_recorded_and_no_other_is_missing(tmp_path):
+    run = context(tmp_path, flush_interval_s=60)
+    core = STAGE.build(run).core
+    start_ns = run.started_t_ns
+    for second in range(1300):
+        problem = f"no data for {second} s" if 700 <= second < 710 else ""
+        status = StageStatus.DEGRADED if problem else StageStatus.OK
+        lost = 1 if second >= 900 else 0
+        output = Output(key=RAW_KEY, published=0 if second < 1299 else 3)
+        now = replace(health_of("acquisition-1", 0, "acquisition"), status=status, problem=problem, lost=lost)
+        now = replace(now, header=Header("acquisition-1", second, ""), outputs=(output,))
+        core.step(envelope(now, "health", start_ns + second * SECOND_NS))
+        core.tick(start_ns + second * SECOND_NS)
     core.close()
-    assert read_metadata(path.with_suffix("")).metadata["flush_interval_s"] == f"{flush_s:g}"
+    path = run.run_folder / "recording.mcap"
+    assert [each.message.header.sequence for each in read_recording(path)] == [0, 700, 710, 900, 1299]
+    streams = contents_of(path).streams
+    assert streams[health_key("plant", "scorer", "all"), "acquisition-1"].missing == 0
+    assert streams[RAW_KEY, "acquisition-1"].missing == 3, "the last one says what was published"
+    assert scan(path).counts.ledger.counts[health_key("plant", "scorer", "all"), "acquisition-1"].missing == 0
+
+
+def day_old(disk: Disk, days: float) -> list[StoredPart]:
+    return [StoredPart(NOW_NS - round(days * 86_400) * SECOND_NS, 1, Path(f"{days:g}-days.mcap")), *disk.old]
+
+
+def test_parts_older_than_the_limit_of_days_are_deleted_and_it_is_said(caplog):
+    disk = Disk()
+    for days in (3, 14.1, 20):
+        disk.old = day_old(disk, days)
+    with caplog.at_level(logging.WARNING):
+        core = recorder(disk)
+    assert disk.old_names == ["3-days.mcap"]
+    assert "20-days.mcap, the oldest part, was deleted: older than 14 days (recorder.keep_days)" in caplog.text
+    assert core.counters()["parts_deleted"] == 2
+    assert core.notes()[0] == "recordings: 0 bytes of 1.76 TB, 3.0 of 14 days"
+    for hour in range(1, 12 * 24):
+        core.tick(NOW_NS + hour * 3600 * SECOND_NS)
+    assert disk.old_names == []
+    assert {round((b.t_ns - a.t_ns) / 86_400e9, 1) for a, b in pairwise(disk.parts)} == {1.8}, "an eighth of 14 days"
+
+
+def test_the_oldest_parts_are_deleted_when_all_exceed_their_share_of_the_disk(caplog):
+    disk = Disk()
+    disk.disk, disk.freed_by_each, disk.old = 1_000_000_000, 30_000_000, old_parts("a.mcap", "b.mcap", "c.mcap")
+    with caplog.at_level(logging.WARNING):
+        core = recorder(disk)
+    assert disk.old_names == ["b.mcap", "c.mcap"], "with room for the next part, of an eighth"
+    assert "a.mcap, the oldest part, was deleted: recordings and clips would exceed 100 MB" in caplog.text
+    assert core.notes()[0].startswith("recordings: 60 MB of 100 MB")
+    for sequence in range(13):
+        core.step(envelope(raw(sequence, samples=25_000), "raw", NOW_NS))
+        core.tick(NOW_NS + (sequence + 1) * SECOND_NS)
+    assert disk.parts[0].closed and 12_500_000 <= disk.parts[0].size < 14_000_000
 
 
 def test_the_topics_of_samples_can_be_chosen():
@@ -641,7 +720,7 @@ def test_a_recording_says_which_topics_were_left_out_on_purpose(tmp_path):
             outputs=outputs,
         )
         core.step(envelope(health, "health"))
-    assert core.notes() == ["not recorded: grid, prediction, score (recorder.topics)"]
+    assert core.notes()[-1] == "not recorded: grid, prediction, score (recorder.topics)"
     core.close()
     path = run.run_folder / "recording.mcap"
     assert read_metadata(path).left_out == ("grid", "prediction", "score")

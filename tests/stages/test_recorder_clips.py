@@ -21,7 +21,7 @@ from schemas.enums import Severity, Transition
 from schemas.header import Header
 from schemas.messages import Alarm
 from stages.recorder import Recorder, RecorderConfig
-from tests.stages.test_recorder import NOW_NS, SECOND_NS, Disk, envelope
+from tests.stages.test_recorder import NOW_NS, SECOND_NS, Disk, envelope, old_parts
 from tests.support.clipped_recordings import record
 from tests.support.offline_replay import recorded, recording_of
 
@@ -158,7 +158,7 @@ def test_an_alarm_that_a_restarted_recorder_receives_again_gives_one_clip():
 
 def test_the_disk_guard_takes_what_is_oldest_but_no_unacknowledged_clip_and_last_what_a_clip_needs():
     disk, maker = Disk(), Maker()
-    config = RecorderConfig(min_free_bytes=50_000_000, delete_oldest=True)
+    config = RecorderConfig(min_free_bytes=50_000_000)
     core = Recorder(disk, config, NOW_NS, clips=AlarmClips(ClipTracker((), 60, 60, 0), maker))
     now_ns = NOW_NS
     for fan in range(2):
@@ -170,15 +170,15 @@ def test_the_disk_guard_takes_what_is_oldest_but_no_unacknowledged_clip_and_last
     core.step(envelope(raised(0, now_ns, acknowledged=True, transition=Transition.ACKNOWLEDGED), "alarm", now_ns))
     core.step(envelope(raised(2, now_ns), "alarm", now_ns))
     acknowledged, _, running = [clip.name for clip in core._clips._tracker.clips]  # type: ignore[union-attr]
-    disk.free, disk.oldest, disk.oldest_ns = 1, ["r-0.mcap", "r-1.mcap"], NOW_NS - 1000 * SECOND_NS
+    disk.free, disk.old = 1, old_parts("r-0.mcap", "r-1.mcap", last_ns=NOW_NS - 1000 * SECOND_NS)
     core.tick(now_ns := now_ns + SECOND_NS)
-    assert disk.oldest == ["r-1.mcap"] and maker.deleted == []  # this part is older than any clip
-    disk.oldest_ns = now_ns
+    assert disk.old_names == ["r-1.mcap"] and maker.deleted == []  # this part is older than any clip
+    disk.old = old_parts("r-1.mcap", "r-2.mcap", last_ns=now_ns)
     core.tick(now_ns := now_ns + SECOND_NS)
-    assert disk.oldest == ["r-1.mcap"] and maker.deleted == [acknowledged]
+    assert disk.old_names == ["r-1.mcap", "r-2.mcap"] and maker.deleted == [acknowledged]
     assert core.problem() == ""
     core.tick(now_ns := now_ns + SECOND_NS)
-    assert disk.oldest == []  # the running clip needs it, but the disk is full
+    assert disk.old_names == ["r-2.mcap"]  # the running clip needs the other, but the disk is full
     lacking = next(clip for clip in maker.saved if clip.name == running)
     assert lacking.problem == "a part that it needs was deleted to make room"
     core.tick(now_ns + SECOND_NS)

@@ -523,7 +523,7 @@ def context(folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", serve: bo
     return Context(
         site="site",
         trays=(TrayConfig(name="tray1", fans=fans, speed_unit=speed_unit),),
-        config=ViewerConfig(serve=serve, **config),
+        config=ViewerConfig(serve=serve, **{"file": "view.rrd", **config}),
         folder=folder,
         run_folder=folder,
         started_t_ns=START_NS,

@@ -127,7 +127,8 @@ class Chain:
         stages = ["acquisition", "resampler", "twin_integrator", "scorer", "recorder", *(["viewer"] if viewer else [])]
         self.settings = [
             *(f"run_folder='{folder}'", f"tray.0.port='{self.port}'", f"bus.endpoint='{endpoint}'"),
-            *("viewer.serve=false", f"launcher.stages={json.dumps(stages)}", *settings),
+            *("viewer.serve=false", "viewer.file='view.rrd'", f"launcher.stages={json.dumps(stages)}"),
+            *("recorder.topics=['raw', 'grid', 'prediction', 'score']", "recorder.flush_interval_s=1", *settings),
         ]
         self.stages = [f"acquisition/{TRAY}", *stages[1:]]
         self.tray: RunningCommand | None = None

@@ -30,7 +30,7 @@ class Run:
         self.begin(folder, **config)
 
     def begin(self, folder: Path, **config) -> None:
-        core = STAGE.build(context(folder, **config)).core
+        core = STAGE.build(context(folder, **{"keep_share_of_disk": 1.0, **config})).core
         assert isinstance(core, Recorder)
         self.core = core
 
@@ -72,16 +72,15 @@ def until(happens, run: Run) -> None:
 
 def test_a_full_disk_loses_nothing_that_memory_can_hold(small_disk):
     run = Run(small_disk, min_free_bytes=0, part_bytes=1_000_000)
-    until(lambda: len(run.parts()) == 3, run)
-    before = {path: path.read_bytes() for path in run.parts()}
     ballast = small_disk / "ballast"
-    ballast.write_bytes(bytes(SIZE_BYTES - 3_900_000))
+    ballast.write_bytes(bytes(SIZE_BYTES - 900_000))
     until(run.core.problem, run)
+    before = {path: path.read_bytes() for path in run.parts()}
     assert re.search(r"NOTHING IS RECORDED: .*make room", run.core.problem())
     for _ in range(5):
         run.second()
     assert run.core.problem(), "there is still no room"
-    assert {path: path.read_bytes() for path in before} == before, "earlier parts are intact"
+    assert {path: path.read_bytes() for path in before} == before, "the last part is intact"
     for path in run.parts():
         assert_readable(path)
     ballast.unlink()
@@ -100,15 +99,19 @@ def test_a_full_disk_loses_nothing_that_memory_can_hold(small_disk):
 def test_messages_that_memory_cannot_hold_are_missing_in_the_ledger(small_disk, monkeypatch):
     monkeypatch.setattr("stages.recorder.HELD_BYTES", 400_000)
     run = Run(small_disk, min_free_bytes=3_000_000)
+    for _ in range(3):
+        run.second()
+    ballast = small_disk / "ballast"
+    ballast.write_bytes(bytes(SIZE_BYTES - 3_000_000))
     until(run.core.problem, run)
     assert "MB are free on the disk, but 3.0 MB are required" in run.core.problem()
     for _ in range(10):
         run.second()
-    for path in run.parts():
-        path.unlink()
+    assert len(run.parts()) == 1, "older ones made room"
+    ballast.unlink()
     until(lambda: not run.core.problem(), run)
     run.core.close()
-    (part,) = run.parts()
+    part = run.parts()[-1]
     found = [envelope.message.header.sequence for envelope in read_recording(part)]
     holes = sum(later - earlier - 1 for earlier, later in pairwise(found))
     contents = contents_of(part)
@@ -118,8 +121,8 @@ def test_messages_that_memory_cannot_hold_are_missing_in_the_ledger(small_disk, 
     assert found[-1] == run.sent - 1
 
 
-def test_disk_use_is_bounded_if_the_oldest_parts_may_be_deleted(small_disk):
-    run = Run(small_disk, min_free_bytes=3_000_000, part_bytes=1_000_000, delete_oldest=True)
+def test_on_a_full_disk_the_oldest_parts_are_deleted(small_disk):
+    run = Run(small_disk, min_free_bytes=3_000_000, part_bytes=1_000_000)
     for _ in range(300):  # 30 MB, on a disk of 8
         run.second()
         assert run.core.problem() == ""
@@ -132,6 +135,23 @@ def test_disk_use_is_bounded_if_the_oldest_parts_may_be_deleted(small_disk):
     for path in run.parts():
         assert_readable(path)
         assert scan(path).is_intact
+
+
+def test_recordings_keep_their_share_of_a_disk_that_others_fill_too(small_disk):
+    limit_bytes = round(0.3 * SIZE_BYTES)
+    ballast = small_disk / "ballast"
+    run = Run(small_disk, min_free_bytes=1_000_000, keep_share_of_disk=0.3)
+    largest = 0
+    for second in range(200):  # 20 MB
+        ballast.write_bytes(bytes(min(25_000 * second, SIZE_BYTES - limit_bytes - 1_100_000)))
+        run.second()
+        assert run.core.problem() == ""
+        largest = max(largest, sum(path.stat().st_size for path in run.folder.iterdir()))
+    run.core.close()
+    assert 0.8 * limit_bytes < largest <= limit_bytes
+    assert run.core.counters()["lost_unwritten"] == 0 and run.core.counters().get("pauses", 0) == 0
+    sequences = run.sequences()
+    assert sequences == list(range(sequences[0], run.sent)), "the newest, without a gap"
 
 
 def test_an_unmounted_disk_is_waited_for_and_its_mount_point_not_written(small_disk):

@@ -56,8 +56,11 @@ run_folder = "{folder}"
 endpoint = "{endpoint}"
 [resampler]
 watermark_s = 5  # a host that runs other tests may stall for more than the default, and late samples would be lost
+[recorder]
+topics = ["raw", "score"]
 [viewer]
 serve = false
+file = "view.rrd"
 """
 TRAY = """
 [[tray]]

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from pipeline.cli.options import JsonOption, fan_numbers
+from pipeline.cli.recordings.with_scores import with_scores
 from pipeline.errors import UsageError
 from pipeline.extras import require
 
@@ -29,6 +30,8 @@ def plot(
 ) -> None:
     """Plot measured speed, prediction, band, alarms and states of a recording.
 
+    What the recorder left out (recorder.topics) is made again first.
+
     Example: fantwin plot runs/demo/recording.mcap --truth runs/demo/truth.json -o bands.png
     """
     require("a plot", "report", "matplotlib")
@@ -36,8 +39,8 @@ def plot(
 
     if unit not in ("rpm", "rad/s", None):
         raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
-    with Console(stderr=True).status(f"drawing {output}"):
-        drawn = plot_recording(recordings, output, tray=tray, fans=fan_numbers(fans), speed_unit=unit, truth=truth)
+    with Console(stderr=True).status(f"drawing {output}"), with_scores(recordings) as files:
+        drawn = plot_recording(files, output, tray=tray, fans=fan_numbers(fans), speed_unit=unit, truth=truth)
     if json_output:
         typer.echo(json.dumps({"plot": str(output), "fans": drawn}))
     else:

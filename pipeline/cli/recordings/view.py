@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from pipeline.cli.options import JsonOption, ViewLayout
+from pipeline.cli.recordings.with_scores import with_scores
 from pipeline.errors import UsageError, UserError
 from pipeline.extras import require
 
@@ -29,6 +30,8 @@ def view(
 ) -> None:
     """Turn a recording into a view file that shows what the stage `viewer` shows live.
 
+    What the recorder left out (recorder.topics) is made again first.
+
     Exits with 3 if the recording could not be read in full; the view then shows what could be read.
 
     Example: fantwin view runs/demo/recording.mcap --layout alarms -o alarms.rrd
@@ -41,9 +44,9 @@ def view(
         raise UsageError(f"{output}: name a file that ends in .rrd with -o")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or use --force")
-    site = recorded_site(recordings)
-    output.unlink(missing_ok=True)
-    with Console(stderr=True).status(f"drawing {output}"):
+    with Console(stderr=True).status(f"drawing {output}"), with_scores(recordings) as files:
+        site = recorded_site(files)
+        output.unlink(missing_ok=True)
         options = ViewOptions(layout=layout.value, window_s=window, fleet_above=fleet_above)
         damage = write_view(site, output, options)
     fans = sum(tray.fans for tray in site.trays)

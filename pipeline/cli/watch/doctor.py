@@ -27,11 +27,13 @@ from pipeline.cli.exposure import exposure_problem, is_exposed
 from pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from pipeline.cli.watch.line_check import check_line
 from pipeline.config.models import Config, ConfigError
-from pipeline.config.registry import STAGES
+from pipeline.config.registry import RECORDER, STAGES
 from pipeline.config.roles import READERS, role_names
+from pipeline.errors import UserError
 from pipeline.extras import how_to_install
 from pipeline.launch.processes import process_list
 from pipeline.launch.this_host import load_for_this_host
+from pipeline.recordings.disk_room import usage_of
 from pipeline.runtime.second_owner import GOSSIP_S
 from pipeline.runtime.sessions import Session
 from pipeline.runtime.stage import Context, load_stage
@@ -268,10 +270,21 @@ def _check_stages(
             found.setdefault(problem, []).append(row.label)
         if not problems:
             yield True, f"{row.label}: {_runs_already(session, row.label) if session else 'can start'}"
+        if row.stage == RECORDER and not problems:
+            yield from _check_recordings(contexts[0], row.label)
         if row.stage == "acquisition" and listen_s and not problems:
             for context in contexts:
                 yield from check_line(context, config, listen_s, is_running=session is not None)
     yield from ((False, f"{', '.join(labels)}: {problem}") for problem, labels in found.items())
+
+
+def _check_recordings(context: Context, label: str) -> Iterator[tuple[bool, str]]:
+    """What recordings take of what they may."""
+    try:
+        folder = context.own_file(context.config.file).parent
+        yield True, f"{label}: {usage_of(folder, context.config, context.started_t_ns)}"
+    except (OSError, UserError) as error:
+        yield False, f"{label}: the recordings cannot be read: {error}"
 
 
 def _runs_already(session: Session, label: str) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from pipeline.recordings.clips.clip import NOT_A_LIST, clips_in, list_path
+from pipeline.recordings.clips.clip import NOT_A_LIST, Clip, clips_in, list_path
 from pipeline.recordings.clips.cutting import LEAD_NS
 from pipeline.recordings.clips.tracker import LONGEST_NS, RETRY_NS, ClipTracker
 from pipeline.recordings.clips.worker import ClipMaker
@@ -70,6 +70,10 @@ class AlarmClips:
         clip = self._tracker.oldest_acknowledged
         return clip.until_ns if clip else None
 
+    def unacknowledged_before(self, t_ns: float) -> list[Clip]:
+        """The clips from before this time that wait until their alarms are acknowledged."""
+        return [clip for clip in self._tracker.clips if clip.until_ns < t_ns and not clip.is_acknowledged]
+
     def delete_oldest_acknowledged(self) -> str | None:
         """Delete the first clip that may be deleted, and give its name; None if there is none."""
         clip = self._tracker.oldest_acknowledged
@@ -83,6 +87,11 @@ class AlarmClips:
         """Whether a clip that is still to be cut needs what was received up to this time."""
         since_ns = self._tracker.needed_since_ns
         return since_ns is not None and since_ns - LEAD_NS <= last_ns
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a clip is still to be cut."""
+        return self._tracker.needed_since_ns is not None
 
     def part_deleted(self) -> None:
         """A part that due clips need was deleted, because the disk was full."""

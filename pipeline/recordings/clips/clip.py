@@ -11,11 +11,10 @@ from typing import Any
 
 from pipeline.recordings.reading import read_metadata
 from pipeline.recordings.records import RecordingError
+from pipeline.recordings.run_recordings import CLIPS
 from schemas.messages import Alarm
 from schemas.units import NS_PER_S
 
-CLIPS = "clips"
-"""the folder, beside the recording"""
 CLIP_KEY = "clip"
 """in the metadata of a clip: what `Clip.about` says, as JSON"""
 CLIP_SNAPSHOT_KEY = "clip_snapshot_t_ns"

@@ -56,14 +56,12 @@ class ClipMaker(Protocol):
 class ClipWorker(ClipMaker):
     """Cuts the clips of one recording."""
 
-    def __init__(
-        self, recording: Path, min_free_bytes: int, free_bytes: Callable[[], int], *, others_make_room: bool = False
-    ) -> None:
-        """recording: its first part. free_bytes: of its disk; raises DiskError. others_make_room: below min_free_bytes
-        the oldest part is deleted, and recording does not pause; then half of them may be used meanwhile."""
+    def __init__(self, recording: Path, min_free_bytes: int, free_bytes: Callable[[], int]) -> None:
+        """recording: its first part. free_bytes: of its disk; raises DiskError. While a clip is written it may use half
+        of min_free_bytes: the oldest part is deleted meanwhile."""
         self._recording, self._folder, self._list = recording, clip_folder(recording), list_path(recording)
         self._begin_bytes = min_free_bytes + ROOM_BYTES
-        self._least_bytes = min_free_bytes // 2 if others_make_room else self._begin_bytes
+        self._least_bytes = min_free_bytes // 2
         self._free_bytes = free_bytes
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._results: SimpleQueue[CutResult] = SimpleQueue()

@@ -111,6 +111,8 @@ def test_only_the_lines_of_the_named_trays_are_checked(tmp_path, port):
 
     (problem,) = problems()
     assert problem.startswith("acquisition/b: ")
+    good = json.loads(fantwin("doctor", "-c", path, "--listen-s", 0, "--json").stdout)["good"]
+    assert any(line.startswith("recorder: recordings: 0 bytes of ") and line.endswith("of 14 days") for line in good)
     assert problems("--tray", "b") == [problem]
     assert problems("--tray", "a") == []
     assert problems("--tray", "c") == [f"{path}: no tray called 'c'; known: a, b"]

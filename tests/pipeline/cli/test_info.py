@@ -242,7 +242,7 @@ def test_parts_whose_oldest_were_deleted_are_continuous(tmp_path):
     for first in (0, 10, 20):
         part(place, range(first, first + 10), ledger).finish()
         ledger = ledger.for_next_part()
-    assert place.delete_oldest() == "r.mcap"
+    (tmp_path / "r.mcap").unlink()
     assert shown(tmp_path / "r-2.mcap", tmp_path / "r-3.mcap")["continuity"] == []
     assert "continues r.mcap" in fantwin("info", tmp_path / "r-2.mcap", tmp_path / "r-3.mcap").stdout
 

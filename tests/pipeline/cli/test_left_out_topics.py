@@ -4,6 +4,7 @@ command makes it."""
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -66,11 +67,19 @@ def test_a_difference_is_exit_code_1(lean, tmp_path):
     assert "DIFFERS" in done.stdout and "snapshots differ" in done.stdout and "tray1: snapshot of " in done.stdout
 
 
-def test_commands_that_need_scores_name_the_command_that_makes_them_and_work_after_it(lean, tmp_path):
-    picture, made = tmp_path / "b.png", tmp_path / "whole-again.mcap"
-    assert error_of("plot", lean, "-o", picture) == f"{lean}: holds no scores to plot; {advice(lean, 'score')}"
-    assert fantwin("replay", "--offline", lean, "-o", made).exit_code == 0
-    assert fantwin("plot", made, "-o", picture).exit_code == 0 and picture.exists()
+def test_a_plot_makes_the_scores_again_and_shows_the_same(lean, whole, tmp_path):
+    pictures = [tmp_path / name for name in ("lean.svg", "whole.svg")]
+    for path, picture in zip((lean, whole), pictures, strict=True):
+        assert fantwin("plot", path, "--fans", "0,1,2", "-o", picture).exit_code == 0
+    paths = [re.findall(r'<path d="[^"]{200,}"', picture.read_text()) for picture in pictures]
+    assert len(paths[0]) > 3 and paths[0] == paths[1], "the curves"
+
+
+def test_a_view_makes_the_scores_again(lean, tmp_path):
+    done = fantwin("view", lean, "-o", tmp_path / "v.rrd", "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["fans"] == 3
+    assert (tmp_path / "v.rrd").stat().st_size > 50_000
 
 
 def test_an_export_has_raw_samples_and_names_what_is_missing(lean, tmp_path):

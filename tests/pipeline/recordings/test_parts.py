@@ -76,29 +76,45 @@ def test_an_open_part_is_called_active(tmp_path):
     writer.finish()
 
 
+def oldest_deleted(place: RecordingParts) -> str | None:
+    for oldest in place.stored().parts[:1]:
+        assert place.delete(oldest)
+        return oldest.path.name
+    return None
+
+
 def test_the_oldest_part_is_deleted_first_and_its_name_is_not_used_again(tmp_path):
     place = parts_in(tmp_path)
     for _ in range(11):
         part(place, [0]).finish()
-    assert [place.delete_oldest() for _ in range(10)] == ["r.mcap", *(f"r-{n}.mcap" for n in range(2, 11))]
-    assert place.delete_oldest() == "r-11.mcap"
-    assert place.delete_oldest() is None
+    assert [oldest_deleted(place) for _ in range(10)] == ["r.mcap", *(f"r-{n}.mcap" for n in range(2, 11))]
+    assert oldest_deleted(place) == "r-11.mcap"
+    assert oldest_deleted(place) is None
     part(place).finish()
     assert names(tmp_path) == ["r-12.mcap"]
 
 
-def test_only_parts_of_this_recording_are_deleted(tmp_path):
-    write(tmp_path / "r.mcap", 3)  # an import, say
+def test_what_other_recorders_wrote_counts_and_what_recorders_did_not_write_is_never_deleted(tmp_path):
+    for name, at in (("2-of-2.r.mcap", 5_000), ("earlier.mcap", 1_000)):
+        with RecordingParts(tmp_path / name, {}, {}, "other").begin(0, SequenceLedger(), {}) as writer:
+            writer.add_message(RAW_KEY, raw(0), at)
+    part(parts_in(tmp_path), [3_000]).finish()
+    write(tmp_path / "import.mcap", 3)
     (tmp_path / "r-2.mcap").write_bytes(b"not ours")
-    RecordingParts(tmp_path / "r-3.mcap", {}, {}, "other").begin(0, SequenceLedger(), {}).finish()
-    assert parts_in(tmp_path).delete_oldest() is None
-    assert len(names(tmp_path)) == 3
+    (tmp_path / "kept-by-me.mcap").write_bytes((tmp_path / "r.mcap").read_bytes())
+    (tmp_path / "clips").mkdir()
+    (tmp_path / "clips" / "c.mcap").write_bytes(bytes(100))
+    place = parts_in(tmp_path)
+    written = sum((tmp_path / name).stat().st_size for name in ("2-of-2.r.mcap", "earlier.mcap", "r.mcap"))
+    assert place.stored().finished_bytes == written + 100
+    assert [oldest_deleted(place) for _ in range(4)] == ["earlier.mcap", "r.mcap", "2-of-2.r.mcap", None]
+    assert names(tmp_path) == ["clips", "import.mcap", "kept-by-me.mcap", "r-2.mcap"]
 
 
 def test_the_part_that_is_open_is_not_deleted(tmp_path):
     place = parts_in(tmp_path)
     writer = part(place)
-    assert place.delete_oldest() is None
+    assert place.stored().parts == () and place.stored().open_bytes == writer.size
     writer.finish()
 
 

@@ -75,12 +75,12 @@ def test_between_two_reports_nothing_is_missing_and_no_timer_has_acted(events):
         assert other.t_ns - one.t_ns <= PERIOD_NS
 
 
-def test_a_run_without_a_break_is_reported_each_ten_seconds():
+def test_a_run_without_a_break_is_reported_each_two_minutes():
     stage = Resampler()
-    for sequence in range(35):
+    for sequence in range(250):
         stage.takes("acquisition-0", sequence)
-    assert [report.output_sequence for report in stage.reported] == [0, 10, 20, 30]
-    assert [report.output_sequence for report in stage.reports.last()] == [34]
+    assert [report.output_sequence for report in stage.reported] == [0, 120, 240]
+    assert [report.output_sequence for report in stage.reports.last()] == [249]
     assert stage.reports.last() == [], "the end is reported once"
 
 

@@ -62,6 +62,19 @@ def test_row_09_a_view_on_a_full_disk_is_reported_and_the_viewer_goes_on_and_end
     assert core.counters()["samples_drawn"] == sum(len(score.t_ns) for score in scores)
 
 
+def test_the_file_ends_before_it_exceeds_its_limit(tmp_path: Path) -> None:
+    path = tmp_path / "view.rrd"
+    path.touch()
+    file = ViewFile(path, limit_bytes=200_000)
+    with file.pipe.open("wb", buffering=0) as pipe:
+        file.release_pipe()
+        for _ in range(300):
+            pipe.write(bytes(1000))
+    file.close()
+    assert 100_000 < path.stat().st_size <= 200_000
+    assert "it has the size of viewer.file_bytes" in file.problem
+
+
 def test_row_09_a_disk_that_hangs_keeps_nobody_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(view_file, "HELD_BYTES", 1 << 20)
     monkeypatch.setattr(view_file, "CLOSE_LIMIT_S", 0.2)

@@ -1,0 +1,60 @@
+"""Which healths are recorded: a stage sends one a second, and most say nothing new."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from schemas.envelope import Envelope
+from schemas.health import Health
+from schemas.units import NS_PER_S
+
+HEALTH_S = 3600
+"""at least one in this time is recorded of each session"""
+_NUMBERS = re.compile(r"[\d.,]+")
+
+
+@dataclass
+class _Session:
+    said: object
+    recorded_t_ns: int
+    waiting: Envelope | None = None
+    """the newest, if it is not recorded"""
+
+
+class RecordedHealths:
+    """Takes the first and the last health of a session, one each HEALTH_S, and each that reports something new: another
+    status or problem, more losses."""
+
+    def __init__(self) -> None:
+        self._sessions: dict[str, _Session] = {}
+
+    def is_due(self, envelope: Envelope, health: Health) -> bool:
+        """Whether it is to be recorded; if not, it waits until a newer one comes."""
+        producer, said = health.header.producer, _said(health)
+        session = self._sessions.get(producer)
+        age_ns = abs(envelope.received_t_ns - session.recorded_t_ns) if session else 0
+        if session is None or session.said != said or age_ns >= HEALTH_S * NS_PER_S:
+            self._sessions[producer] = _Session(said, envelope.received_t_ns)
+            return True
+        session.waiting = envelope
+        return False
+
+    def take_waiting(self) -> list[Envelope]:
+        """The newest of each session that is not recorded, for the end of a part: it says what was published. Sessions
+        that have ended are forgotten."""
+        found: list[Envelope] = []
+        for producer, session in list(self._sessions.items()):
+            if session.waiting is None:
+                del self._sessions[producer]
+            else:
+                found.append(session.waiting)
+                session.waiting = None
+        return found
+
+
+def _said(health: Health) -> object:
+    """What matters when it changes. Numbers in the text of a problem may change each second."""
+    lost = sum(line.missing + line.refused for line in health.inputs)
+    awaited = tuple(line.key for line in health.waiting_for)
+    return health.status, _NUMBERS.sub("", health.problem), health.lost, lost, awaited, health.is_last

@@ -1,0 +1,90 @@
+"""The recordings that recorders have finished in a folder: which may be deleted, and what all of them take.
+
+Those of earlier runs, of other names and of other shards count too. A file that fantwin's recorder did not write under
+this name is never deleted: an import, a clip, a part that was renamed to keep it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from pipeline.recordings.rare_messages import last_message_ns
+from pipeline.recordings.reading import RecordingError, read_metadata
+from pipeline.recordings.records import ACTIVE_SUFFIX
+from pipeline.recordings.run_recordings import CLIPS, RECORDING_KEY
+
+SUFFIX = ".mcap"
+
+
+class StoredPart(NamedTuple):
+    """A finished part of a recording."""
+
+    last_ns: int
+    """when its last message was received; when it began if its index does not say it"""
+    number: int
+    path: Path
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What is in the folder now."""
+
+    parts: tuple[StoredPart, ...] = ()
+    """the oldest first"""
+    finished_bytes: int = 0
+    """of parts, and of all clips"""
+    open_bytes: int = 0
+    """of parts that are being written"""
+
+
+class StoredRecordings:
+    """The folder of a recording. A file is opened once: afterwards its size and time show that it is the same."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._known: dict[tuple[Path, int, int], StoredPart | None] = {}
+
+    def look(self) -> Stored:
+        """What is there now. OSError if the folder cannot be read."""
+        known, self._known = self._known, {}
+        parts: list[StoredPart] = []
+        finished_bytes = open_bytes = 0
+        for path, size, written_ns in _files(self._folder):
+            if path.name.endswith(SUFFIX + ACTIVE_SUFFIX):
+                open_bytes += size
+            elif path.suffix == SUFFIX:
+                key = path, size, written_ns
+                part = self._known[key] = known[key] if key in known else _part(path)
+                if part:
+                    parts.append(part)
+                    finished_bytes += size
+        with suppress(FileNotFoundError):
+            finished_bytes += sum(size for path, size, _ in _files(self._folder / CLIPS) if path.suffix == SUFFIX)
+        return Stored(tuple(sorted(parts)), finished_bytes, open_bytes)
+
+
+def _files(folder: Path) -> Iterator[tuple[Path, int, int]]:
+    """Each file with its size and the time at which it was written."""
+    for path in folder.iterdir():
+        with suppress(FileNotFoundError):
+            found = path.stat()
+            yield path, found.st_size, found.st_mtime_ns
+
+
+def _part(path: Path) -> StoredPart | None:
+    """None: it is no part that a recorder wrote under this name."""
+    try:
+        metadata = read_metadata(path).metadata
+    except RecordingError:
+        return None
+    first = Path(metadata.get(RECORDING_KEY, ""))
+    named = re.fullmatch(rf"{re.escape(first.stem)}(?:-(\d+))?{re.escape(first.suffix)}", path.name)
+    began_ns = metadata.get("started_t_ns", "")
+    if not (first.name and named and "session" in metadata and began_ns.isdecimal()):
+        return None
+    return StoredPart(last_message_ns(path) or int(began_ns), int(named[1] or 1), path)
