@@ -8,6 +8,7 @@ import numpy as np
 
 from schemas.model_uncertainty import ModelUncertainty
 from schemas.twin_card import DriveCard
+from tests.support.uncertainty_tables import by_speed
 from twin.report.record_next import least_known
 from twin.report.steady_states import StaticCurve
 
@@ -21,7 +22,7 @@ def known(**unknown: float) -> ModelUncertainty:
     std = np.full((11, 11), 2.0)
     if unknown:
         std[int(unknown["speed"] / 20.0), round(unknown["command"] * 10)] = unknown["std"]
-    return ModelUncertainty(SPEEDS_RAD_S, tuple(COMMANDS.tolist()), (tuple(map(tuple, std.tolist())),), (2.0,))
+    return by_speed(SPEEDS_RAD_S, COMMANDS.tolist(), std.tolist(), 2.0)
 
 
 def test_a_command_that_was_never_held_comes_first() -> None:
