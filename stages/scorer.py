@@ -51,7 +51,7 @@ SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "baselines, alarms and wear start from the beginning"
 OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
 ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
-FORMER_TWIN = (
+EARLIER_TWIN = (
     "the snapshot is of the twin before: baselines and alarms start from the beginning, wear continues; "
     f"{OPERATORS_KEPT}"
 )
@@ -139,7 +139,7 @@ class ScorerCore(Core):
             return []
         if snapshot.twin_sha256 != self._twin.sha256:
             self._counts["snapshots_of_another_twin"] += 1
-            self._not_restored = FORMER_TWIN if self._is_learned and self._restore_wear(state) else ANOTHER_TWIN
+            self._not_restored = EARLIER_TWIN if self._is_learned and self._restore_wear(state) else ANOTHER_TWIN
         else:
             try:
                 self.tray.restore_baselines(state)
@@ -157,7 +157,7 @@ class ScorerCore(Core):
     def _restore_wear(self, state: Mapping[str, Any]) -> bool:
         """Continue the wear of the twin before; False if it cannot be read."""
         try:
-            self.tray.wear.restore_of_former_twin(state["wear"])
+            self.tray.wear.restore_of_earlier_twin(state["wear"])
         except RESTORE_ERRORS:
             return False
         return True
@@ -168,7 +168,7 @@ class ScorerCore(Core):
         _, *alarms = self.restore(snapshot)
         if not self._not_restored:
             return []
-        if self._not_restored in (ANOTHER_TWIN, FORMER_TWIN):  # as it should be
+        if self._not_restored in (ANOTHER_TWIN, EARLIER_TWIN):  # as it should be
             self._not_restored = ""
         return alarms
 

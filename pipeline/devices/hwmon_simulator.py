@@ -75,7 +75,7 @@ class HwmonTree:
     """The files of a chip with so many fans; for a driver of single fans, a chip for each."""
 
     def __init__(self, root: Path, chip: str, fans: int) -> None:
-        """Write the tree. A tree that a former simulation left is replaced.
+        """Write the tree. A tree that an earlier simulation left is replaced.
 
         Raises:
             UserError: the folder holds something else, or cannot be written.

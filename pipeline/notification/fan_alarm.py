@@ -12,7 +12,7 @@ from scoring.alarms.alarm_flags import is_presented, is_silenced
 
 FanName = tuple[str, int]
 """tray and fan"""
-MOST_FORMER = 8
+MOST_EARLIER = 8
 _WITH_DEVIATION = (Transition.RAISED, Transition.SEVERITY)
 _NAMES_WHO_ACKNOWLEDGED = (Transition.ACKNOWLEDGED, Transition.REPUBLISHED)
 
@@ -49,7 +49,7 @@ class FanAlarm:
     causes: tuple[NamedCause, ...]
     deviation_t_ns: int = 0
     """when that was, by the clock of the device; 0: unknown"""
-    former_producers: tuple[str, ...] = ()
+    earlier_producers: tuple[str, ...] = ()
     """the last ones before `producer`: what comes from them now is old"""
 
     @property
@@ -71,7 +71,7 @@ class FanAlarm:
         """What `to_json` wrote."""
         values = json.loads(text)
         causes = tuple(NamedCause(**each) for each in values["causes"])
-        return cls(**{**values, "causes": causes, "former_producers": tuple(values["former_producers"])})
+        return cls(**{**values, "causes": causes, "earlier_producers": tuple(values["earlier_producers"])})
 
 
 def after(before: FanAlarm | None, message: Alarm, now_ns: int) -> FanAlarm | None:
@@ -80,14 +80,14 @@ def after(before: FanAlarm | None, message: Alarm, now_ns: int) -> FanAlarm | No
     now_ns: time of the host.
     """
     header = message.header
-    former = before.former_producers if before else ()
+    earlier = before.earlier_producers if before else ()
     if before and before.producer == header.producer:
         if header.sequence <= before.sequence:
             return None
-    elif header.producer in former:
+    elif header.producer in earlier:
         return None
     elif before:
-        former = (*former, before.producer)[-MOST_FORMER:]
+        earlier = (*earlier, before.producer)[-MOST_EARLIER:]
     of_same = before if before and before.onset_t_ns == message.onset_t_ns else None
     presented = is_presented(message)
     first_heard_ns = of_same.first_heard_ns if of_same else 0
@@ -115,7 +115,7 @@ def after(before: FanAlarm | None, message: Alarm, now_ns: int) -> FanAlarm | No
         deviation=deviation,
         causes=tuple(NamedCause(each.cause, each.probability, each.evidence) for each in message.causes),
         deviation_t_ns=deviation_t_ns,
-        former_producers=former,
+        earlier_producers=earlier,
     )
 
 

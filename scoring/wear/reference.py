@@ -81,14 +81,14 @@ def healthy_fans(balances: Sequence[HealthyBalance], residual: HealthyResidual) 
 class WearReference:
     """What the wear of one fan is measured against.
 
-    offset_command: of the fan's balance at the end of commissioning, at the reference speed. of_former_twin: another
+    offset_command: of the fan's balance at the end of commissioning, at the reference speed. of_earlier_twin: another
     twin or other limits are in force now, so the reference stays as it is. Until then its offset is the present one:
     commissioning refines it when a fan first runs faster.
     """
 
     healthy: HealthyFan
     offset_command: float
-    of_former_twin: bool = False
+    of_earlier_twin: bool = False
 
     def offset_at(self, speed_rad_s: float) -> float:
         """The fan's offset at a speed, in units of the command."""
@@ -104,7 +104,7 @@ class WearReference:
     def snapshot(self) -> dict[str, Any]:
         """As JSON values."""
         return {
-            "of_former_twin": self.of_former_twin,
+            "of_earlier_twin": self.of_earlier_twin,
             "offset_command": self.offset_command,
             "healthy": self.healthy.snapshot(),
         }
@@ -117,4 +117,4 @@ class WearReference:
             ValueError, KeyError, TypeError: it is not such a snapshot.
         """
         healthy = HealthyFan.restore(snapshot["healthy"])
-        return cls(healthy, float(snapshot["offset_command"]), bool(snapshot["of_former_twin"]))
+        return cls(healthy, float(snapshot["offset_command"]), bool(snapshot["of_earlier_twin"]))

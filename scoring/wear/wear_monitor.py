@@ -199,7 +199,7 @@ class WearMonitor:
             fan.keep_reference_unless_of(healthy)
         self._last_turn, self._disturbed_t_ns, self._fans = last_turn, disturbed_t_ns, fans
 
-    def restore_of_former_twin(self, snapshot: Mapping[str, Any]) -> None:
+    def restore_of_earlier_twin(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a snapshot of the twin before: drag, friction and gain go on, the balance starts again.
 
         A fan without a reference in the snapshot starts again as a whole. Nothing has changed if this raises.
@@ -231,7 +231,7 @@ class WearMonitor:
         if window is None:
             return False
         wear, present = self._fans[fan], WearReference(self._healthy[fan], commissioned)
-        reference = wear.reference if wear.reference and wear.reference.of_former_twin else present
+        reference = wear.reference if wear.reference and wear.reference.of_earlier_twin else present
         drifts = parameter_shifts(reference.applied_to(window), reference.healthy.balance)
         if not drifts:
             return False
@@ -267,13 +267,13 @@ class _FanWear:
     def keep_reference_unless_of(self, present: HealthyFan) -> None:
         """Keep the reference of a twin that was calibrated again since."""
         if self.reference and self.reference.healthy.snapshot() != present.snapshot():
-            self.reference = replace(self.reference, of_former_twin=True)
+            self.reference = replace(self.reference, of_earlier_twin=True)
 
     def with_next_twin(self) -> _FanWear:
         """The wear of the fan when another twin takes over. Its points count from the first sample again."""
         following = _FanWear()
         if self.reference is not None:
-            following.reference = replace(self.reference, of_former_twin=True)
+            following.reference = replace(self.reference, of_earlier_twin=True)
             following.series |= {name: series for name, series in self.series.items() if name != "balance"}
             following.evaluate(self.t_ns, np.inf)
         return following

@@ -59,7 +59,7 @@ def test_an_unknown_speed_has_no_expected_balance() -> None:
 
 
 def test_a_snapshot_of_it_is_json_and_loses_nothing() -> None:
-    reference = replace(reference_of(1), of_former_twin=True)
+    reference = replace(reference_of(1), of_earlier_twin=True)
     stored = json.loads(json.dumps(reference.snapshot(), allow_nan=False))
     assert WearReference.restore(stored).snapshot() == reference.snapshot()
 

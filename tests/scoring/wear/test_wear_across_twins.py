@@ -307,8 +307,8 @@ def test_a_fan_that_is_commissioned_again_refers_to_the_present_twin(stopped: Tr
     snapshot = stopped.stop()
     assert min(wear_of(snapshot, WORN)["parameters"]["friction"]["series"]["t_ns"]) > EPOCH_NS + DAYS * DAY_NS
     assert last_friction(stopped, WORN) == pytest.approx(0.0, abs=0.04)
-    assert not wear_of(snapshot, WORN)["reference"]["of_former_twin"]
-    assert wear_of(snapshot, HEALTHY)["reference"]["of_former_twin"]
+    assert not wear_of(snapshot, WORN)["reference"]["of_earlier_twin"]
+    assert wear_of(snapshot, HEALTHY)["reference"]["of_earlier_twin"]
 
 
 def restored(folder: Path, snapshot: ScorerSnapshot) -> Tray:
@@ -332,7 +332,7 @@ def test_a_snapshot_of_an_earlier_version_refers_to_its_own_twin(worn: Tray, tmp
     tray.live(retrained_twin(tmp_path, ABSORBED), DAYS, DAYS + 0.25)
     found = wear_of(tray.stop(), WORN)
     assert found["parameters"]["friction"]["days"] > DAYS - 0.5
-    assert not found["reference"]["of_former_twin"]
+    assert not found["reference"]["of_earlier_twin"]
     assert last_friction(tray, WORN) == pytest.approx((DAYS - TAKEOVER_DAY) * GROWTH_PER_DAY, rel=0.1)
 
 
