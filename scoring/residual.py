@@ -152,7 +152,7 @@ class Residual:
             standardised=standardised.clip(-of.clip, of.clip),
             persistent=(standardised / persistent_std).clip(-of.clip, of.clip),
             shift=shift,
-            baseline=own + sampled.shared if self._sharing else own,  # a sum would make -0.0 of older recordings 0.0
+            baseline=own + sampled.shared,
             shared=sampled.shared,
             intervals=sampled.intervals,
             state=state,

@@ -31,7 +31,6 @@ from pipeline.errors import UserError
 from pipeline.gateway.config import NEEDED
 from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.runtime.signals import stop_on_signals
-from pipeline.runtime.snapshot_store import FORMER_SUFFIX
 from pipeline.selftest.scratch_site import FANTWIN, free_port
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import short_name
@@ -46,7 +45,7 @@ SHOWN_FAN = 5
 """in the picture of the page, while it is in alarm"""
 OUTPUTS = (
     *("recording*.mcap*", "view*.rrd", "bands.png", PICTURE, "summary.json", "truth.json", "up.log", "tray"),
-    *("*.snapshot", f"*{FORMER_SUFFIX}", "alarms.sqlite*", "clips/*"),
+    *("*.snapshot", "alarms.sqlite*", "clips/*"),
 )
 _START_TIMEOUT_S = 60.0
 _STOP_TIMEOUT_S = 60.0
