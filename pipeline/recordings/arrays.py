@@ -121,7 +121,7 @@ def read_arrays(recording: Path | Iterable[Path], topic: str, tray: str | None =
 
     Args:
         recording: a file, or the parts of one recording in any order. A message that is in two parts counts once.
-        topic: see docs/reference/messages.md; names of older recordings work too.
+        topic: see docs/reference/messages.md.
         tray: the tray to read; None for all. The health of stages belongs to no tray and is always read.
         rows: rows of a block. As many are held in memory for each tray.
 

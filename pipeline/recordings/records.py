@@ -274,11 +274,10 @@ def indexed_reader(file: BinaryIO) -> McapReader:
 
 def _second_record(file: BinaryIO) -> McapRecord | None:
     """The record after the header; None where it has no place of its own in the library."""
-    place = len(MCAP0_MAGIC)
-    for _ in range(2):
-        file.seek(place)
-        opcode, length = RECORD.unpack(file.read(RECORD.size))
-        place += RECORD.size + length
+    file.seek(len(MCAP0_MAGIC))
+    _, length = RECORD.unpack(file.read(RECORD.size))
+    file.seek(length, os.SEEK_CUR)
+    opcode, length = RECORD.unpack(file.read(RECORD.size))
     return _parse_known(opcode, file.read(min(length, LARGEST_RECORD_BYTES)))
 
 

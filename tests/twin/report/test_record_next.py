@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from schemas.model_uncertainty import ModelUncertainty
@@ -37,9 +35,8 @@ def test_where_all_commands_were_held_it_is_a_step() -> None:
     assert (found.command, found.speed_rad_s, found.held) == (COMMANDS[2], SPEEDS_RAD_S[8], False)
 
 
-def test_nothing_is_asked_for_that_would_tell_little_or_that_the_card_does_not_know() -> None:
+def test_nothing_is_asked_for_that_would_tell_little() -> None:
     assert least_known(known(speed=140.0, command=0.7, std=2.9), CURVE, None) is None
-    assert least_known(replace(known(speed=140.0, command=0.7, std=9.0), seen_std_rad_s=()), CURVE, None) is None
     diverging = StaticCurve((), np.column_stack((COMMANDS, np.full(11, np.nan))))
     assert least_known(known(speed=140.0, command=0.7, std=9.0), diverging, None) is None
 
