@@ -23,8 +23,6 @@ from schemas.fields import Array, Column, OpenEnum, columns, other_fields, time_
 from schemas.messages import LARGEST_PERIOD_NS, Message
 from schemas.wire_fields import LENGTH_DELIMITED, WireError, WireField, wire_fields
 
-FORMER = "former_"
-"""begins the name of a field with the values of a column in older recordings"""
 _HEADER_KEY = 1 << 3 | LENGTH_DELIMITED  # of the field `header`, in every message
 _BOOLS = b"\0\1"
 _SHORT = 48  # values; up to this length a list is a faster way into an array than the protobuf field itself
@@ -116,7 +114,6 @@ class _PackedColumn:
     """A column with the dtype of its packed bytes, and the key of its field.
 
     Attributes:
-        former: name of the field with its values in older recordings; "": there is none.
         nothing: what an optional column is where the message has none; None: it is not optional.
     """
 
@@ -124,7 +121,6 @@ class _PackedColumn:
     declared: Column
     dtype: np.dtype[Any]
     key: bytes
-    former: str
     nothing: Array | None
 
 
@@ -155,7 +151,6 @@ def _layout(message_type: type[Message]) -> _Layout:
             column,
             column.dtype.newbyteorder("<"),
             _varint(numbers[name] << 3 | LENGTH_DELIMITED),
-            former if (former := f"{FORMER}{name}") in numbers else "",
             _nothing(column.dtype) if column.optional else None,
         )
         for name, column in declared.items()
@@ -219,7 +214,7 @@ def encode(message: Message) -> bytes:
 def decode(message_type: type[AnyMessage], data: bytes) -> AnyMessage:
     """Parse bytes into a message; columns come back read-only in their declared shape.
 
-    A column that was added after the message was recorded is NaN, or 0. Enum values of a newer version are kept.
+    An optional column that the message does not have is empty. Enum values of a newer version are kept.
 
     Raises:
         CodecError: the bytes are not such a message.
@@ -238,11 +233,7 @@ def decode(message_type: type[AnyMessage], data: bytes) -> AnyMessage:
             values[column.name] = column.nothing
             continue
         array = _array(layout, column, field)
-        if not array.size and column.former:
-            array = _array(layout, column, getattr(proto, column.former))
-        if not array.size and column.declared.added_later and samples > 0:
-            array = _absent(column.declared, samples, fans)
-        elif column.declared.shape == "samples x fans":
+        if column.declared.shape == "samples x fans":
             if array.size and (fans == 0 or array.size % fans):
                 raise CodecError(f"{layout.name}.{column.name} has {array.size} values for {fans} fans")
             array = array.reshape(-1 if array.size else 0, fans)
@@ -281,7 +272,7 @@ def decode_columns(message_type: type[AnyMessage], data: bytes, names: Collectio
     layout = _layout(message_type)
     try:
         proto, arrays = _views(layout, data, {*names, layout.time} - {None})
-    except (_OtherFormError, WireError):
+    except (_PackedOtherwiseError, WireError):
         return decode(message_type, data)
     values = layout.record.read(proto)
     fans, samples = values.get("fans", -1), len(arrays[layout.time]) if layout.time else -1
@@ -298,16 +289,16 @@ def decode_columns(message_type: type[AnyMessage], data: bytes, names: Collectio
     return message
 
 
-class _OtherFormError(Exception):
-    """A message of another encoder or an earlier version, which only `decode` can read."""
+class _PackedOtherwiseError(Exception):
+    """A message that another encoder packed otherwise, which only `decode` can read."""
 
 
 def _views(layout: _Layout, data: bytes, names: AbstractSet[str | None]) -> tuple[Any, dict[str, Array]]:
     """The fields that are no columns, parsed, and the named columns by name, flat, as they lie in `data`.
 
     Raises:
-        _OtherFormError: a column that is not optional is missing; one is in several pieces, or not packed as `encode`
-            does it.
+        _PackedOtherwiseError: a column that is not optional is missing; one is in several pieces, or not packed as
+            `encode` does it.
         CodecError: the rest cannot be parsed, or a value is out of its limits.
         WireError: these are no fields.
     """
@@ -318,11 +309,11 @@ def _views(layout: _Layout, data: bytes, names: AbstractSet[str | None]) -> tupl
         if column is None:
             others.append(data[field.key : field.end])
         elif field.wire_type != LENGTH_DELIMITED or column.name in arrays:
-            raise _OtherFormError
+            raise _PackedOtherwiseError
         elif column.name in names:
             arrays[column.name] = _view(layout, column, data, field)
     if len(arrays) < len(names) and not layout.required.isdisjoint(names - arrays.keys()):
-        raise _OtherFormError
+        raise _PackedOtherwiseError
     try:
         return layout.proto.FromString(b"".join(others)), arrays
     except DecodeError as error:
@@ -333,7 +324,7 @@ def _view(layout: _Layout, column: _PackedColumn, data: bytes, field: WireField)
     """The values of a packed field where they lie, (n,)."""
     length, size = field.end - field.start, column.dtype.itemsize
     if not length or length % size:
-        raise _OtherFormError
+        raise _PackedOtherwiseError
     array = np.frombuffer(data, column.dtype, length // size, field.start)
     if size > 1:
         _check_limits(layout, column, array)
@@ -341,7 +332,7 @@ def _view(layout: _Layout, column: _PackedColumn, data: bytes, field: WireField)
         if not data[field.start : field.end].isascii():
             raise _out_of_limits(layout, column)
     elif data[field.start : field.end].translate(None, _BOOLS):
-        raise _OtherFormError
+        raise _PackedOtherwiseError
     return array
 
 
@@ -351,15 +342,6 @@ def _array(layout: _Layout, column: _PackedColumn, field: Any) -> Array:
     if len(values):
         _check_limits(layout, column, values)
     return np.asarray(values, column.declared.dtype)
-
-
-def _absent(column: Column, samples: int, fans: int) -> Array:
-    """The values of a column that the recording does not have: NaN, or 0.
-
-    A broadcast view takes no memory: nothing has checked `fans` yet, and it may be anything.
-    """
-    value = np.array(np.nan if column.dtype.kind == "f" else 0, column.dtype)
-    return np.broadcast_to(value, (samples, fans) if column.by_sample else (fans,))
 
 
 def _sample_count(layout: _Layout, message: Message) -> int:

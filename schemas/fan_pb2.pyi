@@ -355,7 +355,7 @@ class Prediction(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., air_density_ratio: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Score(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic", "supply_voltage_v", "current_a", "temperature_c", "former_command", "former_measured_speed_rad_s", "former_predicted_speed_rad_s", "former_band_variance", "former_smoothed_residual_rad_s", "former_torque_balance_command", "former_speed_baseline_rad_s", "former_balance_baseline_command", "former_score")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic", "supply_voltage_v", "current_a", "temperature_c")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -376,15 +376,6 @@ class Score(_message.Message):
     SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
     CURRENT_A_FIELD_NUMBER: _ClassVar[int]
     TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
-    FORMER_COMMAND_FIELD_NUMBER: _ClassVar[int]
-    FORMER_MEASURED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    FORMER_PREDICTED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    FORMER_BAND_VARIANCE_FIELD_NUMBER: _ClassVar[int]
-    FORMER_SMOOTHED_RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    FORMER_TORQUE_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
-    FORMER_SPEED_BASELINE_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    FORMER_BALANCE_BASELINE_COMMAND_FIELD_NUMBER: _ClassVar[int]
-    FORMER_SCORE_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     period_ns: int
@@ -405,36 +396,23 @@ class Score(_message.Message):
     supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
     current_a: _containers.RepeatedScalarFieldContainer[float]
     temperature_c: _containers.RepeatedScalarFieldContainer[float]
-    former_command: _containers.RepeatedScalarFieldContainer[float]
-    former_measured_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    former_predicted_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    former_band_variance: _containers.RepeatedScalarFieldContainer[float]
-    former_smoothed_residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    former_torque_balance_command: _containers.RepeatedScalarFieldContainer[float]
-    former_speed_baseline_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    former_balance_baseline_command: _containers.RepeatedScalarFieldContainer[float]
-    former_score: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ..., former_command: _Optional[_Iterable[float]] = ..., former_measured_speed_rad_s: _Optional[_Iterable[float]] = ..., former_predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., former_band_variance: _Optional[_Iterable[float]] = ..., former_smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., former_torque_balance_command: _Optional[_Iterable[float]] = ..., former_speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., former_balance_baseline_command: _Optional[_Iterable[float]] = ..., former_score: _Optional[_Iterable[float]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Diagnosis(_message.Message):
-    __slots__ = ("cause", "probability", "parameter", "change", "change_low", "change_high", "unit", "evidence")
+    __slots__ = ("cause", "probability", "parameter", "change", "unit", "evidence")
     CAUSE_FIELD_NUMBER: _ClassVar[int]
     PROBABILITY_FIELD_NUMBER: _ClassVar[int]
     PARAMETER_FIELD_NUMBER: _ClassVar[int]
     CHANGE_FIELD_NUMBER: _ClassVar[int]
-    CHANGE_LOW_FIELD_NUMBER: _ClassVar[int]
-    CHANGE_HIGH_FIELD_NUMBER: _ClassVar[int]
     UNIT_FIELD_NUMBER: _ClassVar[int]
     EVIDENCE_FIELD_NUMBER: _ClassVar[int]
     cause: str
     probability: float
     parameter: str
     change: float
-    change_low: float
-    change_high: float
     unit: str
     evidence: str
-    def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., parameter: _Optional[str] = ..., change: _Optional[float] = ..., change_low: _Optional[float] = ..., change_high: _Optional[float] = ..., unit: _Optional[str] = ..., evidence: _Optional[str] = ...) -> None: ...
+    def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., parameter: _Optional[str] = ..., change: _Optional[float] = ..., unit: _Optional[str] = ..., evidence: _Optional[str] = ...) -> None: ...
 
 class Alarm(_message.Message):
     __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "limit_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_limit_command", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed", "out_of_service", "causes", "request", "operator_name", "comment", "stale", "feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
@@ -519,18 +497,20 @@ class Request(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., action: _Optional[_Union[Action, str]] = ..., fan: _Optional[int] = ..., duration_s: _Optional[float] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., onset_t_ns: _Optional[int] = ...) -> None: ...
 
 class ScorerSnapshot(_message.Message):
-    __slots__ = ("header", "t_ns", "twin_sha256", "restored", "state_json")
+    __slots__ = ("header", "t_ns", "twin_sha256", "restored", "state_json", "format")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     T_NS_FIELD_NUMBER: _ClassVar[int]
     TWIN_SHA256_FIELD_NUMBER: _ClassVar[int]
     RESTORED_FIELD_NUMBER: _ClassVar[int]
     STATE_JSON_FIELD_NUMBER: _ClassVar[int]
+    FORMAT_FIELD_NUMBER: _ClassVar[int]
     header: Header
     t_ns: int
     twin_sha256: str
     restored: bool
     state_json: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin_sha256: _Optional[str] = ..., restored: _Optional[bool] = ..., state_json: _Optional[str] = ...) -> None: ...
+    format: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin_sha256: _Optional[str] = ..., restored: _Optional[bool] = ..., state_json: _Optional[str] = ..., format: _Optional[int] = ...) -> None: ...
 
 class Command(_message.Message):
     __slots__ = ("header", "fans", "t_ns", "command", "set_point_rad_s")
@@ -583,18 +563,16 @@ class NewTwin(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin: _Optional[str] = ..., sha256: _Optional[str] = ..., content: _Optional[bytes] = ..., first_sample_t_ns: _Optional[int] = ...) -> None: ...
 
 class Consumed(_message.Message):
-    __slots__ = ("header", "topic", "output_sequence", "first_t_ns", "t_ns")
+    __slots__ = ("header", "topic", "first_t_ns", "t_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     TOPIC_FIELD_NUMBER: _ClassVar[int]
-    OUTPUT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     FIRST_T_NS_FIELD_NUMBER: _ClassVar[int]
     T_NS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     topic: str
-    output_sequence: int
     first_t_ns: int
     t_ns: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., topic: _Optional[str] = ..., output_sequence: _Optional[int] = ..., first_t_ns: _Optional[int] = ..., t_ns: _Optional[int] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., topic: _Optional[str] = ..., first_t_ns: _Optional[int] = ..., t_ns: _Optional[int] = ...) -> None: ...
 
 class Clock(_message.Message):
     __slots__ = ("header", "t_ns", "rate")

@@ -63,8 +63,7 @@ class Column:
         shape: `samples` (n,), `samples x fans` (n, fans) or `fans` (fans,).
         dtype: of the array, and of its packed bytes.
         enum: what the values mean; None for quantities.
-        optional: the array may be empty although the message has samples.
-        added_later: older recordings lack the column; it then reads as NaN, or 0.
+        optional: the array may be empty although the message has samples, as a column that a recording lacks.
         limits: the smallest and the largest value accepted; None for any.
     """
 
@@ -72,7 +71,6 @@ class Column:
     dtype: np.dtype[Any]
     enum: type[OpenEnum] | None = None
     optional: bool = False
-    added_later: bool = False
     limits: tuple[int, int] | None = None
 
     @property
@@ -91,7 +89,6 @@ def column(
     kind: type,
     *,
     optional: bool = False,
-    added_later: bool = False,
     limits: tuple[int, int] | None = None,
 ) -> Any:
     """Declare a column of a message; see `Column`. `kind` is a NumPy type or an OpenEnum."""
@@ -99,7 +96,7 @@ def column(
     dtype = np.dtype(np.uint8 if enum else kind)
     if enum:
         limits = (0, LARGEST_ENUM_VALUE)
-    declared = Column(shape, dtype, enum, optional, added_later, limits)
+    declared = Column(shape, dtype, enum, optional, limits)
     return field(default_factory=lambda: np.zeros(0, dtype), metadata={"column": declared})
 
 

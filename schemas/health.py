@@ -97,11 +97,10 @@ class Health:
 
     Attributes:
         latency_p50_ms: of the outputs of the last ten seconds, as latency_p99_ms.
-        latencies: a histogram of all outputs of its session, whose latencies add up to latency_sum_s; earlier versions,
-            and a stage without outputs, send none.
-        trays: those that it has, separated by commas; empty: all of the site. Earlier versions do not say it: there, a
-            stage with a process for each tray has the one that its instance names.
-        is_last: the last message of its session, whatever its status. Earlier versions do not set it: see `has_ended`.
+        latencies: a histogram of all outputs of its session, whose latencies add up to latency_sum_s; a stage without
+            outputs sends none.
+        trays: those that it has, separated by commas; empty: all of the site.
+        is_last: the last message of its session, whatever its status.
     """
 
     header: Header = Header()
@@ -127,8 +126,3 @@ class Health:
     is_last: bool = False
     latencies: tuple[LatencyBucket, ...] = ()
     latency_sum_s: float = 0.0
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether its session has ended, in order or with an error. It sends no more."""
-        return self.is_last or self.status == StageStatus.STOPPED

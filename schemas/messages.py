@@ -14,6 +14,7 @@ import numpy as np
 
 from schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Statistic, TachoKind, Transition
 from schemas.fields import Array, column, derived, time_column
+from schemas.formats import SNAPSHOT
 from schemas.header import Header
 from schemas.health import Health
 from schemas.tacho import Tacho
@@ -125,8 +126,8 @@ class Prediction:
     valid: Array = column("samples x fans", np.bool_)
     invalid_reason: Array = column("samples x fans", InvalidReason)
     twin: str = ""
-    torque_balance_command: Array = column("samples x fans", np.float64, added_later=True)
-    torque_balance_sigma_command: Array = column("fans", np.float64, added_later=True)
+    torque_balance_command: Array = column("samples x fans", np.float64)
+    torque_balance_sigma_command: Array = column("fans", np.float64)
     reading_range_rad_s: Array = column("samples x fans", np.float64, optional=True)
     averaged_command: Array = column("samples x fans", np.float64, optional=True)
     reading_missing: Array = column("samples x fans", np.bool_, optional=True)
@@ -158,11 +159,11 @@ class Score:
     state: Array = column("samples x fans", FanState)
     valid: Array = column("samples x fans", np.bool_)
     invalid_reason: Array = column("samples x fans", InvalidReason)
-    torque_balance_command: Array = column("samples x fans", np.float32, added_later=True)
-    speed_baseline_rad_s: Array = column("samples x fans", np.float32, added_later=True)
-    balance_baseline_command: Array = column("samples x fans", np.float32, added_later=True)
-    score: Array = column("samples x fans", np.float32, added_later=True)
-    statistic: Array = column("samples x fans", Statistic, added_later=True)
+    torque_balance_command: Array = column("samples x fans", np.float32)
+    speed_baseline_rad_s: Array = column("samples x fans", np.float32)
+    balance_baseline_command: Array = column("samples x fans", np.float32)
+    score: Array = column("samples x fans", np.float32)
+    statistic: Array = column("samples x fans", Statistic)
     supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
     current_a: Array = column("samples x fans", np.float32, optional=True)
     temperature_c: Array = column("samples x fans", np.float32, optional=True)
@@ -196,8 +197,6 @@ class Diagnosis:
     probability: float
     parameter: str = ""
     change: float = 0.0
-    change_low: float = 0.0
-    change_high: float = 0.0
     unit: str = ""
     evidence: str = ""
 
@@ -256,13 +255,14 @@ class Request:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScorerSnapshot:
-    """State that a scorer needs to continue after a restart."""
+    """State that a scorer needs to continue after a restart. format: of `state_json`; 0 where none was stated."""
 
     header: Header = Header()
     t_ns: int
     twin_sha256: str
     restored: bool = False
     state_json: str = ""
+    format: int = SNAPSHOT.written
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -315,13 +315,12 @@ class Consumed:
     """What a session of a stage had consumed when it made an output: the input position of the header is the output's.
 
     Attributes:
-        topic, output_sequence: of the output.
+        topic: of the output.
         first_t_ns, t_ns: its first and its newest sample.
     """
 
     header: Header = Header()
     topic: str
-    output_sequence: int
     first_t_ns: int
     t_ns: int
 

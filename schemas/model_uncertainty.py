@@ -5,25 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, ConfigDict, model_validator
+from pydantic import ConfigDict, model_validator
 from pydantic.dataclasses import dataclass
 
 from schemas.fields import Array
 
 Table: TypeAlias = tuple[tuple[float, ...], ...]
-
-
-def _one_for_all(ndim: int) -> BeforeValidator:
-    """Accepts the value of an early card: one for all fans, of so many dimensions, becomes a tuple of one; None, ()."""
-
-    def of_each(value: Any) -> Any:
-        return () if value is None else (value,) if np.ndim(value) == ndim else value
-
-    return BeforeValidator(of_each)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="ignore", allow_inf_nan=False))
@@ -35,45 +26,27 @@ class ModelUncertainty:
     settles. std_rad_s: (fans, commands, speeds), rad/s; a card with a single table uses it for all fans. With a drive,
     a command on its plateau is the end of the plateau. seen_std_rad_s: (fans,) where a fan was held in training the
     standard deviation is hardly ever above this one.
-
-    Early cards have no settled_speed_rad_s: their speeds are absolute, their one table is (1, speeds, commands), and
-    seen_std_rad_s may be empty.
     """
 
     speeds_rad_s: tuple[float, ...]
     commands: tuple[float, ...]
-    std_rad_s: Annotated[tuple[Table, ...], _one_for_all(2)]
-    seen_std_rad_s: Annotated[tuple[float, ...], _one_for_all(0)] = ()
-    settled_speed_rad_s: tuple[tuple[float, ...], ...] = ()
+    std_rad_s: tuple[Table, ...]
+    seen_std_rad_s: tuple[float, ...]
+    settled_speed_rad_s: tuple[tuple[float, ...], ...]
 
     @model_validator(mode="after")
     def _check(self) -> ModelUncertainty:
         if any(len(axis) < 2 or np.diff(axis).min() <= 0.0 for axis in (self.speeds_rad_s, self.commands)):
             raise ValueError("speeds_rad_s and commands must be rising, two of each at least")
-        shape = len(self.rows), len(self.columns)
+        shape = len(self.commands), len(self.speeds_rad_s)
         found = [[len(row) for row in table] for table in self.std_rad_s]
         if not found or found != [[shape[1]] * shape[0]] * len(found) or np.min(self.std_rad_s) < 0.0:
             raise ValueError("std_rad_s must have a value for each command and speed, none below zero")
-        if self.settled_speed_rad_s and [len(row) for row in self.settled_speed_rad_s] != [shape[0]] * len(found):
+        if [len(row) for row in self.settled_speed_rad_s] != [shape[0]] * len(found):
             raise ValueError("settled_speed_rad_s must have a speed for each command of each fan")
-        if self.seen_std_rad_s and (len(self.seen_std_rad_s) != len(found) or min(self.seen_std_rad_s) < 0.0):
+        if len(self.seen_std_rad_s) != len(found) or min(self.seen_std_rad_s) < 0.0:
             raise ValueError("seen_std_rad_s must have a value for each table, none below zero")
         return self
-
-    @property
-    def is_early(self) -> bool:
-        """Whether it is of an early card."""
-        return not self.settled_speed_rad_s
-
-    @property
-    def rows(self) -> tuple[float, ...]:
-        """The axis of the rows of each table."""
-        return self.speeds_rad_s if self.is_early else self.commands
-
-    @property
-    def columns(self) -> tuple[float, ...]:
-        """The axis of their columns."""
-        return self.commands if self.is_early else self.speeds_rad_s
 
     def of_fans(self, rows: Sequence[int]) -> ModelUncertainty:
         """The tables of the fans in these rows; a single table for all fans is returned as it is."""
@@ -81,7 +54,7 @@ class ModelUncertainty:
             return self
         names = "std_rad_s", "seen_std_rad_s", "settled_speed_rad_s"
         of_all = {name: getattr(self, name) for name in names}
-        return replace(self, **{name: tuple(of[row] for row in rows) for name, of in of_all.items() if of})
+        return replace(self, **{name: tuple(of[row] for row in rows) for name, of in of_all.items()})
 
     def std_at(self, speed_rad_s: Array, command: Array) -> Array:
         """Standard deviation, rad/s, at speeds and commands of one shape, whose last axis is over the fans; NaN where
@@ -99,16 +72,14 @@ class ModelUncertainty:
     def unseen_std_at(self, speed_rad_s: Array, command: Array) -> Array:
         """What of it adds to the errors that training has seen, rad/s: 0 at most samples at which the fan was held."""
         row, column = self._places(speed_rad_s, command)
-        cell = self._first_cell + row.before * (len(self.columns) - 1) + column.before
-        if not self.seen_std_rad_s or not self._has_unseen.take(cell).any():
+        cell = self._first_cell + row.before * (len(self.speeds_rad_s) - 1) + column.before
+        if not self._has_unseen.take(cell).any():
             return np.zeros(speed_rad_s.shape)  # as nearly always
         unseen = np.sqrt(np.maximum(self._between(row, column) ** 2 - self._seen_squared, 0.0))
         return np.where(self._has_unseen.take(cell), unseen, 0.0)  # whatever the other fans and samples are
 
     def _places(self, speed_rad_s: Array, command: Array) -> tuple[_Place, _Place]:
         """On the axes of rows and of columns."""
-        if self.is_early:
-            return _place(speed_rad_s, *self._row_axis), _place(command, *self._column_axis)
         row = _place(command, *self._row_axis)
         at = self._first_row + row.before
         before = self._settled.take(at)
@@ -116,7 +87,7 @@ class ModelUncertainty:
         return row, _place(speed_rad_s - settled_rad_s, *self._column_axis)
 
     def _between(self, row: _Place, column: _Place) -> Array:
-        width, table = len(self.columns), self._tables
+        width, table = len(self.speeds_rad_s), self._tables
         at = self._first_point + row.before * width + column.before
         lower = table.take(at) + column.share * (table.take(at + 1) - table.take(at))
         upper = table.take(at + width) + column.share * (table.take(at + width + 1) - table.take(at + width))
@@ -137,17 +108,17 @@ class ModelUncertainty:
     @cached_property
     def _first_row(self) -> NDArray[np.intp]:
         """(fans or 1,) where the rows of each table begin."""
-        return np.arange(len(self._tables)) * len(self.rows)
+        return np.arange(len(self._tables)) * len(self.commands)
 
     @cached_property
     def _first_point(self) -> NDArray[np.intp]:
         """(fans or 1,) where the table of each fan begins."""
-        return self._first_row * len(self.columns)
+        return self._first_row * len(self.speeds_rad_s)
 
     @cached_property
     def _first_cell(self) -> NDArray[np.intp]:
         """(fans or 1,) where the cells between the points of each table begin."""
-        return np.arange(len(self._tables)) * (len(self.rows) - 1) * (len(self.columns) - 1)
+        return np.arange(len(self._tables)) * (len(self.commands) - 1) * (len(self.speeds_rad_s) - 1)
 
     @cached_property
     def _has_unseen(self) -> NDArray[np.bool_]:
@@ -158,11 +129,11 @@ class ModelUncertainty:
 
     @cached_property
     def _row_axis(self) -> tuple[Array, Array]:
-        return _axis(self.rows)
+        return _axis(self.commands)
 
     @cached_property
     def _column_axis(self) -> tuple[Array, Array]:
-        return _axis(self.columns)
+        return _axis(self.speeds_rad_s)
 
 
 class _Place(NamedTuple):

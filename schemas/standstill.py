@@ -37,7 +37,7 @@ class Standstill(BaseModel):
         default=None,
         ge=0,
         description="longest time from a command to stop to a reading of 70 % of the speed, less the mean delay of "
-        "readings; null in early cards",
+        "readings; null where none was seen",
     )
     coast_time_constant_s: float | None = Field(
         default=None, gt=0, description="typical time constant of a fan that coasts"

@@ -136,13 +136,6 @@ TOPICS: tuple[Topic, ...] = (
     ),
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}
-FORMER_NAMES = {"memory": "snapshot"}
-"""names of topics in the keys of older recordings, which are still read"""
-
-
-def current_name(topic: str) -> str:
-    """The name of a topic today, given a name that it has or had."""
-    return FORMER_NAMES.get(topic, topic)
 
 
 def most_samples(fans: int) -> int:
@@ -195,7 +188,7 @@ def sessions_key(site: str, stage: str = "*", instance: str = "*") -> str:
 
 def session_key(site: str, stage: str, instance: str, *parts: object) -> str:
     """Key of the token of one session. parts: when it started, its producer, its host, its process id; and its trays,
-    where its instance does not say them."""
+    unless it has all."""
     return "/".join((sessions_key(site, stage, instance).removesuffix("/**"), *map(str, parts)))
 
 
@@ -225,5 +218,5 @@ def topic_of(key: str) -> Topic:
     if len(parts) == 5 and parts[0] == ROOT and parts[2] == HEALTH_CHUNK:
         return BY_NAME["health"]
     if len(parts) == 4 and parts[0] == ROOT:
-        return BY_NAME[current_name(parts[3])]
+        return BY_NAME[parts[3]]
     raise KeyError(key)

@@ -10,7 +10,7 @@ The graph beside it (float64) takes `state` (fans, n_state), `command` (n, fans)
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -19,25 +19,15 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
+from schemas.formats import TWIN_CARD
 from schemas.model_uncertainty import ModelUncertainty
 from schemas.reference_conditions import ReferenceConditions
 from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 
 CARD_PROPERTY = "fantwin.card"
-FORMAT_VERSION = 3
 GRAPH_INPUTS = ("state", "command", "step_s", "parameters")
 GRAPH_OUTPUTS = ("speed_rad_s", "state_out")
-
-FORMER_FIELDS_BY_KIND: dict[str, dict[str, Any]] = {
-    "physical": {"fixed_rate": False, "used_parameters": ("J", "alpha", "C_D", "lag_s")},
-    "hybrid": {"fixed_rate": False, "used_parameters": ("J", "alpha", "C_D", "lag_s")},
-    "neural-ode": {"fixed_rate": False, "used_parameters": ("lag_s",)},
-    "narx": {"fixed_rate": True, "used_parameters": ()},
-}
-"""Fields that early cards do not have: their kind implies them."""
-FORMER_ERRORS = "std_errors"
-"""Early cards have standard errors of the balance in place of `covariance`: their correlations are not known."""
 
 Array: TypeAlias = NDArray[np.float64]
 Positive: TypeAlias = Annotated[float, Field(gt=0)]
@@ -100,7 +90,7 @@ class TrainingCard:
     """How the twin was trained.
 
     physics: whether they were refined together with the network. duration_s: duration of the training. fans: the fan
-    numbers in the recordings, in the order of the card's lists; empty in early cards. networks: how many were trained;
+    numbers in the recordings, in the order of the card's lists; empty: counted from 0. networks: how many were trained;
     the twin is the mean of those that ended about as well as the best. iterations: of all of them. of_type: name of the
     twin of the type whose network it has, if only its physics are of these fans; else empty.
     """
@@ -225,13 +215,13 @@ class TwinCard:
     speed_range_rad_s, command_range, rate_hz: of the training data; outside them the twin extrapolates. calibration:
     of the alarms (scoring.limits), None before calibration. tacho: what the free run must pass before it is compared
     with readings, and the command before the torque balance; one for all fans, or one for each. standstill: how the
-    fans stop, stand and start; None in early cards, and where the runs do not show at which commands fans turn. drive:
+    fans stop, stand and start; None where the runs do not show at which commands fans turn. drive:
     of fans that control their own speed; None: the command acts as it is. reading_sigma_rad_s: per fan, root mean
     square of the distance of healthy readings from those that the tachos may show of the free run, of fans that neither
-    start nor stand; empty in early cards and where tachos are instantaneous: it is sigma_rad_s there.
+    start nor stand; empty where tachos are instantaneous: it is sigma_rad_s there.
     model_uncertainty: how far the twin itself may be wrong at each speed and command, for each fan; of hybrids only,
-    None for other kinds and in early cards. conditions: the supply voltage and the air for which it holds, and so the
-    columns that it needs beside the command (schemas.reference_conditions); None: none, as in early cards.
+    None for other kinds. conditions: the supply voltage and the air for which it holds, and so the
+    columns that it needs beside the command (schemas.reference_conditions); None: none. format: of the card.
     """
 
     kind: str
@@ -266,7 +256,7 @@ class TwinCard:
     reading_sigma_rad_s: tuple[Positive, ...] = ()
     model_uncertainty: ModelUncertainty | None = None
     conditions: ReferenceConditions | None = None
-    format_version: int = FORMAT_VERSION
+    format: int = TWIN_CARD.written
 
     @model_validator(mode="after")
     def _check_consistency(self) -> TwinCard:
@@ -313,48 +303,24 @@ class TwinCard:
 
     @staticmethod
     def from_json(text: str) -> TwinCard:
-        """The card in JSON text of this format, earlier forms of its fields included.
+        """The card in JSON text.
 
         Raises:
-            CardError: it is not a card, or of another format.
+            CardError: it is not a card, or of an unknown format.
         """
         try:
             fields = json.loads(text)
         except json.JSONDecodeError as error:
             raise CardError(f"the twin's card cannot be used: it is not JSON ({error}); train it again") from error
+        stated = fields.get("format") if isinstance(fields, dict) else None
+        if refusal := TWIN_CARD.refusal(stated):
+            raise CardError(refusal)
         try:
-            version = _ANY_FORMAT.validate_python(fields).format_version
-            if version != FORMAT_VERSION:
-                advice = "update fantwin" if version > FORMAT_VERSION else "train it again"
-                raise CardError(f"twin format {version}, this fantwin knows {FORMAT_VERSION}: {advice}")
-            return _CARD.validate_python(_in_present_form(fields))
+            return _CARD.validate_python(fields)
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"])) or "it"
             raise CardError(f"the twin's card cannot be used: {where}: {first['msg']}; train it again") from error
 
 
-@dataclass(frozen=True, config=_CONFIG)
-class _CardOfAnyFormat:
-    format_version: int
-
-
-def _in_present_form(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a card, with those of earlier cards of the same format in their present form."""
-    present = FORMER_FIELDS_BY_KIND.get(str(fields.get("kind")), {}) | dict(fields)
-    balance = present.get("balance")
-    if isinstance(balance, dict) and balance.get("covariance") is None and FORMER_ERRORS in balance:
-        try:
-            errors = _FOURS.validate_python(balance[FORMER_ERRORS])
-        except ValidationError as error:
-            raise CardError(
-                f"the twin's card cannot be used: balance.{FORMER_ERRORS} must have four numbers for each fan; "
-                "train it again"
-            ) from error
-        present["balance"] = balance | {"covariance": [np.diag(np.square(of_fan)).tolist() for of_fan in errors]}
-    return present
-
-
 _CARD = TypeAdapter(TwinCard)
-_ANY_FORMAT = TypeAdapter(_CardOfAnyFormat)
-_FOURS = TypeAdapter(tuple[Four, ...])

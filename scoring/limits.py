@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
 from scoring.baseline.healthy_residual import HealthyResidual
@@ -19,9 +19,7 @@ from scoring.detectors.missing_readings import MissingReadingsSettings
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
 from scoring.detectors.tacho import TachoSettings
-from scoring.former_limits import FORMER_FORMAT_VERSION, upgraded
 
-FORMAT_VERSION = 2
 NEVER_S = 1e9
 ADAPTATION_BESIDE_OTHERS_S = 300.0
 Settings = TypeVar("Settings", bound=DetectorSettings)
@@ -66,7 +64,6 @@ class DeclaredRate(_Entry):
 class Limits(_Entry):
     """All limits of a twin."""
 
-    format_version: int = FORMAT_VERSION
     speed: HealthyResidual = Field(description="the healthy speed residual")
     balance: HealthyResidual = Field(description="the healthy torque balance")
     detectors: dict[str, SerializeAsAny[DetectorSettings]] = Field(
@@ -77,12 +74,6 @@ class Limits(_Entry):
     )
     timing: Timing = Field(default=Timing(), description="the times for which the limits are valid")
     declared_rate: DeclaredRate | None = Field(default=None, description="null where these limits have none")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_older_card(cls, card: Any) -> Any:
-        is_older = isinstance(card, Mapping) and isinstance(card.get("speed"), Mapping) and "detectors" not in card
-        return upgraded(card) if is_older and card.get("format_version", 1) == FORMER_FORMAT_VERSION else card
 
     @field_validator("detectors", mode="before")
     @classmethod

@@ -148,7 +148,7 @@ class Residual:
             standardised=standardised.clip(-of.clip, of.clip),
             persistent=(standardised / persistent_std).clip(-of.clip, of.clip),
             shift=shift,
-            baseline=own + sampled.shared if self._sharing else own,
+            baseline=own + sampled.shared,
             shared=sampled.shared,
             intervals=sampled.intervals,
             state=state,

@@ -21,7 +21,6 @@ from pipeline.presenting.alarm_rates import AlarmRates
 from pipeline.presenting.alarm_store import HISTORY, AlarmStore
 from pipeline.presenting.fan_history import curves_of
 from pipeline.presenting.other_stages import VIEWER, configured, recordings_of, viewer_urls
-from pipeline.presenting.recorded_alarms import RecordedAlarms
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stages_json
 from pipeline.presenting.site_core import SiteCore
@@ -44,11 +43,8 @@ MOST_FOLLOWED = 32
 class GatewayCore(SiteCore):
     """Collects what the server shows, and sends what operators ask."""
 
-    def __init__(
-        self, model: SiteModel, feed: LiveFeed, desk: RequestDesk, serve: Server, recorded: RecordedAlarms
-    ) -> None:
+    def __init__(self, model: SiteModel, feed: LiveFeed, desk: RequestDesk, serve: Server) -> None:
         super().__init__(model, desk)
-        self._recorded = recorded
         self._feed = feed
         self._server = serve
         self._is_small = sum(tray.fans for tray in model.trays) <= ALL_FOLLOWED
@@ -92,7 +88,6 @@ class GatewayCore(SiteCore):
     def close(self) -> Sequence[Message]:
         """Stop the server, and close the history."""
         self._server.stop()
-        self._recorded.stop()
         self._model.close()
         return ()
 
@@ -117,7 +112,7 @@ class GatewayCore(SiteCore):
 
     def problem(self) -> str:
         """Of the server, the users and the history."""
-        return "; ".join(filter(None, (self._server.problem(), self._model.problem(), self._recorded.problem)))
+        return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
 
 
 class Server:
@@ -138,7 +133,6 @@ class _Running(Server):
         model: SiteModel,
         feed: LiveFeed,
         desk: RequestDesk,
-        recorded: RecordedAlarms,
         clip_folders: Sequence[Path],
     ) -> None:
         from pipeline.gateway.access import Access  # noqa: PLC0415  slow to import
@@ -155,9 +149,7 @@ class _Running(Server):
         self._access = Access(config, Users(context.resolve(config.users)) if config.users else None)
         listening = listen(config.host, config.port + context.shard_number - 1)
         site = configured(context, VIEWER)
-        app = application(
-            Api(model, self._access, feed, desk, recorded, viewer_urls(site) if site else {}, clip_folders), config
-        )
+        app = application(Api(model, self._access, feed, desk, viewer_urls(site) if site else {}, clip_folders), config)
         self._server = WebServer(app, listening, tls, feed.end, frozenset({"127.0.0.1", "::1", *config.proxies}))
 
     def stop(self) -> None:
@@ -180,12 +172,8 @@ def build(context: Context) -> BuiltStage:
     model = SiteModel(context.site, context.trays, store, rates=AlarmRates(path))
     feed, desk = LiveFeed(), RequestDesk(context.producer)
     site = configured(context, RECORDER)
-    recordings = recordings_of(site) if site else ()
-    recorded = RecordedAlarms(model, recordings)
-    clip_folders = tuple(dict.fromkeys(map(clip_folder, recordings)))
-    core = GatewayCore(model, feed, desk, _Running(context, model, feed, desk, recorded, clip_folders), recorded)
-    recorded.start()
-    return BuiltStage(core)
+    clip_folders = tuple(dict.fromkeys(map(clip_folder, recordings_of(site) if site else ())))
+    return BuiltStage(GatewayCore(model, feed, desk, _Running(context, model, feed, desk, clip_folders)))
 
 
 def check(context: Context) -> list[str]:

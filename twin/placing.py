@@ -59,7 +59,7 @@ def place_twin(
     acting = drive.driven(runs) if drive else runs
     identification, of_unknowns = place_fans(model.network, card, acting, _correlated_samples(card, runs), progress)
     uncertainty = None
-    if card.model_uncertainty and not card.model_uncertainty.is_early:
+    if card.model_uncertainty:
         friction = drive.settings[:, DRIVE_PARAMETERS.index("friction")] if drive else np.zeros(fans)
         top_speed_rad_s = float(identification.top_speed_rad_s[0])
         uncertainty = placed_uncertainty(

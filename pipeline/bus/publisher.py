@@ -104,8 +104,8 @@ class Publisher:
     def _answer(self, query: zenoh.Query) -> None:
         """Answer with what is kept of a range, and at the end with the number of published messages.
 
-        A consumer that begins asks for the newest ones only. If more is kept than a consumer takes in one answer, that
-        number is left out: the consumer then asks for the rest.
+        A consumer that begins asks for the newest ones only, and gets no number. If more is kept than a consumer takes
+        in one answer, the number is left out: the consumer then asks for the rest.
         """
         first, last, newest = (number_in(query.parameters.get(name) or "") for name in ("first", "last", "newest"))
         first, last = first or 0, LAST_SEQUENCE if last is None else last
@@ -125,5 +125,5 @@ class Publisher:
                 if messages > MOST_RECOVERED_MESSAGES or (size > MOST_RECOVERED_BYTES and messages > 1):
                     return
                 query.reply(self._recovery_key, payload)
-            if query.parameters.get("count"):  # earlier versions do not ask, and would take it for a message
+            if not newest:
                 query.reply(self._recovery_key, b"", attachment=str(published).encode())

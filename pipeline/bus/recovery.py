@@ -79,10 +79,9 @@ class RecoveryRequest:
         self._lock = threading.Lock()
         self._has_ended = False
         self._cancellation = zenoh.CancellationToken()
-        if newest is not None:
-            more = f";newest={newest}"
-        else:
-            more = ";count=1" if self._is_of_one else f";count=1;newest={CATCH_UP_MESSAGES}"
+        if newest is None and not self._is_of_one:
+            newest = CATCH_UP_MESSAGES
+        more = "" if newest is None else f";newest={newest}"
         session.get(
             f"{recovery_key(key, producer)}?first={first};last={last}{more}",
             zenoh.handlers.Callback(self._receive, lambda: self._end(None), indirect=False),

@@ -31,6 +31,7 @@ from pipeline.config.models import (
 from pipeline.config.registry import STAGES
 from pipeline.devices.sample_source import SourceConfig
 from pipeline.devices.source_kinds import SOURCE_KINDS, source_config
+from schemas.formats import CONFIGURATION
 
 LARGEST_FILE_BYTES = 1 << 20
 LONGEST_OVERRIDE = 1000
@@ -42,6 +43,7 @@ MOST_SHOWN = 5
 
 
 class _File(Section):
+    format: int = Field(default=CONFIGURATION.written, description="number of the format of this file")
     site: Name = Field(default="site", description="name of the site: it begins the keys on the bus")
     run_folder: Path = Field(default=Path("runs"), description="where recordings, snapshots and logs are written")
     bus: BusConfig = BusConfig()
@@ -105,6 +107,8 @@ def parse_config(
 def _checked(
     table: dict[str, Any], text: str, path: Path, overrides: tuple[str, ...], stages: Iterable[str] | None
 ) -> Config:
+    if refusal := CONFIGURATION.refusal(table.get("format", CONFIGURATION.written)):
+        raise ConfigError(f"{path}: {refusal}")
     own = {key: value for key, value in table.items() if key not in STAGES}
     for key in own:
         if key not in _File.model_fields:

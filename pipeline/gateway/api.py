@@ -28,7 +28,6 @@ from pipeline.gateway.metrics import metrics_text
 from pipeline.gateway.shared_answer import SharedAnswer
 from pipeline.presenting.fan_groups import FanGroup
 from pipeline.presenting.fan_history import HISTORY_S
-from pipeline.presenting.recorded_alarms import RecordedAlarms
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.request_form import RequestForm
 from pipeline.presenting.shown import (
@@ -81,7 +80,6 @@ class Api:
     access: Access
     feed: LiveFeed
     desk: RequestDesk
-    recorded: RecordedAlarms
     viewer_urls: Mapping[str, str]
     """by tray, of Rerun's viewer for browsers; none where it is not served"""
     clip_folders: Sequence[Path] = ()
@@ -149,7 +147,6 @@ class Api:
                     transition_json(number, alarm, said) for (number, alarm), said in zip(found, feedback, strict=True)
                 ],
                 "begins_t_ns": begins_t_ns,
-                "is_reading_recordings": self.recorded.is_reading,
             }
         )
 

@@ -28,7 +28,7 @@ from pipeline.runtime.stage import load_stage
 from schemas.enums import StageStatus
 from schemas.health import Health
 from schemas.streams import StreamId, StreamState, input_streams, output_streams
-from schemas.topics import ALL_TRAYS, HEALTH_CHUNK, current_name, stage_label
+from schemas.topics import HEALTH_CHUNK, stage_label
 
 Launched: TypeAlias = tuple[str, int]
 """label and process id of a session"""
@@ -68,11 +68,7 @@ def label(health: Health) -> str:
 
 def trays_of(health: Health) -> tuple[str, ...]:
     """The trays of the process of a stage; none: all of the site."""
-    if health.trays:
-        return tuple(health.trays.split(","))
-    row = STAGES.get(health.stage)
-    is_of_one = row is not None and row.scope == "tray" and health.instance != ALL_TRAYS  # of an earlier version
-    return (health.instance,) if is_of_one else ()
+    return tuple(health.trays.split(",")) if health.trays else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +141,7 @@ class _Site:
         tray, topic = key.split("/")[-2:]
         is_its_tray = tray in (trays_of(health) or (tray,))
         reads = self.reads[stage] if stage in self.reads else load_stage(stage).reads
-        return is_its_tray and current_name(topic) in reads
+        return is_its_tray and topic in reads
 
     def has_ended(self, stream: StreamId, run: Sequence[_Session]) -> bool:
         """Whether the producer of a stream had ended when these sessions of a stage had stopped."""

@@ -104,20 +104,6 @@ class AlarmRates:
             return
         self.problem = ""
 
-    def add_earlier(self, alarms: Sequence[Alarm]) -> None:
-        """Take what operators said of alarms of before the gateway's first start. They count in no rate: for how long
-        fans were judged then is not known here.
-
-        Raises:
-            UserError: it cannot be kept.
-        """
-        try:
-            for alarm in alarms:
-                if alarm.transition in _GIVEN:
-                    self._add(alarm)
-        except sqlite3.Error as error:
-            raise UserError(f"{self._path}: {error}: feedback on alarms of recordings is not kept") from error
-
     def observed(self) -> dict[str, ObservedRate]:
         """Of each tray, since its twin of now began to judge it.
 

@@ -1,7 +1,6 @@
 """The history of alarms: each transition that was heard, in a file that survives a restart of the gateway.
 
-The bus keeps the last transitions too, and a gateway that starts asks for them: each is kept once. Those of before its
-first start may be in recordings: they get numbers below 0, so that the order by number is that of time.
+The bus keeps the last transitions too, and a gateway that starts asks for them: each is kept once.
 """
 
 from __future__ import annotations
@@ -127,40 +126,12 @@ class AlarmStore:
                 self._file.execute("UPDATE beginning SET t_ns = (SELECT MIN(t_ns) FROM transition)")
         return done.rowcount > 0
 
-    def add_earlier(self, alarms: Sequence[Alarm]) -> int:
-        """Keep transitions of before all others, the last first, as far as there is room; returns how many had room.
-
-        Raises:
-            UserError: they cannot be kept.
-        """
-        try:
-            first, last = self._file.execute("SELECT MIN(number), MAX(number) FROM transition").fetchone()
-            number = min(first or 0, 0)
-            lowest = max(last or 0, 0) - MOST_TRANSITIONS + 1
-            room = alarms[: max(0, number - lowest)]
-            self._file.execute("BEGIN")
-            for alarm in room:
-                number -= 1
-                header = alarm.header
-                row = (number, header.tray, alarm.fan, alarm.t_ns, header.producer, header.sequence, encode(alarm))
-                self._file.execute("INSERT OR IGNORE INTO transition VALUES (?, ?, ?, ?, ?, ?, ?)", row)
-            self._file.execute("COMMIT")
-        except sqlite3.Error as error:
-            with suppress(sqlite3.Error):
-                self._file.rollback()
-            raise UserError(f"{self._path}: {error}: alarms of recordings are not in the history") from error
-        return len(room)
-
     def begins(self, t_ns: int) -> None:
         """The history is complete from this time on, or from an earlier one that was given before. `problem` says it if
         that cannot be kept."""
         try:
-            kept = self.begins_t_ns()
-            if kept is None:
-                (first_t_ns,) = self._file.execute("SELECT MIN(t_ns) FROM transition").fetchone()
-                self._file.execute("INSERT INTO beginning VALUES (?)", (min(t_ns, first_t_ns or t_ns),))
-            elif t_ns < kept:
-                self._file.execute("UPDATE beginning SET t_ns = ?", (t_ns,))
+            if self.begins_t_ns() is None:
+                self._file.execute("INSERT INTO beginning VALUES (?)", (t_ns,))
         except sqlite3.Error as error:
             self._why_unsaved = f"{self._path}: {error}: how far back the history reaches is not kept"
         except UserError:

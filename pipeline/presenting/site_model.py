@@ -285,26 +285,6 @@ class SiteModel:
         with self._lock:
             return self._store.begins_t_ns()
 
-    def add_earlier_alarms(self, alarms: Sequence[Alarm]) -> int:
-        """Transitions of before all others: `AlarmStore.add_earlier`."""
-        with self._lock:
-            kept = self._store.add_earlier(alarms)
-            if self._rates is not None:
-                self._rates.add_earlier(alarms[:kept])
-            return kept
-
-    def has_read(self, reader: str) -> bool:
-        """Whether a reader of earlier alarms has finished, in this process or one before."""
-        with self._lock:
-            return self._store.position(reader) != 0
-
-    def finish_reading(self, reader: str, begins_t_ns: int | None) -> None:
-        """A reader of earlier alarms has finished. begins_t_ns: from when on they are complete; None: it is unknown."""
-        with self._lock:
-            self._store.set_position(reader, 1)
-            if begins_t_ns is not None:
-                self._store.begins(begins_t_ns)
-
     def add_snapshot(self, snapshot: ScorerSnapshot) -> None:
         """A scorer has sent its state, of which the wear is kept."""
         tray = snapshot.header.tray

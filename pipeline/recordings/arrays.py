@@ -18,7 +18,7 @@ from pipeline.recordings.reading import RecordingError, read_recording
 from schemas.envelope import Envelope
 from schemas.fields import LARGEST_ENUM_VALUE, Array, OpenEnum, columns, derived_columns, other_fields, time_column
 from schemas.messages import Message
-from schemas.topics import BY_NAME, HEALTH_CHUNK, TOPICS, current_name
+from schemas.topics import BY_NAME, HEALTH_CHUNK, TOPICS
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def read_arrays(recording: Path | Iterable[Path], topic: str, tray: str | None =
 
     Args:
         recording: a file, or the parts of one recording in any order. A message that is in two parts counts once.
-        topic: see docs/reference/messages.md; names of older recordings work too.
+        topic: see docs/reference/messages.md.
         tray: the tray to read; None for all. The health of stages belongs to no tray and is always read.
         rows: rows of a block. As many are held in memory for each tray.
 
@@ -137,7 +137,6 @@ def read_topics(parts: Iterable[Path], topics: Collection[str], tray: str | None
     Raises:
         RecordingError: as in `read_arrays`.
     """
-    topics = [current_name(topic) for topic in topics]
     for topic in topics:
         if topic not in BY_NAME:
             known = ", ".join(known.name for known in TOPICS if known.recorded)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from importlib.metadata import version
 
 from pipeline.recordings.reading import TACHO_KEY
 from pipeline.runtime.stage import Context
@@ -18,7 +17,6 @@ _LOG = logging.getLogger(__name__)
 def recording_metadata(context: Context) -> tuple[dict[str, str], dict[str, bytes]]:
     """Metadata and attachments of every part: all that is needed to read it and to score it again, anywhere."""
     metadata = {
-        "made_by": f"fantwin {version('fantwin')}",
         "site": context.site,
         "trays": ",".join(tray.name for tray in context.trays),
     }

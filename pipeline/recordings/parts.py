@@ -19,7 +19,6 @@ from pipeline.recordings.rare_messages import last_messages
 from pipeline.recordings.reading import RecordingError, read_metadata
 from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.repair import (
-    FORMER_ORIGINAL_SUFFIX,
     ORIGINAL_SUFFIX,
     Recovery,
     free_original_name,
@@ -46,7 +45,7 @@ def part_files(path: Path) -> list[tuple[int, Path]]:
         OSError: the folder cannot be read.
     """
     stem, suffix = re.escape(path.stem), re.escape(path.suffix)
-    others = "|".join(map(re.escape, (ACTIVE_SUFFIX, ORIGINAL_SUFFIX, FORMER_ORIGINAL_SUFFIX)))
+    others = "|".join(map(re.escape, (ACTIVE_SUFFIX, ORIGINAL_SUFFIX)))
     pattern = re.compile(rf"{stem}(?:-(\d+))?{suffix}({others})?")
     paths = path.parent.iterdir() if path.parent.is_dir() else ()
     matches = ((pattern.fullmatch(path.name), path) for path in paths)

@@ -6,8 +6,10 @@ as far as possible. See docs/reference/recordings.md.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -17,6 +19,7 @@ from pipeline.recordings.disk import is_being_written
 from pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,
     MESSAGE,
+    METADATA_NAME,
     RECORD,
     RecordingError,
     RecordReader,
@@ -27,12 +30,10 @@ from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.messages import StatedTacho
 from schemas.tacho import INSTANTANEOUS, Tacho, tachos_from_json
-from schemas.topics import current_name, topic_of
+from schemas.topics import topic_of
 
 __all__ = ["METADATA_NAME", "Reading", "RecordingError", "RecordingMetadata", "read_metadata", "read_recording"]
 
-METADATA_NAME = "fantwin"
-"""the metadata record that describes a recording"""
 TACHO_KEY = "tacho"
 """with the name of a tray: its tachos, as schemas.tacho writes them"""
 LEFT_OUT_KEY = "left_out"
@@ -136,10 +137,10 @@ def read_recording(path: Path, topics: Collection[str] | None = None, tray: str 
     """The messages of a recording, to iterate over: of all topics and trays, or only of those named.
 
     Raises:
-        RecordingError: the file cannot be opened or is not a recording.
+        RecordingError: the file cannot be opened, is not a recording, or is of an unknown format.
     """
-    next(iter(RecordReader(path)), None)
-    return Reading(path, None if topics is None else {current_name(topic) for topic in topics}, tray)
+    deque(islice(RecordReader(path), 2), 0)  # header and metadata
+    return Reading(path, None if topics is None else set(topics), tray)
 
 
 @dataclass(frozen=True)

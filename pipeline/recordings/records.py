@@ -10,7 +10,10 @@ import os
 import struct
 from collections import deque
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
@@ -26,7 +29,12 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from pipeline.errors import UserError
+from schemas.formats import RECORDING
 
+METADATA_NAME = "fantwin"
+"""the metadata record that describes a recording; it follows the header"""
+FORMAT_KEY, MADE_BY_KEY = "format", "made_by"
+"""in these metadata: the format number of the recording, and the program that wrote it"""
 LARGEST_CHUNK_BYTES = 64 << 20
 """of a chunk without compression; a larger one is treated as damaged"""
 LARGEST_RECORD_BYTES = 256 << 20
@@ -106,7 +114,7 @@ class RecordReader:
     """offsets of bytes before `end` that are no records: first, and one past the last"""
 
     def __iter__(self) -> Iterator[Record]:
-        """Raises RecordingError if the file cannot be read or is not an MCAP file."""
+        """Raises RecordingError if the file cannot be read, is not an MCAP file, or is of an unknown format."""
         self.is_complete, self.end, self.damaged_ranges = False, len(MCAP0_MAGIC), []
         try:
             with self.path.open("rb") as file:
@@ -134,6 +142,7 @@ class RecordReader:
                 file.seek(resumed)
                 continue
             self.end = record.end
+            _check_format(record.parsed, self.path)
             yield record
             if record.opcode == Opcode.FOOTER and len(record.content) == _FOOTER_BYTES:
                 self.is_complete = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC and self.end + 8 == self.size
@@ -252,8 +261,40 @@ def _decompressed(chunk: Chunk) -> bytes:
 
 
 def indexed_reader(file: BinaryIO) -> McapReader:
-    """The library's reader of the index, for files from anywhere. It raises one of CORRUPT_DATA_ERRORS."""
+    """The library's reader of the index, for files from anywhere. It raises one of CORRUPT_DATA_ERRORS.
+
+    Raises:
+        RecordingError: the recording is of an unknown format.
+    """
+    with suppress(*CORRUPT_DATA_ERRORS):
+        _check_format(_second_record(file), file.name)
+    file.seek(0)
     return SeekingReader(file, record_size_limit=LARGEST_RECORD_BYTES)
+
+
+def _second_record(file: BinaryIO) -> McapRecord | None:
+    """The record after the header; None where it has no place of its own in the library."""
+    file.seek(len(MCAP0_MAGIC))
+    _, length = RECORD.unpack(file.read(RECORD.size))
+    file.seek(length, os.SEEK_CUR)
+    opcode, length = RECORD.unpack(file.read(RECORD.size))
+    return _parse_known(opcode, file.read(min(length, LARGEST_RECORD_BYTES)))
+
+
+@cache
+def this_program() -> str:
+    """This program as the maker of a recording: its name and version."""
+    return f"fantwin {version('fantwin')}"
+
+
+def _check_format(record: McapRecord | None, path: Path | str) -> None:
+    """Raises RecordingError for the metadata of a recording of an unknown format."""
+    if isinstance(record, Metadata) and record.name == METADATA_NAME:
+        stated = record.metadata.get(FORMAT_KEY)
+        number = int(stated) if stated and stated.isdecimal() else stated
+        if refusal := RECORDING.refusal(number):
+            made_by = record.metadata.get(MADE_BY_KEY, "an unknown program")
+            raise RecordingError(f"{path}: {refusal} (made by {made_by})")
 
 
 def chunk_at(file: BinaryIO, offset: int, length: int) -> bytes:

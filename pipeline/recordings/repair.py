@@ -35,8 +35,6 @@ from pipeline.recordings.sequence_ledger import LEDGER_NAME, ledger_metadata
 from pipeline.recordings.writing import CHUNK_BYTES, free_name
 
 ORIGINAL_SUFFIX = ".original"
-FORMER_ORIGINAL_SUFFIX = ".torn"
-"""the same in folders of earlier versions"""
 _UNFINISHED_SUFFIX = ".recovering"
 
 

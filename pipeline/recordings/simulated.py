@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,6 @@ def record(
     """
     played = PlaybackCounts(start_ns=epoch_ns)
     metadata = {
-        "made_by": f"fantwin {version('fantwin')}",
         "source": "simulated tray",
         "site": SITE,
         "trays": TRAY,

@@ -24,11 +24,21 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from pipeline.recordings.chunk import FillingChunk
 from pipeline.recordings.disk import AtomicAppendFile, Disk, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING, Index, PartIndex, write_ending
-from pipeline.recordings.reading import METADATA_NAME
-from pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, active_path, indexed_reader, record_bytes
+from pipeline.recordings.records import (
+    CORRUPT_DATA_ERRORS,
+    FORMAT_KEY,
+    MADE_BY_KEY,
+    METADATA_NAME,
+    RecordingError,
+    active_path,
+    indexed_reader,
+    record_bytes,
+    this_program,
+)
 from pipeline.recordings.sequence_ledger import BEFORE_NAME, SequenceLedger, ledger_metadata
 from schemas.codec import proto_type, type_name
 from schemas.envelope import Envelope
+from schemas.formats import RECORDING
 from schemas.health import Health
 from schemas.messages import Message
 from schemas.topics import HEALTH, topic_of
@@ -62,7 +72,8 @@ class RecordingWriter:
 
         Args:
             path: NAME.mcap.
-            metadata: about the recording, see docs/reference/recordings.md.
+            metadata: about the recording, see docs/reference/recordings.md. Its format number is added, and this
+                version of fantwin as its maker if they name none.
             attachments: name -> content.
             t_ns: time of the attachments, ns since 1970.
             overwrite: replace a finished file.
@@ -107,7 +118,8 @@ class RecordingWriter:
             raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
         try:
             self._file.write(MCAP0_MAGIC + record_bytes(Header(profile="", library="fantwin")))
-            self._write_metadata(METADATA_NAME, metadata)
+            about = {MADE_BY_KEY: this_program(), **metadata, FORMAT_KEY: str(RECORDING.written)}
+            self._write_metadata(METADATA_NAME, about)
             if self.ledger.next:
                 self._write_metadata(BEFORE_NAME, self.ledger.before_as_metadata())
             for name, content in (attachments or {}).items():

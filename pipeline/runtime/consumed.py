@@ -54,7 +54,6 @@ class ConsumedReports:
         newest = Consumed(
             header=message.header,
             topic=topic,
-            output_sequence=message.header.sequence,
             first_t_ns=times.item(0),
             t_ns=times.item(-1),
         )

@@ -48,7 +48,7 @@ class Peers:
     def add_health(self, key: str, health: Health) -> None:
         """The session with the liveliness key `key` has published a health."""
         is_producer = any(output.key in self._read_keys for output in health.outputs)
-        _remember(self._reported, key, _Reported(is_producer, health.has_ended))
+        _remember(self._reported, key, _Reported(is_producer, health.is_last))
 
     def has_producer(self) -> bool:
         """Whether a stage that writes what this one reads is alive."""

@@ -224,7 +224,7 @@ class Receiver:
             return
         self.peers.add_health(alive_key(self._site, health.stage, health.instance), health)
         if health.stage == REPLAY:
-            self._clock.add_replay_health(health.header.producer, has_ended=health.has_ended)
+            self._clock.add_replay_health(health.header.producer, has_ended=health.is_last)
         self._sessions.add_health(health, self._subscriptions.keys)
         self._due.add(self.tracker.reconcile(health, self.current_keys))
         self._silences.add_health(health, self.tracker.has_all_of)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from pipeline.config.shards import Shard
 from schemas.health import Health
-from schemas.topics import ALL_TRAYS, SESSION_CHUNK, health_key, session_key, stage_label, topic_of
+from schemas.topics import SESSION_CHUNK, health_key, session_key, stage_label, topic_of
 
 MOST_SESSIONS = 4096
 _BETWEEN_TRAYS = "+"
@@ -54,9 +54,7 @@ class Session:
     @classmethod
     def of_key(cls, key: str) -> Session | None:
         """The session that shows the token `key`; None if it is no such token, or names a producer of others: rights
-        are about stage and instance alone.
-
-        A token without trays, as those of earlier versions, is of all trays or of the one that its instance names.
+        are about stage and instance alone. A token without trays is of all of the site.
         """
         parts = key.split("/")
         if len(parts) not in (9, 10) or parts[2] != SESSION_CHUNK:
@@ -66,15 +64,14 @@ class Session:
             return None
         if producer.rpartition("-")[0] != f"{stage}-{instance}":
             return None
-        named = parts[9].split(_BETWEEN_TRAYS) if len(parts) > 9 else () if instance == ALL_TRAYS else (instance,)
+        named = parts[9].split(_BETWEEN_TRAYS) if len(parts) > 9 else ()
         return cls(stage, instance, int(started), producer, host, int(process_id), tuple(named))
 
     def key(self, site: str) -> str:
         """The key of its token."""
         parts = (self.started_t_ns, self.producer, self.host, self.process_id)
         own = session_key(site, self.stage, self.instance, *parts)
-        is_named = not self.trays or (self.trays == (self.instance,) and self.instance != ALL_TRAYS)
-        return own if is_named else f"{own}/{_BETWEEN_TRAYS.join(self.trays)}"
+        return f"{own}/{_BETWEEN_TRAYS.join(self.trays)}" if self.trays else own
 
     def has(self, tray: str) -> bool:
         """Whether this tray is one of its trays."""
@@ -157,7 +154,7 @@ class Sessions:
         """A stage has said what it publishes; `read_keys`: the keys that matter here."""
         producer = health.header.producer
         written = self._written.get(producer)
-        if health.has_ended and (written is not None or producer in self._ended):
+        if health.is_last and (written is not None or producer in self._ended):
             self._said_last[producer] = None
             if len(self._said_last) > MOST_SESSIONS:
                 del self._said_last[next(iter(self._said_last))]

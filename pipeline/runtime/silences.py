@@ -90,7 +90,7 @@ class Silences:
                 continue
             has_all = partial(has_all_of, (output.key, producer), published)
             self._reporting[tray] = producer, has_all
-            if health.has_ended:
+            if health.is_last:
                 self._end(tray, is_in_order=health.status == StageStatus.STOPPED)
                 continue
             self._ended.pop(tray, None)

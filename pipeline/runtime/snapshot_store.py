@@ -14,12 +14,9 @@ from pathlib import Path
 
 from pipeline.runtime.stage import StageError
 from schemas.codec import CodecError, decode, encode
+from schemas.formats import SNAPSHOT
 from schemas.messages import ScorerSnapshot
 from schemas.units import NS_PER_S
-
-FORMER_SUFFIX = ".memory"
-"""what earlier versions called the file: a site that is upgraded must not forget its baselines and alarms"""
-
 
 RECENT_NS = 120 * NS_PER_S
 """a file that is no older, two periods of snapshots, is that of the last session, unless somebody knows a newer one"""
@@ -30,11 +27,7 @@ Elsewhere = Callable[[bool], tuple[Sequence[ScorerSnapshot], str]]
 
 
 class SnapshotStore:
-    """One file. A kill at any moment leaves the old file or the new one, never a part of either.
-
-    If only a file with the former suffix exists, it is loaded. Saving writes the new file and deletes the former one: a
-    user who later removes the new file, to start without, must not get back the state from before the upgrade.
-    """
+    """One file. A kill at any moment leaves the old file or the new one, never a part of either."""
 
     def __init__(self, path: Path, elsewhere: Elsewhere | None = None, now_ns: int = 0) -> None:
         """elsewhere: asked once, by the first `load`; None: nobody is. now_ns: the present time."""
@@ -45,7 +38,6 @@ class SnapshotStore:
         self._kept: Sequence[ScorerSnapshot] = ()
         self._is_asked = False
         self._now_ns = now_ns
-        self._former = path.with_suffix(FORMER_SUFFIX)
         self._lock: int | None = None
         self.problem = ""
         """one line, while the last snapshot could not be saved"""
@@ -90,7 +82,7 @@ class SnapshotStore:
         The last one counts also if it is of another twin: what operators have set since must not be forgotten.
 
         Raises:
-            StageError: there is a file, and it cannot be read.
+            StageError: there is a file and it cannot be read, or the last snapshot is of an unknown format.
         """
         own = self._read()
         if self._elsewhere is None:
@@ -108,22 +100,24 @@ class SnapshotStore:
                 f"the file here is {(last.t_ns - own.t_ns) / NS_PER_S:.0f} s older" if own else "there is none here"
             )
             self.note = f"continued from the snapshot that the recorder keeps; {of_file}"
+            _check_format(last, f"{self.path.stem}: the snapshot that the recorder keeps")
         return last
 
     def _read(self) -> ScorerSnapshot | None:
-        path = self._former if self._former.exists() and not self.path.exists() else self.path
         try:
-            return decode(ScorerSnapshot, path.read_bytes())
+            own = decode(ScorerSnapshot, self.path.read_bytes())
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise StageError(f"{path}: cannot read the scorer's snapshot: {error.strerror}") from error
+            raise StageError(f"{self.path}: cannot read the scorer's snapshot: {error.strerror}") from error
         except CodecError as error:
             start = "continue from the one that the recorder keeps, or" if self._elsewhere else "start"
             raise StageError(
-                f"{path}: not a scorer's snapshot ({error}); remove it to {start} without one: all fans are then "
+                f"{self.path}: not a scorer's snapshot ({error}); remove it to {start} without one: all fans are then "
                 "commissioned again"
             ) from error
+        _check_format(own, str(self.path))
+        return own
 
     def save(self, snapshot: ScorerSnapshot) -> None:
         """Replace the snapshot. A full disk is reported in `problem` and does not stop the scorer."""
@@ -135,9 +129,13 @@ class SnapshotStore:
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(self.path)
-            self._former.unlink(missing_ok=True)
             self.problem = ""
         except OSError as error:
             self.problem = (
                 f"{self.path}: cannot save baselines and alarms: {error.strerror}; a restart would forget them"
             )
+
+
+def _check_format(snapshot: ScorerSnapshot, where: str) -> None:
+    if refusal := SNAPSHOT.refusal(snapshot.format or None):
+        raise StageError(f"{where}: {refusal}")

@@ -95,13 +95,8 @@ class TrayTwin:
     def usable_commands(self) -> tuple[float, float]:
         """The lowest and the highest command for which the twin is used."""
         low, high = self.card.command_range
-        width, table = high - low, self.unseen_error.table if self.unseen_error else None
-        if table is None:
-            return low - RANGE_MARGIN * width, high + RANGE_MARGIN * width
-        if table.is_early:  # as recordings of these cards were judged, to the last digit
-            near = low - RANGE_MARGIN * width, high + RANGE_MARGIN * width
-            return min(table.commands[0], near[0]), max(table.commands[-1], near[1])
-        return low - RANGE_MARGIN_OF_TABLE * width, high + RANGE_MARGIN_OF_TABLE * width
+        margin = (RANGE_MARGIN_OF_TABLE if self.unseen_error else RANGE_MARGIN) * (high - low)
+        return low - margin, high + margin
 
     @property
     def bend_rad_s(self) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 from pipeline.config.models import TrayConfig
 from pipeline.errors import UserError
@@ -16,7 +15,6 @@ from pipeline.recordings.run_recordings import run_metadata
 from pipeline.viewing.view_of_site import ViewOptions, view_of_site
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
-from schemas.messages import Score
 from schemas.units import SpeedUnit
 
 TOPICS = ("score", "alarm", "twin", "health", "snapshot")
@@ -40,9 +38,8 @@ def recorded_site(recordings: Iterable[Path]) -> RecordedSite:
     """
     parts = in_order(recordings)
     metadata = run_metadata(parts)
-    counts = {tray: int(metadata.metadata.get(f"fans.{tray}", 0)) for tray in metadata.trays}
-    if not counts or not all(counts.values()):  # of an earlier version, or not made by a recorder
-        counts = _fans_in_scores(parts)
+    stated = {tray: metadata.metadata.get(f"fans.{tray}") for tray in metadata.trays}
+    counts = {tray: int(fans) for tray, fans in stated.items() if fans}
     trays = [TrayConfig(name=tray, fans=fans, speed_unit=_unit(metadata, tray)) for tray, fans in counts.items()]
     if not trays:
         why = left_out_hint(parts, ("score",)) or "did twin_integrator and scorer run?"
@@ -85,16 +82,6 @@ def _messages(parts: Sequence[Path], damage: list[str]) -> Iterator[Envelope]:
             if seen.setdefault((envelope.key, header.producer), Seen()).is_new(header.sequence):
                 yield envelope
         damage += [reading.damage] if reading.damage else []
-
-
-def _fans_in_scores(parts: Sequence[Path]) -> dict[str, int]:
-    counts: dict[str, int] = {}
-    for part in parts:
-        for envelope in read_recording(part, ("score",)):
-            tray = envelope.header.tray
-            if tray not in counts:
-                counts[tray] = cast(Score, envelope.message).fans
-    return counts
 
 
 def _unit(metadata: RecordingMetadata, tray: str) -> SpeedUnit:

@@ -264,8 +264,6 @@ def _message(cause: RankedCause) -> CauseMessage:
         probability=cause.probability,
         parameter=change.parameter,
         change=change.change,
-        change_low=change.low,
-        change_high=change.high,
         unit=change.unit,
         evidence=cause.sentence,
     )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf.descriptor import FieldDescriptor
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.records import Schema
 from mcap.well_known import MessageEncoding
@@ -17,7 +17,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from schemas import fan_pb2, messages
-from schemas.codec import FORMER, CodecError, decode, encode, proto_type, type_name
+from schemas.codec import CodecError, decode, encode, proto_type, type_name
 from schemas.fields import OpenEnum, columns, other_fields
 from schemas.header import Header, InputPosition
 from schemas.health import Counter, Input, Output
@@ -95,8 +95,7 @@ def test_any_bytes_are_refused_or_decoded(message_type, payload):
 
 @pytest.mark.parametrize("message_type", MESSAGE_TYPES, ids=lambda t: t.__name__)
 def test_a_message_has_the_fields_of_its_schema_in_order(message_type):
-    declared = [f.name for f in proto_type(message_type).DESCRIPTOR.fields]
-    assert [f.name for f in fields(message_type)] == [name for name in declared if not name.startswith(FORMER)]
+    assert [f.name for f in fields(message_type)] == [f.name for f in proto_type(message_type).DESCRIPTOR.fields]
 
 
 @pytest.mark.parametrize("record", RECORDS, ids=lambda t: t.__name__)
@@ -117,7 +116,7 @@ def test_a_column_has_the_type_of_its_schema(message_type):
     repeated = {
         f.name: wire_types[f.type]
         for f in proto_type(message_type).DESCRIPTOR.fields
-        if f.is_repeated and f.type in wire_types and not f.name.startswith(FORMER)
+        if f.is_repeated and f.type in wire_types
     }
     assert {name: column.dtype for name, column in columns(message_type).items()} == repeated
 
@@ -238,51 +237,9 @@ def grid_of(samples: int) -> Grid:
     )
 
 
-def without(message: Message, *absent: str) -> bytes:
-    """The message as it was recorded before these columns were added."""
-    proto = proto_type(type(message)).FromString(encode(message))
-    for name in absent:
-        proto.ClearField(name)
-    return proto.SerializeToString()
-
-
-BEFORE_BALANCE = {
-    Prediction: ("torque_balance_command", "torque_balance_sigma_command"),
-    Score: ("torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic"),
-}
-
-
-@pytest.mark.parametrize("kind", BEFORE_BALANCE)
-@given(data=st.data())
-def test_a_column_added_later_reads_as_nan_or_0_in_older_recordings(kind, data):
-    message: Any = data.draw(any_message(kind))
-    assume(len(message.t_ns) > 0)
-    back: Any = decode(kind, without(message, *BEFORE_BALANCE[kind]))
-    for name, column in columns(kind).items():
-        values, there = getattr(back, name), getattr(message, name)
-        if name not in BEFORE_BALANCE[kind]:
-            assert same(there, values), name
-            continue
-        assert (values.shape, values.dtype) == (there.shape, column.dtype), name
-        assert np.isnan(values).all() if column.dtype.kind == "f" else (values == 0).all()
-    again = decode(kind, encode(back))
-    assert all(same(getattr(back, name), getattr(again, name)) for name in columns(kind))
-
-
-@given(data=st.data())
-def test_numbers_of_64_bits_of_older_recordings_are_read_with_32(data):
-    message: Any = data.draw(any_message(Score))
-    proto: Any = proto_type(Score).FromString(encode(message))
-    former = [f.name for f in proto.DESCRIPTOR.fields if f.name.startswith(FORMER)]
-    assert [name.removeprefix(FORMER) for name in former] == [
-        n for n, c in columns(Score).items() if c.dtype.kind == "f" and not c.optional
-    ]
-    for name in former:
-        now = name.removeprefix(FORMER)
-        getattr(proto, name).extend(np.float64(getattr(message, now)).ravel())
-        proto.ClearField(now)
-    back = decode(Score, proto.SerializeToString())
-    assert all(same(getattr(message, name), getattr(back, name)) for name in columns(Score))
+@pytest.mark.parametrize("kind", [*fan_pb2.DESCRIPTOR.message_types_by_name.values()], ids=lambda kind: kind.name)
+def test_fields_are_numbered_from_1_without_holes(kind):
+    assert [f.number for f in kind.fields] == list(range(1, len(kind.fields) + 1))
 
 
 def test_an_absurd_number_of_fans_without_columns_is_refused():

@@ -54,23 +54,10 @@ def test_columns_that_are_not_named_are_empty_and_nothing_is_copied():
     assert {name for name in columns(Score) if getattr(read, name).size} == {"t_ns", "score"}
 
 
-def in_former_fields(score: Score) -> bytes:
-    """A score as an earlier version encoded it."""
-    proto: Any = fan_pb2.Score.FromString(encode(score))
-    for name in columns(Score):
-        if (former := f"former_{name}") in proto.DESCRIPTOR.fields_by_name:
-            getattr(proto, former).extend(getattr(proto, name))
-            proto.ClearField(name)
-    return proto.SerializeToString()
-
-
-def test_columns_that_another_encoder_wrote_are_read():
-    """In pieces, as protobuf allows; and as double, as an earlier version wrote them."""
+def test_a_column_that_another_encoder_wrote_in_pieces_is_read():
     (score,), _ = made_up_tray(seconds=0.1)
     in_pieces = b"".join(encode(part) for part in made_up_tray(seconds=0.1, block=5)[0])
-    former = in_former_fields(score)
     assert same(decode_columns(Score, in_pieces, ("state",)).state, score.state)
-    assert same(decode_columns(Score, former, ("score", "state")).score, score.score)
 
 
 @given(any_message(Grid), st.data())

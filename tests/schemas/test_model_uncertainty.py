@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from schemas.model_uncertainty import ModelUncertainty
+from tests.support.uncertainty_tables import by_speed
 
 STD_RAD_S = ((1.0, 2.0), (3.0, 4.0), (5.0, 10.0))
-TABLE = ModelUncertainty((0.0, 100.0, 200.0), (0.0, 1.0), (STD_RAD_S,))
-"""of an early card"""
+TABLE = by_speed((0.0, 100.0, 200.0), (0.0, 1.0), STD_RAD_S, 10.0)
+"""of one fan, that settles at 0"""
 OF_FANS = ModelUncertainty(
     (0.0, 1.0),
     (0.0, 100.0, 200.0),
@@ -31,7 +32,7 @@ OF_FANS = ModelUncertainty(
 )
 def test_another_table_is_refused(speeds_rad_s, commands, std_rad_s, words: str) -> None:
     with pytest.raises(ValidationError, match=words):
-        ModelUncertainty(speeds_rad_s, commands, (std_rad_s,))
+        by_speed(speeds_rad_s, commands, std_rad_s, 1.0)
 
 
 def test_values_that_do_not_fit_the_tables_are_refused() -> None:
@@ -63,7 +64,7 @@ def test_only_what_training_has_not_shown_is_unseen() -> None:
         np.zeros((3, 1)),
     )
     np.testing.assert_allclose(table.unseen_std_at(speeds_rad_s, command), [[0.0], [0.0], [4.0]])  # of 2, 3 and 5
-    np.testing.assert_array_equal(TABLE.unseen_std_at(speeds_rad_s, command), 0.0, "early cards do not say")
+    np.testing.assert_array_equal(TABLE.unseen_std_at(speeds_rad_s, command), 0.0, "all is seen")
 
 
 def test_each_fan_has_its_own_around_the_speeds_at_which_it_settles() -> None:
@@ -82,15 +83,3 @@ def test_of_one_fan_all_may_be_seen_and_of_another_not() -> None:
     found = table.unseen_std_at(np.array([[0.3, 15.0]]), np.full((1, 2), 150.0))
     np.testing.assert_allclose(found, [[0.0, 8.0]])
     np.testing.assert_allclose(table.over(np.array([0.3, 0.8]), np.array([150.0]))[:, 0], [4.0, 5.5])
-
-
-def test_the_unseen_error_of_an_early_card_is_that_of_its_recordings_to_the_last_digit() -> None:
-    table = ModelUncertainty((0.0, 1.0), (0.0, 1.0), (((0.05, 0.05), (0.05, 0.05)),), (0.0397,))
-    assert table.unseen_std_at(np.zeros((1, 1)), np.zeros((1, 1)))[0, 0] == np.sqrt(0.05**2 - 0.0397**2)
-
-
-def test_the_table_of_an_early_card_is_that_of_all_fans() -> None:
-    of_card = {"speeds_rad_s": TABLE.speeds_rad_s, "commands": TABLE.commands, "std_rad_s": STD_RAD_S}
-    read = TypeAdapter(ModelUncertainty).validate_python
-    assert read(of_card) == read(of_card | {"seen_std_rad_s": None}) == TABLE
-    assert read(of_card | {"seen_std_rad_s": 3.0}) == replace(TABLE, seen_std_rad_s=(3.0,))

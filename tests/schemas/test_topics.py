@@ -9,7 +9,6 @@ from pipeline.runtime.stage import load_stage
 from schemas.messages import MESSAGE_TYPES
 from schemas.topics import (
     BY_NAME,
-    FORMER_NAMES,
     RESERVED_TRAY_NAMES,
     TOPICS,
     alive_key,
@@ -34,12 +33,6 @@ def test_the_topic_of_a_tray_key_is_found(topic):
 
 def test_the_topic_of_a_health_key_is_health():
     assert topic_of(health_key("plant", "scorer", "all")) is BY_NAME["health"]
-
-
-@pytest.mark.parametrize(("former", "topic"), FORMER_NAMES.items())
-def test_the_topic_of_a_key_in_an_older_recording_is_found(former, topic):
-    assert former not in BY_NAME
-    assert topic_of(tray_key("plant", "tray1", former)) is BY_NAME[topic]
 
 
 @pytest.mark.parametrize(

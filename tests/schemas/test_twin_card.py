@@ -1,4 +1,4 @@
-"""schemas.twin_card: one definition for maker and runtime, which reads earlier forms and needs no heavy library."""
+"""schemas.twin_card: one definition for maker and runtime, which needs no heavy library."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import pipeline
@@ -27,33 +26,13 @@ def test_a_card_survives_conversion_to_json_and_back() -> None:
     assert TwinCard.from_json(card.to_json()) == card
 
 
-@pytest.mark.parametrize(
-    ("kind", "fixed_rate", "used"),
-    [("hybrid", False, 4), ("physical", False, 4), ("neural-ode", False, 1), ("narx", True, 0)],
-)
-def test_fields_missing_from_early_cards_follow_from_their_kind(kind: str, fixed_rate: bool, used: int) -> None:
-    early = json.loads(made_up_card(PhysicalModel(), 1).to_json()) | {"kind": kind}
-    del early["fixed_rate"], early["used_parameters"]
-    card = TwinCard.from_json(json.dumps(early))
-    assert (card.fixed_rate, len(card.used_parameters)) == (fixed_rate, used)
-
-
-def test_standard_errors_of_early_cards_become_a_covariance_without_correlations() -> None:
-    early = json.loads(made_up_card(PhysicalModel(), 1).to_json())
-    del early["balance"]["covariance"]
-    early["balance"]["std_errors"] = [[0.1, 0.2, 0.3, 0.4]]
-    covariance = TwinCard.from_json(json.dumps(early)).balance.covariance
-    np.testing.assert_allclose(covariance[0], np.diag(np.square([0.1, 0.2, 0.3, 0.4])))
-
-
 def test_fields_of_a_later_card_are_ignored_and_its_kind_needs_not_be_known() -> None:
     later = json.loads(made_up_card(PhysicalModel(), 1).to_json()) | {"kind": "of tomorrow", "more": 1}
     assert TwinCard.from_json(json.dumps(later)).kind == "of tomorrow"
 
 
-def test_the_tacho_is_one_for_all_fans_or_one_for_each_and_early_cards_are_instantaneous() -> None:
+def test_the_tacho_is_one_for_all_fans_or_one_for_each() -> None:
     fields = json.loads(made_up_card(PhysicalModel(), 2).to_json())
-    del fields["tacho"]
     slow, fast = ({"kind": "count", "window_s": window_s} for window_s in (1.0, 0.5))
 
     def windows_s(tacho: object) -> list[float]:
@@ -61,19 +40,10 @@ def test_the_tacho_is_one_for_all_fans_or_one_for_each_and_early_cards_are_insta
         assert TwinCard.from_json(card.to_json()) == card
         return [tacho.window_s for tacho in card.tacho_of_each_fan]
 
-    early = TwinCard.from_json(json.dumps(fields))
-    assert [tacho.kind for tacho in early.tacho_of_each_fan] == ["instantaneous"] * 2
     assert windows_s(slow) == windows_s([slow]) == [1.0, 1.0]
     assert windows_s([slow, fast]) == [1.0, 0.5]
     with pytest.raises(CardError, match="3 tachos for 2 fans"):
         windows_s([slow, fast, fast])
-
-
-def test_a_card_of_an_unknown_kind_must_state_the_fields_that_an_early_kind_implies() -> None:
-    later = json.loads(made_up_card(PhysicalModel(), 1).to_json()) | {"kind": "of tomorrow"}
-    del later["fixed_rate"]
-    with pytest.raises(CardError, match="fixed_rate"):
-        TwinCard.from_json(json.dumps(later))
 
 
 def test_the_twin_of_the_demo_and_the_card_in_the_golden_recording_are_read() -> None:

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from scoring.baseline.healthy_residual import FanOffsets, HealthyResidual
-from scoring.baseline.settings import BaselineSettings
+from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.detectors.deviation import smoothed_deviation, summed_deviation
 from scoring.detectors.drift import DriftSettings
 from scoring.detectors.low_pass import LowPass
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.tacho import TachoSettings
 from scoring.detectors.variance_growth import VarianceGrowthSettings
-from scoring.limits import FORMAT_VERSION, DeclaredRate, Limits, Timing, uncalibrated
+from scoring.limits import DeclaredRate, Limits, Timing, uncalibrated
 from tests.support.healthy_residuals import autoregressive
 
 STEP_S = 0.01
@@ -95,51 +94,6 @@ def test_a_factor_scales_every_limit_and_voids_the_declared_rate() -> None:
     ],
 )
 def test_wrong_limits_are_refused_by_name(wrong: dict[str, object], where: str) -> None:
-    card = {"format_version": FORMAT_VERSION, "speed": {}, "balance": {}, "detectors": {}} | wrong
+    card = {"speed": {}, "balance": {}, "detectors": {}} | wrong
     with pytest.raises(ValidationError, match=where):
         Limits.model_validate(card)
-
-
-@pytest.mark.parametrize("version", ["1", "x", None, [1]])
-def test_a_format_version_that_is_no_number_is_refused(version: object) -> None:
-    with pytest.raises(ValidationError):
-        Limits.model_validate({"format_version": version, "speed": {}, "balance": {}, "stuck_s": 5.0})
-
-
-def test_a_card_of_format_1_is_read_with_its_former_names() -> None:
-    former = {
-        "format_version": 1,
-        "speed": {
-            "fans": {"speeds_rad_s": [1.0], "offset_sigmas": [[0.5]]}, "speeds_rad_s": [50.0, 100.0],
-            "offset_sigmas": [0.1, 0.2], "spread": [0.9, 1.1], "lasting": [1.0, 1.2], "motion_rad_s": 3.0,  # FORMER
-            "autocorrelation_time_s": 0.3, "step": 4.0, "drift": 10.0, "reference_sigmas": 0.7, "growth": 1.4,
-            "usual_growth": 1.0, "baseline_sigmas": 2.0, "adaptation_sigmas": 0.8, "baseline_power": 2,
-            "baseline_speed_rad_s": 70.0, "baseline_bend_rad_s": 20.0, "baseline_ridge": 0.2,
-            "baseline_usual_sigmas": 0.6,
-        },
-        "balance": {"step": 5.0, "drift": None},
-        "stuck_s": 3.0, "missing_share": 0.5,
-        "timing": {"smoothing_s": 0.3, "baseline_s": 1.0, "adaptation_s": 60.0, "on_delay_s": 0.1},
-        "promise": {"false_alarms_per_day": 1.0, "interval_95": [0.5, 2.0], "extrapolated": False, "fan_hours": 100.0,
-                    "runs": 3},
-    }  # fmt: skip
-    baseline = BaselineSettings(
-        commissioning_limit_sigmas=2.0, adaptation_limit_sigmas=0.8, speed_exponent=2, reference_speed_rad_s=70.0,
-        crossover_speed_rad_s=20.0, ridge=0.2, rms_sigmas=0.6,
-    )  # fmt: skip
-    limits = Limits.model_validate(former)
-    assert limits.speed == HealthyResidual(
-        fan_offsets=FanOffsets(speeds_rad_s=(1.0,), offset_sigmas=((0.5,),)), speeds_rad_s=(50.0, 100.0),
-        expected_residual_sigmas=(0.1, 0.2), residual_std=(0.9, 1.1), persistent_std=(1.0, 1.2),
-        transient_scale_rad_s=3.0, autocorrelation_time_s=0.3, baseline=baseline,
-    )  # fmt: skip
-    assert limits.detectors == {
-        "speed_smoothed": SmoothedSettings(limit=4.0),
-        "speed_drift": DriftSettings(limit=10.0, reference_sigmas=0.7, period_s=0.01),
-        "speed_variance_growth": VarianceGrowthSettings(limit=1.4, healthy=1.0),
-        "balance_smoothed": SmoothedSettings(limit=5.0),
-        "sensor": TachoSettings(stuck_s=3.0, missing_share=0.5),
-    }
-    assert limits.timing == Timing(smoothing_s=0.3)
-    assert limits.declared_rate and limits.declared_rate.runs == 3
-    assert limits.format_version == FORMAT_VERSION

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from schemas.messages import Array
-from schemas.model_uncertainty import ModelUncertainty
 from schemas.twin_card import DriveCard
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits
@@ -16,10 +15,11 @@ from scoring.samples import Samples
 from scoring.unseen_error import RANGE_STDS, UnseenError
 from tests.support.healthy_residuals import samples_of as healthy_samples
 from tests.support.scored_blocks import CALIBRATION, NEEDED, TWIN_SPEED, prediction_of
+from tests.support.uncertainty_tables import by_speed
 
 SECOND = 100
 UNSEEN_SIGMAS = 5.0
-TABLE = ModelUncertainty((0.0, 600.0), (0.0, 100.0), (((0.0, 0.0), (0.0, 20.0)),), seen_std_rad_s=(0.0,))
+TABLE = by_speed((0.0, 600.0), (0.0, 100.0), ((0.0, 0.0), (0.0, 20.0)), 0.0)
 """more at high speeds under high commands"""
 
 
@@ -75,9 +75,7 @@ def test_the_limit_that_people_are_shown_is_the_wider_one(scorer: FanScorer) -> 
 def test_a_fault_does_not_widen_its_own_limits() -> None:
     """A fan that needs twice the command for its speed: nobody has seen that pair, but both of a healthy fan."""
     off_the_diagonal = tuple(tuple(20.0 * (row != column) for column in range(3)) for row in range(3))
-    table = ModelUncertainty(
-        (0.0, TWIN_SPEED, 2.0 * TWIN_SPEED), (0.0, NEEDED, 2.0 * NEEDED), (off_the_diagonal,), (0.0,)
-    )
+    table = by_speed((0.0, TWIN_SPEED, 2.0 * TWIN_SPEED), (0.0, NEEDED, 2.0 * NEEDED), off_the_diagonal, 0.0)
     prediction = prediction_of(np.zeros(1), balance=NEEDED)
     prediction = replace(prediction, predicted_speed_rad_s=2.0 * prediction.predicted_speed_rad_s)
     known = replace(of_twin(), table=table)

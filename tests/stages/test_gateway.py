@@ -19,11 +19,9 @@ from pipeline.gateway.config import GatewayConfig
 from pipeline.presenting.users import User, UserRole, hasher, write_users
 from pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
 from pipeline.recordings.rare_messages import rare_messages
-from pipeline.recordings.writing import RecordingWriter
 from schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Transition
 from schemas.header import Header
 from schemas.messages import Alarm, Diagnosis, ModelCard, Request, Score, ScorerSnapshot
-from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
@@ -352,45 +350,22 @@ def test_nothing_of_a_fan_is_shown_as_now_once_its_tray_is_silent(gateway, monke
     assert 'fantwin_fan_scored{fan="0",site="hall",tray="tray1"} 0' in metrics
 
 
-def test_alarms_of_before_the_first_start_are_read_from_the_recordings_once(tmp_path):
-    run = tmp_path / "run"
-    run.mkdir()
-    for number, began_s in ((1, 0), (2, 10)):
-        with RecordingWriter(run / ("recording.mcap" if number == 1 else "recording-2.mcap"), {}) as writer:
-            for sequence in range(3):
-                each = alarm(
-                    sequence=sequence, t_ns=NOW_NS + round((began_s + sequence) * 1e9), message=f"{number}.{sequence}"
-                )
-                each = replace(each, header=Header(f"scorer-{number}", sequence, TRAY))
-                writer.add_message(tray_key(SITE, TRAY, "alarm"), each, each.t_ns)
-                writer.add_message(tray_key("elsewhere", TRAY, "alarm"), each, each.t_ns)
-    began_t_ns = NOW_NS + 60 * 10**9
+def test_the_history_begins_with_the_first_start_and_survives_a_restart(tmp_path):
+    def history(gateway: RunningGateway) -> dict[str, Any]:
+        return Client(gateway).ask("GET", "/api/v1/alarms/history")[1]
 
-    def history(gateway: RunningGateway, query: str = "") -> dict[str, Any]:
-        client = Client(gateway)
-        return eventually(
-            lambda: (
-                (h := client.ask("GET", f"/api/v1/alarms/history?{query}")[1]) and not h["is_reading_recordings"] and h
-            ),
-            "the recordings are read",
-        )
-
-    gateway = RunningGateway(run, configuration=CONFIGURATION, started_t_ns=began_t_ns)
+    gateway = RunningGateway(tmp_path, started_t_ns=NOW_NS)
     try:
-        gateway.feed(alarm(t_ns=began_t_ns, message="live"))
-        found = history(gateway)
-        assert [each["message"] for each in found["transitions"]] == ["live", "2.2", "2.1", "2.0", "1.2", "1.1", "1.0"]
-        assert found["begins_t_ns"] == NOW_NS
-        older = history(gateway, f"limit=2&before={found['transitions'][3]['number']}")["transitions"]
-        assert [each["message"] for each in older] == ["1.2", "1.1"]
+        for sequence in range(3):
+            gateway.feed(alarm(sequence=sequence, t_ns=NOW_NS + sequence, message=f"{sequence}"))
+        assert [each["message"] for each in history(gateway)["transitions"]] == ["2", "1", "0"]
+        before = history(gateway)
     finally:
         gateway.close()
-    for path in run.glob("*.mcap"):
-        path.unlink()
-    gateway = RunningGateway(run, configuration=CONFIGURATION, started_t_ns=began_t_ns + 1)
+    gateway = RunningGateway(tmp_path, started_t_ns=NOW_NS + 60 * 10**9)
     try:
-        assert len(history(gateway)["transitions"]) == 7
-        assert history(gateway)["begins_t_ns"] == NOW_NS
+        assert history(gateway) == before
+        assert before["begins_t_ns"] == NOW_NS
     finally:
         gateway.close()
 

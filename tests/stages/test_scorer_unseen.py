@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
-from schemas.model_uncertainty import ModelUncertainty
 from scoring.unseen_error import UnseenError
 from stages.scorer import NOT_CALIBRATED, ScorerCore
 from tests.support.scored_blocks import CALIBRATION, SIGMA, balance_of_a_fan, feed, prediction_of
+from tests.support.uncertainty_tables import by_speed
 
-EVERYWHERE = ModelUncertainty((0.0, 600.0), (0.0, 100.0), (((20.0, 20.0), (20.0, 20.0)),), seen_std_rad_s=(0.0,))
+EVERYWHERE = by_speed((0.0, 600.0), (0.0, 100.0), ((20.0, 20.0), (20.0, 20.0)), 0.0)
 
 
 @pytest.mark.parametrize("is_calibrated", [True, False])

@@ -38,7 +38,7 @@ from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
 
 LATER_NS = START_NS + 400 * 86_400 * 1_000_000_000  # the host's time while what was recorded at START_NS is replayed
 
-TORQUE = Diagnosis(cause="external_torque", probability=0.64, parameter="", change=0.1, change_low=0.0, change_high=0.2)
+TORQUE = Diagnosis(cause="external_torque", probability=0.64, parameter="", change=0.1)
 CAUSES = (TORQUE, replace(TORQUE, cause="drag_up", probability=0.36))
 
 

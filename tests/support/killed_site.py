@@ -31,9 +31,18 @@ from tests.support.twin_files import small_hybrid, write_twin
 SITE, TRAY, FANS = "plant", "tray1", 3
 CHAIN = ("resampler", "twin_integrator", "scorer")
 CALIBRATION = {
-    "speed": {"step": 2.0, "drift": 8.0, "growth": 4.0},
-    "balance": {"step": 4.0, "drift": 20.0, "growth": 6.0},
-    "missing_share": 0.5,
+    "speed": {},
+    "balance": {},
+    "detectors": {
+        "speed_smoothed": {"limit": 2.0},
+        "speed_drift": {"limit": 8.0, "period_s": 0.01},
+        "speed_variance_growth": {"limit": 4.0},
+        "balance_smoothed": {"limit": 4.0},
+        "balance_drift": {"limit": 20.0, "period_s": 0.01},
+        "balance_variance_growth": {"limit": 6.0},
+        "sensor": {"stuck_s": 5.0, "missing_share": 0.5},
+        "missing_readings": {"healthy_share": 0.5 / 3.0},
+    },
     "timing": {"smoothing_s": 0.2, "baseline_s": 0.2, "adaptation_s": 5.0, "on_delay_s": 0.1},
 }
 """limits of no particular fan, such that alarms come and go"""

@@ -1,10 +1,15 @@
-"""Makes tests/support/data/golden.mcap again: python -m tests.support.make_golden
+"""Makes the golden recordings in tests/support/data again: python -m tests.support.make_golden
 
-A real site watches a simulated tray of two fans for some ten seconds; one inlet is covered and uncovered, its alarm is
-acknowledged, that of the other fan is shelved, and the twin integrator and the scorer are killed on the way, so that
-the scorer continues from its snapshot. The twin is a physical one, which needs no function whose last bit depends on
-the machine, and its alarms are calibrated. Make it again only when what the stages decide is meant to change, and say
-why in the commit.
+Of golden.mcap: a real site watches a simulated tray of two fans for some ten seconds; one inlet is covered and
+uncovered, its alarm is acknowledged, that of the other fan is shelved, and the twin integrator and the scorer are
+killed on the way, so that the scorer continues from its snapshot. The twin is a physical one, which needs no function
+whose last bit depends on the machine, and its alarms are calibrated.
+
+Of golden-restart.mcap: a site without processes. An alarm is acknowledged, a fan shelved and another one taken out of
+service; then the scorer is killed and continues from its snapshot.
+
+Make them again only when what the stages decide, or a format, is meant to change, and say why in the commit. It takes
+some minutes.
 """
 
 from __future__ import annotations
@@ -18,9 +23,11 @@ sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parent)]
 
 from pipeline.recordings.reading import read_metadata, read_recording  # noqa: E402
 from pipeline.recordings.writing import RecordingWriter  # noqa: E402
+from schemas.enums import Action  # noqa: E402
+from tests.support.killed_site import Site  # noqa: E402
 from tests.support.running_chain import TRAY, Chain, eventually, fantwin, published, view_of  # noqa: E402
 
-GOLDEN = Path(__file__).parent / "data" / "golden.mcap"
+DATA = Path(__file__).parent / "data"
 FANS, FAULTY = 2, 1
 CONFIGURATION = f"""
 site = "demo"
@@ -42,6 +49,15 @@ adaptation_s = 10.0
 
 
 def main() -> None:
+    """Make both."""
+    DATA.mkdir(exist_ok=True)
+    make_golden(DATA / "golden.mcap")
+    make_golden_restart(DATA / "golden-restart.mcap")
+    for path in DATA.glob("golden*.mcap"):
+        print(f"{path}: {path.stat().st_size} bytes")
+
+
+def make_golden(path: Path) -> None:
     """Train a twin, run the site, kill two stages, and keep the recording."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -62,14 +78,27 @@ def main() -> None:
         finally:
             chain.close()
         (recording,) = chain.recordings()
-        keep(recording)
-    print(f"{GOLDEN}: {GOLDEN.stat().st_size} bytes")
+        keep(recording, path)
+
+
+def make_golden_restart(path: Path) -> None:
+    """Kill a scorer while its operators have set something for each fan."""
+    with tempfile.TemporaryDirectory() as name:
+        site = Site(Path(name), seed=1, scorer_settings="wear_every_s = 1.0\nlatching = true\n")
+        site.run(180)
+        site.ask(Action.ACKNOWLEDGE, fan=0)
+        site.ask(Action.SHELVE, fan=1, duration_s=60.0)
+        site.ask(Action.OUT_OF_SERVICE, fan=2)
+        site.run(10)
+        site.kill("scorer")
+        site.run(110)
+        path.write_bytes(site.finished().read_bytes())
 
 
 def record(chain: Chain) -> None:
     """Some ten seconds with a fault and two killed stages."""
     tray = chain.start_tray(
-        "--fans", str(FANS), "--rate", "50", "--fault", f"inlet:fan={FAULTY},start=3,stop=6,size=2.0"
+        "--fans", str(FANS), "--rate", "50", "--fault", f"inlet:fan={FAULTY},start=3,stop=9,size=2.0"
     )
     up = chain.start_up()
     with chain.watcher() as watcher:
@@ -84,12 +113,11 @@ def record(chain: Chain) -> None:
     assert up.end() == 0, up.output()
 
 
-def keep(recording: Path) -> None:
+def keep(recording: Path, path: Path) -> None:
     """Write the golden recording: all decisions and their input, without health, ports and folders of the machine."""
     head = read_metadata(recording)
     metadata = {key: value for key, value in head.metadata.items() if key != "overrides"}
-    GOLDEN.parent.mkdir(exist_ok=True)
-    with RecordingWriter(GOLDEN, metadata, head.attachments, overwrite=True) as writer:
+    with RecordingWriter(path, metadata, head.attachments, overwrite=True) as writer:
         for entry in read_recording(recording):
             if entry.topic != "health":
                 writer.add_message(entry.key, entry.message, entry.received_t_ns)

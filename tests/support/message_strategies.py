@@ -36,6 +36,7 @@ SCALARS: dict[str, st.SearchStrategy[Any]] = {
     **dict.fromkeys(_TIMES, INT64),
     "period_ns": PERIOD_NS,
     "process_id": UINT32,
+    "format": UINT32,
     "fans": UINT32,
     "pulses": UINT32,
     "lost": UINT64,

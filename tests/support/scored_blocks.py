@@ -26,7 +26,6 @@ TWIN_SPEED = 300.0
 NEEDED = 50.0
 """command at which the synthetic fan runs at TWIN_SPEED"""
 CALIBRATION: dict[str, Any] = {
-    "format_version": 2,
     "speed": {},
     "balance": {},
     "detectors": {

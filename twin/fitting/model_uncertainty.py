@@ -97,6 +97,7 @@ def model_uncertainty(
         tuple(significant(offsets_rad_s)),
         tuple(significant(commands)),
         tuple(tuple(tuple(significant(row, 4)) for row in each) for each in std_rad_s),
+        seen_std_rad_s=(0.0,) * len(std_rad_s),  # found below
         settled_speed_rad_s=tuple(tuple(significant(each)) for each in settled_rad_s),
     )
     seen_rad_s = [

@@ -153,8 +153,6 @@ def _what_is_known(content: Content, fan: FanContent, curve: StaticCurve) -> lis
 
 
 def _record_next(content: Content, fan: FanContent, known: ModelUncertainty, curve: StaticCurve) -> str:
-    if not known.seen_std_rad_s:
-        return "Record where it may be most wrong, and train again to rely on it."
     least = least_known(known, curve, fan.drive)
     if least is None:
         return (

@@ -28,10 +28,10 @@ def least_known(known: ModelUncertainty, curve: StaticCurve, drive: DriveCard | 
     """The held command, or else the step from one settled speed, at which the twin may be most wrong.
 
     known, curve, drive: of the fan; curve over the commands that are possible. None: nothing within these commands is
-    much less known than what training has seen, or the card does not say what that is.
+    much less known than what training has seen.
     """
     settled = curve.twin[np.isfinite(curve.twin).all(axis=1)]
-    if not known.seen_std_rad_s or not len(settled):
+    if not len(settled):
         return None
     commands, speeds_rad_s = settled.T
     raised = drive.raised(commands[:, np.newaxis])[:, 0] if drive else commands

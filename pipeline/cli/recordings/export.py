@@ -26,7 +26,6 @@ from pipeline.recordings.reading import read_recording
 from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.run_recordings import run_metadata
 from pipeline.recordings.tables import Form, TableFile, open_table
-from schemas.topics import current_name
 
 _PART = ".part"
 
@@ -58,7 +57,7 @@ def export(
     if to == "parquet":
         require("--to parquet (--to csv does not)", "logs", "pyarrow")
     parts = in_order(recordings)
-    topics = list(dict.fromkeys(map(current_name, topic or _default_topics(parts))))
+    topics = list(dict.fromkeys(topic or _default_topics(parts)))
     arrays = read_topics(parts, topics, tray)
     with (
         Console(stderr=True).status(f"exporting {parts[0]}") as status,

@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -204,7 +203,6 @@ def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...]
         RecordingError: it cannot be written.
     """
     metadata = {
-        "made_by": f"fantwin {version('fantwin')}",
         "source": table.path.name,
         "site": SITE,
         "trays": tray,

@@ -128,6 +128,8 @@ def print_result(result: dict[str, Any], output: Path | None) -> None:
         console.print(f"{result['restarts']} restarts of stages, replayed as recorded")
     for damage in result["damage"]:
         console.print(f"[bold yellow]damaged:[/bold yellow] {escape(damage)}")
+    for line in result["other_version"]:
+        console.print(f"{line}: decisions are the same for the same version only", markup=False)
     for one in result.get("recordings", [result]):
         for name in ("gained", "lost") if "what_if" in one else ():
             found = one["what_if"][name]

@@ -11,6 +11,7 @@ from typing import Any
 
 from pipeline.cli.progress import show_part
 from pipeline.errors import UserError
+from pipeline.recordings.records import MADE_BY_KEY, this_program
 from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
 from pipeline.replay.offline.comparison import CannotCompareError
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
@@ -18,7 +19,7 @@ from pipeline.replay.offline.rescoring import RescoredTray, rescore
 from schemas.units import NS_PER_S
 
 SUMS = ("hours", "samples", "lost", "restarts")
-LISTS = ("not_scored", "damage")
+LISTS = ("not_scored", "damage", "other_version")
 """of a result, that those of many recordings have together"""
 
 
@@ -95,6 +96,7 @@ def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray]) -> dict[st
         "counts": {tray.tray: dict(sorted(tray.counts.items())) for tray in trays},
         "restarts": sum(tray.plan.restarts for tray in trays),
         "damage": list(replay_input.damage.values()),
+        "other_version": _other_version(replay_input),
     }
     compared = [tray.comparison for tray in trays if tray.comparison]
     if compared:
@@ -123,6 +125,14 @@ def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray]) -> dict[st
         what_if = compare_episodes(now, episodes(within))
         result["what_if"] = _what_if(what_if)
     return result
+
+
+def _other_version(replay_input: ReplayInput) -> list[str]:
+    """A line if another version of fantwin wrote the recording."""
+    made_by = replay_input.metadata.metadata.get(MADE_BY_KEY, "")
+    if made_by == this_program():
+        return []
+    return [f"{replay_input.paths[0]}: recorded by {made_by or 'an unknown program'}, replayed by {this_program()}"]
 
 
 def _what_if(found: AlarmDiff) -> dict[str, Any]:

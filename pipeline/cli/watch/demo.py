@@ -30,7 +30,6 @@ from pipeline.errors import UserError
 from pipeline.extras import missing_extra
 from pipeline.launch.this_host import load_for_this_host
 from pipeline.runtime.signals import stop_on_signals
-from pipeline.runtime.snapshot_store import FORMER_SUFFIX
 from pipeline.selftest.scratch_site import FANTWIN, free_port
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import short_name
@@ -55,7 +54,7 @@ OUTPUTS = (
         "tray.log",
         "tray",
     ),
-    *("*.snapshot", f"*{FORMER_SUFFIX}", "alarms.sqlite*", "clips/*"),
+    *("*.snapshot", "alarms.sqlite*", "clips/*"),
 )
 ERROR_PREFIX = "fantwin: "
 """of the line in which a command says why it failed"""

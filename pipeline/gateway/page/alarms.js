@@ -135,12 +135,7 @@ export class HistoryView {
     }
     if (before === null) this.newest = transitions[0]?.number ?? this.newest;
     const begins = found.begins_t_ns ? `Reaches back to ${clock(found.begins_t_ns)}.` : "";
-    this.reach.textContent = [begins, this.oldest === null ? "No alarms so far." : "",
-      found.is_reading_recordings ? "Earlier alarms are being read from the recordings." : ""].filter(Boolean).join(" ");
-    if (found.is_reading_recordings) {
-      clearTimeout(this.timer);
-      this.timer = setTimeout(() => this.root.isConnected && this.begin(), 1000);
-    }
+    this.reach.textContent = [begins, this.oldest === null ? "No alarms so far." : ""].filter(Boolean).join(" ");
   }
 
   begin() {

@@ -70,7 +70,7 @@ class Sender:
             counters={},
             now_ns=time.time_ns(),
         )
-        self._put(self._health, health, "")
+        self._put(self._health, replace(health, is_last=status == StageStatus.STOPPED), "")
 
     def published(self) -> Mapping[str, int]:
         """Messages sent, by key."""

@@ -177,7 +177,7 @@ def test_a_folder_that_cannot_be_used_is_one_line(tmp_path):
 
 
 def test_a_demo_ignores_the_state_of_an_earlier_one_and_does_not_touch_other_files(tmp_path):
-    for name in ("recording.mcap", "scorer-tray1.snapshot", "scorer-tray1.memory", "notes.txt"):
+    for name in ("recording.mcap", "scorer-tray1.snapshot", "notes.txt"):
         (tmp_path / name).touch()
     _clear(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

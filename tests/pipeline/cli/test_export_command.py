@@ -20,7 +20,7 @@ from schemas.codec import proto_type
 from schemas.enums import FanState, Statistic
 from schemas.health import Health
 from schemas.messages import MESSAGE_TYPES, ModelCard, Raw
-from tests.pipeline.recordings.test_arrays import GOLDEN, alarm, raw, write
+from tests.pipeline.recordings.test_arrays import alarm, raw, write
 from tests.support.failing_writers import disk_of
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.score_data import START_NS, made_up_tray
@@ -180,11 +180,6 @@ def test_a_topic_that_was_not_recorded_is_reported(tmp_path):
     result = fantwin("export", path, "--to", "csv", "--topic", "score", "--topic", "alarm", "-o", tmp_path, "--json")
     assert (result.exit_code, result.stderr) == (0, "no alarm in this recording\n")
     assert json.loads(result.stdout)["absent"] == ["alarm"]
-
-
-def test_a_topic_of_an_older_recording_is_exported_under_its_name_today(tmp_path):
-    result = fantwin("export", GOLDEN, "--to", "csv", "--topic", "memory", "--topic", "snapshot", "-o", tmp_path)
-    assert (result.stdout, result.stderr) == (f"{tmp_path}/golden.tray1.snapshot.csv: 9 rows\n", "")
 
 
 @pytest.mark.parametrize("form", FORMS)

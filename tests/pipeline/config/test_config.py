@@ -51,6 +51,11 @@ def test_a_good_file_gives_every_enabled_stage_its_section():
             for role in ("scorer", "operator", "viewer", "source", "replay", "router")
         ),
         ("site = 'x'\n", ["'tray' is missing"]),
+        (
+            "format = 2\nnew_key = 1\n" + GOOD,
+            ["a configuration of format 2; this fantwin reads format 1: update"],
+        ),
+        ("format = '1'\n" + GOOD, ["a configuration of format '1'; ", "write format = 1, or leave it out"]),
         ("site = \n", ["not valid TOML"]),
         (GOOD.replace("0.25", "inf"), ["scorer.on_delay_s = inf", "finite"]),
         (GOOD.replace("fans = 8", "fans = 8\nspeed_max = nan"), ["tray.0.speed_max = nan", "finite"]),

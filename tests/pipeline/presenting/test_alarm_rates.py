@@ -7,13 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config.models import TrayConfig
 from pipeline.presenting import alarm_rates
 from pipeline.presenting.alarm_rates import AlarmRates
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.judged_time import JudgedStretch, JudgedTime
-from pipeline.presenting.site_model import SiteModel
-from schemas.enums import Feedback, Severity, Transition
+from schemas.enums import Severity, Transition
 from schemas.header import Header
 from schemas.messages import Alarm
 from schemas.units import NS_PER_S
@@ -60,25 +58,6 @@ def test_alarms_count_from_the_first_to_the_last_score_of_the_twin_in_force(tmp_
     assert rates.observed()["tray1"].unmarked == len(within)
     rates.close()
     store.close()
-
-
-def test_what_was_said_of_an_alarm_before_the_first_start_is_known_and_counts_in_no_rate(tmp_path: Path) -> None:
-    store = AlarmStore(tmp_path / "alarms.sqlite")
-    rates = AlarmRates(tmp_path / "alarms.sqlite")
-    model = SiteModel("plant", [TrayConfig(name="tray1", fans=1, speed_unit="rpm")], store, rates=rates)
-    alarm = raised(FIRST.first_t_ns, 1)
-    said = replace(
-        alarm,
-        header=replace(alarm.header, sequence=2),
-        t_ns=alarm.t_ns + HOUR_NS,
-        transition=Transition.MARKED_FALSE,
-        marked_onset_t_ns=alarm.onset_t_ns,
-    )
-    assert model.add_earlier_alarms([said, alarm]) == 2
-    assert model.feedback_on([alarm]) == [Feedback.FALSE_ALARM]
-    rates.catch_up(store, [FIRST])
-    assert (rates.observed()["tray1"].false_alarms, rates.observed()["tray1"].unmarked) == (0, 0)
-    model.close()
 
 
 def test_the_time_of_fans_that_are_sampled_slowly_counts() -> None:

@@ -198,12 +198,6 @@ def test_several_topics_are_read_in_one_pass(tmp_path):
     assert [(block.topic, len(block)) for block in read_topics([path], ("raw", "alarm"))] == [("raw", 20), ("alarm", 1)]
 
 
-def test_a_topic_of_an_older_recording_is_read_by_both_names():
-    for topic in ("snapshot", "memory"):
-        (block,) = read_arrays(GOLDEN, topic)
-        assert (block.topic, len(block)) == ("snapshot", 9)
-
-
 def test_parts_in_any_order_are_one_recording_and_duplicates_count_once(tmp_path):
     first = write(tmp_path / "z.mcap", (raw(n) for n in range(6)))
     second = write(tmp_path / "a.mcap", (raw(n) for n in range(4, 9)), start=100)

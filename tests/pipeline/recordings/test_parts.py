@@ -119,7 +119,7 @@ def test_the_part_that_is_open_is_not_deleted(tmp_path):
 
 
 def test_a_new_recorder_takes_a_number_above_all_existing_ones(tmp_path):
-    for name in ("r.mcap", "r-7.mcap", "r-9.mcap.torn"):  # the last has the FORMER suffix
+    for name in ("r.mcap", "r-7.mcap", "r-9.mcap.original"):
         (tmp_path / name).touch()
     part(parts_in(tmp_path)).finish()
     assert "r-10.mcap" in names(tmp_path)

@@ -1,15 +1,20 @@
 """Recordings: written messages are read back, by fantwin and by others, after damage too."""
 
+from importlib.metadata import version
+
 import numpy as np
 import pytest
 from google.protobuf.descriptor_pool import DescriptorPool
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from pipeline.recordings.contents import contents_of
+from pipeline.recordings.rare_messages import last_message_ns, last_messages, rare_messages
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from pipeline.recordings.scan import scan
 from pipeline.recordings.writing import RecordingWriter
 from schemas.envelope import Envelope
 from schemas.header import Header
@@ -47,7 +52,7 @@ def test_a_reading_can_be_iterated_again(tmp_path):
 
 def test_metadata_and_attachments_are_read_back(tmp_path):
     head = read_metadata(write(tmp_path / "r.mcap", 0))
-    assert head.metadata == {"site": "plant"}
+    assert head.metadata == {"site": "plant", "format": "1", "made_by": f"fantwin {version('fantwin')}"}
     assert head.attachments == {"configuration.toml": b"site = 'plant'"}
 
 
@@ -72,7 +77,7 @@ def test_other_readers_need_no_code_of_fantwin(tmp_path):
         assert {schema.name for schema in summary.schemas.values()} == {"fantwin.Raw", "fantwin.Alarm"}
         assert {channel.topic for channel in summary.channels.values()} == {RAW_KEY, ALARM_KEY}
         assert [a.name for a in reader.iter_attachments()] == ["configuration.toml"]
-        assert {m.name: m.metadata for m in reader.iter_metadata()}["fantwin"] == {"site": "plant"}
+        assert {m.name: m.metadata for m in reader.iter_metadata()}["fantwin"]["site"] == "plant"
         decoded = list(reader.iter_decoded_messages())
     _, channel, message, proto = decoded[2]
     assert (channel.message_encoding, message.log_time, message.sequence) == ("protobuf", 1002, 2)
@@ -91,7 +96,53 @@ def test_the_embedded_schema_needs_no_other_file(tmp_path):
     pool = DescriptorPool()
     for file_descriptor in files.file:
         pool.Add(file_descriptor)  # type: ignore[attr-defined]
-    assert pool.FindMessageTypeByName("fantwin.Score").fields_by_name["band_variance"].number == 25
+    assert pool.FindMessageTypeByName("fantwin.Score").fields_by_name["band_variance"].number == 8
+
+
+@pytest.fixture
+def of_tomorrow(tmp_path):
+    """A recording of the format that comes after the present one."""
+    path = write(tmp_path / "r.mcap", 2)
+    stated = b"format\1\0\0\0"
+    content = path.read_bytes()
+    assert content.count(stated + b"1") == 1
+    path.write_bytes(content.replace(stated + b"1", stated + b"2"))
+    return path
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        read_metadata,
+        read_recording,
+        contents_of,
+        scan,
+        last_message_ns,
+        lambda path: rare_messages(path, "alarm"),
+        lambda path: last_messages(path, "alarm"),
+    ],
+)
+def test_a_recording_of_an_unknown_format_is_refused_however_it_is_read(of_tomorrow, read):
+    with pytest.raises(RecordingError, match=r"r\.mcap: a recording of format 2; this fantwin reads format 1: update"):
+        read(of_tomorrow)
+
+
+def test_a_copy_names_the_program_that_made_the_first_one(tmp_path):
+    about = read_metadata(write(tmp_path / "r.mcap", 0)).metadata
+    with RecordingWriter(tmp_path / "copy.mcap", {**about, "made_by": "fantwin 0.0.9", "format": "0"}):
+        pass
+    head = read_metadata(tmp_path / "copy.mcap")
+    assert (head.metadata["made_by"], head.metadata["format"]) == ("fantwin 0.0.9", "1")
+
+
+def test_a_recording_without_a_format_number_is_refused(tmp_path):
+    with (tmp_path / "r.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("fantwin", {"made_by": "fantwin 0.0.1"})
+        writer.finish()
+    with pytest.raises(RecordingError, match=r"without a format number; .* \(made by fantwin 0\.0\.1\)"):
+        read_metadata(tmp_path / "r.mcap")
 
 
 def test_a_recording_is_called_active_until_it_is_finished(tmp_path):
@@ -161,8 +212,6 @@ def test_changed_bytes_anywhere_never_make_a_reader_crash(tmp_path, data):
 
 
 def test_channels_of_other_programs_are_skipped(tmp_path):
-    from mcap.writer import Writer  # noqa: PLC0415
-
     path = tmp_path / "foreign.mcap"
     with path.open("wb") as file:
         writer = Writer(file)

@@ -116,7 +116,12 @@ def test_with_new_limits_alone_baselines_and_alarms_go_on(tmp_path: Path) -> Non
     site = Site(tmp_path, 9, learns=True)
     model = small_hybrid(1)
     first = write_twin(tmp_path / "1.onnx", model, fans=FANS, name="tray1-1", calibration=CALIBRATION).read_bytes()
-    wider = {**CALIBRATION, "speed": {"step": 2.5, "drift": 9.0, "growth": 5.0}}
+    detectors = {
+        "speed_smoothed": {"limit": 2.5},
+        "speed_drift": {"limit": 9.0, "period_s": 0.01},
+        "speed_variance_growth": {"limit": 5.0},
+    }
+    wider = {**CALIBRATION, "detectors": {**CALIBRATION["detectors"], **detectors}}
     second = write_twin(tmp_path / "2.onnx", model, fans=FANS, name="tray1-2", calibration=wider).read_bytes()
     site.put_in_force("tray1-1", first)
     site.run(585)

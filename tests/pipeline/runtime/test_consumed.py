@@ -58,15 +58,15 @@ def test_between_two_reports_nothing_is_missing_and_no_timer_has_acted(events):
         else:
             stage.takes(f"acquisition-{life}", sequence)
     stage.reported += stage.reports.last()
-    numbers = [report.output_sequence for report in stage.reported]
+    numbers = [report.header.sequence for report in stage.reported]
     assert numbers == sorted(set(numbers))
     assert not stage.grids or {0, len(stage.grids) - 1} <= set(numbers)
     for report in stage.reported:
-        grid = stage.grids[report.output_sequence]
+        grid = stage.grids[report.header.sequence]
         assert (report.header, report.topic) == (grid.header, "grid")
         assert (report.first_t_ns, report.t_ns) == (grid.t_ns[0], grid.t_ns[-1])
     for one, other in pairwise(stage.reported):
-        between = stage.grids[one.output_sequence + 1 : other.output_sequence]
+        between = stage.grids[one.header.sequence + 1 : other.header.sequence]
         positions = [each.header.input_position for each in between]
         assert not any(position.from_timer for position in positions if position)
         chain = [one.header.input_position, *positions, other.header.input_position]
@@ -79,8 +79,8 @@ def test_a_run_without_a_break_is_reported_each_two_minutes():
     stage = Resampler()
     for sequence in range(250):
         stage.takes("acquisition-0", sequence)
-    assert [report.output_sequence for report in stage.reported] == [0, 120, 240]
-    assert [report.output_sequence for report in stage.reports.last()] == [249]
+    assert [report.header.sequence for report in stage.reported] == [0, 120, 240]
+    assert [report.header.sequence for report in stage.reports.last()] == [249]
     assert stage.reports.last() == [], "the end is reported once"
 
 

@@ -48,12 +48,12 @@ class Replay:
         self.clock.put(encode(Clock(header=header, t_ns=t_ns, rate=rate)))
 
     def stop(self) -> None:
-        self._publish_health(StageStatus.STOPPED)
+        self._publish_health(StageStatus.STOPPED, is_last=True)
 
-    def _publish_health(self, status: StageStatus) -> None:
+    def _publish_health(self, status: StageStatus, *, is_last: bool = False) -> None:
         header = Header("replay-1", self.health.published, "")
-        health = Health(header=header, stage="replay", instance="all", status=status, t_ns=0, uptime_s=0.0)
-        self.health.put(encode(health))
+        about = {"stage": "replay", "instance": "all", "status": status, "is_last": is_last}
+        self.health.put(encode(Health(header=header, t_ns=0, uptime_s=0.0, **about)))
 
 
 @pytest.fixture

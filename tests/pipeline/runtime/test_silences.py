@@ -136,14 +136,6 @@ def test_a_session_whose_device_is_silent_from_the_beginning_shows_it(consumer):
     assert consumer.is_shown()
 
 
-def test_after_a_producer_that_has_stopped_in_order_nothing_more_is_waited_for(consumer):
-    consumer.hear(5)
-    consumer.arrived = 5
-    consumer.hear(5, STOPPED)
-    assert consumer.is_shown()
-    assert consumer.is_shown()
-
-
 @pytest.mark.parametrize("status", [STOPPED, DEGRADED])
 def test_what_a_producer_that_has_ended_has_sent_is_still_waited_for(consumer, status):
     consumer.hear(5, status, is_last=True)
@@ -155,7 +147,7 @@ def test_what_a_producer_that_has_ended_has_sent_is_still_waited_for(consumer, s
 
 
 def test_a_producer_that_begins_again_is_waited_for_again(consumer):
-    consumer.hear(5, STOPPED)
+    consumer.hear(5, STOPPED, is_last=True)
     consumer.hear(7)
     consumer.arrived = 5
     assert not consumer.is_shown(), "the seventh is on the way"

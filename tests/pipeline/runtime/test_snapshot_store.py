@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from pipeline.runtime.snapshot_store import AHEAD_NS, RECENT_NS, SnapshotStore
 from pipeline.runtime.stage import StageError
-from schemas.codec import encode
 from schemas.messages import ScorerSnapshot
 
 
@@ -104,20 +104,15 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path) -> No
     assert str(refused.value) == f"{tmp_path}: cannot read the scorer's snapshot: Is a directory"
 
 
-def test_a_snapshot_under_the_name_of_earlier_versions_is_loaded_until_there_is_a_newer_one(tmp_path: Path) -> None:
-    store = SnapshotStore(tmp_path / "scorer-tray.1.snapshot")
-    (tmp_path / "scorer-tray.1.memory").write_bytes(encode(snapshot(1)))
-    assert saved(store.path) == 1
-    store.save(snapshot(2))
-    assert saved(store.path) == 2
-
-
-def test_a_removed_snapshot_does_not_bring_back_the_one_of_an_earlier_version(tmp_path: Path) -> None:
-    store = SnapshotStore(tmp_path / "scorer-tray1.snapshot")
-    (tmp_path / "scorer-tray1.memory").write_bytes(encode(snapshot(1)))
-    store.save(snapshot(2))
-    store.path.unlink()
-    assert store.load() is None
+@pytest.mark.parametrize(("number", "advice"), [(0, "remove it to start without one"), (2, "update fantwin")])
+def test_a_snapshot_of_an_unknown_format_is_refused_in_one_line(tmp_path: Path, number: int, advice: str) -> None:
+    unknown = replace(snapshot(9), format=number)
+    store = SnapshotStore(tmp_path / "m.snapshot")
+    store.save(unknown)
+    with pytest.raises(StageError, match=rf"m\.snapshot: a scorer's snapshot .*reads format 1: {advice}"):
+        store.load()
+    with pytest.raises(StageError, match=rf"m: the snapshot that the recorder keeps: .*{advice}"):
+        SnapshotStore(tmp_path / "n" / "m.snapshot", lambda _is_patient: ([unknown], "")).load()
 
 
 def test_of_a_file_and_what_others_keep_the_newest_counts(tmp_path: Path) -> None:

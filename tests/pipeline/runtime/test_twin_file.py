@@ -78,14 +78,6 @@ def test_the_balance_of_each_fan_is_read_and_that_of_one_fan_holds_for_all(tmp_p
     np.testing.assert_allclose(five.sigma_command, SIGMA_COMMAND)
 
 
-def test_errors_in_an_older_card_have_no_correlations(tmp_path: Path) -> None:
-    older = asdict(made_up_balance((PARAMETERS,))) | {"std_errors": [[0.001, 0.001, 1e-5, 0.1]], "covariance": None}
-    balance = TwinFile.load(write_twin(tmp_path / "twin.onnx", balance=older), 1).balance
-    np.testing.assert_allclose(balance.covariance[0], np.diag(np.square(older["std_errors"][0])))
-    older["std_errors"] = [[1.0, 1.0, 1.0]]
-    assert "std_errors must have four numbers" in _refusal(write_twin(tmp_path / "twin.onnx", balance=older))
-
-
 def test_a_calibration_is_kept_unchanged(tmp_path: Path) -> None:
     assert TwinFile.load(write_twin(tmp_path / "never.onnx"), 1).card.calibration is None
     calibration = {"limits": [1.5, {"kind": "fast"}]}
@@ -159,17 +151,13 @@ def test_a_card_on_another_graph_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_newer_format_is_refused_even_if_its_card_looks_different(tmp_path: Path) -> None:
-    assert "update fantwin" in _refusal(write_twin(tmp_path / "a.onnx", format_version=4))
-    assert "update fantwin" in _refusal(write_twin(tmp_path / "b.onnx", format_version=4, sigma_rad_s=None))
+    assert "update fantwin" in _refusal(write_twin(tmp_path / "a.onnx", format=2))
+    assert "update fantwin" in _refusal(write_twin(tmp_path / "b.onnx", format=2, sigma_rad_s=None))
 
 
-def test_an_older_format_is_refused_with_the_advice_to_train_again(tmp_path: Path) -> None:
-    line = _refusal(write_twin(tmp_path / "a.onnx", format_version=1, parameters=[[0.15, 0.12, 0.0005]], n_state=1))
-    assert "twin format 1, this fantwin knows 3: train it again" in line
-
-
-def test_a_card_without_a_format_is_refused(tmp_path: Path) -> None:
-    assert "format_version" in _refusal(write_twin(tmp_path / "a.onnx", format_version=None))
+def test_a_card_without_a_format_is_refused_with_the_advice_to_train_again(tmp_path: Path) -> None:
+    line = _refusal(write_twin(tmp_path / "a.onnx", format=None, parameters=[[0.15, 0.12, 0.0005]], n_state=1))
+    assert "a twin card without a format number; this fantwin reads format 1: train the twin again" in line
 
 
 @pytest.mark.parametrize(

@@ -229,8 +229,7 @@ def test_a_file_that_is_not_a_twin_is_refused_in_one_line(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"format_version": 99}, "twin format 99"),
-        ({"format_version": 1}, "twin format 1, this fantwin knows 3"),
+        ({"format": 99}, "a twin card of format 99; this fantwin reads format 1: update fantwin"),
         ({"state_layout": {"speed": 1, "command": 0}, "n_state": 1}, r"the card says (fans, 1)"),
         ({"n_state": 3}, "n_state"),
         ({"parameters": [[0.1, 0.1, 0.1, 0.0]]}, "parameters"),

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from schemas.model_uncertainty import ModelUncertainty
 from schemas.twin_card import DriveCard
+from tests.support.uncertainty_tables import by_speed
 from twin.report.record_next import least_known
 from twin.report.steady_states import StaticCurve
 
@@ -21,7 +20,7 @@ def known(**unknown: float) -> ModelUncertainty:
     std = np.full((11, 11), 2.0)
     if unknown:
         std[int(unknown["speed"] / 20.0), round(unknown["command"] * 10)] = unknown["std"]
-    return ModelUncertainty(SPEEDS_RAD_S, tuple(COMMANDS.tolist()), (tuple(map(tuple, std.tolist())),), (2.0,))
+    return by_speed(SPEEDS_RAD_S, COMMANDS.tolist(), std.tolist(), 2.0)
 
 
 def test_a_command_that_was_never_held_comes_first() -> None:
@@ -36,9 +35,8 @@ def test_where_all_commands_were_held_it_is_a_step() -> None:
     assert (found.command, found.speed_rad_s, found.held) == (COMMANDS[2], SPEEDS_RAD_S[8], False)
 
 
-def test_nothing_is_asked_for_that_would_tell_little_or_that_the_card_does_not_know() -> None:
+def test_nothing_is_asked_for_that_would_tell_little() -> None:
     assert least_known(known(speed=140.0, command=0.7, std=2.9), CURVE, None) is None
-    assert least_known(replace(known(speed=140.0, command=0.7, std=9.0), seen_std_rad_s=()), CURVE, None) is None
     diverging = StaticCurve((), np.column_stack((COMMANDS, np.full(11, np.nan))))
     assert least_known(known(speed=140.0, command=0.7, std=9.0), diverging, None) is None
 

@@ -495,7 +495,11 @@ def test_what_the_twin_knows_is_drawn_where_its_card_says_it(twin, hybrid, monke
     assert page.count("<svg ") == len(TITLES_OF_HYBRID) + 1
     assert "What to record next: " in page or "more such data hardly reduce its error" in page
     everywhere = replace(
-        known, std_rad_s=(((0.1, 0.2), (0.1, 0.2)),), seen_std_rad_s=(), settled_speed_rad_s=(), **CORNERS
+        known,
+        std_rad_s=(((0.1, 0.2), (0.1, 0.2)),),
+        seen_std_rad_s=(0.2,),
+        settled_speed_rad_s=((0.0, 0.0),),
+        **CORNERS,
     )
     assert figures.OUTSIDE not in figures.what_is_known(content, content.fans[0], everywhere), "no line where none is"
 
