@@ -200,7 +200,7 @@ def _of_numbers(largest: dict[str, Any]) -> str:
         return "and all numbers to the last digit"
     return (
         f"numbers within {RELATIVE:g} of their size (largest difference: {largest['difference']:.2g} in "
-        f"{largest['name']}, {100 * largest['share']:.2g} % of what is allowed)"
+        f"{largest['name']})"
     )
 
 
