@@ -1,7 +1,7 @@
 """What a message of a small tray costs integrator and scorer: each tray alone, and all trays in one pass.
 
 Rough fans at 100 Hz under random stairs, watched by a calibrated twin of one such fan. The messages of all trays are
-made outside of the measured time, and the cores run in this process. Both ways make the same messages, to the bit
+made outside of the measured time, and the cores run in this process. Both ways make the same messages, but for rounding
 (tests/stages/test_joint_steps.py).
 
     python -m bench.fleet.joint_cost

@@ -13,7 +13,7 @@ MOST_FANS = 512
 
 
 def step_together(joint: Joint, cores: Sequence[Core], items: Sequence[Any]) -> Iterator[list[Message]]:
-    """What `core.step(item)` returns for each of several trays, to the bit.
+    """What `core.step(item)` returns for each of several trays: decisions are the same, numbers but for rounding.
 
     A core finishes its step only when its messages are taken, so what it saves is never ahead of what is published.
     """

@@ -1,4 +1,4 @@
-"""Scores blocks of several trays with one twin in one pass; each tray gets what it would get alone, to the bit."""
+"""Scores blocks of several trays with one twin in one pass; each gets what it would get alone, but for rounding."""
 
 from __future__ import annotations
 

@@ -120,8 +120,8 @@ class Joint(Protocol):
     """Processes admitted blocks, for one process of a stage."""
 
     def process(self, cores: Sequence[Any], blocks: Sequence[Any]) -> Sequence[Any]:
-        """What is made of the block of each core, for its `finish`: to the bit what would be made of it alone. Blocks
-        of several cores have equal keys."""
+        """What is made of the block of each core, for its `finish`: what would be made of it alone, but for
+        rounding. Blocks of several cores have equal keys."""
         ...
 
 

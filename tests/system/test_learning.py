@@ -68,4 +68,4 @@ def test_a_twin_is_learned_and_takes_over_while_the_stages_run(configuration: Pa
     assert not without[t_ns >= card.t_ns].any()
     verified = fantwin("replay", "--offline", "--verify", recording)
     assert verified.exit_code == 0, verified.output
-    assert "to the bit" in verified.stdout
+    assert "all decisions are identical" in verified.stdout

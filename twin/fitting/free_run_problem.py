@@ -22,7 +22,7 @@ Flags = NDArray[np.bool_]
 HUBER_DELTA = 3.0
 FAST_CHUNK_NUMBERS, MAX_CHUNK_NUMBERS = 500_000, 4_000_000
 FEWER = 0.75  # share of the fans: with fewer left to fit than that, the others are left out
-ALIGNED_COLUMNS = 16  # of fast chunks: sums over the units of a network are the same to the bit however they are cut
+ALIGNED_COLUMNS = 16  # of fast chunks: whole registers, so that all columns of a chunk are summed alike
 HELD = 1e12
 
 ALL_FREE = np.ones(len(PARAMETER_NAMES), dtype=bool)

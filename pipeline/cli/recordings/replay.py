@@ -107,7 +107,11 @@ def replay(
     ] = None,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="Compare with the recorded result, bit for bit.", rich_help_panel=_DECIDING),
+        typer.Option(
+            "--verify",
+            help="Compare with the recorded result: decisions exactly, numbers within a tolerance.",
+            rich_help_panel=_DECIDING,
+        ),
     ] = False,
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,

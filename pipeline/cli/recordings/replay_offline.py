@@ -26,6 +26,7 @@ from pipeline.recordings.dates import format_utc, has_date
 from pipeline.recordings.grouping import describe, recordings_of
 from pipeline.recordings.records import active_path
 from pipeline.recordings.run_recordings import recorded_files
+from pipeline.replay.offline.tolerance import RELATIVE
 from schemas.messages import Diagnosis
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import most_probable
@@ -171,8 +172,8 @@ def _print_verified(found: dict[str, Any], console: Console) -> None:
     what = "samples" if has_scores else "snapshots"
     if found["equal"]:
         console.print(
-            f"[bold green]equal:[/bold green] {found[f'{what}_equal']} {what} and {found['alarms_equal']} alarms, "
-            "to the bit"
+            f"[bold green]equal:[/bold green] {found[f'{what}_equal']} {what} and {found['alarms_equal']} alarms; all "
+            f"decisions are identical, {_of_numbers(found['largest_difference'])}"
         )
     else:
         different, equal = found[f"{what}_different"], found[f"{what}_equal"]
@@ -194,6 +195,15 @@ def _print_verified(found: dict[str, Any], console: Console) -> None:
             console.print(f"  {reason}", markup=False)
     if found["samples_not_recorded"]:
         console.print(f"{found['samples_not_recorded']} replayed samples are not in the recording")
+
+
+def _of_numbers(largest: dict[str, Any]) -> str:
+    if not largest["share"]:
+        return "and all numbers to the last digit"
+    return (
+        f"numbers within {RELATIVE:g} of their size (largest difference: {largest['difference']:.2g} in "
+        f"{largest['name']})"
+    )
 
 
 def _print_alarms(console: Console, title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> None:

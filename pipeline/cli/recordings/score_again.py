@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,7 @@ def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray]) -> dict[st
             "snapshots_equal": sum(one.snapshots_equal for one in compared),
             "snapshots_different": sum(one.snapshots_different for one in compared),
             "snapshots_not_comparable": sum(one.snapshots_not_comparable for one in compared),
+            "largest_difference": max(one.largest for one in compared)._asdict(),
             "left_out": list(replay_input.metadata.left_out),
             "not_comparable": [reason for one in compared for reason in one.reasons],
             "differences": [line for one in compared for line in one.named],
@@ -147,6 +149,7 @@ def _verified(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {
         "equal": all(one["equal"] for one in found),
         **counts,
+        "largest_difference": max((one["largest_difference"] for one in found), key=itemgetter("share")),
         "left_out": list(dict.fromkeys(topic for one in found for topic in one["left_out"])),
         "not_comparable": [line for one in found for line in one["not_comparable"]],
         "differences": [line for one in found for line in one["differences"]],

@@ -1,9 +1,8 @@
 """The plan of a replay of an alarm clip that begins in the middle of a scorer's session, with the scorer's snapshot.
 
 Such a clip lacks what the stages before the scorer had in memory. A replay runs them over the clip's raw samples, which
-begin early enough for them to settle; the scorer continues from the snapshot. Its samples then differ from the recorded
-ones in the last digits: the same alarms come out, and not the same bits. To verify bits, the scorer is given the
-predictions that were recorded.
+begin early enough for them to settle; the scorer continues from the snapshot. The same alarms come out, and may come a
+few samples earlier or later. To verify them, the scorer is given the predictions that were recorded.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from schemas.streams import continues
 from schemas.units import NS_PER_S
 from scoring.diagnosis.diagnoser import WINDOW_S
 
-NOT_TO_THE_BIT = (
-    "an alarm clip without predictions cannot be compared to the bit: leave out --verify, and its alarms come out again"
+NO_PREDICTIONS = (
+    "an alarm clip without predictions cannot be compared: leave out --verify, and its alarms come out again"
 )
 AFTER_SNAPSHOT = "the clip begins after the snapshot from which it is scored"
 

@@ -8,28 +8,15 @@ of the recorded ones.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
 
 from pipeline.recordings.dates import format_utc
-from pipeline.replay.offline.comparison import CAUSE_TOLERANCE, Comparison
+from pipeline.replay.offline.comparison import Comparison
 from pipeline.replay.offline.plan import Limit, Session
+from pipeline.replay.offline.tolerance import Apart, differences
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.messages import ScorerSnapshot
-
-REGRESSED = ("wear", "causes")
-"""entries whose numbers come from linear regressions: they may differ by CAUSE_TOLERANCE"""
-
-
-class Difference(NamedTuple):
-    """Where two states differ first."""
-
-    where: str
-    """keys and places in lists, with dots between"""
-    is_of_form: bool = False
-    """one has an entry that the other has not, because another version took it"""
 
 
 class SnapshotVerifier:
@@ -82,57 +69,35 @@ class SnapshotVerifier:
 
     def _compare(self, recorded: ScorerSnapshot, made: Sequence[ScorerSnapshot]) -> None:
         found = self._found
-        differences = list(filter(None, (first_difference(each, recorded) for each in made)))
-        if len(differences) < len(made):
+        places = [first_difference(each, recorded, found.note) for each in made]
+        if "" in places:
             found.snapshots_equal += 1
             return
         limit = self._limit_of(self._producer or "")
         at = f"{found.tray}: snapshot of {format_utc(recorded.t_ns)}"
         if limit is not None and recorded.t_ns > limit.t_ns:
             found.snapshots_not_comparable += 1
-        elif not differences:
+        elif not places:
             found.snapshots_different += 1
             found.name(f"{at}: recorded and not replayed")
-        elif differences[-1].is_of_form:
-            found.snapshots_not_comparable += 1
-            found.add_reason(f"{found.tray}: snapshots have another form, see {differences[-1].where}")
         else:
             found.snapshots_different += 1
-            found.name(f"{at}: {differences[-1].where} differs")
+            found.name(f"{at}: {places[-1]} differs")
 
 
-def first_difference(made: ScorerSnapshot, recorded: ScorerSnapshot) -> Difference | None:
-    """Where two snapshots differ; a difference of values before one of form. None: nowhere."""
+def first_difference(
+    made: ScorerSnapshot, recorded: ScorerSnapshot, note: Callable[[Apart], None] = lambda _apart: None
+) -> str:
+    """Where two snapshots differ by more than is allowed; empty: nowhere. note: see `tolerance.differences`."""
     if made.twin_sha256 != recorded.twin_sha256:
-        return Difference("twin_sha256")
+        return "twin_sha256"
     if made.state_json == recorded.state_json:
-        return None
+        return ""
     try:
-        one, other = (json.loads(each.state_json) for each in (made, recorded))
-    except (ValueError, TypeError, AttributeError):
-        return Difference("state_json", is_of_form=True)
-    return min(_differences(one, other, ()), key=lambda difference: difference.is_of_form, default=None)
-
-
-def _differences(one: Any, other: Any, path: tuple[str, ...]) -> Iterator[Difference]:
-    if isinstance(one, dict) and isinstance(other, dict):
-        for key in {**one, **other}:
-            if key in one and key in other:
-                yield from _differences(one[key], other[key], (*path, key))
-            else:  # entries of fans are named by their number
-                yield Difference(".".join((*path, key)), is_of_form=not key.isdigit())
-    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
-        for number, (mine, others) in enumerate(zip(one, other, strict=True)):
-            if mine != others:
-                yield from _differences(mine, others, (*path, str(number)))
-    elif not _is_same(one, other, path):
-        yield Difference(".".join(path))
-
-
-def _is_same(one: Any, other: Any, path: tuple[str, ...]) -> bool:
-    if isinstance(one, float) and isinstance(other, float) and not set(REGRESSED).isdisjoint(path):
-        return math.isclose(one, other, rel_tol=CAUSE_TOLERANCE, abs_tol=CAUSE_TOLERANCE**2)
-    return one == other
+        one, other = json.loads(made.state_json), json.loads(recorded.state_json)
+    except ValueError:
+        return "state_json"
+    return next(differences(one, other, note), "")
 
 
 def _saved(envelopes: Iterable[Envelope], producer: str) -> Iterator[ScorerSnapshot]:

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from pipeline.errors import UserError
 from pipeline.recordings.dates import format_utc
 from pipeline.replay.offline.plan import BEGINNING, Limit
+from pipeline.replay.offline.tolerance import Apart
 
-CAUSE_TOLERANCE = 1e-6
-"""relative"""
 MAX_NAMED = 5
 """differences that are described"""
 
@@ -25,7 +24,9 @@ class Comparison:
     tray: str
     equal: int = 0
     different: int = 0
-    """replayed, and not equal"""
+    """replayed, and another decision or a number that differs by more than its tolerance"""
+    numbers_different: int = 0
+    """those with such a number"""
     not_made: int = 0
     """recorded, and not replayed"""
     not_recorded: int = 0
@@ -42,6 +43,8 @@ class Comparison:
     snapshots_equal: int = 0
     snapshots_different: int = 0
     snapshots_not_comparable: int = 0
+    largest: Apart = Apart()
+    """the largest difference of numbers that is allowed, by its share of the tolerance"""
     reasons: list[str] = field(default_factory=list)
     """why something is not comparable, a line each"""
     named: list[str] = field(default_factory=list)
@@ -58,6 +61,10 @@ class Comparison:
         if self.has_scores:
             return bool(self.equal or self.different or self.not_made)
         return bool(self.alarms_equal or self.snapshots_equal or not self.is_equal)
+
+    def note(self, apart: Apart) -> None:
+        """Keep the largest of the differences that are allowed."""
+        self.largest = max(self.largest, apart)
 
     def add_not_comparable(self, samples: int, limit: Limit) -> None:
         """Count samples beyond the limit of their session."""

@@ -18,7 +18,7 @@ from pipeline.recordings.order import in_order
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
 from pipeline.recordings.run_recordings import run_metadata
 from pipeline.replay.default_config import default_config, first_raw
-from pipeline.replay.offline.clip_plan import NOT_TO_THE_BIT, plan_from_snapshot, plan_with_recorded_inputs
+from pipeline.replay.offline.clip_plan import NO_PREDICTIONS, plan_from_snapshot, plan_with_recorded_inputs
 from pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
 from pipeline.replay.offline.plan_reader import PlanReader
@@ -112,7 +112,7 @@ class ReplayInput:
             twins = reader.twins if self.twins[tray] is None else []
             return plan_from_snapshot(self.stages, snapshot, twins, reader.answered_requests), ""
         if self.stages.outputs[-2] in self.metadata.left_out:
-            return None, NOT_TO_THE_BIT
+            return None, NO_PREDICTIONS
         plan = reader.plan()
         return (plan_with_recorded_inputs(plan, snapshot) if plan else None), reader.no_plan_reason
 

@@ -1,22 +1,21 @@
-"""Comparing replayed scores and alarms with the recorded ones, to the bit; where scores are not recorded, snapshots.
+"""Comparing replayed scores and alarms with the recorded ones; where scores are not recorded, snapshots.
 
-Only the numbers of causes (probability, size and its interval) may differ by CAUSE_TOLERANCE: they come from a linear
-regression, whose last digits depend on the processor.
+Decisions must be equal: states, statistics, validity and its reasons, times, and alarms with the order of their causes.
+Numbers may differ within a tolerance (pipeline.replay.offline.tolerance).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import fields, replace
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 
 import numpy as np
 
 from pipeline.recordings.dates import format_utc
 from pipeline.replay.offline.compare_snapshots import SnapshotVerifier
-from pipeline.replay.offline.comparison import CAUSE_TOLERANCE, Comparison
+from pipeline.replay.offline.comparison import Comparison
 from pipeline.replay.offline.plan import BEGINNING, Limit, Session
+from pipeline.replay.offline.tolerance import Apart, differences, shares
 from schemas.blocks import cut
 from schemas.enums import Transition
 from schemas.envelope import Envelope
@@ -26,6 +25,10 @@ from schemas.messages import Alarm, Array, Score, ScorerSnapshot
 
 SCORE, SNAPSHOT = "score", "snapshot"
 CAUSES = "causes of alarms soon after the beginning of a clip rest on samples from before it"
+AT_A_LIMIT = (
+    "although all numbers agree within the tolerance: one lies so close to its limit that processors decide "
+    "differently, or the way of deciding has changed"
+)
 _BLOCK_MESSAGES = 512
 _SAMPLE_COLUMNS = {
     name: column.dtype
@@ -138,23 +141,56 @@ def compare_scores(made: Score, recorded: RecordedSession, found: Comparison, li
         count_not_made(block.t_ns[~is_made], found, limit)
         rows = at[is_made]
         taken += len(rows)
-        different = np.zeros(len(rows), np.bool_)
         within = _within(block.t_ns[is_made], limit)
         if block.fans != made.fans:
-            different[:] = True
+            different = np.ones(len(rows), np.bool_)
             found.name(f"{found.tray}: {made.fans} fans replayed, {block.fans} recorded")
         else:
-            for name, dtype in _SAMPLE_COLUMNS.items():
-                differs = _differ(getattr(made, name)[rows].astype(dtype), getattr(block, name)[is_made])
-                different |= differs.any(axis=1)
-                differs &= within[:, np.newaxis]
-                if differs.any():
-                    _name_first(found, name, block.t_ns[is_made], differs, made, block, rows, is_made)
+            one, other = _columns(made, rows), _columns(block, is_made)
+            different = _compare_samples(block.t_ns[is_made], one, other, within, found)
         if limit is not None:
             found.add_not_comparable(int((different & ~within).sum()), limit)
         found.different += int((different & within).sum())
         found.equal += int((~different).sum())
     found.not_recorded += len(made.t_ns) - taken
+
+
+def _columns(score: Score, rows: Array) -> dict[str, Array]:
+    return {name: getattr(score, name)[rows].astype(dtype) for name, dtype in _SAMPLE_COLUMNS.items()}
+
+
+def _compare_samples(
+    t_ns: Array, made: Mapping[str, Array], recorded: Mapping[str, Array], within: Array, found: Comparison
+) -> Array:
+    """(n,) whether a sample differs. within: (n,) which are not beyond the limit of their session: those are named."""
+    differ = {name: _differ(name, values, recorded[name], found) for name, values in made.items()}
+    is_number = {name: values.dtype.kind == "f" for name, values in made.items()}
+    number_differs = np.any([differs for name, differs in differ.items() if is_number[name]], axis=0)
+    found.numbers_different += int((number_differs.any(axis=1) & within).sum())
+    for name, differs in differ.items():
+        named = differs & within[:, np.newaxis]
+        if named.any():
+            row, fan = np.argwhere(named)[0].tolist()
+            found.name(
+                f"{found.tray}: {format_utc(int(t_ns[row]))}, fan {fan}: {name} {made[name][row, fan]!s} replayed, "
+                f"{recorded[name][row, fan]!s} recorded (in {int(named.any(axis=1).sum())} of {len(t_ns)} samples "
+                f"from here on){'' if number_differs[row, fan] else ', ' + AT_A_LIMIT}"
+            )
+    return np.any([differs.any(axis=1) for differs in differ.values()], axis=0)
+
+
+def _differ(name: str, one: Array, other: Array, found: Comparison) -> Array:
+    """(n, fans) which values differ: decisions at all, numbers by more than is allowed. All NaN are equal."""
+    differs = one != other
+    if one.dtype.kind == "f":
+        differs &= ~(np.isnan(one) & np.isnan(other))
+        one, other = one[differs], other[differs]
+        share = shares(name, one, other)
+        differs[differs] = share > 1.0
+        if (allowed := share <= 1.0).any():
+            largest = int(np.argmax(np.where(allowed, share, 0.0)))
+            found.note(Apart(float(share[largest]), name, abs(float(one[largest]) - float(other[largest]))))
+    return differs
 
 
 def _within(t_ns: Array, limit: Limit | None) -> Array:
@@ -188,13 +224,15 @@ def compare_alarms(
 
     def is_of_causes(alarm: Alarm, other: Alarm | None) -> bool:
         """Whether only the causes may differ."""
-        is_same = other is not None and _decided(replace(alarm, message="")) == _decided(replace(other, message=""))
+        is_same = other is not None and not first_difference(alarm, other, found.note, ("causes", "message"))
         return alarm.t_ns < causes_from_t_ns and (is_same or alarm.transition == Transition.DIAGNOSED)
 
+    at_a_limit = f" ({AT_A_LIMIT})" if found.equal and not found.numbers_different else ""
     left = {(alarm.fan, alarm.t_ns, alarm.transition, alarm.request): alarm for alarm in recorded}
     for alarm in made:
         other = left.pop((alarm.fan, alarm.t_ns, alarm.transition, alarm.request), None)
-        if other is not None and _decided(alarm) == _decided(other) and _have_same_causes(alarm, other):
+        where = first_difference(alarm, other, found.note, _reworded(alarm)) if other is not None else ""
+        if other is not None and not where:
             found.alarms_equal += 1
         elif limit is not None and alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
@@ -203,12 +241,12 @@ def compare_alarms(
             found.add_reason(f"{found.tray}: {CAUSES}")
         elif other is not None:
             found.alarms_different += 1
-            found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, {other.message!r} recorded")
+            found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, {other.message!r} recorded: {where} differs")
         elif alarm.t_ns >= last_scored_t_ns:
             found.alarms_not_recorded += 1
         else:
             found.alarms_different += 1
-            found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, none recorded")
+            found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, none recorded{at_a_limit}")
     for alarm in left.values():
         if limit is not None and alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
@@ -218,7 +256,7 @@ def compare_alarms(
             found.add_reason(f"{found.tray}: {CAUSES}")
             continue
         found.alarms_different += 1
-        found.name(f"{found.tray}: alarm {_describe(alarm)} recorded, none replayed")
+        found.name(f"{found.tray}: alarm {_describe(alarm)} recorded, none replayed{at_a_limit}")
 
 
 def _scores(envelopes: Iterable[Envelope], producer: str) -> Iterator[Score]:
@@ -235,46 +273,18 @@ def _scores(envelopes: Iterable[Envelope], producer: str) -> Iterator[Score]:
     yield from decode_together(Score, waiting)
 
 
-def _differ(one: Array, other: Array) -> Array:
-    """(n, fans): which values differ in any bit as they were recorded; all NaN are equal."""
-    if one.dtype.kind != "f":
-        return one != other
-    bits = np.dtype(f"i{one.itemsize}")
-    differ = np.ascontiguousarray(one).view(bits) != np.ascontiguousarray(other).view(bits)
-    return differ & ~(np.isnan(one) & np.isnan(other))
-
-
-def _name_first(
-    found: Comparison, name: str, t_ns: Array, differs: Array, made: Score, block: Score, rows: Array, is_made: Array
-) -> None:
-    row, fan = np.argwhere(differs)[0].tolist()
-    other = getattr(block, name)[is_made][row, fan]
-    one = getattr(made, name)[rows][row, fan].astype(other.dtype)
-    found.name(
-        f"{found.tray}: {format_utc(int(t_ns[row]))}, fan {fan}: {name} {one!s} replayed, {other!s} recorded "
-        f"(in {int(differs.any(axis=1).sum())} of {len(rows)} samples from here on)"
+def first_difference(alarm: Alarm, other: Alarm, note: Callable[[Apart], None], left_out: Collection[str] = ()) -> str:
+    """Where two alarms differ by more than is allowed; empty: nowhere. left_out: fields that may differ."""
+    one, beside = (
+        {name: value for name, value in asdict(each).items() if name not in ("header", *left_out)}
+        for each in (alarm, other)
     )
+    return next(differences(one, beside, note), "")
 
 
-def _decided(alarm: Alarm) -> tuple[Any, ...]:
-    """What is compared. The line of a republished alarm is not: it follows from the flags, and was worded otherwise."""
-    left_out = {"header", "causes", *(["message"] if alarm.transition == Transition.REPUBLISHED else [])}
-    return tuple(getattr(alarm, f.name) for f in fields(alarm) if f.name not in left_out)
-
-
-def _have_same_causes(one: Alarm, other: Alarm) -> bool:
-    """Whether the same causes are named, in the same order and words, with the same numbers within the tolerance."""
-    return len(one.causes) == len(other.causes) and all(
-        _is_same(getattr(cause, f.name), getattr(beside, f.name))
-        for cause, beside in zip(one.causes, other.causes, strict=True)
-        for f in fields(cause)
-    )
-
-
-def _is_same(value: object, other: object) -> bool:
-    if isinstance(value, float) and isinstance(other, float):
-        return math.isclose(value, other, rel_tol=CAUSE_TOLERANCE, abs_tol=CAUSE_TOLERANCE**2)
-    return value == other
+def _reworded(alarm: Alarm) -> tuple[str, ...]:
+    """Fields that may differ: the line of a republished alarm follows from its flags, and was worded otherwise."""
+    return ("message",) if alarm.transition == Transition.REPUBLISHED else ()
 
 
 def _describe(alarm: Alarm) -> str:

@@ -48,7 +48,7 @@ def test_it_is_verified_by_its_alarms_and_snapshots(lean):
     done = fantwin("replay", "--offline", "--verify", lean)
     alarms, snapshots = len(recorded(lean, "alarm")), len(recorded(lean, "snapshot"))
     assert done.exit_code == 0, done.output
-    assert f"equal: {snapshots} snapshots and {alarms} alarms, to the bit" in done.stdout
+    assert f"equal: {snapshots} snapshots and {alarms} alarms; all decisions are identical" in done.stdout
     assert "scores were not recorded (recorder.topics)" in done.stdout
     found = json.loads(fantwin("replay", "--offline", "--verify", "--json", lean).stdout)["verified"]
     assert (found["samples_equal"], found["snapshots_equal"], found["alarms_equal"]) == (0, snapshots, alarms)

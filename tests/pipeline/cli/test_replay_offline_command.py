@@ -55,7 +55,7 @@ def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_equal_is_exit_code_0():
     result = replay("--verify", GOLDEN)
     assert result.exit_code == 0, result.stderr
-    assert "equal:" in result.stdout and "to the bit" in result.stdout
+    assert "equal:" in result.stdout and "all decisions are identical" in result.stdout
     assert "2 restarts of stages" in result.stdout
 
 

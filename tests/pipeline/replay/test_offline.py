@@ -1,4 +1,8 @@
-"""Offline replay: the same decisions to the bit, whatever was killed; and a difference is detected."""
+"""Offline replay: the same decisions, whatever was killed; and a difference is detected.
+
+On the machine that made a recording, the same operations run on the same samples: there the numbers are equal to the
+bit as well.
+"""
 
 from __future__ import annotations
 
@@ -130,20 +134,21 @@ def test_with_another_twin_a_restart_costs_no_commissioning(scorer_killed, tmp_p
     assert tray.counts["snapshots_of_another_twin"] == 0
 
 
-def test_one_bit_is_found_and_named(short, tmp_path):
+def test_a_number_beyond_the_tolerance_is_found_and_named(short, tmp_path):
 
-    def flip(entry):
-        if entry.topic != "score" or entry.message.header.sequence != 200:
+    def change(entry):
+        if entry.topic != "score" or entry.message.header.sequence not in (100, 200):
             return entry.message
         speed = entry.message.predicted_speed_rad_s.copy()
-        speed[0, 1] = np.nextafter(speed[0, 1], np.float32(np.inf))
+        speed[0, 1] *= 1 + (1e-5 if entry.message.header.sequence == 200 else 2e-7)
         return replace(entry.message, predicted_speed_rad_s=speed)
 
-    found = verified(changed(short, tmp_path / "flipped.mcap", flip)).comparison
+    found = verified(changed(short, tmp_path / "changed.mcap", change)).comparison
     assert found and not found.is_equal
     assert (found.different, found.not_made, found.alarms_different) == (1, 0, 0)
     (line,) = found.named
     assert "fan 1: predicted_speed_rad_s" in line
+    assert found.largest.name == "predicted_speed_rad_s", "the other one is within the tolerance"
 
 
 def test_an_alarm_that_was_never_raised_is_found(undisturbed, tmp_path):
@@ -237,7 +242,7 @@ def test_a_damaged_configuration_is_not_silently_replaced_by_defaults(tmp_path, 
 def test_the_golden_recording_is_decided_as_it_was():
     tray = verified(DATA / "golden.mcap")
     assert tray.plan.restarts == 2, "two stages were killed while it was made"
-    assert made_equal(tray) > 400
+    assert made_equal(tray, share=1.0) > 400, "it was made on another processor"
     assert tray.comparison and tray.comparison.alarms_equal >= 2
 
 

@@ -1,4 +1,7 @@
-"""Fits of many fans at once: what is saved changes no result."""
+"""Fits of many fans at once: what is saved changes no result but in its last digits.
+
+The same fit is made with matrices of other shapes, which a BLAS multiplies in another order on some processors.
+"""
 
 from dataclasses import fields
 
@@ -18,9 +21,18 @@ def tray() -> Run:
     return rough_run(11, 40.0, 16).run
 
 
+ROUNDING = 1e-11
+"""Relative; 1e-15 to 3e-13 were measured. A fit that stops one iteration earlier differs by 1e-7 or more."""
+
+
 def assert_same(one: Identification, other: Identification) -> None:
     for field in fields(Identification):
-        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
+        found, expected = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(expected, np.ndarray):
+            of_all_fans = np.abs(expected).max(axis=0)
+            np.testing.assert_array_less(np.abs(found - expected), ROUNDING * of_all_fans + 1e-300, field.name)
+        else:
+            assert found == expected, field.name
 
 
 def test_fans_that_have_converged_are_left_out_and_all_end_as_if_they_were_not(tray: Run, monkeypatch) -> None:
@@ -41,7 +53,7 @@ def test_fans_that_have_converged_are_left_out_and_all_end_as_if_they_were_not(t
     monkeypatch.setattr(FreeRunProblem, "pays_for_some", lambda *_: False)
     assert_same(identify([tray], progress=lambda _part, _done, _most, rmse: of_all.append(rmse)), found)
     assert fans == {16}
-    np.testing.assert_array_equal(reported, of_all)
+    np.testing.assert_allclose(reported, of_all, ROUNDING)
 
 
 def test_first_estimates_do_not_depend_on_how_many_are_tried_together(tray: Run, monkeypatch) -> None:

