@@ -22,7 +22,7 @@ from schemas.enums import StageStatus
 from schemas.header import Header
 from schemas.health import Health, Output
 from schemas.messages import Raw, Score
-from schemas.topics import ALL_TRAYS, BY_NAME, CATCH_UP_MESSAGES, health_key, tray_key
+from schemas.topics import ALL_TRAYS, BY_NAME, health_key, tray_key
 from schemas.units import NS_PER_S
 from simulation.faults import Fault
 from simulation.tray import SimulatedTray, TraySample, TraySettings
@@ -84,15 +84,6 @@ class Load:
         faults = (Fault("rotor", n % FANS, start_s, start_s + FAULT_S, 1.0) for n, start_s in enumerate(times))
         run_s = end_s + self.trays * SHIFT / RATE_HZ
         return SimulatedTray(TraySettings(seed=7, duration_s=run_s, faults=tuple(faults)))
-
-
-def longer_than_kept_s(block: int) -> float:
-    """A beginning that is longer than what a stage which starts asks for, in messages of so many samples.
-
-    It is needed where resampler and integrator are killed as well as the scorer. Otherwise the samples that they send
-    again reach back to the first one, and the scorer takes that for another replay of the same recording.
-    """
-    return 5.0 + CATCH_UP_MESSAGES * block / RATE_HZ
 
 
 class Feed:

@@ -76,13 +76,14 @@ def core_of(
     snapshot_store: SnapshotStore | None = None,
     decision_rules: DecisionRules = CURRENT_RULES,
     tachos: tuple[Tacho, ...] = INSTANTANEOUS,
+    is_replayed: bool = False,
     **config: Any,
 ) -> ScorerCore:
     """Without a calibration: limits on the speed residual alone, 2 SIGMA."""
     settings = ScorerConfig.model_validate(config)
     limits = limits_in_force(settings, calibration, None, decision_rules)
     twin = HealthyTwin(sha256, limits, [balance_of_a_fan()] * fans, "%", tachos=tachos)
-    return ScorerCore(fans, unit, settings, twin, snapshot_store, decision_rules)
+    return ScorerCore(fans, unit, settings, twin, snapshot_store, decision_rules, is_replayed=lambda: is_replayed)
 
 
 def prediction_of(
