@@ -30,6 +30,9 @@ from simulation.tray import SimulatedTray, TraySample, TraySettings
 SITE, PRODUCER, FANS, RATE_HZ = "fleet", "feed-1", 8, 100
 FAULT_S, PERIOD_S = 6.0, 10.0
 """a fault of this length begins once in each period"""
+FREE_RUN_BEGINS_AGAIN_S = 8.0
+"""by how much an alarm may move where resampler or integrator are restarted: with the free run the statistics begin
+again, and are valid after the warm-up of 3 s. Where only scorer and recorder are, no alarm moves"""
 SHIFT = 50
 """samples by which a tray begins later in the run of the fans than the one before"""
 BUSY = "restart_delay_max_s = 0.5\nstop_timeout_s = 120\n"
@@ -80,7 +83,8 @@ class Load:
 
     def _device(self) -> SimulatedTray:
         end_s = self.beginning_s + self.seconds
-        times = np.arange(self.beginning_s, end_s - PERIOD_S + 1.0, PERIOD_S).tolist()  # the last alarm clears in time
+        latest_s = end_s - PERIOD_S - FREE_RUN_BEGINS_AGAIN_S  # so that the last alarm clears in time, if it moves too
+        times = np.arange(self.beginning_s, latest_s + 1.0, PERIOD_S).tolist()
         faults = (Fault("rotor", n % FANS, start_s, start_s + FAULT_S, 1.0) for n, start_s in enumerate(times))
         run_s = end_s + self.trays * SHIFT / RATE_HZ
         return SimulatedTray(TraySettings(seed=7, duration_s=run_s, faults=tuple(faults)))

@@ -26,8 +26,8 @@ from typing import Annotated
 
 import typer
 
-from bench.fleet.fed_outcome import FREE_RUN_BEGINS_AGAIN_S, Outcome, outcome_of
-from bench.fleet.fed_trays import BUSY, SITE, Feed, Load, NewestScores
+from bench.fleet.fed_outcome import Outcome, outcome_of
+from bench.fleet.fed_trays import BUSY, FREE_RUN_BEGINS_AGAIN_S, SITE, Feed, Load, NewestScores
 from bench.printing import JsonOption, progress, show
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
