@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,7 +27,7 @@ from pipeline.runtime.judged_share import JudgedShare
 from pipeline.runtime.learned_scorer import LearnedTwinScorer
 from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.snapshot_store import Elsewhere, SnapshotStore
-from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError
+from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError, never
 from pipeline.runtime.tray_scorer import TrayScorer
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.blocks import select
@@ -62,7 +62,6 @@ NOT_CALIBRATED = (
 )
 RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 SET_BACK_NS = NS_PER_S  # a snapshot further ahead of the present is of a clock that was set back since
-BACK_IN_TIME_NS = 120 * NS_PER_S  # a restarted producer catches up with less; older samples are of another recording
 
 
 class ScorerCore(Core):
@@ -78,15 +77,17 @@ class ScorerCore(Core):
         started_t_ns: int | None = None,
         continues: ScorerSnapshot | None = None,
         is_learned: bool = False,
+        is_replayed: Callable[[], bool] = never,
     ) -> None:
         """snapshot_store: where snapshots are kept; None: nowhere, as in a replay. started_t_ns: the present time.
         continues: the last snapshot of the twin before this one, instead of the one in the store. is_learned: the twin
-        is one of several of the same fans, so wear goes on from one to the next."""
+        is one of several of the same fans, so wear goes on from one to the next. is_replayed: see Context."""
         self._fans = fans
         self._twin = twin
         self._config = config
         self._text = AlarmText(speed_unit, twin.command_unit)
         self._is_learned = is_learned
+        self._is_replayed = is_replayed
         self._unscored = UnscoredMonitor(fans, max(1, round(config.not_judged_s * NS_PER_S)))
         self._snapshot_store = snapshot_store
         self._wrong_fans = 0
@@ -196,7 +197,7 @@ class ScorerCore(Core):
             return Admitted([])
         self._wrong_fans = 0
         self._set_snapshot_back(item)
-        before_score = [*self.tick(0), *self._discard_if_of_other_times(item)]
+        before_score = [*self.tick(0), *self._discard_if_replayed(item)]
         before = np.maximum.accumulate(np.concatenate(([self._last_t_ns], item.t_ns)))[:-1]
         new = item.t_ns > before
         self._counts["repeated"] += int((~new).sum())
@@ -296,18 +297,18 @@ class ScorerCore(Core):
             "baselines, alarms and wear continue, with their times set back as well"
         )
 
-    def _discard_if_of_other_times(self, item: Prediction) -> list[Alarm]:
-        """Discard a restored snapshot if it is of later times than the first prediction, as when another recording is
-        played, or the same one again. Returns the messages on alarms that are discarded.
+    def _discard_if_replayed(self, item: Prediction) -> list[Alarm]:
+        """Discard a restored snapshot if a replay plays samples from before it. Returns the messages on alarms that are
+        discarded.
+
+        Of a live site, older samples are no reason: a restarted producer repeats all that those before it have kept.
         """
         if not self._is_restored or not len(item.t_ns):
             return []
         self._is_restored = False
-        if item.header.producer == self._input_producer:
-            return []  # the producer of the last prediction still runs, and repeats what it has kept
-        first_t_ns, origin_t_ns = int(item.t_ns[0]), self.tray.fan_scorer.origin_t_ns
-        again = origin_t_ns is not None and first_t_ns <= origin_t_ns
-        if not again and first_t_ns >= self._last_t_ns - BACK_IN_TIME_NS:
+        first_t_ns = int(item.t_ns[0])
+        is_repeated = item.header.producer == self._input_producer  # what it has kept, in a replay as well
+        if first_t_ns > self._last_t_ns or is_repeated or not self._is_replayed():
             return []
         discarded, self._not_restored = self.tray.alarms.discard_all(first_t_ns, keep_silenced=False), ""
         self._start_new()
@@ -396,6 +397,7 @@ def build(context: Context) -> BuiltStage:
             started_t_ns=context.started_t_ns,
             continues=continues,
             is_learned=tray.twin is None,
+            is_replayed=context.is_replayed,
         )
 
     twin = load_tray_twin(twin_path(tray, context.folder), tray.fans) if tray.twin else None

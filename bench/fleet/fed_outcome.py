@@ -28,10 +28,6 @@ from schemas.messages import Alarm, Message, Raw, Score
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 
-FREE_RUN_BEGINS_AGAIN_S = 8.0
-"""by how much an alarm may move where resampler or integrator are restarted: with the free run the statistics begin
-again, and are valid after the warm-up of 3 s. Where only scorer and recorder are, no alarm moves"""
-
 
 @dataclass
 class Outcome:

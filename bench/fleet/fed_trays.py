@@ -22,7 +22,7 @@ from schemas.enums import StageStatus
 from schemas.header import Header
 from schemas.health import Health, Output
 from schemas.messages import Raw, Score
-from schemas.topics import ALL_TRAYS, BY_NAME, CATCH_UP_MESSAGES, health_key, tray_key
+from schemas.topics import ALL_TRAYS, BY_NAME, health_key, tray_key
 from schemas.units import NS_PER_S
 from simulation.faults import Fault
 from simulation.tray import SimulatedTray, TraySample, TraySettings
@@ -30,6 +30,9 @@ from simulation.tray import SimulatedTray, TraySample, TraySettings
 SITE, PRODUCER, FANS, RATE_HZ = "fleet", "feed-1", 8, 100
 FAULT_S, PERIOD_S = 6.0, 10.0
 """a fault of this length begins once in each period"""
+FREE_RUN_BEGINS_AGAIN_S = 8.0
+"""by how much an alarm may move where resampler or integrator are restarted: with the free run the statistics begin
+again, and are valid after the warm-up of 3 s. Where only scorer and recorder are, no alarm moves"""
 SHIFT = 50
 """samples by which a tray begins later in the run of the fans than the one before"""
 BUSY = "restart_delay_max_s = 0.5\nstop_timeout_s = 120\n"
@@ -80,19 +83,11 @@ class Load:
 
     def _device(self) -> SimulatedTray:
         end_s = self.beginning_s + self.seconds
-        times = np.arange(self.beginning_s, end_s - PERIOD_S + 1.0, PERIOD_S).tolist()  # the last alarm clears in time
+        latest_s = end_s - PERIOD_S - FREE_RUN_BEGINS_AGAIN_S  # so that the last alarm clears in time, if it moves too
+        times = np.arange(self.beginning_s, latest_s + 1.0, PERIOD_S).tolist()
         faults = (Fault("rotor", n % FANS, start_s, start_s + FAULT_S, 1.0) for n, start_s in enumerate(times))
         run_s = end_s + self.trays * SHIFT / RATE_HZ
         return SimulatedTray(TraySettings(seed=7, duration_s=run_s, faults=tuple(faults)))
-
-
-def longer_than_kept_s(block: int) -> float:
-    """A beginning that is longer than what a stage which starts asks for, in messages of so many samples.
-
-    It is needed where resampler and integrator are killed as well as the scorer. Otherwise the samples that they send
-    again reach back to the first one, and the scorer takes that for another replay of the same recording.
-    """
-    return 5.0 + CATCH_UP_MESSAGES * block / RATE_HZ
 
 
 class Feed:

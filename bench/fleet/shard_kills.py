@@ -26,8 +26,8 @@ from typing import Annotated
 
 import typer
 
-from bench.fleet.fed_outcome import FREE_RUN_BEGINS_AGAIN_S, Outcome, outcome_of
-from bench.fleet.fed_trays import BUSY, SITE, Feed, Load, NewestScores, longer_than_kept_s
+from bench.fleet.fed_outcome import Outcome, outcome_of
+from bench.fleet.fed_trays import BUSY, FREE_RUN_BEGINS_AGAIN_S, SITE, Feed, Load, NewestScores
 from bench.printing import JsonOption, progress, show
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
@@ -38,8 +38,6 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.support.running_chain import RunningCommand, eventually
 
 STAGES = ("resampler", "twin_integrator", "scorer", "recorder")
-BLOCK = 5
-"""samples of a message"""
 DEADLINE_S = 900.0  # far beyond what anything takes
 
 
@@ -69,7 +67,7 @@ def main(
 ) -> None:
     """Print what was lost and which alarms differ; exit code 1 if something was lost and not counted, or one does."""
     with tempfile.TemporaryDirectory() as folder:
-        load = Load(trays, seconds, BLOCK, longer_than_kept_s(BLOCK))
+        load = Load(trays, seconds)
         found, killed = run(load, Kills(kills, shards, seed, stage or STAGES), Path(folder), progress)
     rows = [{"stage": stage, "killed": number} for stage, number in killed.items()]
     tables = {"kills": rows, f"{trays} trays, {shards} shards of each stage": [found.row()]}

@@ -1,8 +1,8 @@
 """A recorder killed (kill -9) a hundred times at random under load: what is readable, missing and counted.
 
-Another process feeds it and knows what it has sent. Each load is run twice: with a bus that holds what a stage of ours
-holds for those who missed it (1,024 messages of each topic), and with one that holds next to nothing, so that every
-kill costs messages and the ledgers must know each of them.
+Another process feeds it and knows what it has sent. Each load is run twice: with a bus that holds more of each topic
+than is sent while no recorder is ready, and with one that holds next to nothing, so that every kill costs messages and
+the ledgers must know each of them.
 """
 
 from __future__ import annotations

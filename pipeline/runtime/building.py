@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 
 from pipeline.bus.session import Bus, join_bus
@@ -16,10 +17,16 @@ from pipeline.runtime.stage import BuiltStage, Context, Kept, Stage
 
 
 def build_and_join(
-    stage: Stage, config: Config, shard: Shard, session: Session, stop: threading.Event
+    stage: Stage,
+    config: Config,
+    shard: Shard,
+    session: Session,
+    stop: threading.Event,
+    is_replayed: Callable[[], bool],
 ) -> tuple[Bus, dict[str, BuiltStage]]:
     """Build a process of a stage and join the bus: afterwards, so that what cannot be built says so even where the bus
-    cannot be joined; earlier if a core continues from what others keep. If it fails, nothing is left.
+    cannot be joined; earlier if a core continues from what others keep. If it fails, nothing is left. is_replayed: see
+    Context.
 
     Raises:
         StageError: it cannot be built, or another process has one of its trays.
@@ -40,7 +47,7 @@ def build_and_join(
     kept = KeptSnapshots(bus, config.site, stop, refuse_others, timeout_s, is_one_expected=is_one_expected)
     parts: dict[str, BuiltStage] = {}
     try:
-        parts = build_parts(stage, _context_of(stage, config, shard, session, kept))
+        parts = build_parts(stage, _context_of(stage, config, shard, session, kept, is_replayed))
         refuse_others()
         return bus(), parts
     except BaseException:
@@ -74,7 +81,9 @@ def abort(parts: dict[str, BuiltStage]) -> None:
         each.core.abort()
 
 
-def _context_of(stage: Stage, config: Config, shard: Shard, session: Session, kept: Kept) -> Context:
+def _context_of(
+    stage: Stage, config: Config, shard: Shard, session: Session, kept: Kept, is_replayed: Callable[[], bool]
+) -> Context:
     """What a process of a stage is built from. kept: what others keep of its state."""
     return Context(
         site=config.site,
@@ -88,6 +97,7 @@ def _context_of(stage: Stage, config: Config, shard: Shard, session: Session, ke
         shard_number=shard.number,
         snapshot_folder=config.run_folder,
         kept=kept,
+        is_replayed=is_replayed,
         configuration_path=config.path,
         configuration_text=config.text,
         overrides=config.overrides,

@@ -47,7 +47,8 @@ class StageClock:
     ) -> None:
         self._host_ns = host_ns
         self._monotonic_s = monotonic_s
-        self._is_replay_alive = False
+        self.is_replay_alive = False
+        """whether a replay presents the site"""
         self._owner = ""
         """the producer of the replay"""
         self._times: dict[str, _ReplayTime] = {}
@@ -57,7 +58,7 @@ class StageClock:
 
     def set_replay_alive(self, alive: bool) -> None:
         """The replayer's liveliness token has appeared or gone."""
-        self._is_replay_alive = alive
+        self.is_replay_alive = alive
         if not alive:
             self._clear()
 
@@ -72,7 +73,7 @@ class StageClock:
     def update(self, clock: Clock) -> bool:
         """A replay has published its time, which from now on applies to that tray; False if it does not own the
         site."""
-        if not self._is_replay_alive or clock.header.producer != self._owner:
+        if not self.is_replay_alive or clock.header.producer != self._owner:
             return False
         self._replayed_until_ns[clock.header.tray] = self._host_ns()
         self._times[clock.header.tray] = _ReplayTime(clock, self._host_ns(), self._monotonic_s())

@@ -94,7 +94,9 @@ class Runner:
         self._clock = StageClock()
         self._sessions = Sessions()
         self._session = Session.of_this_process(stage.name, shard, started_t_ns, self.producer)
-        self._bus, self._parts = build_and_join(stage, config, shard, self._session, stop)
+        self._bus, self._parts = build_and_join(
+            stage, config, shard, self._session, stop, lambda: self._clock.is_replay_alive
+        )
         if config.bus.spool:
             folder = config.run_folder / "spool" / f"{stage.name}-{shard.name}"
             self._bus.spool = Spool(folder, round(config.bus.spool.megabytes * 1e6), config.bus.spool.kept_s)

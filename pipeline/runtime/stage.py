@@ -147,6 +147,11 @@ class Kept(Protocol):
         ...
 
 
+def never() -> bool:
+    """False: see `Context.is_replayed`."""
+    return False
+
+
 @dataclass(frozen=True)
 class Context:
     """What a stage is built from: its own section, the trays it serves, and where relative paths start."""
@@ -167,6 +172,8 @@ class Context:
     """where a stage keeps the state that survives a restart; None: nothing is kept, as in a replay"""
     kept: Kept | None = field(default=None, repr=False)
     """what others keep of that state; None: nobody is asked"""
+    is_replayed: Callable[[], bool] = field(default=never, repr=False)
+    """whether the samples that come now are of a recording"""
     configuration_path: Path | None = None
     """the configuration file; None: there is none, as in a replay"""
     configuration_text: str = field(default="", repr=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from schemas.topics import BY_NAME
 from tests.support.killed_recorder import Kills, Outcome
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
@@ -18,7 +19,7 @@ def outcome(folder, endpoint, history: int) -> Outcome:
 
 
 def test_messages_that_the_bus_still_holds_are_not_lost(tmp_path, endpoint):
-    found = outcome(tmp_path, endpoint, history=1024)
+    found = outcome(tmp_path, endpoint, history=BY_NAME["raw"].history)
     assert found.unreadable == []
     assert found.recorded > 1000
     assert (found.missing, found.counted_missing, found.repeated) == (0, 0, 0)

@@ -348,36 +348,40 @@ def test_a_snapshot_of_another_number_of_fans_is_refused() -> None:
     assert (score.state == FanState.COMMISSIONING).all()
 
 
-def restored(first: int, producer: str) -> tuple[ScorerCore, list[Any]]:
+def restored(first: int, producer: str, *, is_replayed: bool) -> tuple[ScorerCore, list[Any]]:
     """A successor of `raised`, which began at sample -1101 and ended at 100, and its output for its first block."""
-    successor = core_of(3)
+    successor = core_of(3, is_replayed=is_replayed)
     successor.restore(snapshot_of(raised()))
     return successor, list(successor.step(prediction_of(np.zeros((20, 3)), first=first, producer=producer)))
 
 
+@pytest.mark.parametrize("is_replayed", [False, True], ids=["live", "replay"])
 @pytest.mark.parametrize(
-    ("first", "producer", "discarded"),
+    ("first", "producer", "is_of_before"),
     [
         (50, "integrator-1", False),  # what it still keeps
         (-HOUR, "integrator-1", False),  # at a slow rate that may be of long ago
-        (50, "integrator-2", False),  # it was killed as well, and takes again what it was given
         (200, "integrator-2", False),
-        (-HOUR, "integrator-2", True),  # another recording is played
-        (-1101, "integrator-2", True),  # the same is played again
+        (50, "integrator-2", True),
+        (-1101, "integrator-2", True),  # of a live site, all that was kept; of a replay, the same recording once more
+        (-HOUR, "integrator-2", True),  # of a live site, that at a slow rate; of a replay, another recording
     ],
 )
-def test_a_snapshot_of_later_times_is_discarded_unless_producers_repeat_samples(first, producer, discarded) -> None:
-    successor, messages = restored(first, producer)
-    assert successor.counters().get("snapshots_of_other_times", 0) == discarded
+def test_only_a_replay_of_earlier_samples_makes_a_snapshot_be_discarded(
+    first: int, producer: str, is_of_before: bool, is_replayed: bool
+) -> None:
+    successor, messages = restored(first, producer, is_replayed=is_replayed)
+    is_discarded = is_of_before and is_replayed
+    assert successor.counters().get("snapshots_of_other_times", 0) == is_discarded
     scores = [message for message in messages if isinstance(message, Score)]
-    if discarded:
+    if is_discarded:
         assert (scores[0].state == FanState.COMMISSIONING).all()
     else:
         assert not scores or scores[0].t_ns[0] > prediction_of(np.zeros(1), first=99).t_ns[0]
 
 
 def test_alarms_of_a_discarded_snapshot_are_no_longer_current() -> None:
-    successor = core_of(3)
+    successor = core_of(3, is_replayed=True)
     republished = successor.restore(snapshot_of(raised()))
     assert [is_listed(each.newest) for each in standing_of(republished)] == [True, True]
     later = successor.step(prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2"))
@@ -388,7 +392,7 @@ def test_alarms_of_a_discarded_snapshot_are_no_longer_current() -> None:
 
 
 def test_only_the_first_prediction_can_discard_a_snapshot() -> None:
-    successor, _ = restored(50, "integrator-1")
+    successor, _ = restored(50, "integrator-1", is_replayed=True)
     feed(successor, [prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2")])
     assert "snapshots_of_other_times" not in successor.counters()
     assert successor.counters()["repeated"] == 40

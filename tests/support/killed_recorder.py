@@ -9,7 +9,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from mcap.reader import make_reader
 
 from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.reading import RecordingError, read_recording
-from pipeline.recordings.scan import scan
+from pipeline.recordings.scan import Scan, scan
 from schemas.enums import StageStatus
 from tests.support.recorder_feed import PRODUCER, SITE
 from tests.support.running_chain import DEADLINE_S, FANTWIN, eventually
@@ -88,16 +89,17 @@ class Kills:
         """Kill it so many times, at random, and let the last one end in order."""
         chance = random.Random(seed)
         self._start()
-        eventually(self._has_caught_up, "the recorder records")
+        eventually(self._records, "the recorder records")
         for number in range(kills):
             time.sleep(chance.uniform(0.0, 4.0))  # at any moment, also while it starts or repairs
             self._kill()
             self._start()
             progress(number + 1)
-        eventually(self._has_caught_up, "the recorder has caught up")
+        eventually(self._records, "the recorder records")
         assert self._feed.stdin and self._recorder
         self._feed.stdin.close()
         self._heard("fed")
+        eventually(self._has_all, "the recorder has recorded all that was sent, or counted it as missing")
         self._recorder.send_signal(signal.SIGINT)
         status = self._recorder.wait(DEADLINE_S)
         assert status in (0, 3), (status, (self._folder / "recorder.log").read_text()[-2000:])
@@ -143,16 +145,23 @@ class Kills:
             if has_caught_up and found.index.first_ns is not None:
                 self._killed.append(_Killed(found.index.first_ns, at_ns, due, found.index.last_ns))
 
-    def _has_caught_up(self) -> bool:
-        """Whether the running recorder has written the messages of the last two seconds to its file."""
+    def _records(self) -> bool:
+        """Whether a message of the feed that was sent since the recorder started is in its file."""
+        return any(found.index.first_ns and found.index.last_ns > self._started_ns for found in self._active())
+
+    def _has_all(self) -> bool:
+        """Whether the running recorder has recorded everything, or counted it as missing."""
+        sent = {key: len(times) for key, times in json.loads(self._sent.read_text()).items()}
+        return any(
+            all(found.counts.ledger.next.get((key, PRODUCER)) == count for key, count in sent.items())
+            for found in self._active()
+        )
+
+    def _active(self) -> Iterator[Scan]:
+        """The file of the running recorder, read as far as it is written; none before it has been created."""
         for active in self._runs.glob("*.active"):
-            try:
-                index = scan(active).index
-            except RecordingError:  # it has only just been created
-                continue
-            if index.first_ns and index.first_ns > self._started_ns:
-                return time.time_ns() - index.last_ns < 2e9
-        return False
+            with suppress(RecordingError):
+                yield scan(active)
 
     def _parts(self) -> list[Path]:
         return sorted(self._runs.glob("*.mcap"), key=lambda path: int((re.findall(r"-(\d+)\.", path.name) or [1])[0]))

@@ -1,8 +1,10 @@
 """A process on the bus that sends the messages of trays of fans at 100 Hz, and counts what it has sent.
 
 Words: ENDPOINT TRAYS FANS HISTORY FILE. Each tray has raw, grid, prediction and score messages of one sample. It keeps
-the last HISTORY messages of each for whoever missed them. When its standard input closes it ends like a stage, and
-writes to FILE, for each key, at which time (ns since 1970) each message was sent: the place is the sequence number.
+the last HISTORY messages of each for consumers that missed them. While no recorder is ready it sends MOST_WITHOUT
+samples at most, however long a busy machine takes to start one. When its standard input closes it ends like a stage,
+and writes to FILE, for each key, at which time (ns since 1970) each message was sent: the place is the sequence number.
+Then it answers for what it keeps until it is killed.
 """
 
 from __future__ import annotations
@@ -27,7 +29,10 @@ from schemas.messages import Grid, Message, Prediction, Raw, Score
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 SITE, PRODUCER, STAGE = "kills", "feed-1", "feed"
+HEALTH_PERIOD_S = 1.0
 STEP_S = 0.01
+MOST_WITHOUT = 400
+"""samples that are sent while no recorder is ready"""
 TOPICS = ("raw", "grid", "prediction", "score")
 
 
@@ -74,6 +79,15 @@ def main(endpoint: str, trays: int, fans: int, history: int, file: Path) -> None
                 key = tray_key(SITE, tray, name)
                 publishers[tray, name] = bus.publisher(key, topic, type_name(topic.message), PRODUCER)
                 sent_ns[key] = []
+        recorders: set[str] = set()
+
+        def note_recorder(key: str, alive: bool) -> None:
+            if alive:
+                recorders.add(key)
+            else:
+                recorders.discard(key)
+
+        bus.watch_alive(alive_key(SITE, "recorder", "*"), note_recorder)
         health_publisher = bus.publisher(health_key(SITE, STAGE, "all"), BY_NAME["health"], type_name(Health), PRODUCER)
         bus.declare_alive(alive_key(SITE, STAGE, "all"))
 
@@ -92,21 +106,27 @@ def main(endpoint: str, trays: int, fans: int, history: int, file: Path) -> None
             health_publisher.put(encode(health))
 
         print("feeding", flush=True)
-        began_s, number = time.monotonic(), 0
-        while not stop.wait(max(0.0, began_s + number * STEP_S - time.monotonic())):
+        number = without = 0
+        next_s = health_s = time.monotonic()
+        while not stop.wait(max(0.0, next_s - time.monotonic())):
+            if time.monotonic() >= health_s:
+                health_s = time.monotonic() + HEALTH_PERIOD_S
+                put_health(StageStatus.OK)
+            without = 0 if recorders else without + 1
+            if without > MOST_WITHOUT:
+                next_s = time.monotonic() + STEP_S
+                continue
+            next_s += STEP_S
             made = messages(fans, number)
             for (tray, name), publisher in publishers.items():
                 stamped = replace(made[name], header=Header(PRODUCER, publisher.published, tray))
                 sent_ns[publisher.key].append(time.time_ns())
                 publisher.put(encode(stamped))
-            if number % 100 == 0:
-                put_health(StageStatus.OK)
             number += 1
         put_health(StageStatus.STOPPED)
         file.write_text(json.dumps(sent_ns))
         print("fed", flush=True)
-        sys.stdin.close()
-        threading.Event().wait(2.0)  # somebody may still ask for what they missed
+        threading.Event().wait()
 
 
 if __name__ == "__main__":

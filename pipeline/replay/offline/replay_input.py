@@ -25,6 +25,7 @@ from pipeline.replay.offline.plan_reader import PlanReader
 from pipeline.replay.offline.raw_blocks import RawBlocks
 from pipeline.replay.resolve_config import attached_config
 from pipeline.replay.stage_chain import StageChain, decision_chain
+from pipeline.runtime.clock import is_of_replay
 from pipeline.runtime.consumed import CONSUMED
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
@@ -52,6 +53,8 @@ class ReplayInput:
     first_sample_t_ns: int
     """of all trays: when it was received"""
     stages: StageChain
+    was_replayed: bool = False
+    """a replay presented the site while it was recorded"""
     start_s: float = 0.0
     end_s: float = math.inf
     """the part that is replayed, in seconds since the tray's first raw sample"""
@@ -147,6 +150,7 @@ class ReplayInput:
                 folder=self.config.folder,
                 run_folder=self.config.run_folder,
                 started_t_ns=self.started_t_ns,
+                is_replayed=lambda: self.was_replayed,
                 configuration_text=self.config.text,
                 overrides=self.config.overrides,
             )
@@ -212,6 +216,7 @@ def open_replay_input(
             is_as_recorded=is_as_recorded,
             is_same_grid=attached is not None and base.sections["resampler"] == attached.sections["resampler"],
             stages=stages,
+            was_replayed=any(is_of_replay(raws[0].header.producer) for raws in first.values()),
             start_s=start_s,
             end_s=end_s,
             trays_of={path: found.trays for path, found in each.items()},
