@@ -90,7 +90,7 @@ def test_the_name_of_a_topic_is_whole_and_those_of_fantwin_have_room_in_80_colum
 
 def test_metadata_twins_and_stages_are_in_the_json(tmp_path):
     (found,) = shown(recording(tmp_path / "r.mcap"), exit_code=3)["files"]
-    assert found["metadata"] == METADATA
+    assert found["metadata"] == METADATA | {"format": "1"}
     assert (found["messages"], found["duration_s"]) == (8, 6.0)
     assert found["size_bytes"] == (tmp_path / "r.mcap").stat().st_size
     assert found["has_configuration"] is True
