@@ -91,7 +91,7 @@ $(VENV)/bin/python:
 	@$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.runtime: requirements.lock pyproject.toml | $(VENV)/bin/python
-	@echo "installing fantwin and what it runs on into $(VENV), about 250 MB (once)"
+	@echo "installing fantwin and what it runs on into $(VENV), about 460 MB (once)"
 	@$(PIP) install --require-hashes -r requirements.lock
 	@$(PIP) install --no-deps --editable .
 	@touch $@
