@@ -186,6 +186,24 @@ def test_the_disk_guard_takes_what_is_oldest_but_no_unacknowledged_clip_and_last
     assert core.counters()["parts_deleted"] == 2 and core.counters()["clips_deleted"] == 1
 
 
+def test_a_clip_outlives_the_limit_of_days_until_it_is_acknowledged_and_that_is_said_once(caplog):
+    disk, maker = Disk(), Maker()
+    core = Recorder(disk, RecorderConfig(), NOW_NS, clips=AlarmClips(ClipTracker((), 60, 60, 0), maker))
+    core.step(envelope(raised(0, NOW_NS), "alarm", NOW_NS))
+    core.tick(NOW_NS + 70 * SECOND_NS)
+    maker.waiting = [CutResult(maker.asked[0], 5_000_000)]
+    core.tick(NOW_NS + 80 * SECOND_NS)
+    now_ns = NOW_NS
+    for day in range(15, 20):
+        now_ns = NOW_NS + day * 86_400 * SECOND_NS
+        core.tick(now_ns)
+    said = "clips kept beyond 14 days until their alarms are acknowledged: 1, 5 MB"
+    assert maker.deleted == [] and core.notes()[1] == said and caplog.text.count(said) == 1
+    core.step(envelope(raised(0, NOW_NS, acknowledged=True, transition=Transition.ACKNOWLEDGED), "alarm", now_ns))
+    core.tick(now_ns + 10 * SECOND_NS)
+    assert maker.deleted == maker.asked and len(core.notes()) == 1
+
+
 def test_files_that_a_killed_recorder_left_of_a_clip_are_removed(tmp_path):
     recording = tmp_path / "recording.mcap"
     (tmp_path / "clips").mkdir()
