@@ -82,10 +82,14 @@ class Session:
 class Stages:
     """Three stages of one tray, and a recording of all messages between them."""
 
-    def __init__(self, config: Config, path: Path, started_t_ns: int, *, remembers: bool = True) -> None:
+    def __init__(
+        self, config: Config, path: Path, started_t_ns: int, *, remembers: bool = True, is_replayed: bool = False
+    ) -> None:
+        """is_replayed: a replay presents the site instead of acquisition, with samples of an hour ago."""
         (tray,) = config.trays
         self.config = config
         self.remembers = remembers
+        self.is_replayed = is_replayed
         self.tray = tray.name
         self.now_ns = started_t_ns
         metadata = {
@@ -103,7 +107,7 @@ class Stages:
         """raw messages that will be recorded and never reach the resampler"""
         self._lives = 0
         self._ticked_ns = started_t_ns
-        self.source = Session("acquisition-0", None)
+        self.source = Session("replay-0" if is_replayed else "acquisition-0", None)
         self.operator = Session("operator-0", None)
         self.learner = Session("learner-0", None)
         self.stages = {stage: self._begin(stage) for stage in CHAIN}
@@ -175,8 +179,9 @@ class Stages:
             config=self.config.sections[stage],
             folder=self.config.folder,
             run_folder=self.config.folder,
-            started_t_ns=self.now_ns,
+            started_t_ns=self.now_ns + 3600 * NS_PER_S * self.is_replayed,
             snapshot_folder=self.config.folder if self.remembers else None,
+            is_replayed=lambda: self.is_replayed,
         )
         return Session(f"{stage}-{self._lives}", load_stage(stage).build(context).core)
 
@@ -234,6 +239,7 @@ class Site(Stages):
         *,
         calibrated: bool = False,
         remembers: bool = True,
+        is_replayed: bool = False,
         learns: bool = False,
         scorer_settings: str = "",
     ) -> None:
@@ -244,7 +250,8 @@ class Site(Stages):
         text = CONFIGURATION + scorer_settings
         (folder / "site.toml").write_text(text.replace('twin = "twin.onnx"\n', "") if learns else text)
         self.path = folder / "recording.mcap"
-        super().__init__(load_config(folder / "site.toml"), self.path, EPOCH_NS, remembers=remembers)
+        config = load_config(folder / "site.toml")
+        super().__init__(config, self.path, EPOCH_NS, remembers=remembers, is_replayed=is_replayed)
         self.rng = np.random.default_rng(seed)
         self._raw_samples = raw_samples
         self._block: list[Raw] = []

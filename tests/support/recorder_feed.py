@@ -109,7 +109,7 @@ def main(endpoint: str, trays: int, fans: int, history: int, file: Path) -> None
         number = without = 0
         next_s = health_s = time.monotonic()
         while not stop.wait(max(0.0, next_s - time.monotonic())):
-            if time.monotonic() >= health_s:
+            if number and time.monotonic() >= health_s:  # not before the first message: earlier ones are history
                 health_s = time.monotonic() + HEALTH_PERIOD_S
                 put_health(StageStatus.OK)
             without = 0 if recorders else without + 1

@@ -22,7 +22,7 @@ from pipeline.selftest.scratch_site import FANTWIN
 
 DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8
-DEADLINE_S = 60.0  # far beyond what anything takes, so that a slow machine fails no test
+DEADLINE_S = 300.0  # only what hangs takes as long, also on a busy machine
 
 
 def fantwin(*words: object, timeout_s: float = DEADLINE_S) -> subprocess.CompletedProcess[str]:

@@ -53,7 +53,6 @@ def tray(tmp_path: Path) -> Iterator[RunningCommand]:
         yield tray
 
 
-@pytest.mark.timeout(400)
 def test_trays_that_their_plant_moves_get_calibrated_twins(
     configuration: Path, tray: RunningCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,6 +19,7 @@ from schemas.codec import decode
 from schemas.messages import Raw
 from schemas.topics import tray_key
 from tests.support.running_chain import (
+    DEADLINE_S,
     FANS,
     SITE,
     TRAY,
@@ -170,7 +171,7 @@ def test_a_stage_that_cannot_start_ends_all_with_one_line(tmp_path, endpoint):
     chain = Chain(tmp_path, endpoint, f"tray.0.twin='{twin}'", viewer=False)
     try:
         up = chain.start_up()
-        assert up.process.wait(60) == 1
+        assert up.process.wait(DEADLINE_S) == 1
         up.kill()
         assert f"recorded until then: {tmp_path}/recording.mcap" in up.lines
         errors = [line for line in up.lines if line.startswith("fantwin:")]

@@ -14,7 +14,7 @@ from schemas.enums import InvalidReason
 from schemas.messages import ModelCard, Score
 from tests.support.fantwin_command import fantwin
 from tests.support.healthy_recordings import FANS, add_recording
-from tests.support.running_chain import RunningCommand, eventually
+from tests.support.running_chain import DEADLINE_S, RunningCommand, eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
@@ -43,13 +43,12 @@ def tray(tmp_path: Path) -> Iterator[RunningCommand]:
         tray.kill()
 
 
-@pytest.mark.timeout(400)
 def test_a_twin_is_learned_and_takes_over_while_the_stages_run(configuration: Path, tray: RunningCommand) -> None:
     versions = TwinVersions(learning_folder(configuration.parent / "runs", "tray1"), "tray1")
     up = RunningCommand(["up", "-c", configuration, "--json"])
     try:
         up.line_with("learner, tray1: no twin yet, nothing is judged; ")
-        eventually(versions.in_force, "the first version is made", 200.0)
+        eventually(versions.in_force, "the first version is made", 2 * DEADLINE_S)
         up.line_with("learner, tray1: tray1-1 is in force; ")
         assert up.end() == 0
         outcome = up.output()

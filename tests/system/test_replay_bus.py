@@ -247,7 +247,7 @@ def test_a_replay_paused_for_longer_than_the_watermark_gives_the_same_grid(tmp_p
                 terminals[0].press(b" ")
                 status, out, err = terminals[0].end()
                 assert status == 0, (out, err)
-                assert json.loads(out)["rate"] == pytest.approx(8.0, rel=0.5)
+                assert 0.0 < json.loads(out)["rate"] < 8.5, "a busy machine plays more slowly, none faster"
             found.append(columns(site.grids_until(until_ns)))
         finally:
             site.close()

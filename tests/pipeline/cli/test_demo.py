@@ -23,14 +23,14 @@ from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.errors import UserError
-from tests.support.running_chain import fantwin, is_running
+from tests.support.running_chain import DEADLINE_S, fantwin, is_running
 
 
 @pytest.mark.slow
 @pytest.mark.real_time
 def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
     out = tmp_path / "demo"
-    done = fantwin("demo", "-o", out, timeout_s=200)
+    done = fantwin("demo", "-o", out, timeout_s=2 * DEADLINE_S)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Traceback" not in done.stdout + done.stderr
     assert "operators' page, while the demo runs: http://127.0.0.1:" in done.stdout

@@ -118,6 +118,20 @@ def test_a_restarted_scorer_continues_from_its_snapshot_and_so_does_a_replay(tmp
     assert len(raised) == 1 and raised[0].t_ns == first.raised_ns, "one alarm, over the restart"
 
 
+def test_a_site_that_was_presented_by_a_replay_began_without_its_snapshot_and_so_does_a_replay_of_that(tmp_path):
+    live = Site(tmp_path, seed=3)
+    live.kill("twin_integrator")  # its successor has another name than the first of the next site
+    live.run(400)
+    live.finished()
+    site = Site(tmp_path, seed=4, is_replayed=True)
+    site.run(300)
+    path = site.finished()
+    restored, scores = recorded(path, "snapshot")[0], recorded(path, "score")
+    assert restored.restored
+    assert scores[-1].t_ns[-1] < restored.t_ns, "all its samples are from before that snapshot"
+    assert made_equal(verified(path)) == sum(len(score.t_ns) for score in scores) > 250
+
+
 def test_with_other_limits_a_session_continues_from_the_replayed_state_of_the_one_before(scorer_killed):
     with open_replay_input([scorer_killed], None, ("scorer.limit_factor=1000",), None) as replay_input:
         (tray,) = rescore(replay_input, None, verify=False)
