@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
 import socket
-import sqlite3
 import ssl
 import threading
 from collections.abc import Iterator
@@ -31,7 +29,6 @@ from pipeline.gateway.shared_answer import SharedAnswer
 from pipeline.presenting import login_failures
 from pipeline.presenting.users import User, UserRole, write_users
 from pipeline.runtime.stage import StageError
-from stages import gateway as stage
 from tests.stages.test_gateway import PASSWORD, SCRIPT, alarm, granted, score
 from tests.support.running_chain import eventually
 from tests.support.running_core import TRAY
@@ -350,26 +347,6 @@ def test_a_comment_is_one_line_that_shows_what_it_says(gateway):
     assert gateway.sent[0].comment == f"é 扇 \U0001f600 {SCRIPT} [2J  fan 3:  txet  "
 
 
-def test_a_history_that_is_damaged_is_a_problem_and_the_page_goes_on(tmp_path, users):
-    first = RunningGateway(tmp_path)
-    first.feed(*(alarm(sequence=number) for number in range(300)))
-    first.close()
-    path = tmp_path / stage.HISTORY
-    sqlite3.connect(path).execute("PRAGMA wal_checkpoint(TRUNCATE)").connection.close()
-    with path.open("r+b") as file:
-        file.seek(4096)
-        file.write(os.urandom(path.stat().st_size - 4096))
-    second = RunningGateway(tmp_path)
-    try:
-        client = Client(second)
-        assert client.ask("GET", "/api/v1/alarms/history")[0] == 503
-        second.feed(score(), alarm(sequence=1000))
-        assert client.ask("GET", "/api/v1/alarms")[1]["alarms"], "what is now needs no history"
-        eventually(lambda: "move it away" in second.problem(), "the problem is named")
-    finally:
-        second.close()
-
-
 def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_named(tmp_path, users):
     certificates = SiteCertificates(tmp_path)
     certificates.issue("page", lifetime=timedelta(seconds=-1))
@@ -400,16 +377,6 @@ def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_na
         server.check_files(**files)
 
 
-def test_a_key_that_everybody_reads_is_named(tmp_path):
-    certificates = SiteCertificates(tmp_path)
-    certificates.issue("page")
-    (tmp_path / "page.key").chmod(0o640)
-    server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
-    (tmp_path / "page.key").chmod(0o644)
-    with pytest.raises(StageError, match="everybody may read it"):
-        server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
-
-
 def encrypted(key: Path) -> None:
     private = load_pem_private_key(key.read_bytes(), None)
     key.write_bytes(private.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret")))
@@ -424,6 +391,7 @@ def encrypted(key: Path) -> None:
         ("key", Path.unlink, "No such file"),
         ("certificate", lambda path: path.write_text("c", encoding="utf-8"), "this is no certificate in PEM"),
         ("certificate", Path.unlink, "No such file"),
+        ("key", lambda path: path.chmod(0o644), "everybody may read it"),
     ],
 )
 def test_what_is_wrong_with_the_files_of_tls_is_said_and_no_password_is_asked_for(tmp_path, file, break_it, why):
@@ -431,10 +399,11 @@ def test_what_is_wrong_with_the_files_of_tls_is_said_and_no_password_is_asked_fo
     for name in ("page", "other"):
         certificates.issue(name)
     files = {"certificate": tmp_path / "page.pem", "key": tmp_path / "page.key"}
-    server.check_certificate(**files)
+    files["key"].chmod(0o640)
+    server.check_files(**files)
     break_it(files[file])
     with pytest.raises(StageError, match=rf"gateway\.{file} = .*: .*{why}"):
-        server.check_certificate(**files)
+        server.check_files(**files)
 
 
 def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question(

@@ -27,7 +27,7 @@ from tests.stages.test_gateway import alarm, granted, score
 from tests.support.mosquitto import Listener, Mosquitto, needs_mosquitto, retained_by
 from tests.support.mqtt_broker import free_port
 from tests.support.running_chain import RunningCommand, eventually
-from tests.support.running_core import FANS, SITE, TRAY
+from tests.support.running_core import SITE, TRAY
 from tests.support.running_mqtt import ROOT, RunningMqtt
 
 pytestmark = needs_mosquitto
@@ -93,37 +93,6 @@ def test_states_alarms_and_status_are_retained(tmp_path, broker, listener):
     finally:
         stage.close()
     assert retained_by(broker.port)[f"{ROOT}/status"] == "offline"
-
-
-def test_a_fan_that_its_command_stops_stays_in_alarm_in_its_state_and_in_the_summary(tmp_path, broker, listener):
-    stage = RunningMqtt(tmp_path, broker.port)
-    try:
-        stage.feed(score(state=FanState.ALARM), alarm(), score(1.0, state=FanState.STOPPED))
-        stopped = "alarm, now stopped by its command"
-        eventually(lambda: state_of(listener).get("state") == stopped, "the state is there")
-        assert state_of(listener)["in_alarm"] is True
-        summary = eventually(lambda: json.loads(listener.last(f"{ROOT}/summary") or "null"), "the summary is there")
-        assert summary == {"fans": FANS, "in_alarm": 1, "suspect": 0, "not_judged": 1, "silenced": 0}
-    finally:
-        stage.close()
-
-
-def test_what_has_not_changed_is_not_published_again(tmp_path, broker, listener):
-    stage = RunningMqtt(tmp_path, broker.port, period_s=5.0)
-    try:
-        stage.feed(score())
-        eventually(lambda: len(listener.of(f"{FAN}/state")) == 1, "it is published")
-        stage.feed(score(1.0), score(2.0), score(3.0))
-        before = len(listener.of(f"{ROOT}/stages"))
-        time.sleep(0.5)  # 25 s of the stage's time
-        assert len(listener.of(f"{FAN}/state")) == 1
-        assert len(listener.of(f"{ROOT}/stages")) == before
-        stage.feed(score(4.0, state=FanState.SUSPECT))
-        eventually(lambda: state_of(listener)["state"] == "suspect", "a change is published")
-        assert len(listener.of(f"{FAN}/state")) == 2
-        assert len(listener.of(f"{ROOT}/{TRAY}/0/state")) == 1
-    finally:
-        stage.close()
 
 
 def test_a_broker_that_was_away_gets_all_that_is_retained_and_all_transitions_in_order(tmp_path, broker):

@@ -273,33 +273,6 @@ def test_a_sample_without_a_score_has_no_band_and_is_never_outside_it() -> None:
     assert not outside[gap, 1].any() and outside[gap, 0].all()
 
 
-def test_speeds_are_shown_in_the_unit_of_the_tray() -> None:
-    sink = FakeSink()
-    scores, alarms = made_up_tray(seconds=1, gap_fan=None, faulty_fan=2, fault_s=(0.0, 1.0))
-    core = core_of(sink, speed_unit="rpm")
-    core.step(sent(scores[0]))
-    core.step(alarms[0])
-    core.close()
-    rpm = 60 / (2 * np.pi)
-    np.testing.assert_allclose(sink.traces[0].measured, scores[0].measured_speed_rad_s * rpm)
-    np.testing.assert_allclose(sink.traces[0].half_width, 2 * SIGMA * rpm)
-    assert "alarm raised, speed 3.8 x its limit" in sink.lines[0].text
-
-
-def test_alarms_go_to_the_log_of_their_tray_at_the_samples_time() -> None:
-    sink = FakeSink()
-    _, alarms = made_up_tray()
-    core = core_of(sink)
-    for alarm in alarms:
-        core.step(alarm)
-    core.tick(LATER_NS)
-    assert [line[:3] for line in sink.lines] == [
-        ("tray1", alarms[0].t_ns, "ERROR"),
-        ("tray1", alarms[1].t_ns, "INFO"),
-    ]
-    assert "alarm raised" in sink.lines[0][3] and "back to normal" in sink.lines[1][3]
-
-
 def test_health_and_twins_are_a_page_that_is_replaced_when_it_changes() -> None:
     sink = FakeSink()
     core = core_of(sink)
@@ -313,17 +286,6 @@ def test_health_and_twins_are_a_page_that_is_replaced_when_it_changes() -> None:
     core.tick(LATER_NS + 2 * PAGE_PERIOD_NS)
     assert len(sink.pages) == 2 and sink.lines == []
     assert "f40" not in sink.pages[0] and "f40" in sink.pages[1] and "the port is gone" in sink.pages[1]
-
-
-def test_a_page_that_changes_often_is_shown_at_intervals_and_at_the_end() -> None:
-    sink = FakeSink()
-    core = core_of(sink)
-    for tenth in range(200):
-        core.step(health(problem=f"problem {tenth}"))
-        core.tick(LATER_NS + tenth * 100_000_000)
-    assert PAGE_PERIOD_NS == 5_000_000_000 and len(sink.pages) == 4
-    core.close()
-    assert len(sink.pages) == 5 and "problem 199" in sink.pages[-1]
 
 
 def test_scores_that_do_not_fit_the_configuration_are_counted_and_reported() -> None:
@@ -346,11 +308,6 @@ def test_without_the_extra_the_stage_loads_and_build_names_the_package(
         monkeypatch.delitem(sys.modules, f"pipeline.viewing.{name}", raising=False)
     with pytest.raises(StageError, match=r"pip install -e '\.\[view\]'"):
         build(context(tmp_path))
-
-
-def test_importing_the_stage_does_not_import_rerun() -> None:
-    code = "import sys, stages.viewer; sys.exit('rerun' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_what_the_source_measures_beside_is_drawn_from_its_first_sample_on(tmp_path: Path) -> None:
@@ -429,14 +386,6 @@ def test_in_an_alarm_the_area_between_twin_and_measured_speed_is_red(tmp_path: P
         ends = middle - np.sqrt(variance), middle + np.sqrt(variance)
         assert ends == pytest.approx(sorted((measured, predicted)))
     assert "/tray1/fan_0/deviation" not in rows
-
-
-@pytest.mark.parametrize("background", [(13, 16, 17), (255, 255, 255)], ids=["dark", "light"])
-def test_every_line_is_legible_in_both_themes(background: tuple[int, int, int]) -> None:
-    styles: Any = pytest.importorskip("pipeline.viewing.rerun_styles", exc_type=ModuleNotFoundError)
-    for color in (styles.RED, *styles.FAN_COLORS):
-        lighter, darker = sorted((luminance(color), luminance(background)), reverse=True)
-        assert (lighter + 0.05) / (darker + 0.05) > 3.0, f"contrast of {color}, as WCAG asks of graphics"
 
 
 def test_an_area_open_at_the_end_of_a_flush_is_ended_by_the_next_one(tmp_path: Path) -> None:
@@ -604,22 +553,3 @@ def pages_of(path: Path) -> list[str]:
 def styles_of(path: Path, entity: str, component: str) -> list[str]:
     (chunk,) = (chunk for chunk in chunks_of(path) if chunk.is_static and chunk.entity_path == entity)
     return chunk.to_record_batch().column(component)[0].as_py()
-
-
-def test_messages_of_a_tray_that_is_not_configured_are_counted_and_ignored() -> None:
-    sink = FakeSink()
-    core = core_of(sink)
-    scores, alarms = made_up_tray(tray="elsewhere", seconds=1)
-    for message in (*scores, *alarms):
-        core.step(sent(message))
-    core.close()
-    assert core.counters()["unknown_tray"] == len(scores) + len(alarms) > 2
-    assert not sink.traces and not sink.lines
-
-
-def test_a_wrong_number_of_fans_is_reported_until_correct_scores_arrive() -> None:
-    core = core_of(FakeSink(), fans=3)
-    core.step(sent(made_up_tray(fans=2, seconds=1, faulty_fan=None)[0][0]))
-    assert core.problem() == "scores have 2 fans, [[tray]] tray1 has fans = 3: correct `fans`"
-    core.step(sent(made_up_tray(fans=3, seconds=1)[0][0]))
-    assert core.problem() == ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from pipeline.viewing import viewer_core
 from pipeline.viewing.fleet import SILENT, Fan, class_names
 from pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
 from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
-from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
+from pipeline.viewing.viewer_core import ViewerCore
 from schemas.codec import decode_columns
 from schemas.messages import Alarm, Score
 from stages.viewer import ViewerConfig, build, check, topics_read
@@ -194,29 +193,6 @@ def test_the_lane_of_a_silent_fan_says_so_until_it_is_heard_again() -> None:
     ]
 
 
-def test_the_log_of_a_fleet_has_the_alarms_of_all_trays() -> None:
-    sink = FakeSink()
-    core = fleet_core(sink)
-    play(core, messages_of(faulty_fan=1))
-    core.close()
-    assert sorted(line.tray for line in sink.lines) == [tray for tray in TRAYS for _ in range(2)]
-
-
-def test_scores_that_do_not_fit_or_decode_are_counted_and_the_rest_is_shown() -> None:
-    sink = FakeSink()
-    core = fleet_core(sink)
-    play(core, messages_of(seconds=1, faulty_fan=None))
-    wrong: Any = sent(made_up_tray(tray="tray1", fans=2, seconds=1, faulty_fan=None)[0][0])
-    core.step(wrong)
-    core.tick(START_NS + 5 * FLUSH_PERIOD_NS)
-    assert core.counters()["wrong_fan_count"] == 1 and "scores have 2 fans" in core.problem()
-    wrong.payload += b"\xff"
-    core.step(wrong)
-    core.tick(START_NS + 6 * FLUSH_PERIOD_NS)
-    assert core.counters()["undecodable"] == 1
-    assert sink.overviews[-1].counts == {"in alarm": 0, "suspect": 0, "not judged": 0}
-
-
 def context(folder: Path, trays: int, fans: int, **config: Any) -> Context:
     return Context(
         site="site",
@@ -281,23 +257,3 @@ def test_a_fan_to_show_that_does_not_exist_is_a_one_line_error(tmp_path: Path, n
     with pytest.raises(StageError) as caught:
         build(wrong)
     assert str(caught.value) == problem and list(tmp_path.iterdir()) == []
-
-
-def test_what_is_measured_beside_of_a_fan_with_a_plot_is_drawn_and_ends_with_it(tmp_path: Path) -> None:
-    core = build(context(tmp_path, 3, 3, fleet_above=3, alarm_plot_hold_s=HOLD_S)).core
-    assert isinstance(core, ViewerCore)
-    measured = [
-        replace(message, supply_voltage_v=np.full(message.score.shape, 12.5, np.float32))
-        if isinstance(message, Score) and message.header.tray == "tray2"
-        else message
-        for message in messages_of()
-    ]
-    play(core, measured)
-    core.close()
-    rows = {path: of for path, of in rows_of(tmp_path / "view.rrd").items() if "supply_voltage_v" in path}
-    (path,) = rows
-    assert path == "/shown/supply_voltage_v/plot_1"
-    *shown, last = [row["Scalars:scalars"][0] for _, row in rows[path]]
-    assert set(shown) == {12.5} and np.isnan(last)
-    begin_s, end_s = ((rows[path][index][0] - START_NS) / 1e9 for index in (0, -1))
-    assert begin_s < 8.5 and end_s < 19.0

@@ -358,15 +358,6 @@ def test_row_07_beside_a_replay_neither_a_site_nor_an_acquisition_starts_and_the
     assert replay.end() == 0
 
 
-def test_a_replay_without_listeners_is_reported_with_the_endpoint(tmp_path, endpoint):
-    recording = write_raw(tmp_path / "source.mcap", 10)
-    done = fantwin("replay", recording, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
-    assert done.returncode == 0
-    assert done.stderr.startswith(f"no stage on site 'demo' at {endpoint} reads ")
-    assert done.stderr.endswith("; publishing anyway\n")
-    assert json.loads(done.stdout)["messages"] == {"raw": 10}
-
-
 def test_unreadable_parts_are_reported_in_the_output_and_the_exit_code(tmp_path, endpoint):
     whole = write_raw(tmp_path / "whole.mcap", 2000)
     truncated = tmp_path / "truncated.mcap"
@@ -377,10 +368,3 @@ def test_unreadable_parts_are_reported_in_the_output_and_the_exit_code(tmp_path,
     report = json.loads(done.stdout)
     assert report["damage"]
     assert 0 < report["messages"]["raw"] < 2000
-
-
-def test_topics_that_the_recording_does_not_have_are_one_line(tmp_path, endpoint):
-    recording = write_raw(tmp_path / "source.mcap", 10)
-    done = fantwin("replay", recording, "--from", "grid", "--set", f"bus.endpoint={endpoint}")
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == f"fantwin: {recording}: it holds no grid, or none between --start and --end"

@@ -118,11 +118,6 @@ def test_row_01_a_stage_that_works_on_old_input_is_behind_and_not_starved():
     assert idle.word == Word.OK, "the health of others is no input that it is behind with"
 
 
-def test_row_01_a_stage_that_was_behind_when_it_was_last_heard_may_be_at_work():
-    silent = replace(behind(19.0, processed=25), age_s=6.0)
-    assert states(silent)["twin_integrator"].detail.endswith("processor time; before, it was 19 s behind")
-
-
 def test_row_16_a_stage_that_left_the_bus_without_stopping_is_gone():
     found = states(view(CONSUMER, alive=False, age_s=3.0))["twin_integrator"]
     assert (found.word, found.detail) == (Word.GONE, "left the bus without stopping; last heard 3 s ago")

@@ -54,12 +54,6 @@ def test_a_comment_stays_until_the_next_and_that_of_a_refused_request_does_not_c
     assert (fields["Comment"], fields["ClientUserId"]) == ("seen", "ann")
 
 
-def test_the_cause_names_all_that_are_as_likely():
-    tie = (Diagnosis(cause="blocked", probability=0.4), Diagnosis(cause="no_power", probability=0.4))
-    fields = after(alarm(causes=tie)).fields(NOW_NS)
-    assert (fields["Cause"], fields["CauseProbability"]) == ("blocked or no power", 0.4)
-
-
 def test_shelving_counts_down():
     shelved = after(alarm(Transition.SHELVED, shelved_until_t_ns=NOW_NS + 60 * 10**9))
     fields = shelved.fields(NOW_NS + 10 * 10**9)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.errors import UserError
 from pipeline.viewing.viewer_core import ViewerCore
 from stages.viewer import build
 from tests.pipeline.viewing.test_viewer_picture import colors, needs_a_driver, rerun_picture
@@ -63,18 +62,3 @@ def test_a_fan_that_had_a_plot_is_drawn_with_its_band_from_before_the_alarm_on(v
     shares = colors(drawn.png)
     assert shares["band"] > 0.02 and shares["deviation"] > 0.02
     assert "state of each fan" in drawn.reports
-
-
-@needs_a_driver
-def test_a_fan_that_had_no_plot_is_a_one_line_error(view_file: Path) -> None:
-    with pytest.raises(UserError, match="no plot has shown fan 0 of tray2; those shown are 2"):
-        rerun_picture.draw_picture(view_file, tray="tray2", fans=[0])
-
-
-def test_every_class_of_cell_has_a_color_and_neighbors_differ() -> None:
-    colors_of = rerun_fleet.class_colors()
-    names = rerun_fleet.class_names()
-    assert len(colors_of) == len(names)
-    shown = [np.array(colors_of[number]) for number in rerun_fleet._legend_classes()]
-    apart = [np.abs(one - other).max() for place, one in enumerate(shown) for other in shown[:place]]
-    assert min(apart) >= 25

@@ -102,19 +102,6 @@ def samples(path: Path, entity: str) -> np.ndarray:
     return of_entity[np.isfinite(of_entity[:, 1:]).any(axis=1)]
 
 
-def test_an_existing_view_is_kept_and_a_recording_without_scores_is_one_line(tmp_path: Path) -> None:
-    path = recording(tmp_path)
-    (tmp_path / "kept.rrd").write_bytes(b"kept")
-    with pytest.raises(UserError, match="exists; name another file with -o, or use --force"):
-        view([path], tmp_path / "kept.rrd")
-    assert (tmp_path / "kept.rrd").read_bytes() == b"kept"
-    with RecordingWriter(tmp_path / "none.mcap", {"site": "site"}, {}) as writer:
-        writer.add_message(tray_key("site", "tray1", "twin"), card(), START_NS)
-    with pytest.raises(UserError, match="holds no scores to show"):
-        view([writer.path], tmp_path / "new.rrd")
-    assert not (tmp_path / "new.rrd").exists()
-
-
 def test_a_recording_of_a_fleet_shows_its_overview_at_each_time_and_has_a_plot_for_the_fan_in_alarm(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
