@@ -19,6 +19,7 @@ from tests.support.outputs import OUTPUTS, Output
 from tests.support.running_chain import eventually
 from tests.support.running_core import TRAY
 from tests.support.score_data import one_sample
+from tests.support.site_users import quickly_hashed  # noqa: F401  a fixture
 
 SEEN = {"acknowledged": True, "confirmed": True, "operator_name": "ann"}
 SHELVED = {"shelved_until_t_ns": NOW_NS + 10**13}

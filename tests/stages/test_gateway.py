@@ -16,7 +16,6 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from pipeline.gateway.config import GatewayConfig
-from pipeline.presenting.users import User, UserRole, hasher, write_users
 from pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
 from pipeline.recordings.rare_messages import rare_messages
 from pipeline.recordings.writing import RecordingWriter
@@ -28,11 +27,11 @@ from schemas.units import RAD_S_PER_UNIT
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_gateway import Client, RunningGateway
+from tests.support.site_users import PASSWORD, make_users, quickly_hashed  # noqa: F401  a fixture
 
 NOW_NS = 1_790_000_000_000_000_000
 STEP_NS = 10_000_000
 GOLDEN = Path(__file__).parents[1] / "support" / "data" / "golden.mcap"
-PASSWORD = "correct horse battery"
 SCRIPT = "<script>alert(1)</script>"
 CONFIGURATION = f'site = "{SITE}"\nrun_folder = "."\n[[tray]]\nname = "{TRAY}"\nfans = {FANS}\nport = "p"\n[gateway]\n'
 
@@ -97,10 +96,7 @@ def granted(request: Request) -> list[Alarm]:
 
 @pytest.fixture
 def users(tmp_path: Path) -> Path:
-    path = tmp_path / "users.toml"
-    hashed = hasher().hash(PASSWORD)
-    write_users(path, {n: User(n, r, hashed) for n, r in (("ann", UserRole.OPERATOR), ("vic", UserRole.VIEWER))})
-    return path
+    return make_users(tmp_path / "users.toml")
 
 
 @pytest.fixture

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from argon2 import PasswordHasher
 from cryptography.hazmat.primitives.serialization import (
     BestAvailableEncryption,
     Encoding,
@@ -27,36 +26,22 @@ from pipeline.gateway import server
 from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.shared_answer import SharedAnswer
 from pipeline.presenting import login_failures
-from pipeline.presenting.users import User, UserRole, write_users
+from pipeline.presenting.users import UserRole
 from pipeline.runtime.stage import StageError
-from tests.stages.test_gateway import PASSWORD, SCRIPT, alarm, granted, score
+from tests.stages.test_gateway import SCRIPT, alarm, granted, score
 from tests.support.running_chain import eventually
 from tests.support.running_core import TRAY
 from tests.support.running_gateway import Client, RunningGateway
 from tests.support.site_certificates import SiteCertificates
+from tests.support.site_users import PASSWORD, make_users, quickly_hashed  # noqa: F401  a fixture
 
 ACT, ASKED = f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"}
 OTHER_PASSWORD = "another horse battery"
 
 
-def put_users(path: Path, password: str = PASSWORD, **roles: UserRole) -> Path:
-    hashed = quick_hasher().hash(password)
-    write_users(path, {name: User(name, role, hashed) for name, role in roles.items()})
-    return path
-
-
-@pytest.fixture(autouse=True)
-def _quickly_hashed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.presenting.users.hasher", quick_hasher)
-
-
-def quick_hasher() -> PasswordHasher:
-    return PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
-
-
 @pytest.fixture
 def users(tmp_path: Path) -> Path:
-    return put_users(tmp_path / "users.toml", ann=UserRole.OPERATOR, vic=UserRole.VIEWER)
+    return make_users(tmp_path / "users.toml", ann=UserRole.OPERATOR, vic=UserRole.VIEWER)
 
 
 @pytest.fixture
@@ -154,7 +139,7 @@ def test_a_new_password_and_another_login_end_the_session_of_before(gateway, use
     assert again.log_in("ann", PASSWORD) == 200
     assert first.ask("POST", ACT, ASKED)[0] == 401, "this browser has logged in again"
     assert again.ask("POST", ACT, ASKED)[0] == 200
-    put_users(users, OTHER_PASSWORD, ann=UserRole.OPERATOR)
+    make_users(users, OTHER_PASSWORD, ann=UserRole.OPERATOR)
     assert again.ask("POST", ACT, ASKED)[0] == 401
     assert len(gateway.sent) == 1
 
@@ -196,7 +181,7 @@ def test_live_events_end_for_who_may_not_read_any_more(gateway, users, monkeypat
     assert events(gateway).status == 401
     stream = events(gateway, Cookie=logged_in(gateway, "vic").cookie)
     assert stream.readline() == b"event: fleet\n"
-    put_users(users, ann=UserRole.OPERATOR)
+    make_users(users, ann=UserRole.OPERATOR)
     while stream.readline():
         pass
     assert stream.isclosed()
@@ -400,10 +385,15 @@ def test_what_is_wrong_with_the_files_of_tls_is_said_and_no_password_is_asked_fo
         certificates.issue(name)
     files = {"certificate": tmp_path / "page.pem", "key": tmp_path / "page.key"}
     files["key"].chmod(0o640)
-    server.check_files(**files)
+
+    def check() -> None:
+        server.check_files(**files)
+        server.check_certificate(**files)
+
+    check()
     break_it(files[file])
     with pytest.raises(StageError, match=rf"gateway\.{file} = .*: .*{why}"):
-        server.check_files(**files)
+        check()
 
 
 def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question(

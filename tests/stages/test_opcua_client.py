@@ -17,7 +17,8 @@ from tests.support.node_opcua import PACKAGE, VERSION, WHAT, NodeOpcua
 from tests.support.node_packages import node_modules
 from tests.support.running_chain import eventually
 from tests.support.running_core import SITE, TRAY
-from tests.support.running_opcua import OPERATOR, PASSWORD, VIEWER, RunningOpcua
+from tests.support.running_opcua import RunningOpcua
+from tests.support.site_users import OPERATOR, PASSWORD, VIEWER, quickly_hashed  # noqa: F401  a fixture
 
 FAN = f"ns=2;s={TRAY}/2"
 ALARM = f"{FAN}/Alarm"

@@ -6,13 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.opcua.config import OpcuaConfig
-from pipeline.presenting.users import User, UserRole, hasher, write_users
 from stages.opcua import STAGE, OpcuaCore
 from tests.support.running_core import FANS, Answer, RunningCore
 from tests.support.running_gateway import free_port
-
-PASSWORD = "correct horse battery"
-OPERATOR, VIEWER = "ann", "vic"
+from tests.support.site_users import make_users
 
 
 class RunningOpcua(RunningCore[OpcuaCore]):
@@ -22,9 +19,7 @@ class RunningOpcua(RunningCore[OpcuaCore]):
         self.port = free_port()
         self.users = folder / "users.toml"
         folder.mkdir(parents=True, exist_ok=True)
-        hashed = hasher().hash(PASSWORD)
-        roles = ((OPERATOR, UserRole.OPERATOR), (VIEWER, UserRole.VIEWER))
-        write_users(self.users, {name: User(name, role, hashed) for name, role in roles})
+        make_users(self.users)
         super().__init__(STAGE, OpcuaConfig(port=self.port, users=self.users, **settings), folder, answer, fans)
 
     @property

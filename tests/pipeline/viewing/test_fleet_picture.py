@@ -15,7 +15,6 @@ from tests.pipeline.viewing.test_viewer_picture import colors, needs_a_driver, r
 from tests.stages.test_viewer_fleet import context, messages_of, play
 
 rerun_fleet = pytest.importorskip("pipeline.viewing.rerun_fleet", exc_type=ModuleNotFoundError)
-OVERVIEW = {"every fan", "the worst fans", "alarms", "alarm log", "fans in alarm, suspect"}
 
 
 @pytest.fixture(scope="module")
