@@ -126,32 +126,6 @@ def test_a_broker_that_was_away_gets_all_that_is_retained_and_all_transitions_in
         stage.close()
 
 
-def test_transitions_wait_over_a_restart_of_the_stage_and_the_oldest_of_too_many_are_counted(tmp_path, broker):
-    port = free_port()
-    first = RunningMqtt(tmp_path, port, most_waiting=3)
-    for number in range(5):
-        first.feed(alarm(Transition.SEVERITY, number))
-    assert first.counters()["lost_transitions"] == 2
-    eventually(lambda: "the oldest are lost" in first.problem(), "it says so")
-    first.close()
-    listener = Listener(broker.port)
-    second = RunningMqtt(tmp_path, broker.port, most_waiting=3)
-    try:
-        topic = f"{FAN}/alarm/transitions"
-        eventually(lambda: len(listener.of(topic)) == 3, "what waited has come")
-        second.feed(*(alarm(Transition.SEVERITY, number) for number in range(5)))  # the bus sends them again
-        second.feed(alarm(Transition.CLEARED, 5, active=False))
-        eventually(lambda: len(listener.of(topic)) == 4, "all that wait have come")
-        assert [json.loads(text)["number"] for text in listener.of(topic)] == [3, 4, 5, 6]
-        eventually(lambda: second.counters()["waiting_transitions"] == 0, "they are acknowledged")
-    finally:
-        second.close()
-        listener.close()
-    third = RunningMqtt(tmp_path, broker.port)
-    assert third.counters()["waiting_transitions"] == 0, "nothing is sent twice"
-    third.close()
-
-
 def test_a_broker_that_hangs_holds_nobody_up_and_is_named(tmp_path, broker, monkeypatch):
     monkeypatch.setattr("pipeline.broker.link.SILENT_AFTER_S", 0.2)
     stage = RunningMqtt(tmp_path, broker.port)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import socket
 import sqlite3
 import time
@@ -117,23 +116,6 @@ def test_a_target_that_hangs_holds_up_neither_the_core_nor_its_end(tmp_path, mai
     left = file.execute("SELECT under_way FROM message WHERE target = 'hangs' ORDER BY number").fetchall()
     file.close()
     assert left == [(1,), (0,)], "it is sent again after a restart"
-
-
-def test_what_is_too_old_or_too_much_is_lost_counted_and_said(tmp_path, mail, started):
-    mail.stop()
-    notifier = started(tmp_path, [mail_target(tmp_path, mail)], most_messages=3, kept_s=600)
-    for fan in range(5):
-        notifier.hear(alarm(fan=fan))
-    eventually(lambda: notifier.core.counters().get("lost_messages", 0) >= 1, "the oldest are lost")
-    assert "messages were lost" in notifier.core.problem()
-    notifier.wait(700)
-    assert notifier.core.counters()["messages_waiting"] <= 1, "all but one that may be under way are too old"
-    notifier.hear(alarm(fan=6))
-    lost = notifier.core.counters()["lost_messages"]
-    mail.start()
-    eventually(lambda: "WARNING, fan 6 of tray1 (hall)" in mail.subjects(), "the newest arrives")
-    said = [int(number) for _, body in mail.mails for number in re.findall(r"are lost: (\d+)", body)]
-    assert sum(said) == lost, "each is said once"
 
 
 def test_a_mail_whose_answer_does_not_come_is_sent_again_and_says_so(tmp_path, mail, started):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.config.models import TrayConfig
-from pipeline.runtime.stage import Context, StageError
+from pipeline.runtime.stage import Context
 from pipeline.viewing import viewer_core
 from pipeline.viewing.fleet import SILENT, Fan, class_names
 from pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
@@ -18,7 +18,7 @@ from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
 from pipeline.viewing.viewer_core import ViewerCore
 from schemas.codec import decode_columns
 from schemas.messages import Alarm, Score
-from stages.viewer import ViewerConfig, build, check, topics_read
+from stages.viewer import ViewerConfig, build, topics_read
 from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
 from tests.support.score_data import START_NS, STEP_NS, made_up_tray
 
@@ -133,33 +133,6 @@ def test_of_a_tray_without_a_plot_only_the_newest_score_is_decoded(monkeypatch: 
     assert len(messages) == 3000 and len(decoded) <= 3 * 21
 
 
-def test_the_overview_follows_every_fan_and_repeats_what_does_not_change() -> None:
-    sink = FakeSink()
-    core = fleet_core(sink)
-    play(core, messages_of())
-    core.close()
-    steady = [overview for overview in sink.overviews[1:] if overview.classes is not None]
-    assert steady[0].classes is not None and len(steady[0].classes) == 9
-    times = np.array([overview.t_ns for overview in sink.overviews])
-    assert (np.diff(times) > 0).all() and len(times) in (40, 41)
-    of_faulty = {
-        round((each.t_ns - START_NS) / 1e9, 1): class_names()[each.classes[5]]
-        for each in steady
-        if each.classes is not None
-    }
-    assert "alarm" in {name for at_s, name in of_faulty.items() if 9 < at_s < 14}
-    assert {name for at_s, name in of_faulty.items() if at_s < 8 or at_s > 15} <= set(class_names()[:5])
-    marked = [((each.t_ns - START_NS) / 1e9, each.alarms) for each in sink.overviews if each.alarms is not None]
-    assert max(np.diff([at_s for at_s, _ in marked])) <= 5.1
-    changes = [next(group) for _, group in groupby(marked, key=lambda pair: pair[1])]
-    assert [alarms for _, alarms in changes] == [[], [5], []]
-    assert 8.5 <= changes[1][0] <= 9.1 and 14.5 <= changes[2][0] <= 15.1
-    assert [each.counts["in alarm"] for each in sink.overviews].count(1) in (12, 13)
-    pages = [(each.t_ns, each.page) for each in sink.overviews if each.page is not None]
-    assert min(np.diff([t for t, _ in pages])) >= 1_000_000_000
-    assert any("**tray2/2** | alarm" in page for _, page in pages) and "9 fans" in pages[0][1]
-
-
 def test_a_tray_that_sends_no_more_becomes_silent_and_its_alarm_gives_up_its_plot() -> None:
     sink = FakeSink()
     core = fleet_core(sink)
@@ -240,20 +213,3 @@ def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Pa
     texts = [row["TextLog:text"][0] for _, row in rows["/fleet/log"]]
     assert texts[0].startswith("22:13:28  tray2 fan 2: alarm raised") and len(texts) == 2
     assert "TextDocument:text" in rows["/fleet/worst"][0][1]
-
-
-@pytest.mark.parametrize(
-    ("name", "problem"),
-    [
-        ("tray1", 'viewer.show: \'tray1\' is no fan; write "tray/number", for example "tray1/0"'),
-        ("tray1/x", 'viewer.show: \'tray1/x\' is no fan; write "tray/number", for example "tray1/0"'),
-        ("tary1/0", "viewer.show: 'tary1/0': no tray called 'tary1'; did you mean 'tray1'?"),
-        ("tray1/3", "viewer.show: 'tray1/3': tray1 has fans 0 to 2"),
-    ],
-)
-def test_a_fan_to_show_that_does_not_exist_is_a_one_line_error(tmp_path: Path, name: str, problem: str) -> None:
-    wrong = context(tmp_path, 1, 3, show=("tray1/1", name))
-    assert check(wrong) == [problem]
-    with pytest.raises(StageError) as caught:
-        build(wrong)
-    assert str(caught.value) == problem and list(tmp_path.iterdir()) == []

@@ -259,12 +259,6 @@ def test_a_stage_for_which_there_is_no_process_at_the_end_has_failed(monkeypatch
     assert launcher.outcome.failed == ["recorder"]
 
 
-def test_a_site_for_which_there_is_no_process_is_refused_in_one_line(monkeypatch, no_room):
-    launcher, _, _ = recorder_only([], monkeypatch)
-    with pytest.raises(UserError, match="^recorder: no process could be started: Resource .* unavailable; free "):
-        launcher._start_all(threading.Event())
-
-
 @pytest.mark.parametrize("fails", ["Popen", "Thread"])
 def test_of_a_process_that_could_not_be_started_nothing_is_left(monkeypatch, fails):
     closed, killed = [], []

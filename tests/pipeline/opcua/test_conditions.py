@@ -15,7 +15,7 @@ from pipeline.opcua.events import condition_event, system_event
 from pipeline.viewing.fleet import Fan
 from schemas.enums import Severity, Transition
 from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis
+from schemas.messages import Alarm
 from scoring.alarms.current_alarms import current_alarms
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, TRAY, alarm
