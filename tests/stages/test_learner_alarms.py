@@ -25,14 +25,15 @@ def test_nothing_is_learned_beside_an_alarm(tmp_path: Path) -> None:
     assert all(each.span[1] < START_NS + 600 * NS_PER_S for each in healthy_recordings(tmp_path))
 
 
-def test_fans_are_checked_each_day_beside_an_alarm(tmp_path: Path) -> None:
+def test_fans_are_checked_each_day_beside_an_alarm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.learning.learning_schedule.CHECK_AFTER_S", 2 * 3600.0)
     learner = Learner(tmp_path)
     learner.run(600)
     before = len(learner.learning.starts)
-    learner.run(50 * 3600, state=FanState.ALARM)
+    learner.run(5 * 3600, state=FanState.ALARM)
     first_h, second_h = ((t_ns - START_NS) / NS_PER_S / 3600.0 for t_ns in learner.learning.checked_t_ns)
-    assert 24.0 < first_h < 24.5
-    assert second_h - first_h == pytest.approx(24.0, abs=0.1)
+    assert 2.0 < first_h < 2.5
+    assert second_h - first_h == pytest.approx(2.0, abs=0.1)
     assert len(learner.learning.starts) == before
 
 

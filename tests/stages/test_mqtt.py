@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -26,7 +24,7 @@ from stages.mqtt import build, check
 from tests.stages.test_gateway import alarm, granted, score
 from tests.support.mosquitto import Listener, Mosquitto, needs_mosquitto, retained_by
 from tests.support.mqtt_broker import free_port
-from tests.support.running_chain import RunningCommand, eventually
+from tests.support.running_chain import eventually
 from tests.support.running_core import SITE, TRAY
 from tests.support.running_mqtt import ROOT, RunningMqtt
 
@@ -144,23 +142,6 @@ def test_a_broker_that_hangs_holds_nobody_up_and_is_named(tmp_path, broker, monk
     began_s = time.monotonic()
     stage.close()
     assert time.monotonic() - began_s < 10
-
-
-@pytest.mark.slow
-def test_the_last_will_says_that_a_killed_stage_is_gone(tmp_path, broker, listener):
-    config = tmp_path / "site.toml"
-    config.write_text(
-        f'site = "{SITE}"\nrun_folder = "run"\n[bus]\nendpoint = "tcp/127.0.0.1:{free_port()}"\n'
-        f'[[tray]]\nname = "{TRAY}"\nfans = 4\n[mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n'
-    )
-    running = RunningCommand(["run", "mqtt", "-c", config])
-    try:
-        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
-        eventually(lambda: state_of(listener).get("state") == "silent", "a tray that sends nothing is silent")
-        os.kill(running.process.pid, signal.SIGKILL)
-        eventually(lambda: listener.last(f"{ROOT}/status") == "offline", "the broker says that it is gone")
-    finally:
-        running.kill()
 
 
 def test_the_last_will_of_a_connection_that_is_dead_comes_before_the_next_one_says_online(tmp_path, broker, listener):

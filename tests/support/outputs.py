@@ -67,8 +67,12 @@ class GatewayOutput:
         self.feed, self.close = self.running.feed, self.running.close
 
     def alarms(self) -> dict[int, tuple[bool, bool]]:
-        found = Client(self.running).ask("GET", "/api/v1/alarms?all=1")[1]["alarms"]
-        return {a["fan"]: (a["acknowledged"], _is_silenced(a)) for a in found if a["active"]}
+        """Of the fans that the list of alarms and the list of fans agree on."""
+        client = Client(self.running)
+        found = client.ask("GET", "/api/v1/alarms?all=1")[1]["alarms"]
+        groups = [client.ask("GET", f"/api/v1/fans?state={group}")[1]["fans"] for group in ("alarm", "silenced")]
+        fans = {each["fan"] for group in groups for each in group}
+        return {a["fan"]: (a["acknowledged"], _is_silenced(a)) for a in found if a["active"] and a["fan"] in fans}
 
     def refused(self) -> int:
         return _refused(self.running.counters())
