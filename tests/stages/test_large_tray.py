@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from pipeline.config.loading import parse_config
-from pipeline.config.models import Config
+from pipeline.config.models import Config, ConfigError
 from pipeline.devices.measured_table import Table, read_table
 from pipeline.devices.sample_source import (
+    MOST_FANS,
     LinkUp,
     Reading,
     ReadingBatch,
@@ -21,10 +22,13 @@ from pipeline.devices.sample_source import (
     SourceContext,
     SourceEvent,
 )
+from pipeline.devices.serial_config import MOST_FANS_ON_LINE
 from pipeline.devices.source_kinds import SOURCE_KINDS, SourceKind
 from pipeline.devices.table_device import TableDevice
+from pipeline.errors import UserError
 from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
+from schemas import wire
 from schemas.codec import decode, encode
 from schemas.enums import Transition
 from schemas.header import Header
@@ -156,3 +160,20 @@ def test_all_fans_of_a_large_tray_are_judged_and_its_messages_stay_within_their_
     assert judged.shape[1] == FANS and judged[200:].all()
     raised = [alarm for alarm in found if isinstance(alarm, Alarm) and alarm.transition == Transition.RAISED]
     assert [alarm.fan for alarm in raised] == [FAULTY]
+
+
+def test_a_tray_has_at_most_the_fans_that_its_source_carries():
+    assert wire.MAX_FANS == MOST_FANS_ON_LINE < FANS == MOST_FANS
+    (tray,) = config_of(Path(), CONFIGURATION).trays
+    assert tray.fans == FANS
+    with pytest.raises(ConfigError, match=r"tray.0.fans = 1025: input should be less than or equal to 1024"):
+        config_of(Path(), CONFIGURATION.replace(str(FANS), "1025"))
+    line = CONFIGURATION.replace('{ kind = "table", path = "hall.csv" }', '{ kind = "serial", port = "/dev/ttyUSB0" }')
+    refused = "fans = 1024: a serial source carries at most 64 fans; make several trays of them"
+    with pytest.raises(ConfigError) as caught:
+        config_of(Path(), line)
+    assert str(caught.value) == f"site.toml: tray.0: {refused}"
+    without_port = config_of(Path(), line.replace(', port = "/dev/ttyUSB0"', ""))
+    assert without_port.trays[0].fans == FANS, "its samples come from elsewhere, such as a replay"
+    with pytest.raises(UserError, match=refused):
+        load_stage("acquisition").build(context_of(without_port, "acquisition"))

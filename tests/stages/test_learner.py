@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.learning.versions import Check
 from schemas.enums import Action, FanState
 from schemas.messages import Request
 from schemas.units import NS_PER_S
@@ -218,6 +219,18 @@ def test_a_failure_is_over_although_the_version_was_made_before_the_failure_was_
         learner.run(10)
     learner.add_version("tray1-9")
     learner.run(20)
+    assert learner.core.problem() == ""
+
+
+def test_a_check_that_failed_is_over_when_anybody_has_made_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.learning.learning_schedule.CHECK_AFTER_S", 1000.0)
+    learner = Learner(tmp_path)
+    learner.learning.checks_fail_with = "a check failed"
+    while not learner.core.problem():
+        learner.run(10)
+    until_t_ns = START_NS + learner.now_s * NS_PER_S
+    learner.versions.add_check(Check(t_ns=until_t_ns, reference="", change=(), found="", spans=()))
+    learner.run(10)
     assert learner.core.problem() == ""
 
 

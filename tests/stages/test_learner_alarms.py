@@ -113,6 +113,28 @@ def test_a_restarted_learner_publishes_the_version_before_while_a_fan_may_have_a
     assert second.versions.read().published == "tray1-2"
 
 
+def test_a_restarted_learner_publishes_at_once_what_an_operator_chose(tmp_path: Path) -> None:
+    first = Learner(tmp_path)
+    first.run(600)
+    first.run(20, state=FanState.ALARM)
+    first.add_version("tray1-2")
+    first.versions.use("tray1-2")
+    second = restarted(first)
+    second.run(10, state=None)
+    assert second.put_in_force == ["tray1-2"]
+
+
+def test_a_restarted_learner_publishes_the_version_in_force_if_the_one_before_is_gone(tmp_path: Path) -> None:
+    first = Learner(tmp_path)
+    first.run(600)
+    first.run(20, state=FanState.ALARM)
+    first.add_version("tray1-2")
+    first.versions.file("tray1-1").unlink()
+    second = restarted(first)
+    second.run(10, state=None)
+    assert second.put_in_force == ["tray1-2"]
+
+
 def test_samples_of_stopped_fans_are_learned_from(tmp_path: Path) -> None:
     learner = Learner(tmp_path)
     learner.run(600)

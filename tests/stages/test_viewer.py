@@ -372,6 +372,13 @@ def test_an_existing_view_is_not_overwritten(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["view-2.rrd", "view-3.rrd", "view.rrd"]
 
 
+def test_a_file_that_cannot_be_written_is_a_one_line_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(StageError, match="cannot write the view") as caught:
+        build(context(tmp_path, file="file/view.rrd"))
+    assert "\n" not in str(caught.value)
+
+
 def test_live_viewers_are_served_on_the_loopback_only(tmp_path: Path) -> None:
     port = free_port()
     core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.config.models import TrayConfig
-from pipeline.runtime.stage import Context
+from pipeline.runtime.stage import Context, StageError
 from pipeline.viewing import viewer_core
 from pipeline.viewing.fleet import SILENT, Fan, class_names
 from pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
@@ -18,7 +18,7 @@ from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
 from pipeline.viewing.viewer_core import ViewerCore
 from schemas.codec import decode_columns
 from schemas.messages import Alarm, Score
-from stages.viewer import ViewerConfig, build, topics_read
+from stages.viewer import ViewerConfig, build, check, topics_read
 from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
 from tests.support.score_data import START_NS, STEP_NS, made_up_tray
 
@@ -213,3 +213,20 @@ def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Pa
     texts = [row["TextLog:text"][0] for _, row in rows["/fleet/log"]]
     assert texts[0].startswith("22:13:28  tray2 fan 2: alarm raised") and len(texts) == 2
     assert "TextDocument:text" in rows["/fleet/worst"][0][1]
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("tray1", 'viewer.show: \'tray1\' is no fan; write "tray/number", for example "tray1/0"'),
+        ("tray1/x", 'viewer.show: \'tray1/x\' is no fan; write "tray/number", for example "tray1/0"'),
+        ("tary1/0", "viewer.show: 'tary1/0': no tray called 'tary1'; did you mean 'tray1'?"),
+        ("tray1/3", "viewer.show: 'tray1/3': tray1 has fans 0 to 2"),
+    ],
+)
+def test_a_fan_to_show_that_does_not_exist_is_a_one_line_error(tmp_path: Path, name: str, problem: str) -> None:
+    wrong = context(tmp_path, 1, 3, show=("tray1/1", name))
+    assert check(wrong) == [problem]
+    with pytest.raises(StageError) as caught:
+        build(wrong)
+    assert str(caught.value) == problem and list(tmp_path.iterdir()) == []

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
-from schemas.enums import Action, FanState, Transition
+from schemas.enums import Action, FanState, Feedback, Transition
 from schemas.messages import Alarm, Diagnosis, Request
-from tests.stages.test_gateway import alarm, score
+from tests.stages.test_gateway import NOW_NS, alarm, golden_twin, marked, score
 from tests.support.page_browser import inaccessible, opened, running_browser
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, TRAY
@@ -104,6 +104,16 @@ def test_everything_is_done_by_keyboard(gateway, browser):
     keyboard.press("Escape")
     expect(page.get_by_label("State")).to_be_visible()
     assert f"{TRAY} fan {FAULTY}" in page.evaluate(FOCUSED)
+    assert errors == []
+
+
+def test_the_rate_on_an_open_page_follows_what_is_said_of_an_alarm(gateway, browser):
+    gateway.feed(golden_twin(), score(2.0), score(6.0), alarm(sequence=1, onset_t_ns=5, t_ns=NOW_NS + 3 * 10**9))
+    errors: list[str] = []
+    rate = opened(browser, f"http://127.0.0.1:{gateway.port}/#/alarms", errors).locator("#alarm-rate")
+    expect(rate).to_contain_text("0 false alarms")
+    gateway.feed(replace(marked(Feedback.FALSE_ALARM, 2, "a door was open"), marked_onset_t_ns=5))
+    expect(rate).to_contain_text("1 false alarm in")
     assert errors == []
 
 

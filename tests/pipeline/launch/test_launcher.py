@@ -259,6 +259,12 @@ def test_a_stage_for_which_there_is_no_process_at_the_end_has_failed(monkeypatch
     assert launcher.outcome.failed == ["recorder"]
 
 
+def test_a_site_for_which_there_is_no_process_is_refused_in_one_line(monkeypatch, no_room):
+    launcher, _, _ = recorder_only([], monkeypatch)
+    with pytest.raises(UserError, match="^recorder: no process could be started: Resource .* unavailable; free "):
+        launcher._start_all(threading.Event())
+
+
 @pytest.mark.parametrize("fails", ["Popen", "Thread"])
 def test_of_a_process_that_could_not_be_started_nothing_is_left(monkeypatch, fails):
     closed, killed = [], []
@@ -433,6 +439,15 @@ def test_it_says_which_files_a_run_recorded_also_one_that_failed(tmp_path, monke
 )
 def test_the_exit_code_says_whether_anything_was_lost(outcome, code):
     assert outcome.exit_code == code
+
+
+def test_the_search_ends_when_the_launcher_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus: Any = LateBus("elsewhere", 5.0)
+    monkeypatch.setattr("pipeline.launch.launcher.time", bus)
+    stop = threading.Event()
+    stop.set()
+    Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)._refuse_second_launcher(bus, stop)
+    assert bus.now_s == 100.0
 
 
 def test_row_13_a_stage_goes_on_with_the_time_of_its_launcher_when_it_is_started_again(tmp_path, monkeypatch):

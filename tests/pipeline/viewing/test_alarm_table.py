@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.viewing.alarm_table import AlarmTable
+from pipeline.viewing.alarm_table import ALARMS_LISTED, AlarmTable
 from schemas.enums import Severity, Statistic, Transition
 from schemas.header import Header
 from schemas.messages import Alarm, Diagnosis
@@ -57,6 +57,15 @@ def test_active_alarms_come_first_with_cause_and_who_has_seen_them_and_those_ove
     alarms.add(2, Transition.SUPPRESSED, severity=Severity.WARNING, suppressed=True)
     alarms.add(1, Transition.DATA_LOST, stale=True)
     assert [row.split(" | ")[1] for row in rows(table)] == ["alarm, no data", "warning, silenced"]
+
+
+def test_of_many_alarms_the_newest_are_listed_and_the_rest_counted() -> None:
+    table = AlarmTable()
+    alarms = Transitions(table)
+    for fan in range(ALARMS_LISTED + 5):
+        alarms.add(fan, Transition.RAISED)
+    assert len(rows(table)) == ALARMS_LISTED and rows(table)[0].startswith(f"| **tray1/{ALARMS_LISTED + 4}**")
+    assert "and 5 more: `fantwin alarms` lists them" in table.text()
 
 
 def test_the_table_is_shown_when_it_changes_and_repeated_for_viewers_that_join_late() -> None:

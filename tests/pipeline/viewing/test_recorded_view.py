@@ -12,6 +12,7 @@ import pytest
 
 from pipeline.cli.options import ViewLayout
 from pipeline.cli.recordings.view import view
+from pipeline.errors import UserError
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Alarm, Message, Score
 from schemas.topics import health_key, tray_key
@@ -98,3 +99,16 @@ def samples(path: Path, entity: str) -> np.ndarray:
     count = 2 if entity.endswith("/speed") else None
     of_entity = np.array([[t_ns, *row[component][:count]] for t_ns, row in rows], float)
     return of_entity[np.isfinite(of_entity[:, 1:]).any(axis=1)]
+
+
+def test_an_existing_view_is_kept_and_a_recording_without_scores_is_one_line(tmp_path: Path) -> None:
+    path = recording(tmp_path)
+    (tmp_path / "kept.rrd").write_bytes(b"kept")
+    with pytest.raises(UserError, match="exists; name another file with -o, or use --force"):
+        view([path], tmp_path / "kept.rrd")
+    assert (tmp_path / "kept.rrd").read_bytes() == b"kept"
+    with RecordingWriter(tmp_path / "none.mcap", {"site": "site"}, {}) as writer:
+        writer.add_message(tray_key("site", "tray1", "twin"), card(), START_NS)
+    with pytest.raises(UserError, match="holds no scores to show"):
+        view([writer.path], tmp_path / "new.rrd")
+    assert not (tmp_path / "new.rrd").exists()
