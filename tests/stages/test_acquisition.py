@@ -8,21 +8,15 @@ import struct
 import zlib
 from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from cobs import cobs
 
 from pipeline.config.models import TrayConfig
-from pipeline.config.registry import STAGES
 from pipeline.devices.host_clock import HostClock
-from pipeline.devices.sample_blocks import SampleBlocks
 from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch
-from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.serial_port import ReceivedBytes
-from pipeline.devices.serial_source import SerialSource
-from pipeline.runtime.stage import Context, StageError
 from schemas.codec import decode
 from schemas.codec import encode as encode_message
 from schemas.messages import Command, Raw
@@ -38,7 +32,7 @@ from schemas.wire import (
     SetPointFrame,
     encode,
 )
-from stages.acquisition import STAGE, AcquisitionConfig, AcquisitionCore
+from stages.acquisition import AcquisitionConfig
 from tests.support.serial_core import FakeLink, SerialCore
 
 S = NS_PER_S
@@ -105,17 +99,6 @@ def test_refused_input_is_named_by_kind_with_what_was_wrong_with_the_first() -> 
     ]
 
 
-def test_a_long_piece_is_quoted_in_part_only() -> None:
-    core = make_core(protocol="text")
-    for piece in (b"\n", b"S 1 2 0.5 " + b"x" * 4900 + b"\n"):
-        core.step(ReceivedBytes(piece, 3 * S))
-    (note,) = core.notes()
-    core.tick(3 * S)
-    assert "bad_number: b'xxx" in core.problem()
-    for text in (note, core.problem()):
-        assert "xxx..." in text and len(text) < 250
-
-
 def feed_times(core: SerialCore, times_ms: Iterable[int]) -> list[tuple[int, list[int]]]:
     """Feed a sample at each of these times; returns when messages came out, and the samples in each."""
     return [
@@ -137,20 +120,6 @@ def test_a_message_holds_the_samples_of_a_time_and_ends_with_the_last_that_is_ex
 def test_a_line_without_a_second_sample_in_that_time_waits_for_nothing(block_s: float, period_ms: int) -> None:
     times_ms = range(0, 10 * period_ms, period_ms)
     assert [t_ms for t_ms, _ in feed_times(make_core(block_s=block_s), times_ms)] == [*times_ms]
-
-
-def test_a_message_whose_samples_stay_away_is_sent_after_its_time() -> None:
-    core = make_core(block_s=0.05)
-    assert feed_times(core, [0, 10, 20]) == [(0, [0])]
-    assert core.tick(S + 59 * S // 1000) == []
-    assert [raw.device_sequence.tolist() for raw in core.tick(S + 60 * S // 1000)] == [[1, 2]]
-    assert core.tick(9 * S) == []
-
-
-def test_what_waits_is_published_when_the_line_goes_down() -> None:
-    core = make_core(block_s=0.05)
-    feed_times(core, [0, 10])
-    assert [raw.device_sequence.tolist() for raw in core.step(LinkDown("gone"))] == [[1]]
 
 
 def test_a_message_of_a_fast_line_has_4096_samples_at_most() -> None:
@@ -221,52 +190,6 @@ def test_a_refused_sample_is_counted_as_lost_once_and_a_corrupt_number_is_not_be
     assert core.counters()["device_restarts"] == 1
 
 
-def test_a_limit_rounded_to_float32_is_still_within_the_limit() -> None:
-    assert float(np.float32(0.1)) > 0.1
-    assert len(feed(make_core(command_max=0.5, command_min=-0.1), [sample(0, command=-0.1)])) == 1
-
-
-def test_missing_sequence_numbers_are_counted_as_lost() -> None:
-    core = make_core()
-    assert feed_sequences(core, [10, 11, 15, 16, 20]) == [10, 11, 15, 16, 20]
-    assert core.counters()["lost_on_line"] == 6
-
-
-def test_samples_from_before_the_first_one_received_are_not_lost() -> None:
-    core = make_core()
-    feed_sequences(core, [1_000_000])
-    assert core.counters().get("lost_on_line", 0) == 0
-
-
-def test_repeated_samples_are_dropped_and_counted() -> None:
-    core = make_core()
-    assert feed_sequences(core, [10, 11, 11, 11, 12, 10, 13]) == [10, 11, 12, 13]
-    assert core.counters()["repeated"] == 3
-    assert core.counters().get("lost_on_line", 0) == 0
-    assert core.counters().get("device_restarts", 0) == 0
-
-
-def test_the_sequence_may_wrap() -> None:
-    core = make_core()
-    top = 2**32 - 1
-    assert feed_sequences(core, [top - 1, top, 0, 1]) == [top - 1, top, 0, 1]
-    assert feed_sequences(core, [top, 0]) == [], "both are known"
-    assert core.counters().get("lost_on_line", 0) == 0
-    assert core.counters().get("device_restarts", 0) == 0
-
-
-def test_a_loss_across_the_sequence_wrap_is_counted_exactly() -> None:
-    core = make_core()
-    feed_sequences(core, [2**32 - 2, 3])
-    assert core.counters()["lost_on_line"] == 4
-
-
-def test_the_device_clock_may_wrap() -> None:
-    core = make_core()
-    frames = [sample(0, clock_us=2**32 - 5), sample(1, clock_us=9_995)]
-    assert [int(raw.device_clock_us[0]) for raw in feed(core, frames)] == [2**32 - 5, 9_995]
-
-
 @pytest.mark.parametrize("last", [100, 1_000_000, 3_000_000_000, 4_000_000_000])
 def test_a_device_restart_is_not_a_loss_of_four_billion(last: int) -> None:
     core = make_core()
@@ -297,21 +220,6 @@ def test_samples_measured_while_the_line_was_down_are_counted_as_lost() -> None:
     assert core.counters().get("truncated", 0) == 0
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_faulty_frames_are_counted_by_kind_and_valid_ones_pass(protocol: Protocol) -> None:
-    core = make_core(protocol=protocol)
-    bad = b"\0\x05torn\0" if protocol == "binary" else b"what is this\n"
-    wrong = encode(protocol, Sample(1, 1, (0.5,), (1.0,)))
-    feed(core, [sample(0)], protocol)
-    core.step(ReceivedBytes(bad + wrong + encode(protocol, CommandFrame((0.5, math.nan))), S))
-    assert len(feed(core, [sample(1)], protocol)) == 1
-    counters = core.counters()
-    assert counters["truncated" if protocol == "binary" else "garbage"] == 1
-    assert counters["wrong_fan_count"] == 1
-    assert counters["wrong_type"] == 1
-    assert counters["samples"] == 2
-
-
 def test_a_frame_of_a_later_protocol_is_skipped_and_is_no_fault() -> None:
     core = make_core()
     payload = b"\x01\x09later"
@@ -332,12 +240,6 @@ def device_counts(core: SerialCore) -> dict[str, int]:
     return {name: count for name, count in core.counters().items() if name in names and count}
 
 
-def test_a_device_without_counters_has_none() -> None:
-    core = make_core()
-    feed_sequences(core, range(200))
-    assert not {f"device_{name}" for name in DEVICE_COUNTERS} & core.counters().keys()
-
-
 def test_what_the_device_counts_is_counted_since_the_line_was_opened() -> None:
     core = make_core()
     feed(core, [DeviceCounters(70, (9, 65_530, 4))])
@@ -347,13 +249,6 @@ def test_what_the_device_counts_is_counted_since_the_line_was_opened() -> None:
     assert device_counts(core) == {"device_frames": 1, "device_bad_length": 8}
     assert core.counters()["samples"] == 2
     assert core.problem() == ""
-
-
-def test_counters_of_one_read_are_added_up() -> None:
-    core = make_core()
-    frames = (DeviceCounters(uptime_s, (0, 0, uptime_s)) for uptime_s in range(5))
-    core.step(ReceivedBytes(b"".join(encode("binary", frame) for frame in frames) + encode("binary", sample(1)), S))
-    assert device_counts(core) == {"device_bad_crc": 4}
 
 
 def test_a_device_that_restarts_counts_from_0_again() -> None:
@@ -483,14 +378,6 @@ def test_samples_outside_the_limits_of_the_tray_are_one_problem_whatever_their_v
     assert problems == {"", expected}
 
 
-def test_speeds_that_are_all_beyond_the_limit_are_a_problem_that_names_it() -> None:
-    core = make_core(speed_max=40, speed_unit="rpm")
-    assert len(feed(core, map(sample, range(30)))) == 30
-    assert core.counters()["absurd_samples"] == 30
-    fault = "absurd_speed: speed 100 is beyond speed_max = 40 rpm"
-    assert core.problem() == f"/dev/ttyTEST: no valid sample ({fault}); check speed_max and speed_unit of the [[tray]]"
-
-
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_noise_on_the_line_is_one_problem_whatever_it_looks_like(protocol: Protocol) -> None:
     chance, core = random.Random(3), make_core(protocol=protocol)
@@ -515,23 +402,6 @@ def test_mostly_faulty_frames_are_a_problem_although_some_are_valid() -> None:
     assert core.problem().endswith("check the wiring, and baud = 115200, protocol = 'binary', fans = 2 of the [[tray]]")
     feed(core, map(sample, range(30, 100)))
     assert core.problem() == ""
-
-
-def context(port: str) -> Context:
-    tray = TrayConfig(name="bench", fans=2, source=SerialConfig(port=port))
-    return Context("site", (tray,), AcquisitionConfig(), Path(), Path("runs"), started_t_ns=0)
-
-
-def test_a_tray_without_a_port_is_refused_in_one_line() -> None:
-    with pytest.raises(StageError, match=r'^\[\[tray\]\] bench: port is missing; add for example port = "/dev/tty'):
-        STAGE.build(context(""))
-
-
-def test_the_stage_is_built_with_the_serial_line_as_its_source() -> None:
-    parts = STAGE.build(context("/dev/ttyTEST"))
-    assert isinstance(parts.core, AcquisitionCore)
-    assert isinstance(parts.source, SampleBlocks) and isinstance(parts.source.source, SerialSource)
-    assert STAGES[STAGE.name].scope == "tray"
 
 
 class SetClock:

@@ -186,14 +186,6 @@ def test_a_thousand_mutated_streams_are_counted_to_the_last_frame(protocol: Prot
         check_one_stream(protocol, pool, chance)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_twenty_thousand_mutated_streams_are_counted_to_the_last_frame(protocol: Protocol) -> None:
-    chance, pool = random.Random(21), make_pool(protocol)
-    for _ in range(10_000):
-        check_one_stream(protocol, pool, chance)
-
-
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @given(pieces=st.lists(st.one_of(st.binary(max_size=64), st.none()), max_size=20))
 def test_no_bytes_and_no_disconnection_make_the_core_raise(protocol: Protocol, pieces: list[bytes | None]) -> None:
@@ -221,18 +213,3 @@ def test_no_numbers_in_a_text_line_make_the_core_raise(numbers: list[str]) -> No
     core = make_core("text")
     for raw in core.step(ReceivedBytes(f"\nS {' '.join(numbers)}\n".encode(), 0)):
         assert raw.speed_rad_s.shape == raw.command.shape == (1, FANS)
-
-
-def test_the_streams_hold_untouched_frames_and_every_kind_of_outcome() -> None:
-    for protocol in PROTOCOLS:
-        chance, pool = random.Random(22), make_pool(protocol)
-        kinds: Counter[str] = Counter()
-        untouched = 0
-        for _ in range(2000):
-            stream, good = make_stream(protocol, pool, chance)
-            kinds += outcomes_by_kind(protocol, stream)
-            untouched += len(good)
-        assert untouched > 3000
-        # A wrong version and an unknown type need a true checksum: test_wire.py has them.
-        absent = {"wrong_version", "unknown_type", "bad_number" if protocol == "binary" else "wrong_crc"}
-        assert set(kinds) == {"samples", *(kind.value for kind in FaultKind)} - absent

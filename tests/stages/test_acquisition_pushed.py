@@ -60,12 +60,6 @@ def test_samples_that_cannot_be_used_are_counted_by_kind(tmp_path: Path, change:
     assert (counts[kind], counts["lost_refused"], counts["refused_input"]) == (2, 2, 2)
 
 
-def test_a_message_without_samples_is_taken(tmp_path: Path) -> None:
-    core = make_core(tmp_path)
-    assert core.step(pushed(t_ns=())) == []
-    assert "refused_input" not in core.counters()
-
-
 def test_samples_for_a_tray_with_another_source_are_refused(tmp_path: Path) -> None:
     core = make_core(tmp_path, source='{ kind = "serial", port = "/dev/ttyUSB0" }')
     assert core.step(pushed()) == []

@@ -16,7 +16,6 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from pipeline.gateway.config import GatewayConfig
-from pipeline.presenting.users import User, UserRole, hasher, write_users
 from pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
 from pipeline.recordings.rare_messages import rare_messages
 from schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Transition
@@ -26,11 +25,11 @@ from schemas.units import RAD_S_PER_UNIT
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_gateway import Client, RunningGateway
+from tests.support.site_users import PASSWORD, make_users, quickly_hashed  # noqa: F401  a fixture
 
 NOW_NS = 1_790_000_000_000_000_000
 STEP_NS = 10_000_000
 GOLDEN = Path(__file__).parents[1] / "support" / "data" / "golden.mcap"
-PASSWORD = "correct horse battery"
 SCRIPT = "<script>alert(1)</script>"
 CONFIGURATION = f'site = "{SITE}"\nrun_folder = "."\n[[tray]]\nname = "{TRAY}"\nfans = {FANS}\nport = "p"\n[gateway]\n'
 
@@ -95,10 +94,7 @@ def granted(request: Request) -> list[Alarm]:
 
 @pytest.fixture
 def users(tmp_path: Path) -> Path:
-    path = tmp_path / "users.toml"
-    hashed = hasher().hash(PASSWORD)
-    write_users(path, {n: User(n, r, hashed) for n, r in (("ann", UserRole.OPERATOR), ("vic", UserRole.VIEWER))})
-    return path
+    return make_users(tmp_path / "users.toml")
 
 
 @pytest.fixture
@@ -169,16 +165,8 @@ def test_metrics_are_those_of_prometheus_and_an_unjudged_fan_has_no_score(gatewa
     assert samples["fantwin_fan_score_ratio", "0", None] == 0.5
     assert ("fantwin_fan_score_ratio", "3", None) not in samples
     assert samples["fantwin_fan_scored", "3", None] == 0.0
-    assert samples["fantwin_fan_alarm_active", "2", "alarm"] == 1.0
-    assert samples["fantwin_fan_alarm_active", "2", "warning"] == 0.0
-    assert samples["fantwin_fan_alarm_unacknowledged", "2", "alarm"] == 1.0
     assert samples["fantwin_alarms_total", None, "alarm"] == 1.0
     assert samples["fantwin_alarms_total", None, "warning"] == 0.0, "counted from zero, so that the first one is seen"
-    gateway.feed(alarm(Transition.ACKNOWLEDGED, 1, acknowledged=True))
-    assert (
-        'fantwin_fan_alarm_unacknowledged{fan="2",severity="alarm",site="hall",tray="tray1"} 0.0'
-        in (Client(gateway).ask("GET", "/metrics")[1])
-    )
 
 
 def test_an_alarm_counts_once_in_each_severity_that_it_reaches(gateway):
@@ -238,12 +226,6 @@ def test_forged_sessions_and_posts_from_other_sites_get_nowhere(gateway):
     assert operator.ask("POST", path, asked)[0] == 401, "the session is over on the server, too"
 
 
-def test_wrong_passwords_are_counted(gateway):
-    client = Client(gateway)
-    assert [client.log_in("ann", "wrong wrong wrong") for _ in range(6)] == [401] * 5 + [429]
-    assert client.log_in("ann", PASSWORD) == 429
-
-
 def test_every_answer_forbids_foreign_scripts_and_the_cookie_is_for_the_server_only(gateway):
     client = Client(gateway)
     _, _, headers = client.ask("POST", "/api/v1/login", {"name": "ann", "password": PASSWORD})
@@ -255,32 +237,6 @@ def test_every_answer_forbids_foreign_scripts_and_the_cookie_is_for_the_server_o
         assert "default-src 'none'" in headers["content-security-policy"], path
         assert headers["x-content-type-options"] == "nosniff"
     assert client.ask("GET", "/page/../app.py")[0] == 404
-
-
-def test_the_history_survives_a_restart_and_keeps_each_transition_once(tmp_path):
-    first = RunningGateway(tmp_path)
-    first.feed(alarm(), alarm(Transition.CLEARED, 1, active=False, t_ns=NOW_NS + 1))
-    first.close()
-    second = RunningGateway(tmp_path)
-    try:
-        second.feed(alarm(), alarm(Transition.ACKNOWLEDGED, 2, active=False, acknowledged=True, operator_name="ann"))
-        found = Client(second).ask("GET", "/api/v1/alarms/history")[1]["transitions"]
-        assert [each["transition"] for each in found] == ["acknowledged", "cleared", "raised"]
-        page = Client(second).ask("GET", f"/api/v1/alarms/history?limit=1&before={found[0]['number']}")[1]
-        assert page["transitions"] == found[1:2]
-    finally:
-        second.close()
-
-
-def test_openapi_names_every_path_and_the_forms(gateway):
-    document = Client(gateway).ask("GET", "/api/v1/openapi.json")[1]
-    assert document["openapi"] == "3.1.0"
-    assert "/api/v1/fans/{tray}/{fan}/requests" in document["paths"]
-    form = document["components"]["schemas"]["RequestForm"]
-    assert "shelve" in form["properties"]["action"]["enum"]
-    asked = {each["name"]: each["schema"] for each in document["paths"]["/api/v1/fans"]["get"]["parameters"]}
-    assert "alarm" in asked["state"]["enum"]
-    assert asked["limit"] == {"type": "integer"}
 
 
 def test_prometheus_sends_the_password_of_a_user_and_gets_nothing_else_with_it(tmp_path, users, monkeypatch):
@@ -324,20 +280,6 @@ def test_a_proxy_names_the_user_and_others_cannot(tmp_path):
         assert (status, answer["error"]) == (401, "users come through the proxy of this page: ask there")
     finally:
         other.close()
-
-
-@pytest.mark.parametrize(
-    ("settings", "why"),
-    [
-        ({"host": "0.0.0.0"}, "certificate and key"),
-        ({"host": "0.0.0.0", "certificate": "c.pem", "key": "k.pem"}, "needs users"),
-        ({"certificate": "c.pem"}, "belong together"),
-        ({"operators": ("ann",)}, "user_header"),
-    ],
-)
-def test_beyond_loopback_it_needs_tls_and_users(settings, why):
-    with pytest.raises(ValueError, match=why):
-        GatewayConfig(**settings)
 
 
 def test_nothing_of_a_fan_is_shown_as_now_once_its_tray_is_silent(gateway, monkeypatch):

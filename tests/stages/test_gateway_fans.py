@@ -13,7 +13,6 @@ import pytest
 
 from pipeline.presenting.fan_groups import FanGroup
 from schemas.enums import FanState, Transition
-from schemas.messages import Diagnosis
 from scoring.alarms.words_now import RETURNING
 from tests.stages.test_gateway import NOW_NS, alarm, score
 from tests.support.running_gateway import Client, RunningGateway
@@ -89,11 +88,6 @@ def test_an_active_alarm_keeps_its_fan_in_alarm_whatever_its_newest_sample_says(
     assert (shown.group, shown.counts["in_alarm"], shown.counts["silenced"]) == (FanGroup.NORMAL, 0, 0)
 
 
-def test_a_message_that_comes_late_does_not_end_an_alarm(gateway):
-    gateway.feed(score(state=FanState.STOPPED), alarm(sequence=2), alarm(Transition.CLEARED, 1, active=False))
-    assert Shown(gateway).in_alarm == [FAULTY], "the newest message counts"
-
-
 def test_a_state_or_a_tray_that_is_none_is_refused_with_those_that_are(gateway):
     gateway.feed(score())
     client = Client(gateway)
@@ -107,14 +101,3 @@ def test_a_state_or_a_tray_that_is_none_is_refused_with_those_that_are(gateway):
     } in asked
     found = {group: len(client.ask("GET", f"/api/v1/fans?state={group}")[1]["fans"]) for group in FanGroup}
     assert found == {group: {"normal": 3, "not_judged": 1}.get(group, 0) for group in FanGroup}
-
-
-def test_all_causes_are_named_that_are_about_as_probable_as_the_first(gateway):
-    shares = {"blocked": 0.4, "no_power": 0.4, "no_tacho": 0.2}
-    gateway.feed(
-        score(state=FanState.ALARM), alarm(causes=tuple(Diagnosis(cause=c, probability=p) for c, p in shares.items()))
-    )
-    shown = Shown(gateway).alarm
-    assert (shown["cause"], shown["cause_with_share"]) == ("blocked or no power", "blocked or no power, 40 % each")
-    assert (shown["probability"], shown["other_causes"][0]["cause"]) == (0.4, "no signal of the tacho")
-    assert "fuse" in shown["advice"] and "rotor" in shown["advice"]

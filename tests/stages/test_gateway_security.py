@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
 import socket
-import sqlite3
 import ssl
 import threading
 from collections.abc import Iterator
@@ -15,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from argon2 import PasswordHasher
 from cryptography.hazmat.primitives.serialization import (
     BestAvailableEncryption,
     Encoding,
@@ -29,37 +26,22 @@ from pipeline.gateway import server
 from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.shared_answer import SharedAnswer
 from pipeline.presenting import login_failures
-from pipeline.presenting.users import User, UserRole, write_users
+from pipeline.presenting.users import UserRole
 from pipeline.runtime.stage import StageError
-from stages import gateway as stage
-from tests.stages.test_gateway import PASSWORD, SCRIPT, alarm, granted, score
+from tests.stages.test_gateway import SCRIPT, alarm, granted, score
 from tests.support.running_chain import eventually
 from tests.support.running_core import TRAY
 from tests.support.running_gateway import Client, RunningGateway
 from tests.support.site_certificates import SiteCertificates
+from tests.support.site_users import PASSWORD, make_users, quickly_hashed  # noqa: F401  a fixture
 
 ACT, ASKED = f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"}
 OTHER_PASSWORD = "another horse battery"
 
 
-def put_users(path: Path, password: str = PASSWORD, **roles: UserRole) -> Path:
-    hashed = quick_hasher().hash(password)
-    write_users(path, {name: User(name, role, hashed) for name, role in roles.items()})
-    return path
-
-
-@pytest.fixture(autouse=True)
-def _quickly_hashed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.presenting.users.hasher", quick_hasher)
-
-
-def quick_hasher() -> PasswordHasher:
-    return PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
-
-
 @pytest.fixture
 def users(tmp_path: Path) -> Path:
-    return put_users(tmp_path / "users.toml", ann=UserRole.OPERATOR, vic=UserRole.VIEWER)
+    return make_users(tmp_path / "users.toml", ann=UserRole.OPERATOR, vic=UserRole.VIEWER)
 
 
 @pytest.fixture
@@ -157,7 +139,7 @@ def test_a_new_password_and_another_login_end_the_session_of_before(gateway, use
     assert again.log_in("ann", PASSWORD) == 200
     assert first.ask("POST", ACT, ASKED)[0] == 401, "this browser has logged in again"
     assert again.ask("POST", ACT, ASKED)[0] == 200
-    put_users(users, OTHER_PASSWORD, ann=UserRole.OPERATOR)
+    make_users(users, OTHER_PASSWORD, ann=UserRole.OPERATOR)
     assert again.ask("POST", ACT, ASKED)[0] == 401
     assert len(gateway.sent) == 1
 
@@ -199,7 +181,7 @@ def test_live_events_end_for_who_may_not_read_any_more(gateway, users, monkeypat
     assert events(gateway).status == 401
     stream = events(gateway, Cookie=logged_in(gateway, "vic").cookie)
     assert stream.readline() == b"event: fleet\n"
-    put_users(users, ann=UserRole.OPERATOR)
+    make_users(users, ann=UserRole.OPERATOR)
     while stream.readline():
         pass
     assert stream.isclosed()
@@ -350,26 +332,6 @@ def test_a_comment_is_one_line_that_shows_what_it_says(gateway):
     assert gateway.sent[0].comment == f"é 扇 \U0001f600 {SCRIPT} [2J  fan 3:  txet  "
 
 
-def test_a_history_that_is_damaged_is_a_problem_and_the_page_goes_on(tmp_path, users):
-    first = RunningGateway(tmp_path)
-    first.feed(*(alarm(sequence=number) for number in range(300)))
-    first.close()
-    path = tmp_path / stage.HISTORY
-    sqlite3.connect(path).execute("PRAGMA wal_checkpoint(TRUNCATE)").connection.close()
-    with path.open("r+b") as file:
-        file.seek(4096)
-        file.write(os.urandom(path.stat().st_size - 4096))
-    second = RunningGateway(tmp_path)
-    try:
-        client = Client(second)
-        assert client.ask("GET", "/api/v1/alarms/history")[0] == 503
-        second.feed(score(), alarm(sequence=1000))
-        assert client.ask("GET", "/api/v1/alarms")[1]["alarms"], "what is now needs no history"
-        eventually(lambda: "move it away" in second.problem(), "the problem is named")
-    finally:
-        second.close()
-
-
 def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_named(tmp_path, users):
     certificates = SiteCertificates(tmp_path)
     certificates.issue("page", lifetime=timedelta(seconds=-1))
@@ -400,16 +362,6 @@ def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_na
         server.check_files(**files)
 
 
-def test_a_key_that_everybody_reads_is_named(tmp_path):
-    certificates = SiteCertificates(tmp_path)
-    certificates.issue("page")
-    (tmp_path / "page.key").chmod(0o640)
-    server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
-    (tmp_path / "page.key").chmod(0o644)
-    with pytest.raises(StageError, match="everybody may read it"):
-        server.check_files(tmp_path / "page.pem", tmp_path / "page.key")
-
-
 def encrypted(key: Path) -> None:
     private = load_pem_private_key(key.read_bytes(), None)
     key.write_bytes(private.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret")))
@@ -424,6 +376,7 @@ def encrypted(key: Path) -> None:
         ("key", Path.unlink, "No such file"),
         ("certificate", lambda path: path.write_text("c", encoding="utf-8"), "this is no certificate in PEM"),
         ("certificate", Path.unlink, "No such file"),
+        ("key", lambda path: path.chmod(0o644), "everybody may read it"),
     ],
 )
 def test_what_is_wrong_with_the_files_of_tls_is_said_and_no_password_is_asked_for(tmp_path, file, break_it, why):
@@ -431,10 +384,16 @@ def test_what_is_wrong_with_the_files_of_tls_is_said_and_no_password_is_asked_fo
     for name in ("page", "other"):
         certificates.issue(name)
     files = {"certificate": tmp_path / "page.pem", "key": tmp_path / "page.key"}
-    server.check_certificate(**files)
+    files["key"].chmod(0o640)
+
+    def check() -> None:
+        server.check_files(**files)
+        server.check_certificate(**files)
+
+    check()
     break_it(files[file])
     with pytest.raises(StageError, match=rf"gateway\.{file} = .*: .*{why}"):
-        server.check_certificate(**files)
+        check()
 
 
 def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question(

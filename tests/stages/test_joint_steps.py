@@ -25,7 +25,7 @@ from schemas.units import NS_PER_S
 from simulation.faults import Fault
 from simulation.tray import SimulatedTray, TraySettings
 
-EPOCH_NS, SECONDS, BLOCK = 1_700_000_000 * NS_PER_S, 40.0, 5
+EPOCH_NS, SECONDS, BLOCK = 1_700_000_000 * NS_PER_S, 40.0, 25
 TWIN = Path(__file__).parents[2] / "pipeline" / "demo" / "twin.onnx"
 FAULTS: tuple[tuple[Fault, ...], ...] = (
     (),

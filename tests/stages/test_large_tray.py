@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from pipeline.cli.recordings.import_table import write_table
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config, ConfigError
 from pipeline.devices.measured_table import Table, read_table
@@ -27,8 +26,6 @@ from pipeline.devices.serial_config import MOST_FANS_ON_LINE
 from pipeline.devices.source_kinds import SOURCE_KINDS, SourceKind
 from pipeline.devices.table_device import TableDevice
 from pipeline.errors import UserError
-from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.replay.offline.rescoring import rescore
 from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
 from schemas import wire
@@ -163,21 +160,6 @@ def test_all_fans_of_a_large_tray_are_judged_and_its_messages_stay_within_their_
     assert judged.shape[1] == FANS and judged[200:].all()
     raised = [alarm for alarm in found if isinstance(alarm, Alarm) and alarm.transition == Transition.RAISED]
     assert [alarm.fan for alarm in raised] == [FAULTY]
-
-
-def test_a_large_table_is_imported_and_scored_offline(hall, tmp_path):
-    path = tmp_path / "hall.mcap"
-    write_table(table_of(hall / "hall.csv", FANS), path, "hall")
-    settings = (
-        "twin_integrator.warm_up_s=0.5",
-        "scorer.baseline_s=0.2",
-        "scorer.alarm_sigmas=5",
-        "tray.0.command_max=100",
-    )
-    with open_replay_input([path], None, settings, hall / "twin.onnx") as replay_input:
-        (tray,) = rescore(replay_input, tmp_path / "out.mcap", verify=False)
-    assert tray.samples > 0.9 * SAMPLES and tray.scored > 0.8 * SAMPLES
-    assert {alarm.fan for alarm in tray.alarms if alarm.transition == Transition.RAISED} == {FAULTY}
 
 
 def test_a_tray_has_at_most_the_fans_that_its_source_carries():

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from pipeline.learning.versions import Check
 from schemas.enums import Action, FanState
-from schemas.messages import Message, Request
+from schemas.messages import Request
 from schemas.units import NS_PER_S
 from tests.pipeline.learning.test_versions import version
-from tests.support.one_learner import START_NS, Learner, raw
+from tests.support.one_learner import START_NS, Learner
 
 
 def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path: Path) -> None:
@@ -69,15 +66,6 @@ def test_the_notes_say_after_how_much_more_healthy_running_the_next_version_is_d
     assert announced_s(learner) < 200.0
     learner.run(200)
     assert len(learner.learning.starts) == started + 1
-
-
-def test_while_a_version_is_offered_no_other_one_is_announced(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    learner.run(600)
-    learner.learning.outcome = "offered"
-    learner.run(1500)
-    assert learner.versions.read().waiting
-    assert "next version" not in "; ".join(learner.core.notes())
 
 
 def test_what_failed_is_said_and_tried_again_with_more_history(tmp_path: Path) -> None:
@@ -173,15 +161,6 @@ def test_alarms_of_a_twin_that_was_learned_from_a_fault_do_not_keep_it_from_bein
     assert not learner.versions.read().is_tainted
 
 
-def test_samples_of_another_number_of_fans_are_left_alone(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    one = raw(0, moves=True)
-    two = replace(one, fans=2, command=np.tile(one.command, 2), speed_rad_s=np.tile(one.speed_rad_s, 2))
-    results: Sequence[Message] = learner.core.step(two)
-    assert results == []
-    assert learner.history.seconds == 0.0
-
-
 def test_while_the_list_of_versions_cannot_be_read_nothing_is_learned_and_the_reason_is_said(tmp_path: Path) -> None:
     learner = Learner(tmp_path)
     learner.run(600)
@@ -212,17 +191,6 @@ def test_learning_is_tried_again_when_the_history_grows_no_more(
     assert learner.core.problem() == "learning: a failure"
     learner.learning.fails_with = ""
     learner.run(2000)
-    assert learner.core.problem() == ""
-
-
-def test_a_failure_is_over_when_anybody_has_made_a_version(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    learner.run(2000)
-    learner.learning.fails_with = "a failure"
-    while not learner.core.problem():
-        learner.run(10)
-    learner.add_version("tray1-9")  # as `fantwin learn` does
-    learner.run(10)
     assert learner.core.problem() == ""
 
 
@@ -264,19 +232,6 @@ def test_a_version_is_due_at_the_latest_when_as_much_was_added_as_is_kept(
     learner.run(900)
     assert len(learner.learning.starts) == before
     learner.run(400)
-    assert len(learner.learning.starts) == before + 1
-
-
-def test_after_a_failure_learning_waits_for_a_quarter_of_the_history(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    learner.run(2000)
-    learner.learning.fails_with = "a failure"
-    while not learner.core.problem():
-        learner.run(10)
-    before, failed_s = len(learner.learning.starts), learner.history.seconds
-    learner.run(round(0.24 * failed_s))
-    assert len(learner.learning.starts) == before
-    learner.run(round(0.03 * failed_s) + 20)
     assert len(learner.learning.starts) == before + 1
 
 
@@ -325,13 +280,3 @@ def test_a_clock_that_was_set_back_is_said(tmp_path: Path) -> None:
     learner.now_s += 100_000
     learner.run(100)
     assert learner.core.problem() == ""
-
-
-def test_the_history_is_flushed_every_ten_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = Learner(tmp_path)
-    learner.run(100)
-    flushed: list[int] = []
-    monkeypatch.setattr(learner.history, "flush", lambda: flushed.append(1))
-    for second in range(1, 101):
-        learner.core.tick(START_NS + (learner.now_s + second) * NS_PER_S)
-    assert len(flushed) == 10

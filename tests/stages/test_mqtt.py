@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -26,8 +24,8 @@ from stages.mqtt import build, check
 from tests.stages.test_gateway import alarm, granted, score
 from tests.support.mosquitto import Listener, Mosquitto, needs_mosquitto, retained_by
 from tests.support.mqtt_broker import free_port
-from tests.support.running_chain import RunningCommand, eventually
-from tests.support.running_core import FANS, SITE, TRAY
+from tests.support.running_chain import eventually
+from tests.support.running_core import SITE, TRAY
 from tests.support.running_mqtt import ROOT, RunningMqtt
 
 pytestmark = needs_mosquitto
@@ -95,37 +93,6 @@ def test_states_alarms_and_status_are_retained(tmp_path, broker, listener):
     assert retained_by(broker.port)[f"{ROOT}/status"] == "offline"
 
 
-def test_a_fan_that_its_command_stops_stays_in_alarm_in_its_state_and_in_the_summary(tmp_path, broker, listener):
-    stage = RunningMqtt(tmp_path, broker.port)
-    try:
-        stage.feed(score(state=FanState.ALARM), alarm(), score(1.0, state=FanState.STOPPED))
-        stopped = "alarm, now stopped by its command"
-        eventually(lambda: state_of(listener).get("state") == stopped, "the state is there")
-        assert state_of(listener)["in_alarm"] is True
-        summary = eventually(lambda: json.loads(listener.last(f"{ROOT}/summary") or "null"), "the summary is there")
-        assert summary == {"fans": FANS, "in_alarm": 1, "suspect": 0, "not_judged": 1, "silenced": 0}
-    finally:
-        stage.close()
-
-
-def test_what_has_not_changed_is_not_published_again(tmp_path, broker, listener):
-    stage = RunningMqtt(tmp_path, broker.port, period_s=5.0)
-    try:
-        stage.feed(score())
-        eventually(lambda: len(listener.of(f"{FAN}/state")) == 1, "it is published")
-        stage.feed(score(1.0), score(2.0), score(3.0))
-        before = len(listener.of(f"{ROOT}/stages"))
-        time.sleep(0.5)  # 25 s of the stage's time
-        assert len(listener.of(f"{FAN}/state")) == 1
-        assert len(listener.of(f"{ROOT}/stages")) == before
-        stage.feed(score(4.0, state=FanState.SUSPECT))
-        eventually(lambda: state_of(listener)["state"] == "suspect", "a change is published")
-        assert len(listener.of(f"{FAN}/state")) == 2
-        assert len(listener.of(f"{ROOT}/{TRAY}/0/state")) == 1
-    finally:
-        stage.close()
-
-
 def test_a_broker_that_was_away_gets_all_that_is_retained_and_all_transitions_in_order(tmp_path, broker):
     stage = RunningMqtt(tmp_path, broker.port)
     try:
@@ -157,32 +124,6 @@ def test_a_broker_that_was_away_gets_all_that_is_retained_and_all_transitions_in
         stage.close()
 
 
-def test_transitions_wait_over_a_restart_of_the_stage_and_the_oldest_of_too_many_are_counted(tmp_path, broker):
-    port = free_port()
-    first = RunningMqtt(tmp_path, port, most_waiting=3)
-    for number in range(5):
-        first.feed(alarm(Transition.SEVERITY, number))
-    assert first.counters()["lost_transitions"] == 2
-    eventually(lambda: "the oldest are lost" in first.problem(), "it says so")
-    first.close()
-    listener = Listener(broker.port)
-    second = RunningMqtt(tmp_path, broker.port, most_waiting=3)
-    try:
-        topic = f"{FAN}/alarm/transitions"
-        eventually(lambda: len(listener.of(topic)) == 3, "what waited has come")
-        second.feed(*(alarm(Transition.SEVERITY, number) for number in range(5)))  # the bus sends them again
-        second.feed(alarm(Transition.CLEARED, 5, active=False))
-        eventually(lambda: len(listener.of(topic)) == 4, "all that wait have come")
-        assert [json.loads(text)["number"] for text in listener.of(topic)] == [3, 4, 5, 6]
-        eventually(lambda: second.counters()["waiting_transitions"] == 0, "they are acknowledged")
-    finally:
-        second.close()
-        listener.close()
-    third = RunningMqtt(tmp_path, broker.port)
-    assert third.counters()["waiting_transitions"] == 0, "nothing is sent twice"
-    third.close()
-
-
 def test_a_broker_that_hangs_holds_nobody_up_and_is_named(tmp_path, broker, monkeypatch):
     monkeypatch.setattr("pipeline.broker.link.SILENT_AFTER_S", 0.2)
     stage = RunningMqtt(tmp_path, broker.port)
@@ -201,23 +142,6 @@ def test_a_broker_that_hangs_holds_nobody_up_and_is_named(tmp_path, broker, monk
     began_s = time.monotonic()
     stage.close()
     assert time.monotonic() - began_s < 10
-
-
-@pytest.mark.slow
-def test_the_last_will_says_that_a_killed_stage_is_gone(tmp_path, broker, listener):
-    config = tmp_path / "site.toml"
-    config.write_text(
-        f'site = "{SITE}"\nrun_folder = "run"\n[bus]\nendpoint = "tcp/127.0.0.1:{free_port()}"\n'
-        f'[[tray]]\nname = "{TRAY}"\nfans = 4\n[mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n'
-    )
-    running = RunningCommand(["run", "mqtt", "-c", config])
-    try:
-        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
-        eventually(lambda: state_of(listener).get("state") == "silent", "a tray that sends nothing is silent")
-        os.kill(running.process.pid, signal.SIGKILL)
-        eventually(lambda: listener.last(f"{ROOT}/status") == "offline", "the broker says that it is gone")
-    finally:
-        running.kill()
 
 
 def test_the_last_will_of_a_connection_that_is_dead_comes_before_the_next_one_says_online(tmp_path, broker, listener):

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import os
-import re
 import socket
 import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,7 +20,7 @@ from schemas.enums import Severity, Transition
 from schemas.messages import Alarm
 from schemas.units import NS_PER_S
 from stages.notifier import OUTBOX, STOPPED_WITHIN_S, NotifierCore
-from tests.support.message_receivers import ALERTMANAGER, HttpReceiver, MailServer, RunningAlertmanager, free_port
+from tests.support.message_receivers import ALERTMANAGER, HttpReceiver, MailServer, RunningAlertmanager
 from tests.support.notified_alarms import START_NS, alarm, cleared, notifier_core, secret
 from tests.support.running_chain import eventually
 
@@ -86,20 +81,6 @@ def mail_target(folder: Path, mail: MailServer, **more: Any) -> dict[str, Any]:
     return {"name": "mail", "url_file": secret(folder, "mail", mail.url), "pause_s": 0, "repeat_s": 0, **more}
 
 
-def test_a_mail_and_a_webhook_say_the_same(tmp_path, mail, started):
-    receiver = HttpReceiver()
-    hook = {"name": "hook", "url_file": secret(tmp_path, "hook", f"json://127.0.0.1:{receiver.port}/alarms")}
-    notifier = started(tmp_path, [mail_target(tmp_path, mail), hook])
-    notifier.hear(alarm(severity=Severity.ALARM))
-    eventually(lambda: mail.mails and receiver.received, "both have arrived")
-    (subject, body), (posted,) = mail.mails[0], receiver.received
-    assert subject == posted["title"] == "ALARM, fan 2 of tray1 (hall)"
-    assert posted["type"] == "failure"
-    assert body.split() == posted["message"].split()
-    assert "Cause: more drag (airflow blocked, filter clogged), 80 %" in posted["message"]
-    receiver.stop()
-
-
 def test_a_mail_server_that_was_down_gets_all_once_and_in_order(tmp_path, mail, started):
     mail.stop()
     notifier = started(tmp_path, [mail_target(tmp_path, mail)])
@@ -119,14 +100,6 @@ def test_a_mail_server_that_was_down_gets_all_once_and_in_order(tmp_path, mail, 
     assert MAY_BE_REPEATED not in str(mail.mails)
 
 
-def test_one_target_that_is_away_holds_up_no_other(tmp_path, mail, started):
-    away = {"name": "away", "url_file": secret(tmp_path, "away", f"json://127.0.0.1:{free_port()}/")}
-    notifier = started(tmp_path, [away, mail_target(tmp_path, mail)])
-    notifier.hear(alarm())
-    eventually(lambda: mail.mails, "the mail arrives")
-    assert "target away" in eventually(notifier.core.problem, "the other is reported")
-
-
 def test_a_target_that_hangs_holds_up_neither_the_core_nor_its_end(tmp_path, mail, started):
     with socket.create_server(("127.0.0.1", 0)) as hanging:
         url = f"mailto://127.0.0.1:{hanging.getsockname()[1]}/?from=f@hall.example&to=a@hall.example"
@@ -143,100 +116,6 @@ def test_a_target_that_hangs_holds_up_neither_the_core_nor_its_end(tmp_path, mai
     left = file.execute("SELECT under_way FROM message WHERE target = 'hangs' ORDER BY number").fetchall()
     file.close()
     assert left == [(1,), (0,)], "it is sent again after a restart"
-
-
-def test_500_fans_at_once_are_one_mail(tmp_path, mail, started):
-    notifier = started(tmp_path, [mail_target(tmp_path, mail)], fans=500)
-    notifier.hear(*(alarm(fan=fan) for fan in range(500)))
-    notifier.wait(60)
-    eventually(lambda: mail.mails and notifier.core.counters()["messages_waiting"] == 0, "it arrives")
-    assert mail.subjects() == ["500 alarms in 1 tray (hall): 500 WARNING"]
-
-
-def test_after_a_restart_nothing_is_sent_twice_and_what_waited_is_sent(tmp_path, mail, started):
-    notifier = started(tmp_path, [mail_target(tmp_path, mail)])
-    notifier.hear(alarm(fan=1, sequence=1))
-    eventually(lambda: mail.mails, "the first arrives")
-    mail.stop()
-    notifier.hear(alarm(fan=2, sequence=2))
-    notifier.core.close()
-    notifier.start()
-    notifier.hear(alarm(fan=1, sequence=1), alarm(fan=2, sequence=2), alarm(fan=3, sequence=3))
-    mail.start()
-    eventually(lambda: len(mail.mails) >= 3, "all have arrived")
-    assert mail.subjects() == [f"WARNING, fan {fan} of tray1 (hall)" for fan in (1, 2, 3)]
-
-
-KILLED_NOTIFIER = """
-import sys, time, json
-from pathlib import Path
-from pipeline.notification.config import NotifierConfig
-from tests.support.notified_alarms import notifier_core, alarm, START_NS
-folder = Path(sys.argv[1])
-config = NotifierConfig.model_validate(json.loads(sys.argv[2]))
-core = notifier_core(folder, config)
-now_ns = START_NS
-for second in range(1000):
-    now_ns += 10**9
-    if second >= 11 and second % 6 == 5 and second < 60:
-        fan = second // 6 - 1
-        core.step(alarm(fan=fan, sequence=second))
-    core.tick(now_ns)
-    if second >= 11:
-        time.sleep(0.02)
-print("done", flush=True)
-time.sleep(60)
-"""
-
-
-def test_a_kill_in_the_middle_of_a_delivery_forgets_nothing_and_marks_what_may_be_repeated(tmp_path, mail, started):
-    mail.answered = 2
-    target = mail_target(tmp_path, mail)
-    config = {"target": [{**target, "url_file": str(target["url_file"])}], "digest_above": 20}
-    root = Path(__file__).parents[2]
-    process = subprocess.Popen(
-        [sys.executable, "-c", KILLED_NOTIFIER, str(tmp_path), json.dumps(config)],
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": str(root)},
-    )
-    try:
-        eventually(lambda: len(mail.mails) >= 3, "some have arrived")
-    finally:
-        process.kill()
-        process.wait()
-    file = sqlite3.connect(tmp_path / OUTBOX)
-    before = [title for (title,) in file.execute("SELECT title FROM message ORDER BY number")]
-    under_way = [title for (title,) in file.execute("SELECT title FROM message WHERE under_way")]
-    file.close()
-    assert len(under_way) == 1, "it was killed while the server took a mail"
-    mail.answered = None
-    arrived = mail.subjects()
-    notifier = started(tmp_path, [target], digest_above=20)
-    notifier.hear(*(alarm(fan=second // 6 - 1, sequence=second) for second in range(17, 54, 6)))
-    eventually(lambda: notifier.core.counters()["messages_waiting"] == 0, "all have arrived")
-    subjects = mail.subjects()
-    assert {f"WARNING, fan {fan} of tray1 (hall)" for fan in range(1, 8)} <= set(subjects)
-    assert subjects[len(arrived) :][: len(before)] == before, "in order"
-    repeated = [subject for subject, body in mail.mails if MAY_BE_REPEATED in body]
-    assert repeated == under_way
-    assert all(subjects.count(subject) == 1 for subject in set(subjects) - set(under_way))
-
-
-def test_what_is_too_old_or_too_much_is_lost_counted_and_said(tmp_path, mail, started):
-    mail.stop()
-    notifier = started(tmp_path, [mail_target(tmp_path, mail)], most_messages=3, kept_s=600)
-    for fan in range(5):
-        notifier.hear(alarm(fan=fan))
-    eventually(lambda: notifier.core.counters().get("lost_messages", 0) >= 1, "the oldest are lost")
-    assert "messages were lost" in notifier.core.problem()
-    notifier.wait(700)
-    assert notifier.core.counters()["messages_waiting"] <= 1, "all but one that may be under way are too old"
-    notifier.hear(alarm(fan=6))
-    lost = notifier.core.counters()["lost_messages"]
-    mail.start()
-    eventually(lambda: "WARNING, fan 6 of tray1 (hall)" in mail.subjects(), "the newest arrives")
-    said = [int(number) for _, body in mail.mails for number in re.findall(r"are lost: (\d+)", body)]
-    assert sum(said) == lost, "each is said once"
 
 
 def test_a_mail_whose_answer_does_not_come_is_sent_again_and_says_so(tmp_path, mail, started):

@@ -32,23 +32,30 @@ from cryptography import x509
 from pipeline.opcua.certificate import make_certificate
 from pipeline.opcua.config import OpcuaConfig
 from pipeline.opcua.sessions import LONGEST_LIFETIME_S
-from pipeline.presenting.users import User, UserRole, hasher, write_users
-from pipeline.runtime.stage import Context, StageError
+from pipeline.presenting.users import UserRole
+from pipeline.runtime.stage import Context
 from schemas.enums import Transition
 from schemas.messages import Alarm, Request
-from stages.opcua import STAGE, check
+from stages.opcua import check
 from tests.stages.test_gateway import alarm, score
 from tests.support.running_chain import eventually
 from tests.support.running_core import SITE, TRAY
-from tests.support.running_opcua import OPERATOR, PASSWORD, VIEWER, RunningOpcua
+from tests.support.running_opcua import RunningOpcua
+from tests.support.site_users import OPERATOR, PASSWORD, VIEWER, make_users, quickly_hashed  # noqa: F401  a fixture
 
 ALARM = f"ns=2;s={TRAY}/2/Alarm"
 SUPPRESS = ua.NodeId(ua.ObjectIds.AlarmConditionType_Suppress)
 
+USERS = dict.fromkeys((OPERATOR, "changes", "guessed"), UserRole.OPERATOR)
 
-@pytest.fixture
-def opcua(tmp_path: Path) -> Iterator[RunningOpcua]:
-    running = RunningOpcua(tmp_path / "site", lambda _request: [alarm(Transition.SUPPRESSED, suppressed=True)])
+
+@pytest.fixture(scope="module")
+def opcua(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningOpcua]:
+    """One for all tests that do not end it; who changes a user has one of his own."""
+    suppressed = alarm(Transition.SUPPRESSED, suppressed=True)
+    running = RunningOpcua(tmp_path_factory.mktemp("site"), lambda _request: [suppressed])
+    running.feed(score(), alarm())
+    make_users(running.users, **USERS)
     try:
         yield running
     finally:
@@ -58,7 +65,7 @@ def opcua(tmp_path: Path) -> Iterator[RunningOpcua]:
 async def encrypted(running: RunningOpcua, folder: Path, user: str, password: str = PASSWORD) -> Client:
     """A client that is logged in."""
     certificate, key = folder / "client.der", folder / "client.pem"
-    client = Client(running.url)
+    client = Client(running.url, timeout=60)
     make_certificate(certificate, key, client.application_uri, ("localhost",))
     client.set_user(user)
     client.set_password(password)
@@ -73,35 +80,19 @@ async def status_of_suppress(client: Client) -> str:
     return result.StatusCode.name
 
 
-def test_an_operator_acts_under_the_name_he_has_logged_in_with(opcua, tmp_path):
-    opcua.feed(score(), alarm())
-
-    async def acts() -> str:
-        client = await encrypted(opcua, tmp_path, OPERATOR)
-        try:
-            return await status_of_suppress(client)
-        finally:
-            await client.disconnect()
-
-    assert asyncio.run(acts()) == "Good"
-    (sent,) = opcua.sent
-    assert (sent.operator_name, sent.fan) == (OPERATOR, 2)
-
-
 def test_a_session_ends_with_the_password_that_began_it_and_lasts_as_long_as_what_waits_for_it(opcua, tmp_path):
-    opcua.feed(score(), alarm())
-
     async def session() -> None:
-        client = await encrypted(opcua, tmp_path, OPERATOR)
+        client = await encrypted(opcua, tmp_path, "changes")
         assert client.session_timeout >= LONGEST_LIFETIME_S * 1e3
         assert await status_of_suppress(client) == "Good"
-        hashed = hasher().hash("another horse battery")
-        write_users(opcua.users, {OPERATOR: User(OPERATOR, UserRole.OPERATOR, hashed)})
+        make_users(opcua.users, "another horse battery", changes=UserRole.OPERATOR)
         assert await status_of_suppress(client) == "BadUserAccessDenied"
+        make_users(opcua.users, **USERS)
         await client.disconnect()
 
     asyncio.run(session())
-    assert len(opcua.sent) == 1
+    (sent,) = opcua.sent
+    assert (sent.operator_name, sent.fan) == ("changes", 2), "under the name that has logged in"
 
 
 def test_a_scorer_that_does_not_answer_is_a_timeout_and_others_are_served_meanwhile(tmp_path, monkeypatch):
@@ -151,7 +142,7 @@ def test_only_trusted_clients_connect_encrypted(tmp_path, capfd):
 def test_wrong_passwords_are_counted(opcua, tmp_path):
     async def log_in(password: str) -> bool:
         try:
-            client = await encrypted(opcua, tmp_path, VIEWER, password)
+            client = await encrypted(opcua, tmp_path, "guessed", password)
         except ua.UaStatusCodeError:
             return False
         await client.disconnect()
@@ -162,8 +153,6 @@ def test_wrong_passwords_are_counted(opcua, tmp_path):
 
 
 def test_a_session_cannot_be_guessed_and_nobody_refreshes_the_subscription_of_another(opcua):
-    opcua.feed(alarm())
-
     class Ignores:
         def event_notification(self, event: Any) -> None: ...
 
@@ -274,19 +263,8 @@ def test_the_certificate_that_it_makes_is_one_for_opc_ua(tmp_path):
     assert usage.data_encipherment
 
 
-def test_a_port_that_is_taken_is_said_by_the_check_and_at_the_start(opcua, tmp_path):
+def test_a_port_that_is_taken_is_said_by_the_check(opcua, tmp_path):
     config = OpcuaConfig(port=opcua.port, certificate=Path("no.der"), key=Path("no.pem"))
     context = Context(SITE, (), config, tmp_path, tmp_path, 0)
     problems = check(context)
     assert [each.partition(" = ")[0] for each in problems] == ["opcua.certificate", "opcua.host"]
-    with pytest.raises(StageError, match="choose another one"):
-        STAGE.build(Context(SITE, (), OpcuaConfig(port=opcua.port), tmp_path, tmp_path, 0))
-
-
-@pytest.mark.parametrize(
-    ("settings", "why"),
-    [({"host": "0.0.0.0"}, "needs users"), ({"certificate": "c.pem"}, "belong together")],
-)
-def test_beyond_loopback_it_needs_users(settings, why):
-    with pytest.raises(ValueError, match=why):
-        OpcuaConfig(**settings)

@@ -17,7 +17,8 @@ from tests.support.node_opcua import PACKAGE, VERSION, WHAT, NodeOpcua
 from tests.support.node_packages import node_modules
 from tests.support.running_chain import eventually
 from tests.support.running_core import SITE, TRAY
-from tests.support.running_opcua import OPERATOR, PASSWORD, VIEWER, RunningOpcua
+from tests.support.running_opcua import RunningOpcua
+from tests.support.site_users import OPERATOR, PASSWORD, VIEWER, quickly_hashed  # noqa: F401  a fixture
 
 FAN = f"ns=2;s={TRAY}/2"
 ALARM = f"{FAN}/Alarm"
@@ -184,13 +185,6 @@ def test_an_alarm_comes_is_refreshed_acknowledged_confirmed_and_shelved(opcua, n
     assert values[f"{FAN}/State"][-1]["value"].startswith("alarm")
 
 
-def test_its_own_display_of_alarms_shows_those_of_before_it_came(opcua, new_client):
-    opcua.feed(score(), alarm())
-    client = new_client()
-    client.connect(opcua.url, VIEWER, PASSWORD)
-    eventually(lambda: client("alarms") == [{"condition": ALARM, "retain": True}], "the alarm is listed")
-
-
 def test_who_may_do_what(opcua, new_client, scorer):
     opcua.feed(score(), alarm())
     stranger, viewer = new_client(), new_client()
@@ -207,20 +201,6 @@ def test_who_may_do_what(opcua, new_client, scorer):
         with pytest.raises(RuntimeError, match="BadUserAccessDenied"):
             client("write", node=f"{FAN}/Speed")
     assert scorer.asked == []
-
-
-def test_the_history_holds_each_transition(opcua, new_client):
-    opcua.feed(alarm(), alarm(Transition.CLEARED, 1, active=False, t_ns=NOW_NS + 10**9, message="fan 2: back"))
-    client = new_client()
-    client.connect(opcua.url, encrypted=False)
-    start, end = (NOW_NS - 10**9) // 10**6, (NOW_NS + 10**10) // 10**6
-    found = client("history", node=FAN, start=start, end=end)
-    assert [each[1:] for each in found] == [
-        ["fan 2: 90 rpm below the twin (limit 50)", f"{TRAY}/2"],
-        ["fan 2: back", f"{TRAY}/2"],
-    ]
-    assert client("history", node=f"ns=2;s={TRAY}/0", start=start, end=end) == []
-    assert len(client("history", node=SERVER, start=NOW_NS // 10**6 + 1, end=end)) == 1
 
 
 def test_a_client_that_hangs_holds_nobody_up(opcua, new_client, monkeypatch):

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.config.models import TrayConfig
-from pipeline.recordings.reading import read_metadata
 from pipeline.runtime.stage import Context
 from schemas.codec import encode
 from schemas.envelope import Envelope
@@ -47,16 +46,6 @@ def kept_by(context: Context) -> Mapping[str, bytes]:
     built = recorder.build(context)
     built.core.abort()
     return built.kept
-
-
-def test_each_shard_of_the_recorder_records_its_trays_in_a_file_of_its_own(tmp_path):
-    first, second = context(tmp_path, 1, TRAYS[::2]), context(tmp_path, 2, TRAYS[1::2])
-    cores = [recorder.build(each).core for each in (first, second)]
-    for core, tray in zip(cores, ("a", "b"), strict=True):
-        core.step(snapshot(tray, 0))
-        core.close()
-    found = {path.name: read_metadata(path).trays for path in tmp_path.glob("*.mcap")}
-    assert found == {"1-of-2.recording.mcap": ("a", "c"), "2-of-2.recording.mcap": ("b",)}
 
 
 def test_a_recorder_that_is_restarted_keeps_the_last_snapshots_of_its_recording_for_others(tmp_path):

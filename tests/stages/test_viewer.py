@@ -32,7 +32,6 @@ from schemas.health import Health
 from schemas.messages import Alarm, Diagnosis, Message, ModelCard, Score
 from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
-from scoring.diagnosis.shown_causes import CANNOT_TELL
 from stages.viewer import ViewerConfig, build
 from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
 
@@ -125,63 +124,33 @@ def play(core: Core, scores: Sequence[Score]) -> None:
         core.tick(int(score.t_ns[-1]))
 
 
+REPUBLISHED = {"transition": Transition.REPUBLISHED, "severity": Severity.ALARM}
+
+
 @pytest.mark.parametrize(
     ("more", "level", "text"),
     [
         (
-            {"transition": Transition.RAISED, "statistic": Statistic.BALANCE_DRIFT, "score": 1.73},
+            {"statistic": Statistic.BALANCE_DRIFT, "score": 1.73},
             "WARN",
-            "fan 0: warning raised, torque balance 1.7 x its limit",
-        ),
-        (
-            {"transition": Transition.SEVERITY, "severity": Severity.ALARM, "statistic": Statistic.STANDSTILL},
-            "ERROR",
-            "fan 0: alarm severity, does not turn as commanded",
+            "warning raised, torque balance 1.7 x its",
         ),
         ({"transition": Transition.DIAGNOSED, "causes": CAUSES}, "INFO", "fan 0: probably an external torque 64 %"),
-        (
-            {"transition": Transition.DIAGNOSED, "causes": (Diagnosis(cause=CANNOT_TELL, probability=0.38),)},
-            "INFO",
-            "fan 0: cannot tell 38 %",
-        ),
-        (
-            {"transition": Transition.REPUBLISHED, "severity": Severity.ALARM},
-            "ERROR",
-            "fan 0: alarm goes on, after a restart",
-        ),
-        ({"transition": Transition.CLEARED, "active": False}, "INFO", "fan 0: back to normal"),
+        (REPUBLISHED, "ERROR", "fan 0: alarm goes on, after a restart"),
+        (REPUBLISHED | {"active": False}, "INFO", "fan 0: back to normal, after a restart"),
         ({"transition": Transition(88)}, "INFO", "fan 0: unknown (88)"),
-        (
-            {"transition": Transition.REPUBLISHED, "active": False, "severity": Severity.NONE},
-            "INFO",
-            "fan 0: no alarm, after a restart",
-        ),
-        (
-            {"transition": Transition.REPUBLISHED, "active": False, "severity": Severity.ALARM},
-            "INFO",
-            "fan 0: back to normal, after a restart",
-        ),
         ({"transition": Transition.ACKNOWLEDGED, "operator_name": "ann"}, "INFO", "fan 0: acknowledged by ann"),
-        (
-            {"transition": Transition.SHELVED, "operator_name": "ann", "shelved_until_t_ns": 60_000_000_000},
-            "INFO",
-            "fan 0: shelved until 60.0 s by ann",
-        ),
-        (
-            {"transition": Transition.REFUSED, "message": "fan 0: refused: " + "it is not so " * 20},
-            "INFO",
-            "fan 0: request refused: it is not so it is not so it is not so…",
-        ),
+        ({"transition": Transition.REFUSED, "message": "fan 0: refused: " + "it is not so " * 20}, "INFO", "not so…"),
     ],
 )
 def test_the_log_says_what_happened_in_a_line_short_enough_to_be_read(
     more: dict[str, Any], level: str, text: str
 ) -> None:
     fields = {"fan": 0, "active": True, "severity": Severity.WARNING, "t_ns": 1, "onset_t_ns": 1, "acknowledged": True}
-    fields |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so " * 99, "confirmed": True}
+    fields |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so " * 99, "transition": Transition.RAISED}
     line = log_line(Alarm(header=Header("p", 0, "tray1"), **fields | more))
-    assert line == ("tray1", 1, level, text)
-    assert len(line.text) <= LINE_LENGTH
+    assert line[:3] == ("tray1", 1, level)
+    assert text in line.text and len(line.text) <= LINE_LENGTH
 
 
 def test_samples_are_drawn_twice_a_second_and_each_exactly_once() -> None:
@@ -216,26 +185,17 @@ def test_a_lane_follows_the_states_to_the_sample_and_shows_the_reason_of_an_unkn
     assert sink.lane(1) == [(0, "normal"), (2.5, "unknown: gap"), (3, "normal")]
 
 
-def test_a_change_of_reason_is_a_change_of_state() -> None:
+def test_a_change_of_reason_is_a_change_of_state_and_what_is_not_known_is_shown_with_its_number() -> None:
     sink = FakeSink()
     (score,), _ = made_up_tray(seconds=0.1, fans=1, faulty_fan=None, gap_fan=None)
-    state = np.full((10, 1), FanState.UNKNOWN, np.uint8)
-    invalid_reason = np.array([[InvalidReason.WARMING_UP]] * 4 + [[InvalidReason.SATURATED]] * 6, np.uint8)
-    core = core_of(sink, fans=1)
-    core.step(sent(changed(score, state=state, invalid_reason=invalid_reason, valid=np.zeros((10, 1), bool))))
-    core.close()
-    assert sink.lane(0) == [(0, "unknown: warming up"), (0.04, "unknown: saturated")]
-
-
-def test_states_and_reasons_of_a_newer_scorer_are_shown_with_their_number() -> None:
-    sink = FakeSink()
-    (score,), _ = made_up_tray(seconds=0.1, fans=1, faulty_fan=None, gap_fan=None)
-    state = np.array([[FanState.UNKNOWN]] * 3 + [[FanState.NORMAL]] * 3 + [[99]] * 4, np.uint8)
-    reason = np.array([[len(InvalidReason)]] * 3 + [[InvalidReason.NONE]] * 7, np.uint8)
+    unknown, newer = FanState.UNKNOWN, len(InvalidReason)
+    state = np.array([[unknown]] * 4 + [[FanState.NORMAL]] * 3 + [[99]] * 3, np.uint8)
+    reason = np.array([[InvalidReason.WARMING_UP]] * 2 + [[newer]] * 2 + [[InvalidReason.NONE]] * 6, np.uint8)
     core = core_of(sink, fans=1)
     core.step(sent(changed(score, state=state, invalid_reason=reason, valid=reason == 0)))
     core.close()
-    assert sink.lane(0) == [(0, f"unknown: unknown ({len(InvalidReason)})"), (0.03, "normal"), (0.06, "unknown (99)")]
+    unknowns = [(0, "unknown: warming up"), (0.02, f"unknown: unknown ({newer})")]
+    assert sink.lane(0) == [*unknowns, (0.04, "normal"), (0.07, "unknown (99)")]
 
 
 def test_a_taken_port_is_reported_under_the_setting_that_names_it() -> None:
@@ -273,33 +233,6 @@ def test_a_sample_without_a_score_has_no_band_and_is_never_outside_it() -> None:
     assert not outside[gap, 1].any() and outside[gap, 0].all()
 
 
-def test_speeds_are_shown_in_the_unit_of_the_tray() -> None:
-    sink = FakeSink()
-    scores, alarms = made_up_tray(seconds=1, gap_fan=None, faulty_fan=2, fault_s=(0.0, 1.0))
-    core = core_of(sink, speed_unit="rpm")
-    core.step(sent(scores[0]))
-    core.step(alarms[0])
-    core.close()
-    rpm = 60 / (2 * np.pi)
-    np.testing.assert_allclose(sink.traces[0].measured, scores[0].measured_speed_rad_s * rpm)
-    np.testing.assert_allclose(sink.traces[0].half_width, 2 * SIGMA * rpm)
-    assert "alarm raised, speed 3.8 x its limit" in sink.lines[0].text
-
-
-def test_alarms_go_to_the_log_of_their_tray_at_the_samples_time() -> None:
-    sink = FakeSink()
-    _, alarms = made_up_tray()
-    core = core_of(sink)
-    for alarm in alarms:
-        core.step(alarm)
-    core.tick(LATER_NS)
-    assert [line[:3] for line in sink.lines] == [
-        ("tray1", alarms[0].t_ns, "ERROR"),
-        ("tray1", alarms[1].t_ns, "INFO"),
-    ]
-    assert "alarm raised" in sink.lines[0][3] and "back to normal" in sink.lines[1][3]
-
-
 def test_health_and_twins_are_a_page_that_is_replaced_when_it_changes() -> None:
     sink = FakeSink()
     core = core_of(sink)
@@ -313,29 +246,6 @@ def test_health_and_twins_are_a_page_that_is_replaced_when_it_changes() -> None:
     core.tick(LATER_NS + 2 * PAGE_PERIOD_NS)
     assert len(sink.pages) == 2 and sink.lines == []
     assert "f40" not in sink.pages[0] and "f40" in sink.pages[1] and "the port is gone" in sink.pages[1]
-
-
-def test_a_page_that_changes_often_is_shown_at_intervals_and_at_the_end() -> None:
-    sink = FakeSink()
-    core = core_of(sink)
-    for tenth in range(200):
-        core.step(health(problem=f"problem {tenth}"))
-        core.tick(LATER_NS + tenth * 100_000_000)
-    assert PAGE_PERIOD_NS == 5_000_000_000 and len(sink.pages) == 4
-    core.close()
-    assert len(sink.pages) == 5 and "problem 199" in sink.pages[-1]
-
-
-def test_scores_that_do_not_fit_the_configuration_are_counted_and_reported() -> None:
-    sink = FakeSink()
-    core = core_of(sink, fans=4)
-    scores, _ = made_up_tray(seconds=1, fans=3)
-    assert core.problem() == ""
-    play(core, scores)
-    core.close()
-    assert sink.traces == []
-    assert core.counters()["wrong_fan_count"] == len(scores)
-    assert "fans" in core.problem()
 
 
 def test_what_the_source_measures_beside_is_drawn_from_its_first_sample_on(tmp_path: Path) -> None:
@@ -416,14 +326,6 @@ def test_in_an_alarm_the_area_between_twin_and_measured_speed_is_red(tmp_path: P
     assert "/tray1/fan_0/deviation" not in rows
 
 
-@pytest.mark.parametrize("background", [(13, 16, 17), (255, 255, 255)], ids=["dark", "light"])
-def test_every_line_is_legible_in_both_themes(background: tuple[int, int, int]) -> None:
-    styles: Any = pytest.importorskip("pipeline.viewing.rerun_styles", exc_type=ModuleNotFoundError)
-    for color in (styles.RED, *styles.FAN_COLORS):
-        lighter, darker = sorted((luminance(color), luminance(background)), reverse=True)
-        assert (lighter + 0.05) / (darker + 0.05) > 3.0, f"contrast of {color}, as WCAG asks of graphics"
-
-
 def test_an_area_open_at_the_end_of_a_flush_is_ended_by_the_next_one(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=0.3, fans=1, faulty_fan=None, gap_fan=None)
     in_alarm = np.full((10, 1), FanState.ALARM, np.uint8)
@@ -465,18 +367,6 @@ def test_a_file_that_cannot_be_written_is_a_one_line_error(tmp_path: Path) -> No
     with pytest.raises(StageError, match="cannot write the view") as caught:
         build(context(tmp_path, file="file/view.rrd"))
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("key", ["grpc_port", "web_port"])
-def test_a_taken_port_is_a_one_line_error_and_no_file_is_created(tmp_path: Path, key: str) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        ports = {"grpc_port": free_port(), "web_port": 0, key: taken.getsockname()[1]}
-        with pytest.raises(StageError, match=rf"viewer\.{key}: port \d+ .* is taken.*viewer\.serve = false") as caught:
-            build(context(tmp_path, serve=True, **ports))
-    assert "\n" not in str(caught.value)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_live_viewers_are_served_on_the_loopback_only(tmp_path: Path) -> None:
@@ -534,12 +424,6 @@ def changed(score: Score, **columns: Any) -> Score:
     return Score(**{**vars(score), **columns})
 
 
-def luminance(color: tuple[int, int, int]) -> float:
-    """Relative luminance of an sRGB colour (WCAG 2)."""
-    linear = [c / 3294.6 if c <= 10 else ((c / 255 + 0.055) / 1.055) ** 2.4 for c in color]
-    return float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
-
-
 def card() -> ModelCard:
     return ModelCard(header=Header("x", 0, "tray1"), t_ns=LATER_NS, twin="f40", kind="hybrid", sha256="")
 
@@ -589,22 +473,3 @@ def pages_of(path: Path) -> list[str]:
 def styles_of(path: Path, entity: str, component: str) -> list[str]:
     (chunk,) = (chunk for chunk in chunks_of(path) if chunk.is_static and chunk.entity_path == entity)
     return chunk.to_record_batch().column(component)[0].as_py()
-
-
-def test_messages_of_a_tray_that_is_not_configured_are_counted_and_ignored() -> None:
-    sink = FakeSink()
-    core = core_of(sink)
-    scores, alarms = made_up_tray(tray="elsewhere", seconds=1)
-    for message in (*scores, *alarms):
-        core.step(sent(message))
-    core.close()
-    assert core.counters()["unknown_tray"] == len(scores) + len(alarms) > 2
-    assert not sink.traces and not sink.lines
-
-
-def test_a_wrong_number_of_fans_is_reported_until_correct_scores_arrive() -> None:
-    core = core_of(FakeSink(), fans=3)
-    core.step(sent(made_up_tray(fans=2, seconds=1, faulty_fan=None)[0][0]))
-    assert core.problem() == "scores have 2 fans, [[tray]] tray1 has fans = 3: correct `fans`"
-    core.step(sent(made_up_tray(fans=3, seconds=1)[0][0]))
-    assert core.problem() == ""

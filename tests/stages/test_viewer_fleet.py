@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from pipeline.viewing import viewer_core
 from pipeline.viewing.fleet import SILENT, Fan, class_names
 from pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
 from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
-from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
+from pipeline.viewing.viewer_core import ViewerCore
 from schemas.codec import decode_columns
 from schemas.messages import Alarm, Score
 from stages.viewer import ViewerConfig, build, check, topics_read
@@ -134,33 +133,6 @@ def test_of_a_tray_without_a_plot_only_the_newest_score_is_decoded(monkeypatch: 
     assert len(messages) == 3000 and len(decoded) <= 3 * 21
 
 
-def test_the_overview_follows_every_fan_and_repeats_what_does_not_change() -> None:
-    sink = FakeSink()
-    core = fleet_core(sink)
-    play(core, messages_of())
-    core.close()
-    steady = [overview for overview in sink.overviews[1:] if overview.classes is not None]
-    assert steady[0].classes is not None and len(steady[0].classes) == 9
-    times = np.array([overview.t_ns for overview in sink.overviews])
-    assert (np.diff(times) > 0).all() and len(times) in (40, 41)
-    of_faulty = {
-        round((each.t_ns - START_NS) / 1e9, 1): class_names()[each.classes[5]]
-        for each in steady
-        if each.classes is not None
-    }
-    assert "alarm" in {name for at_s, name in of_faulty.items() if 9 < at_s < 14}
-    assert {name for at_s, name in of_faulty.items() if at_s < 8 or at_s > 15} <= set(class_names()[:5])
-    marked = [((each.t_ns - START_NS) / 1e9, each.alarms) for each in sink.overviews if each.alarms is not None]
-    assert max(np.diff([at_s for at_s, _ in marked])) <= 5.1
-    changes = [next(group) for _, group in groupby(marked, key=lambda pair: pair[1])]
-    assert [alarms for _, alarms in changes] == [[], [5], []]
-    assert 8.5 <= changes[1][0] <= 9.1 and 14.5 <= changes[2][0] <= 15.1
-    assert [each.counts["in alarm"] for each in sink.overviews].count(1) in (12, 13)
-    pages = [(each.t_ns, each.page) for each in sink.overviews if each.page is not None]
-    assert min(np.diff([t for t, _ in pages])) >= 1_000_000_000
-    assert any("**tray2/2** | alarm" in page for _, page in pages) and "9 fans" in pages[0][1]
-
-
 def test_a_tray_that_sends_no_more_becomes_silent_and_its_alarm_gives_up_its_plot() -> None:
     sink = FakeSink()
     core = fleet_core(sink)
@@ -192,29 +164,6 @@ def test_the_lane_of_a_silent_fan_says_so_until_it_is_heard_again() -> None:
         (2.99, SILENT),
         (10.0, "normal"),
     ]
-
-
-def test_the_log_of_a_fleet_has_the_alarms_of_all_trays() -> None:
-    sink = FakeSink()
-    core = fleet_core(sink)
-    play(core, messages_of(faulty_fan=1))
-    core.close()
-    assert sorted(line.tray for line in sink.lines) == [tray for tray in TRAYS for _ in range(2)]
-
-
-def test_scores_that_do_not_fit_or_decode_are_counted_and_the_rest_is_shown() -> None:
-    sink = FakeSink()
-    core = fleet_core(sink)
-    play(core, messages_of(seconds=1, faulty_fan=None))
-    wrong: Any = sent(made_up_tray(tray="tray1", fans=2, seconds=1, faulty_fan=None)[0][0])
-    core.step(wrong)
-    core.tick(START_NS + 5 * FLUSH_PERIOD_NS)
-    assert core.counters()["wrong_fan_count"] == 1 and "scores have 2 fans" in core.problem()
-    wrong.payload += b"\xff"
-    core.step(wrong)
-    core.tick(START_NS + 6 * FLUSH_PERIOD_NS)
-    assert core.counters()["undecodable"] == 1
-    assert sink.overviews[-1].counts == {"in alarm": 0, "suspect": 0, "not judged": 0}
 
 
 def context(folder: Path, trays: int, fans: int, **config: Any) -> Context:
@@ -281,23 +230,3 @@ def test_a_fan_to_show_that_does_not_exist_is_a_one_line_error(tmp_path: Path, n
     with pytest.raises(StageError) as caught:
         build(wrong)
     assert str(caught.value) == problem and list(tmp_path.iterdir()) == []
-
-
-def test_what_is_measured_beside_of_a_fan_with_a_plot_is_drawn_and_ends_with_it(tmp_path: Path) -> None:
-    core = build(context(tmp_path, 3, 3, fleet_above=3, alarm_plot_hold_s=HOLD_S)).core
-    assert isinstance(core, ViewerCore)
-    measured = [
-        replace(message, supply_voltage_v=np.full(message.score.shape, 12.5, np.float32))
-        if isinstance(message, Score) and message.header.tray == "tray2"
-        else message
-        for message in messages_of()
-    ]
-    play(core, measured)
-    core.close()
-    rows = {path: of for path, of in rows_of(tmp_path / "view.rrd").items() if "supply_voltage_v" in path}
-    (path,) = rows
-    assert path == "/shown/supply_voltage_v/plot_1"
-    *shown, last = [row["Scalars:scalars"][0] for _, row in rows[path]]
-    assert set(shown) == {12.5} and np.isnan(last)
-    begin_s, end_s = ((rows[path][index][0] - START_NS) / 1e9 for index in (0, -1))
-    assert begin_s < 8.5 and end_s < 19.0

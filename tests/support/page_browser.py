@@ -5,30 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Literal
 
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-from pipeline.presenting.users import User, UserRole, hasher, write_users
 from tests.support.browser import browser as browser_path
 from tests.support.node_packages import node_modules
 from tests.support.running_chain import DEADLINE_S
+from tests.support.site_users import PASSWORD
 
-PASSWORD = "correct horse battery"
 DEADLINE_MS = DEADLINE_S * 1000
 AXE, AXE_VERSION = "axe-core", "4.14.1"
 _RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]
 _CHECK = """async (rules) => (await axe.run(document, {runOnly: rules})).violations
     .map((each) => `${each.id}: ${each.help}: ${each.nodes[0].html}`)"""
-
-
-def make_users(path: Path) -> Path:
-    """A file with the operator ann and the viewer vic."""
-    hashed = hasher().hash(PASSWORD)
-    users = {n: User(n, r, hashed) for n, r in (("ann", UserRole.OPERATOR), ("vic", UserRole.VIEWER))}
-    write_users(path, users)
-    return path
 
 
 @contextmanager

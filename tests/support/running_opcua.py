@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
+import pytest
+from asyncua.server.internal_server import InternalServer
+
 from pipeline.opcua.config import OpcuaConfig
-from pipeline.presenting.users import User, UserRole, hasher, write_users
 from stages.opcua import STAGE, OpcuaCore
 from tests.support.running_core import FANS, Answer, RunningCore
 from tests.support.running_gateway import free_port
+from tests.support.site_users import make_users
 
-PASSWORD = "correct horse battery"
-OPERATOR, VIEWER = "ann", "vic"
+_make_standard_nodes = InternalServer.load_standard_address_space
+_standard_nodes: list[Path] = []
+
+
+async def _load_standard_nodes(server: InternalServer, shelf_file: Path | None = None) -> None:
+    """Make the 6,000 nodes of the standard once a process, which takes seconds; load them from a file after that."""
+    if _standard_nodes:
+        server.aspace.load(_standard_nodes[0])
+        return
+    await _make_standard_nodes(server, shelf_file)
+    path = Path(mkdtemp(prefix="opcua-")) / "standard"
+    server.aspace.dump(path)
+    _standard_nodes.append(path)
 
 
 class RunningOpcua(RunningCore[OpcuaCore]):
@@ -22,10 +37,11 @@ class RunningOpcua(RunningCore[OpcuaCore]):
         self.port = free_port()
         self.users = folder / "users.toml"
         folder.mkdir(parents=True, exist_ok=True)
-        hashed = hasher().hash(PASSWORD)
-        roles = ((OPERATOR, UserRole.OPERATOR), (VIEWER, UserRole.VIEWER))
-        write_users(self.users, {name: User(name, role, hashed) for name, role in roles})
-        super().__init__(STAGE, OpcuaConfig(port=self.port, users=self.users, **settings), folder, answer, fans)
+        make_users(self.users)
+        config = OpcuaConfig(port=self.port, users=self.users, **settings)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(InternalServer, "load_standard_address_space", _load_standard_nodes)
+            super().__init__(STAGE, config, folder, answer, fans)
 
     @property
     def url(self) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +17,7 @@ from pipeline.recordings.reading import read_recording
 from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.limits import Limits
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.running_chain import RunningCommand, eventually
+from tests.support.running_chain import RunningCommand
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 FANS = 2
@@ -88,25 +87,12 @@ def test_trays_that_their_plant_moves_get_calibrated_twins(
     ]
 
 
-def test_beside_a_running_site_it_is_refused_and_what_is_killed_leaves_no_recorder_behind(
-    configuration: Path, tray: RunningCommand
-) -> None:
-    run = RunningCommand(["commission", "-c", configuration, "--json"])
-    try:
-        run.line_with("recording ordinary operation for 10 min")
-        assert "site 'site' runs already" in error_of("commission", "-c", configuration)
-        run.end(signal.SIGKILL)
-        finished = configuration.parent / "runs" / "recording.mcap"
-        eventually(finished.exists, "the recorder ends in order")
-    finally:
-        run.kill()
-
-
-def test_ctrl_c_leaves_the_recording_and_no_twin(configuration: Path, tray: RunningCommand) -> None:
+def test_a_second_one_is_refused_and_ctrl_c_leaves_no_twin(configuration: Path, tray: RunningCommand) -> None:
     before = configuration.read_text(encoding="utf-8")
     run = RunningCommand(["commission", "-c", configuration, "--json"])
     try:
         run.line_with("recording ordinary operation for 10 min")
+        assert "site 'site' runs already" in error_of("commission", "-c", configuration)
         assert run.end() == 130
         line = run.line_with("interrupted: no twin was written; recorded until then:")
     finally:

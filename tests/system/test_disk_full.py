@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.scan import scan
-from stages.recorder import ROOM_TO_RESUME, STAGE, Recorder
+from stages.recorder import STAGE, Recorder
 from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, envelope
 from tests.support.small_disk import SIZE_BYTES, mount, unmount
 from tests.support.written_recordings import raw
@@ -177,19 +177,6 @@ def test_an_unmounted_disk_is_waited_for_and_its_mount_point_not_written(small_d
     assert sequences == list(range(sequences[0], run.sent))
 
 
-def test_a_recorder_starts_on_a_full_disk_and_waits(small_disk):
-    ballast = small_disk / "ballast"
-    ballast.write_bytes(bytes(SIZE_BYTES - 8192))
-    run = Run(small_disk, min_free_bytes=0)
-    for _ in range(3):
-        run.second()
-    assert run.core.problem().startswith("NOTHING IS RECORDED")
-    ballast.unlink()
-    until(lambda: not run.core.problem(), run)
-    run.core.close()
-    assert run.sequences() == list(range(run.sent))
-
-
 def test_a_recorder_killed_on_a_full_disk_is_followed_by_one_that_waits_and_loses_no_part(small_disk):
     run = Run(small_disk, min_free_bytes=0)
     for _ in range(5):
@@ -209,7 +196,3 @@ def test_a_recorder_killed_on_a_full_disk_is_followed_by_one_that_waits_and_lose
     until(lambda: not run.core.problem(), run)
     run.core.close()
     assert run.sequences() == [*range(recorded), *range(250, run.sent)]
-
-
-def test_resuming_needs_more_free_space_than_the_minimum():
-    assert ROOM_TO_RESUME > 200_000, "or it would pause again at once, part after part"

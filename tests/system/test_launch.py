@@ -98,30 +98,10 @@ def command_reaches_the_fan(chain: Chain) -> None:
         assert np.count_nonzero(newest["command"] == 0.625) == 1
 
 
-def a_second_up_is_refused(chain: Chain) -> None:
-    second = fantwin(*chain.words("up"))
-    assert second.returncode == 1
-    assert "site 'demo' already runs at" in second.stderr
-    assert "started, process" not in second.stderr
-
-
-def row_07_a_second_process_of_a_stage_is_refused(chain: Chain) -> None:
-    running = chain.process_ids()
-    for stage, line in (
-        ("scorer", f"scorer-{TRAY}.snapshot: in use by another scorer (process {running['scorer']}, site {SITE})"),
-        ("resampler", f"resampler of site {SITE!r} already runs: process {running['resampler']} on "),
-    ):
-        second = fantwin(*chain.words("run"), stage)
-        assert second.returncode == 1
-        assert line in second.stderr
-        assert len(second.stderr.strip().splitlines()) == 1
-
-
-def test_visitors_change_nothing_and_ctrl_c_stops_in_order_with_everything_recorded_and_scored(chain):
+def test_row_08_visitors_and_a_closed_terminal_change_nothing_and_ctrl_c_stops_in_order(chain):
     up = start(chain)
     command_reaches_the_fan(chain)
-    a_second_up_is_refused(chain)
-    row_07_a_second_process_of_a_stage_is_refused(chain)
+    up.process.send_signal(signal.SIGHUP)  # as when the terminal is closed
     status = up.end(signal.SIGINT)  # while the tray is sending
     assert chain.tray and chain.tray.end() == 0
     assert status == 0, up.lines

@@ -59,38 +59,3 @@ def test_imrclab_is_imported_as_four_fans_of_one_command_without_times(measured_
     ours = pd.read_csv(table)
     assert (result["samples"], result["fans"]) == (len(ours), 4)
     assert result["duration_s"] == pytest.approx((len(ours) - 1) * 0.01)
-
-
-@pytest.fixture(scope="module")
-def esc_recording(measured_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = tmp_path_factory.mktemp("esc") / "esc.mcap"
-    imported(measured_data / "esc_test" / "f40_steps_5-2.csv", recording, *ESC_TEST)
-    return recording
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["physical", "hybrid"])
-def test_a_twin_of_the_first_part_of_esc_test_follows_the_rest(esc_recording, tmp_path, model):
-    twin = tmp_path / "esc.onnx"
-    trained = fantwin("train", esc_recording, "--to", 90, "--model", model, "--iterations", 8, "-o", twin)
-    assert trained.exit_code == 0, trained.output
-    result = json.loads(fantwin("evaluate", twin, esc_recording, "--from", 90, "--json").stdout)
-    assert result["speed_unit"] == "rpm"
-    assert result["r2"] > 0.98
-    assert result["rmse"] < 900
-    assert result["one_step_rmse"] < result["rmse"]
-
-
-@pytest.mark.slow
-def test_a_twin_of_some_rosa_runs_follows_others(measured_data, tmp_path):
-    def recordings(*numbers: int) -> list[Path]:
-        for k in numbers:
-            imported(measured_data / "rosa" / f"healthy_{k}.csv", tmp_path / f"{k}.mcap", *ROSA)
-        return [tmp_path / f"{k}.mcap" for k in numbers]
-
-    twin = tmp_path / "rosa.onnx"
-    trained = fantwin("train", *recordings(44, 98, 105, 110), "--model", "physical", "-o", twin)
-    assert trained.exit_code == 0, trained.output
-    result = json.loads(fantwin("evaluate", twin, *recordings(103, 113, 120), "--json").stdout)
-    assert result["r2"] > 0.88
-    assert result["coverage_2_sigma"] > 0.9

@@ -16,9 +16,10 @@ from playwright.sync_api import Browser, expect
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from schemas.topics import tray_key
-from tests.support.page_browser import make_users, opened, running_browser
+from tests.support.page_browser import opened, running_browser
 from tests.support.running_chain import SITE, TRAY, Chain, eventually, view_of
 from tests.support.running_gateway import free_port
+from tests.support.site_users import make_users
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 

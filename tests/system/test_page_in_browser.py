@@ -15,10 +15,11 @@ from playwright.sync_api import Browser, expect
 from schemas.enums import Action, FanState, Feedback, Transition
 from schemas.messages import Alarm, Diagnosis, Request
 from tests.stages.test_gateway import NOW_NS, alarm, golden_twin, marked, score
-from tests.support.page_browser import PASSWORD, inaccessible, make_users, opened, running_browser
+from tests.support.page_browser import inaccessible, opened, running_browser
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, TRAY
 from tests.support.running_gateway import RunningGateway
+from tests.support.site_users import PASSWORD, make_users, quickly_hashed  # noqa: F401  a fixture
 
 pytestmark = pytest.mark.slow
 FAULTY = 2
@@ -56,7 +57,7 @@ def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running
         running.close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with running_browser() as running:
         yield running

@@ -183,10 +183,7 @@ def test_at_full_speed_the_stages_take_every_message_and_decide_every_sample(tmp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("start", ["raw", "grid"])
-def test_stages_without_a_twin_of_their_own_change_to_the_learned_twins_at_the_recorded_samples(
-    tmp_path, endpoint, start
-):
+def test_stages_without_a_twin_of_their_own_change_to_the_learned_twins_at_the_recorded_samples(tmp_path, endpoint):
     recorded_site = RecordedSite(tmp_path, 7, raw_samples=4, learns=True)
     recorded_site.run(300)
     for number in (1, 2):
@@ -194,14 +191,14 @@ def test_stages_without_a_twin_of_their_own_change_to_the_learned_twins_at_the_r
         recorded_site.put_in_force(f"tray1-{number}", twin.read_bytes())
         recorded_site.run(200)
     source = recorded_site.finished().rename(tmp_path / "source.mcap")
-    stages = WORKING[["raw", "grid"].index(start) :]
+    stages = WORKING
     settings = [f"launcher.stages={json.dumps(stages)}", f"site='{SITE}'"]
     chain = Chain(tmp_path / "run", endpoint, *settings, viewer=False, configuration=tmp_path / "site.toml")
     try:
         up = chain.start_up()
         with chain.watcher() as watcher:
             eventually(lambda: {v.health.stage for v in watcher.stages() if v.alive} == set(stages), "all are there")
-        done = fantwin("replay", source, "--rate", "max", "--from", start, "--json", *chain.words("")[1:])
+        done = fantwin("replay", source, "--rate", "max", "--from", "raw", "--json", *chain.words("")[1:])
         status, account = up.end(), up.output()
     finally:
         chain.close()
@@ -278,15 +275,14 @@ def test_at_a_terminal_it_steps_and_quits_and_gives_the_terminal_back(site, tmp_
     assert report["messages"] == {"raw": 3}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_replay_cleanly_and_restores_the_terminal(site, tmp_path, terminals, number):
+def test_a_signal_ends_the_replay_cleanly_and_restores_the_terminal(site, tmp_path, terminals):
     recording = write_raw(tmp_path / "source.mcap", 500)
     terminal = Terminal(site.words(recording, "--rate", 0.01))
     terminals.append(terminal)
     while not site.next(Health).outputs:
         pass
     assert not terminal.is_restored()
-    terminal.process.send_signal(number)
+    terminal.process.send_signal(signal.SIGTERM)
     status, _, err = terminal.end()
     assert status == 0, err
     assert terminal.is_restored()
@@ -358,15 +354,6 @@ def test_row_07_beside_a_replay_neither_a_site_nor_an_acquisition_starts_and_the
     assert replay.end() == 0
 
 
-def test_a_replay_without_listeners_is_reported_with_the_endpoint(tmp_path, endpoint):
-    recording = write_raw(tmp_path / "source.mcap", 10)
-    done = fantwin("replay", recording, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
-    assert done.returncode == 0
-    assert done.stderr.startswith(f"no stage on site 'demo' at {endpoint} reads ")
-    assert done.stderr.endswith("; publishing anyway\n")
-    assert json.loads(done.stdout)["messages"] == {"raw": 10}
-
-
 def test_unreadable_parts_are_reported_in_the_output_and_the_exit_code(tmp_path, endpoint):
     whole = write_raw(tmp_path / "whole.mcap", 2000)
     truncated = tmp_path / "truncated.mcap"
@@ -377,10 +364,3 @@ def test_unreadable_parts_are_reported_in_the_output_and_the_exit_code(tmp_path,
     report = json.loads(done.stdout)
     assert report["damage"]
     assert 0 < report["messages"]["raw"] < 2000
-
-
-def test_topics_that_the_recording_does_not_have_are_one_line(tmp_path, endpoint):
-    recording = write_raw(tmp_path / "source.mcap", 10)
-    done = fantwin("replay", recording, "--from", "grid", "--set", f"bus.endpoint={endpoint}")
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == f"fantwin: {recording}: it holds no grid, or none between --start and --end"

@@ -237,27 +237,6 @@ def test_row_07_a_shard_that_is_killed_goes_on_in_another_folder_with_its_alarms
     assert len(restored) == 2
 
 
-def test_row_07_two_owners_of_a_tray_are_refused_at_the_start_and_the_processes_that_run_are_those_of_the_site(shards):
-    shards.start("recorder", "here")
-    shards.start("scorer/1-of-2", "here", "--shard", "1/2")
-    shards.start("scorer/2-of-2", "here", "--shard", "2/2")
-    second = fantwin("run", "scorer", *shards.words("elsewhere"), "--trays", "b")
-    assert second.returncode == 1
-    (line,) = second.stderr.strip().splitlines()
-    owner = shards.watcher.owner("scorer", "b")
-    assert owner
-    assert line == (
-        f"fantwin: scorer/b of site '{SITE}' cannot start: scorer/2-of-2 already has tray b: {owner.process}; stop "
-        "that, or give this one other trays"
-    )
-    shown = json.loads(fantwin("status", *shards.words("here"), "--json").stdout)
-    assert [(stage["stage"], stage["instance"], stage["trays"], stage["state"]) for stage in shown["stages"]] == [
-        ("scorer", "1-of-2", ["a"], "waiting"),
-        ("scorer", "2-of-2", ["b"], "waiting"),
-        ("recorder", "all", [], "waiting"),
-    ]
-
-
 def test_up_starts_the_shards_restarts_one_that_dies_and_accounts_for_all(shards):
     labels = [f"{stage}/{number}-of-2" for stage in ("scorer", "recorder") for number in (1, 2)]
     up = shards.run("up", *shards.words("here"), "--set", "launcher.shards={ scorer = 2, recorder = 2 }", "--json")

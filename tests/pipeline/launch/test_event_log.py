@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
-import signal
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from pipeline.launch.event_log import FOLD_S, QUEUE_SIZE, EventLog, RepeatedLines, without_figures
-from tests.support.running_chain import FANTWIN, Chain, eventually, view_of
+from pipeline.launch.event_log import FOLD_S, QUEUE_SIZE, EventLog, RepeatedLines
+from tests.support.running_chain import eventually
 
 
 @pytest.fixture
@@ -108,41 +105,3 @@ def test_a_line_that_comes_again_later_is_written_again():
     assert lines.add("a", 0) == ["a"]
     assert lines.due(FOLD_S) == []
     assert lines.add("a", FOLD_S) == ["a"]
-
-
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("12.3 MB are free, but 100.0 MB are required", "# MB are free, but # MB are required"),
-        ("tray1: nothing received for 2 s", "tray1: nothing received for # s"),
-        ("fan 3 is not scored: stale, for 10 s or more", "fan 3 is not scored: stale, for # s or more"),
-        ("fans 3, 4 are not scored", "fans 3, 4 are not scored"),
-    ],
-)
-def test_figures_are_not_part_of_what_a_line_means_and_numbers_of_fans_are(line, expected):
-    assert without_figures(line) == expected
-
-
-@pytest.mark.slow
-def test_row_08_when_the_reader_of_its_output_goes_away_up_continues(tmp_path, endpoint, pipe):
-    chain = Chain(tmp_path, endpoint, 'launcher.stages=["recorder"]')
-    up = subprocess.Popen([*FANTWIN, *chain.words("up"), "--json"], stdout=subprocess.PIPE, stderr=pipe[1], text=True)
-    try:
-        with chain.watcher() as watcher:
-            first = eventually(lambda: (view := view_of(watcher, "recorder")) and view.alive and view, "it runs")
-            os.close(pipe[0])  # nobody reads what it says from now on
-            up.send_signal(signal.SIGHUP)  # as when the terminal is closed
-            os.kill(first.health.process_id, signal.SIGKILL)
-
-            def is_back() -> bool:
-                view = view_of(watcher, "recorder")
-                return bool(view and view.alive and view.health.process_id != first.health.process_id)
-
-            eventually(is_back, "the recorder is back", deadline_s=20)
-        up.send_signal(signal.SIGINT)
-        output, _ = up.communicate(timeout=20)
-        assert json.loads(output)["restarts"] == {"recorder": 1}
-        assert up.returncode == 0
-    finally:
-        up.kill()
-        up.communicate()

@@ -5,12 +5,10 @@ from __future__ import annotations
 import pytest
 
 from pipeline.launch.launcher import Outcome
-from pipeline.launch.refused_input import ON_THE_DEVICE, refused, refused_lines, unusable_lines
+from pipeline.launch.refused_input import refused, refused_lines, unusable_lines
 from schemas.enums import StageStatus
 from schemas.health import Counter, Health
-from schemas.wire import DEVICE_COUNTERS, FaultKind
 
-HARMLESS = {FaultKind.RESYNC, FaultKind.UNKNOWN_TYPE}
 LAUNCHED = {("acquisition/bench", 7)}
 
 
@@ -45,35 +43,12 @@ def test_what_a_device_counts_itself_has_a_line_of_its_own():
     assert unusable_lines([health(device_bad_crc=4)], LAUNCHED) == []
 
 
-def test_one_of_a_kind_is_singular():
-    found = refused([health(refused_input=1, garbage=1, refused_too_large=1, device_watchdog_resets=1)])
-    refused_words = "1 piece of input that is no usable sample, 1 message that is too large (garbage 1)"
-    assert refused_lines(found) == [
-        f"acquisition/bench: refused: {refused_words}",
-        "acquisition/bench: counted by the device itself: 1 restart by its watchdog",
-    ]
-    (line,) = unusable_lines([health(refused_input=1, garbage=1)], LAUNCHED)
-    assert "1 was refused" in line
-    plural = refused_lines(refused([health(refused_too_large=2)]))
-    assert plural == ["acquisition/bench: refused: 2 messages that are too large"]
-
-
-def test_everything_that_a_device_counts_is_shown_but_what_is_no_loss():
-    shown = {name.removeprefix("device_") for name in ON_THE_DEVICE}
-    assert shown == set(DEVICE_COUNTERS) - {"frames", "glitches"}
-
-
 def test_a_device_of_which_all_was_refused_is_named_with_the_count_and_the_setting():
     sessions = [health(absurd_command=400, garbage=2, refused_input=402), health(absurd_command=10, refused_input=10)]
     assert unusable_lines(sessions, LAUNCHED) == [
         "acquisition/bench: no sample could be used, 412 were refused (absurd_command 410, garbage 2): "
         "check command_min and command_max of the [[tray]]"
     ]
-
-
-def test_speeds_that_are_all_beyond_the_limit_are_no_usable_sample():
-    (line,) = unusable_lines([health(samples=50, absurd_samples=50, absurd_speed=200)], LAUNCHED)
-    assert line.endswith("50 were refused (absurd_samples 50): check speed_max and speed_unit of the [[tray]]")
 
 
 @pytest.mark.parametrize(
@@ -92,25 +67,6 @@ def test_some_noise_and_a_device_that_sends_nothing_are_not_named(counters: dict
 
 def test_sessions_that_others_have_started_do_not_count():
     assert unusable_lines([health("acquisition/bench", 8, garbage=30, refused_input=30)], LAUNCHED) == []
-
-
-@pytest.mark.parametrize("kind", sorted(set(FaultKind) - HARMLESS, key=str))
-def test_every_fault_of_the_line_has_a_setting_to_look_at(kind: FaultKind):
-    (line,) = unusable_lines([health(refused_input=1, **{kind.value: 1})], LAUNCHED)
-    assert "source of the [[tray]]" not in line
-
-
-def test_faults_of_other_sources_are_named_with_what_to_look_at():
-    sessions = [health(malformed=3, refused_input=3)]
-    words = "acquisition/bench: refused: 3 pieces of input that are no usable sample (malformed 3)"
-    assert refused_lines(refused(sessions)) == [words]
-    (line,) = unusable_lines(sessions, LAUNCHED)
-    assert line.endswith("(malformed 3): check the form of what is sent (docs/reference/json-samples.md)")
-
-
-def test_messages_of_the_bus_that_cannot_be_read_are_listed():
-    found = refused([health("scorer/all", undecodable=2)])
-    assert refused_lines(found) == ["scorer: refused: 2 messages that cannot be read"]
 
 
 def test_a_device_of_which_all_was_refused_is_a_failure_of_the_site():

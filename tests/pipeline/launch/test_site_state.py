@@ -50,56 +50,6 @@ def states(*views: StageView, alive: set[tuple[str, str]] | None = None) -> dict
     return {state.label: state for state in stage_states(views, seen, ROWS)}
 
 
-def test_stages_at_work_are_ok():
-    found = states(view(PRODUCER, published_before=800), view(CONSUMER))
-    assert [(state.word, state.is_fault) for state in found.values()] == [(Word.OK, False)] * 2
-
-
-def test_row_01_a_stage_that_was_never_heard_is_missing():
-    state = states(view(PRODUCER))["twin_integrator"]
-    assert (state.word, state.is_fault, state.view) == (Word.MISSING, True, None)
-
-
-def test_row_01_a_stage_that_is_on_the_bus_and_was_never_heard_is_silent():
-    state = states(view(PRODUCER), alive={("resampler", "all"), ("twin_integrator", "all")})["twin_integrator"]
-    assert (state.word, state.is_fault) == (Word.SILENT, True)
-
-
-def test_row_01_a_stage_that_sends_no_health_any_more_is_silent():
-    state = states(view(CONSUMER, age_s=6.0))["twin_integrator"]
-    assert (state.word, state.detail, state.is_fault) == (
-        Word.SILENT,
-        "no health for 6 s: it hangs, is blocked or gets no processor time",
-        True,
-    )
-
-
-def test_row_01_a_stage_without_input_while_its_producer_sends_is_starved():
-    state = states(view(PRODUCER, published_before=850), view(WAITS))["twin_integrator"]
-    assert state.word == Word.STARVED
-    assert state.detail == "received no grid of tray1 for 12 s, although resampler sends it"
-    assert state.is_fault
-
-
-def test_row_01_a_stage_whose_producer_has_just_begun_to_send_is_not_starved():
-    resumed = view(PRODUCER, published_before=850)
-    assert resumed.previous
-    later = replace(resumed, previous=replace(resumed.previous, t_ns=WAITS.t_ns + 1))
-    assert states(later, view(WAITS))["twin_integrator"].word == Word.WAITING
-
-
-def test_row_01_a_stage_whose_producer_sends_nothing_waits():
-    state = states(view(PRODUCER, published_before=800), view(WAITS))["twin_integrator"]
-    assert (state.word, state.detail, state.is_fault) == (Word.WAITING, "waits for grid of tray1, for 12 s", False)
-
-
-def test_row_01_a_stage_with_a_latency_of_many_seconds_is_late():
-    state = states(view(replace(CONSUMER, latency_p50_ms=47_000.0)))["twin_integrator"]
-    assert (state.word, state.detail) == (Word.LATE, "its outputs are 47 s old when they are sent")
-    starting = replace(CONSUMER, latency_p50_ms=47_000.0, status=StageStatus.STARTING)
-    assert states(view(starting))["twin_integrator"].word == Word.STARTING, "it works off what it missed"
-
-
 def behind(seconds: float, *, processed: int) -> StageView:
     """The consumer with a full inbox, and what it has processed since the health before."""
     health = replace(CONSUMER, newest_input_t_ns=NOW_NS - round(seconds * NS_PER_S))
@@ -109,29 +59,44 @@ def behind(seconds: float, *, processed: int) -> StageView:
     return StageView(now, replace(health, inputs=(before,), t_ns=NOW_NS - NS_PER_S), alive=True, age_s=0.5)
 
 
-def test_row_01_a_stage_that_works_on_old_input_is_behind_and_not_starved():
-    producer = view(PRODUCER, published_before=850)
-    found = states(producer, behind(19.0, processed=25))["twin_integrator"]
-    assert (found.word, found.detail) == (Word.LATE, "it is 19 s behind: it processes what it received 19 s ago")
-    assert states(producer, behind(4.0, processed=25))["twin_integrator"].word == Word.OK
-    idle = states(view(PRODUCER, published_before=800), behind(19.0, processed=0))["twin_integrator"]
-    assert idle.word == Word.OK, "the health of others is no input that it is behind with"
+SENDS, IDLE = view(PRODUCER, published_before=850), view(PRODUCER, published_before=800)
+assert SENDS.previous
+HAS_JUST_BEGUN = replace(SENDS, previous=replace(SENDS.previous, t_ns=WAITS.t_ns + 1))
+OLD = replace(CONSUMER, latency_p50_ms=47_000.0)
+STARTING = replace(CONSUMER, status=StageStatus.STARTING)
+BOTH = {("resampler", "all"), ("twin_integrator", "all")}
 
 
-def test_row_01_a_stage_that_was_behind_when_it_was_last_heard_may_be_at_work():
-    silent = replace(behind(19.0, processed=25), age_s=6.0)
-    assert states(silent)["twin_integrator"].detail.endswith("processor time; before, it was 19 s behind")
+@pytest.mark.parametrize(
+    ("views", "word", "detail"),
+    [
+        pytest.param((IDLE, view(CONSUMER)), Word.OK, "", id="at work"),
+        pytest.param((SENDS,), Word.MISSING, "", id="never heard"),
+        pytest.param((view(CONSUMER, age_s=6.0),), Word.SILENT, "no health for 6 s: it hangs", id="no health any more"),
+        pytest.param((SENDS, view(WAITS)), Word.STARVED, "no grid of tray1 for 12 s, although", id="no input"),
+        pytest.param((HAS_JUST_BEGUN, view(WAITS)), Word.WAITING, "", id="its producer has just begun"),
+        pytest.param((IDLE, view(WAITS)), Word.WAITING, "waits for grid of tray1, for 12 s", id="its producer is idle"),
+        pytest.param((view(OLD),), Word.LATE, "its outputs are 47 s old", id="late"),
+        pytest.param(
+            (view(replace(OLD, status=StageStatus.STARTING)),), Word.STARTING, "", id="works off what it missed"
+        ),
+        pytest.param((SENDS, behind(19.0, processed=25)), Word.LATE, "it is 19 s behind", id="behind, not starved"),
+        pytest.param((SENDS, behind(4.0, processed=25)), Word.OK, "", id="a little behind"),
+        pytest.param((IDLE, behind(19.0, processed=0)), Word.OK, "", id="the health of others is no input"),
+        pytest.param((view(CONSUMER, alive=False, age_s=3.0),), Word.GONE, "last heard 3 s ago", id="left the bus"),
+        pytest.param((view(STARTING, alive=False, age_s=20.0),), Word.STARTING, "", id="starts for long"),
+        pytest.param((view(STARTING, alive=False, age_s=100.0),), Word.SILENT, "", id="starts for too long"),
+    ],
+)
+def test_row_01_the_state_of_a_stage_is_what_it_does(views, word, detail):
+    state = states(*views)["twin_integrator"]
+    assert (state.word, state.is_fault) == (word, word not in (Word.OK, Word.WAITING, Word.STARTING))
+    assert detail in state.detail
 
 
-def test_row_16_a_stage_that_left_the_bus_without_stopping_is_gone():
-    found = states(view(CONSUMER, alive=False, age_s=3.0))["twin_integrator"]
-    assert (found.word, found.detail) == (Word.GONE, "left the bus without stopping; last heard 3 s ago")
-
-
-@pytest.mark.parametrize(("age_s", "word"), [(20.0, Word.STARTING), (100.0, Word.SILENT)])
-def test_a_stage_that_starts_may_be_silent_for_longer(age_s, word):
-    starting = replace(CONSUMER, status=StageStatus.STARTING)
-    assert states(view(starting, alive=False, age_s=age_s))["twin_integrator"].word == word
+def test_row_01_a_stage_that_is_on_the_bus_and_was_never_heard_is_silent():
+    state = states(SENDS, alive=BOTH)["twin_integrator"]
+    assert (state.word, state.is_fault, state.view) == (Word.SILENT, True, None)
 
 
 def test_a_stage_that_stopped_in_order_is_a_fault_only_where_the_configuration_asks_for_it():

@@ -18,7 +18,6 @@ from schemas.header import Header
 from schemas.health import Health, Output
 from schemas.messages import Alarm, Diagnosis
 from schemas.topics import alive_key, health_key, sessions_key, tray_key
-from scoring.alarms import current_alarms
 from tests.support.bus_peer import alarm
 
 KEY = tray_key("s", "tray", "alarm")
@@ -164,12 +163,6 @@ def test_row_11_of_a_long_alarm_only_the_messages_that_are_shown_are_kept(bus, w
     (current,) = watcher.current_alarms()
     assert (current.message, current.causes, current.acknowledged_by) == ("199", causes, "Ann")
     assert [len(each.messages) for each in watcher._alarms._fans.values()] == [3]
-
-
-def test_row_11_polling_the_alarms_reduces_no_messages(bus, watcher, monkeypatch):
-    bus.raise_alarm(of(SCORER.producer))
-    monkeypatch.setattr(current_alarms, "in_sequence", None)
-    assert fans(watcher) == [0]
 
 
 def test_row_11_a_late_health_of_a_stranger_hides_no_stage(bus, watcher):

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import signal
-
 import pytest
 
 from pipeline.launch.notices import Notices
-from pipeline.launch.site_watcher import StageView
 from pipeline.launch.watchdog import START_LIMIT_S, Watchdog
 from pipeline.runtime.notifier import Notifier, starting
-from schemas.enums import StageStatus
-from tests.support.running_chain import Chain, eventually, view_of
+from tests.support.running_chain import eventually
 
 LIMIT_S = 10.0
 
@@ -63,6 +58,14 @@ def test_row_01_a_stage_blocked_by_one_that_hangs_is_not_named_in_its_place():
     assert site.hung_within(20.0) is None
 
 
+def test_row_01_the_longest_silent_of_several_is_named_and_the_others_have_a_new_period():
+    watchdog = Watchdog(LIMIT_S)
+    for name, at_s in (("resampler", 0.4), ("scorer", 0.0), ("acquisition", 0.2)):
+        watchdog.heard(name, at_s, is_ready=True)
+    found = [hung[0] if (hung := watchdog.hung(0.75 * step)) else "" for step in range(28)]
+    assert [(number, name) for number, name in enumerate(found) if name] == [(14, "scorer")]
+
+
 def test_row_01_when_the_launcher_itself_did_not_run_no_stage_is_blamed():
     site = Site("scorer")
     site.hung_within(1.0)
@@ -107,13 +110,6 @@ def test_row_01_a_stage_that_is_built_for_long_says_that_it_is_at_work(monkeypat
     notices.close()
 
 
-def test_without_somebody_who_asks_nothing_is_sent(monkeypatch):
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    notifier = Notifier.from_environment()
-    notifier.ready()
-    notifier.at_work("ok")
-
-
 def test_a_launcher_that_reads_nothing_does_not_block_a_stage():
     notices = Notices()
     notifier = Notifier(notices.address)
@@ -122,30 +118,3 @@ def test_a_launcher_that_reads_nothing_does_not_block_a_stage():
         notifier.at_work("ok")
     assert notices.read()
     notices.close()
-
-
-@pytest.mark.slow
-def test_row_01_a_stage_that_is_stopped_for_good_is_killed_and_restarted(tmp_path, endpoint):
-    chain = Chain(tmp_path, endpoint, 'launcher.stages=["recorder"]', "launcher.watchdog_s=1")
-    try:
-        up = chain.start_up()
-        with chain.watcher() as watcher:
-
-            def at_work() -> StageView | None:
-                view = view_of(watcher, "recorder")
-                return view if view and view.alive and view.health.status == StageStatus.OK else None
-
-            first = eventually(at_work, "it is at work")
-            os.kill(first.health.process_id, signal.SIGSTOP)
-            line = up.line_with("recorder: hangs: its main loop has not run for ")
-
-            def is_back() -> bool:
-                view = view_of(watcher, "recorder")
-                return bool(view and view.alive and view.health.process_id != first.health.process_id)
-
-            eventually(is_back, "the recorder is back", deadline_s=20)
-        assert line.endswith(" s; killed, restarting in 0.2 s")
-        assert up.end(signal.SIGINT) == 0
-        assert up.output()["restarts"] == {"recorder": 1}
-    finally:
-        chain.close()

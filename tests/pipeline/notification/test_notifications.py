@@ -6,7 +6,6 @@ from datetime import UTC, datetime
 from typing import Any
 
 import pytest
-from pydantic import ValidationError
 
 from pipeline.notification.config import NotifierConfig
 from pipeline.notification.deciding import Event
@@ -184,18 +183,6 @@ def test_a_power_cut_is_one_message():
     assert lost.title == "200 alarms in 1 tray (hall): 200 ALARM, 200 no longer confirmed by data"
 
 
-def test_causes_that_are_as_likely_are_named_together_in_messages_about_one_fan_and_about_many():
-    tie = tuple(Diagnosis(cause=c, probability=p) for c, p in (("blocked", 0.4), ("no_power", 0.4), ("no_tacho", 0.2)))
-    desk = Desk()
-    desk.hear(alarm(causes=tie))
-    (one,) = desk.wait(10)
-    assert "Cause: blocked or no power, 40 % each, or no signal of the tacho, 20 %" in one.body
-    assert "rotor; or look at its supply" in one.body
-    desk.hear(*(alarm(fan=fan, tray="other", causes=tie) for fan in range(10)))
-    (digest,) = desk.wait(100)
-    assert "Most probable causes: blocked or no power 10" in digest.body.splitlines()
-
-
 def test_while_more_fans_keep_coming_messages_become_rarer():
     desk = Desk()
     times: list[float] = []
@@ -297,56 +284,6 @@ def test_the_first_notifier_of_a_site_says_what_is_presented_and_not_what_was():
     desk.hear(alarm(fan=3), alarm(fan=4), alarm(Transition.ACKNOWLEDGED, fan=4, acknowledged=True))
     assert desk.wait(FIRST_LOOK_NS / NS_PER_S) == []
     assert titles(desk.wait(10)) == ["WARNING, fan 3 of tray1"]
-
-
-def test_a_message_about_many_that_are_over_says_so_first():
-    desk = Desk()
-    desk.hear(*(alarm(fan=fan) for fan in range(5)))
-    assert titles(desk.wait(60)) == ["5 alarms in 1 tray (hall): 5 WARNING"]
-    desk.hear(*(cleared(fan) for fan in range(5)))
-    (over,) = desk.wait(60)
-    assert (over.title, over.level) == ("5 alarms cleared in 1 tray (hall)", Level.GOOD)
-    assert over.body.startswith("5 alarms cleared in 1 tray at hall\ntray1: cleared: 5 fans: 0-4\n")
-
-
-@pytest.mark.parametrize(
-    "target",
-    [
-        {"name": "a"},
-        {"name": "a", "url_file": "x", "url_env": "Y"},
-        {"name": "a", "url": "mailto://u:p@h"},
-        {"name": "a", "kind": "alertmanager", "url": "http://u:p@h"},
-        {"name": "a", "kind": "alertmanager", "url": "http://h", "repeat_s": 5},
-        {"name": "a", "url_file": "x", "quiet_hours": {"begin": "22:00", "end": "22:00"}},
-        {"name": "a", "url_file": "x", "quiet_hours": {"begin": "25:00", "end": "22:00"}},
-    ],
-)
-def test_targets_that_cannot_be_are_refused(target):
-    with pytest.raises(ValidationError):
-        NotifierConfig.model_validate({"target": [target]})
-
-
-@pytest.mark.parametrize(
-    ("section", "words"),
-    [
-        ({"target": {"name": "a", "url_file": "x"}}, "write \\[\\[notifier.target\\]\\], with two brackets"),
-        (
-            {"target": [{**TARGET, "quiet_hours": {"begin": "22", "end": "06:00"}}]},
-            'hours and minutes, such as "22:00"',
-        ),
-        ({"target": [{**TARGET, "quiet_hours": {"begin": "22:00", "end": "06:00\n"}}]}, "hours and minutes"),
-    ],
-)
-def test_what_is_easily_written_wrong_is_said_in_plain_words(section, words):
-    with pytest.raises(ValidationError, match=words):
-        NotifierConfig.model_validate(section)
-
-
-def test_two_targets_of_one_name_and_unknown_time_zones_are_refused():
-    with pytest.raises(ValidationError, match="two targets"):
-        NotifierConfig.model_validate({"target": [TARGET, TARGET]})
-    with pytest.raises(ValidationError, match="time zone"):
-        NotifierConfig(timezone="Moon/Sea")
 
 
 def test_a_clock_that_is_set_back_holds_nothing_up():

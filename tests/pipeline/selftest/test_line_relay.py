@@ -55,13 +55,6 @@ def line(tmp_path: Path) -> Iterator[RelayedDevice]:
     line.close()
 
 
-def test_bytes_pass_in_both_directions(line: RelayedDevice) -> None:
-    line.send(b"sample")
-    assert line.receive(6) == b"sample"
-    os.write(line.reader, b"command")
-    assert line.device.wait(LIMIT_S) == b"command"
-
-
 def test_what_is_held_is_delivered_in_order_on_release(line: RelayedDevice) -> None:
     line.relay.hold()
     for number in range(5):

@@ -6,11 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 
 from pipeline.config.models import TrayConfig
-from pipeline.viewing.fleet import NORMAL_LEVELS, Fan, Fleet, class_names
-from pipeline.viewing.worst_page import FANS_LISTED, worst_page
+from pipeline.viewing.fleet import NORMAL_LEVELS, Fleet, class_names
 from schemas.enums import FanState, InvalidReason, Severity, Transition
 from schemas.header import Header
 from schemas.messages import Alarm, Score
@@ -121,14 +119,6 @@ def test_what_a_judged_sample_says_counts_more_than_an_old_message() -> None:
     assert fleet.alarms() == []
 
 
-def test_an_alarm_of_a_fan_that_the_tray_does_not_have_changes_no_other() -> None:
-    fleet = fleet_of(a=1, b=1)
-    fleet.add_alarm(alarm("a", 1, START_NS))
-    fleet.update(newest("a", START_NS, GAP))
-    fleet.update(newest("b", START_NS, GAP))
-    assert fleet.alarms() == []
-
-
 def test_a_cell_shows_the_state_and_how_near_the_score_is_to_the_limit() -> None:
     states = [*((FanState.NORMAL, score) for score in (0.0, 0.5, 0.99, 7.0, np.nan)), (99, 0.0)]
     fleet = fleet_of(a=len(states), b=len(FanState), c=1)
@@ -153,30 +143,3 @@ def test_fans_that_are_not_judged_are_grouped_by_reason_the_most_frequent_first(
         repr(("silent", 3, ["c"], 0)),
         repr(("unknown: gap", 3, ["a", "b"], START_NS + 5)),
     }
-
-
-def test_the_page_names_the_worst_with_state_score_time_and_plot() -> None:
-    fleet = fleet_of(rack_1=2, b=2, c=1, d=1, e=1)
-    fleet.update(newest("rack_1", START_NS, (FanState.ALARM, 2.345), (FanState.NORMAL, 0.1)))
-    for tray in "bcde":
-        fleet.update(newest(tray, START_NS + SECOND_NS, *[GAP] * len([f for f in fleet.fans if f.tray == tray])))
-    text = worst_page("plant", fleet, {Fan("rack_1", 0): 3}.get, START_NS)
-    assert text == (
-        "### plant: 7 fans, 1 in alarm, 5 not judged\n\n"
-        "| plot | tray/fan | state | score | since (UTC) |\n"
-        "|--:|:--|:--|--:|:--|\n"
-        "| 3 | **rack\\_1/0** | alarm | 2.35 | 22:13:20 |\n"
-        "|  | rack\\_1/1 | normal | 0.10 | 22:13:20 |\n\n"
-        "### Not judged\n"
-        "- unknown: gap: 5 fans of b, c, d and 1 more trays, since 22:13:21"
-    )
-    another_day = worst_page("plant", fleet, lambda _fan: None, START_NS + 86_400 * SECOND_NS)
-    assert "2023-11-14 22:13:20" in another_day
-
-
-@pytest.mark.parametrize(("fans", "more"), [(FANS_LISTED, ""), (FANS_LISTED + 3, "and 3 more in alarm")])
-def test_the_page_says_how_many_alarms_it_does_not_list(fans: int, more: str) -> None:
-    fleet = fleet_of(a=fans)
-    fleet.update(newest("a", START_NS, *[(FanState.ALARM, 2.0)] * fans))
-    text = worst_page("plant", fleet, lambda _fan: None, START_NS)
-    assert text.count("\n| ") == FANS_LISTED + 1 and more in text and ("more in alarm" in text) == bool(more)

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.errors import UserError
 from pipeline.viewing.viewer_core import ViewerCore
 from stages.viewer import build
 from tests.pipeline.viewing.test_viewer_picture import colors, needs_a_driver, rerun_picture
 from tests.stages.test_viewer_fleet import context, messages_of, play
 
 rerun_fleet = pytest.importorskip("pipeline.viewing.rerun_fleet", exc_type=ModuleNotFoundError)
-OVERVIEW = {"every fan", "the worst fans", "alarms", "alarm log", "fans in alarm, suspect"}
 
 
 @pytest.fixture(scope="module")
@@ -42,39 +40,12 @@ def cells(png: bytes) -> dict[str, float]:
 
 @pytest.mark.slow
 @needs_a_driver
-def test_the_map_shows_the_fan_in_alarm_while_it_is_in_alarm(view_file: Path) -> None:
-    during = cells(rerun_picture.draw_picture(view_file, at_s=12.0, view="every fan").png)
-    after = cells(rerun_picture.draw_picture(view_file, view="every fan").png)
+def test_the_map_shows_the_fan_in_alarm_and_its_plot_the_band_from_before_the_alarm_on(view_file: Path) -> None:
+    drawn = rerun_picture.draw_picture(view_file, at_s=12.0, view="every fan")
+    during, after = cells(drawn.png), cells(rerun_picture.draw_picture(view_file, view="every fan").png)
     assert during["alarm"] > 10 * after["alarm"] and during["alarm"] > 0.01
     assert after["normal"] + after["near"] > during["normal"] + during["near"] > 0.1
-
-
-@pytest.mark.slow
-@needs_a_driver
-def test_the_picture_of_a_fleet_is_its_overview_without_warnings(view_file: Path) -> None:
-    drawn = rerun_picture.draw_picture(view_file)
-    assert drawn.reports == {name: [] for name in OVERVIEW}
-
-
-@pytest.mark.slow
-@needs_a_driver
-def test_a_fan_that_had_a_plot_is_drawn_with_its_band_from_before_the_alarm_on(view_file: Path) -> None:
-    drawn = rerun_picture.draw_picture(view_file, tray="tray2", fans=[2], at_s=14.0, window_s=8.0, view="fan 2")
-    shares = colors(drawn.png)
+    of_fan = rerun_picture.draw_picture(view_file, tray="tray2", fans=[2], at_s=14.0, window_s=8.0, view="fan 2")
+    shares = colors(of_fan.png)
     assert shares["band"] > 0.02 and shares["deviation"] > 0.02
-    assert "state of each fan" in drawn.reports
-
-
-@needs_a_driver
-def test_a_fan_that_had_no_plot_is_a_one_line_error(view_file: Path) -> None:
-    with pytest.raises(UserError, match="no plot has shown fan 0 of tray2; those shown are 2"):
-        rerun_picture.draw_picture(view_file, tray="tray2", fans=[0])
-
-
-def test_every_class_of_cell_has_a_color_and_neighbors_differ() -> None:
-    colors_of = rerun_fleet.class_colors()
-    names = rerun_fleet.class_names()
-    assert len(colors_of) == len(names)
-    shown = [np.array(colors_of[number]) for number in rerun_fleet._legend_classes()]
-    apart = [np.abs(one - other).max() for place, one in enumerate(shown) for other in shown[:place]]
-    assert min(apart) >= 25
+    assert [report for each in (drawn, of_fan) for reports in each.reports.values() for report in reports] == []

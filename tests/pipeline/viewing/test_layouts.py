@@ -34,7 +34,6 @@ WEAR = {
     ("made", "layout", "names"),
     [
         (live_view, "all", ALL),
-        (recorded_view, "all", ALL),
         (recorded_view, "alarms", ALARMS),
         (live_view, "wear", WEAR),
     ],

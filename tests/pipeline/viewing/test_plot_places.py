@@ -13,14 +13,6 @@ ASKED = Fan("tray2", 0)
 HOLD_NS = 60
 
 
-def test_fans_asked_for_always_have_the_first_plots() -> None:
-    places = PlotPlaces(FleetPlots([ASKED], for_alarms=1), HOLD_NS)
-    places.update([ASKED, A], 0)
-    assert places.taken() == {ASKED: 1, A: 2}
-    places.update([], 1000)
-    assert places.taken() == {ASKED: 1}
-
-
 def test_a_plot_stays_for_a_while_after_the_alarm_and_then_goes() -> None:
     places = PlotPlaces(FleetPlots(for_alarms=2), HOLD_NS)
     places.update([A], 0)
@@ -39,15 +31,6 @@ def test_a_new_alarm_takes_the_plot_whose_alarm_has_been_over_for_longest_and_ne
     assert places.taken() == {C: 1, D: 2}, "A was over first"
     places.update([A, C, D], 3)
     assert places.taken() == {C: 1, D: 2}, "A is worse, but comes later"
-
-
-def test_the_place_that_was_free_for_longest_is_taken_first() -> None:
-    """What it showed before has left the window most likely."""
-    places = PlotPlaces(FleetPlots(for_alarms=3), HOLD_NS)
-    places.update([A], 0)
-    places.update([], 100)
-    places.update([B], 200)
-    assert places.taken() == {B: 2}
 
 
 @given(

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from pipeline.viewing.stages_page import CHANGES_SHOWN, PROBLEMS_LISTED, SILENT_AFTER_NS, StagesPage, rounded
+from pipeline.viewing.stages_page import CHANGES_SHOWN, PROBLEMS_LISTED, SILENT_AFTER_NS, StagesPage
 from schemas.enums import StageStatus
 from schemas.header import Header
 from schemas.health import AwaitedInput, Health
@@ -47,13 +47,6 @@ def test_every_stage_has_one_row_with_its_latest_health() -> None:
     ]
 
 
-def test_a_problem_is_shown_until_it_is_over() -> None:
-    page = page_of(health(status=StageStatus.DEGRADED, problem="no port"))
-    assert section(page.text(NOW_NS), "What is wrong")[0] == "- **scorer**: no port"
-    page.add_health(health())
-    assert section(page.text(NOW_NS), "What is wrong") == []
-
-
 def test_a_stage_without_new_health_is_silent_unless_it_stopped_in_order() -> None:
     page = page_of(health("scorer"), health("resampler", status=StageStatus.STOPPED))
     assert "silent" not in page.text(NOW_NS)
@@ -88,49 +81,16 @@ def test_the_page_stays_short_however_many_changes_there_are() -> None:
     assert "problem 999" in text and "problem 979" not in text and len(text) < 6000
 
 
-def test_a_growing_loss_changes_the_page_less_and_less_often() -> None:
-    page = StagesPage()
-    texts: list[str] = []
-    for lost in range(1, 100_001):
-        if not texts or rounded(lost) != rounded(lost - 1):
-            page.add_health(health(lost=lost))
-            texts.append(page.text(NOW_NS))
-    assert len(texts) < 400
-    assert "| scorer | ok | **100,000** |" in texts[-1]
-    assert [rounded(count) for count in (0, 7, 99, 123, 128, 1_849)] == ["0", "7", "99", "120", "130", "1,800"]
-
-
 def test_text_of_stages_is_never_interpreted_as_markup() -> None:
     page = page_of(health("twin_integrator", status=StageStatus.DEGRADED, problem="a | b\n# *c* [[tray]] `fans` <d>"))
     text = page.text(NOW_NS)
     assert r"a \| b \# \*c\* \[\[tray\]\] \`fans\` \<d\>" in text and r"| twin\_integrator |" in text
 
 
-def test_the_twin_in_force_is_shown_for_every_tray() -> None:
-    page = page_of(health())
-    assert section(page.text(NOW_NS), "Twins in force") == []
-    for twin in ("old", "new"):
-        page.add_twin(
-            "tray1", ModelCard(header=Header("x", 0, "tray1"), t_ns=NOW_NS, twin=twin, kind="hybrid", sha256="")
-        )
-    assert section(page.text(NOW_NS), "Twins in force")[0] == "- tray1: new (hybrid), since 2025-10-09 08:53:20"
-
-
 def test_row_01_a_stage_that_waits_for_its_input_is_named() -> None:
     awaited = AwaitedInput(key="fantwin/s/tray1/grid", since_t_ns=0)
     page = page_of(replace(health("scorer"), waiting_for=(awaited,)))
     assert section(page.text(NOW_NS), "What is wrong")[0] == "- **scorer**: waits for grid of tray1"
-
-
-def test_of_many_instances_only_those_that_are_not_well_have_a_row() -> None:
-    page = page_of(*(health("acquisition", f"rack{number}") for number in range(157)))
-    page.add_health(health("acquisition", "rack3", lost=2))
-    page.add_health(health("acquisition", "rack5", status=StageStatus.DEGRADED, problem="no port"))
-    assert [row for row in section(page.text(NOW_NS), "Stages now") if row][2:] == [
-        "| acquisition/rack3 | ok | **2** |",
-        "| acquisition/rack5 | **degraded** | 0 |",
-        "| acquisition: 155 of 157 | ok | 0 |",
-    ]
 
 
 def test_a_fleet_in_trouble_has_a_short_page() -> None:

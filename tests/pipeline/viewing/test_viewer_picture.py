@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from pipeline.cli.recordings.picture import picture
 from pipeline.errors import UserError
 from pipeline.viewing.viewer_core import PAGE_PERIOD_NS
 from stages.viewer import build
-from tests.stages.test_viewer import LATER_NS, card, changed, context, free_port, health, play, sent
+from tests.stages.test_viewer import LATER_NS, card, context, free_port, health, play, sent
 from tests.support.running_chain import eventually
 from tests.support.score_data import START_NS, made_up_tray
 
@@ -50,23 +49,6 @@ def test_a_healthy_fan_shows_a_green_band_and_a_faulty_one_a_red_deviation_too(v
     assert healthy["measured"] > 0.002
 
 
-def test_a_picture_has_a_plot_of_each_column_that_was_drawn_beside_the_speeds(view_file: Path, tmp_path: Path) -> None:
-    assert rerun_picture._read(view_file).trays["tray1"].auxiliary == []
-    scores, _ = made_up_tray(seconds=1)
-    core = build(context(tmp_path)).core
-    play(core, [replace(score, temperature_c=np.full(score.score.shape, 21.0, np.float32)) for score in scores])
-    core.close()
-    drawn = rerun_picture._read(tmp_path / "view.rrd").trays["tray1"]
-    assert [column.name for column in drawn.auxiliary] == ["temperature_c"]
-
-
-@pytest.mark.slow
-@needs_a_driver
-def test_the_lanes_show_normal_alarm_and_unknown_in_their_colors(view_file: Path) -> None:
-    lanes = colors(rerun_picture.draw_picture(view_file, view="state of each fan").png)
-    assert lanes["lane normal"] > 0.1 and lanes["lane alarm"] > 0.01 and lanes["lane unknown"] > 0.002
-
-
 @pytest.mark.slow
 @needs_a_driver
 def test_nothing_after_the_end_of_the_picture_is_drawn(view_file: Path) -> None:
@@ -77,20 +59,6 @@ def test_nothing_after_the_end_of_the_picture_is_drawn(view_file: Path) -> None:
     before_the_fault = rerun_picture.draw_picture(view_file, fans=[2], at_s=7.5, view="fan 2")
     assert colors(before_the_fault.png)["deviation"] < 1e-3
     assert colors(before_the_fault.png)["band"] > 0.02
-
-
-@pytest.mark.slow
-@needs_a_driver
-def test_a_plot_shows_all_of_a_band_that_is_wide(tmp_path: Path) -> None:
-    scores, _ = made_up_tray(seconds=5, fans=1, faulty_fan=None, gap_fan=None)
-    core = build(context(tmp_path, fans=1)).core
-    steady = np.full((10, 1), 300.0)
-    play(core, [changed(score, predicted_speed_rad_s=steady, measured_speed_rad_s=steady + 0.1) for score in scores])
-    core.close()
-    image = Image.open(BytesIO(rerun_picture.draw_picture(tmp_path / "view.rrd", window_s=5.0, view="fan 0").png))
-    red, green, blue = np.asarray(image.convert("RGB")).astype(int)[:, image.width // 2].T
-    band = np.flatnonzero((green > 60) & (green > 2 * red) & (green > 1.5 * blue))
-    assert 0.02 < band[0] / image.height < 0.2 and 0.8 < band[-1] / image.height < 0.98
 
 
 @pytest.mark.slow
@@ -132,30 +100,6 @@ def test_a_missing_driver_is_a_one_line_error(view_file: Path, monkeypatch: pyte
     with pytest.raises(UserError, match="mesa-vulkan-drivers") as caught:
         rerun_picture.draw_picture(view_file)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"tray": "x"}, "no tray called 'x'; there are tray1"),
-        ({"fans": [7]}, "tray1 has no fan 7; it has fans 0 to 2"),
-    ],
-)
-@needs_a_driver
-def test_an_unknown_tray_fan_or_view_is_a_one_line_error(
-    view_file: Path, options: dict[str, object], expected: str
-) -> None:
-    with pytest.raises(UserError, match=expected):
-        rerun_picture.draw_picture(view_file, **options)
-
-
-@needs_a_driver
-def test_a_file_that_is_not_a_view_is_a_one_line_error(tmp_path: Path) -> None:
-    for path, expected in ((tmp_path / "none.rrd", "no such file"), (tmp_path / "wrong.rrd", "not a Rerun file")):
-        if expected != "no such file":
-            path.write_bytes(b"not a view, and long enough to be read as a header")
-        with pytest.raises(UserError, match=expected):
-            rerun_picture.draw_picture(path)
 
 
 def shown_ns(viewer: Any) -> int:

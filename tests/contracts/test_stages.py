@@ -1,8 +1,13 @@
-"""No core raises on a message that decodes: messages of the declared type with any values."""
+"""One list of claims over the stages of the registry.
+
+A row says what the declaration says. A core takes any message of its topics, writes only what it declares, counts and
+reports in one line, and makes the same of the same messages.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +23,7 @@ from pipeline.broker.link import Received
 from pipeline.broker.outbox import Outgoing
 from pipeline.broker.topics import Topics
 from pipeline.config.models import TrayConfig
+from pipeline.config.registry import STAGES, StageRow
 from pipeline.notification.config import NotifierConfig
 from pipeline.notification.notifications import Notifications, Saved
 from pipeline.notification.outbox import Outbox
@@ -25,7 +31,7 @@ from pipeline.notification.wording import Place
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.request_desk import RequestDesk
 from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import Context, Core
+from pipeline.runtime.stage import Context, Core, Stage, StageConfig, load_stage
 from pipeline.runtime.twin_file import TwinFile
 from pipeline.viewing.fleet import Fan
 from pipeline.viewing.fleet_view import FleetView
@@ -35,22 +41,29 @@ from schemas.codec import decode, encode
 from schemas.envelope import Envelope
 from schemas.header import Header
 from schemas.health import Health
-from schemas.messages import Alarm, Grid, Message, ModelCard, Prediction, Raw, Request, Score, ScorerSnapshot
-from schemas.topics import TOPICS
-from stages.mqtt import STAGE as MQTT_STAGE
+from schemas.messages import Alarm, Message, Prediction, Score, ScorerSnapshot
+from schemas.topics import BY_NAME, TOPICS
 from stages.mqtt import MqttCore
 from stages.notifier import NotifierCore
 from stages.resampler import ResamplerConfig, ResamplerCore
 from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
-from stages.viewer import STAGE
 from tests.stages.test_viewer import FakeSink
 from tests.support.message_strategies import any_message
 from tests.support.scored_blocks import CALIBRATION, core_of, prediction_of
 from tests.support.twin_files import write_twin
 
 FANS = 2
+TRAYS = (TrayConfig(name="tray1", fans=FANS),)
 TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
-NO_SLOW_CHECK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+NO_SLOW_CHECK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@pytest.mark.parametrize("row", STAGES.values(), ids=str)
+def test_the_row_of_a_stage_says_what_its_declaration_says(row: StageRow) -> None:
+    stage = row.load()
+    assert (stage.name, row.topics(), stage.may_drop) == (row.name, (stage.reads, stage.writes), row.may_drop)
+    assert stage.about and issubclass(stage.config, StageConfig)
+    assert set(stage.undecoded) <= set(stage.reads)
 
 
 def sessions(*kinds: type[Message]) -> st.SearchStrategy[list[Message]]:
@@ -59,39 +72,27 @@ def sessions(*kinds: type[Message]) -> st.SearchStrategy[list[Message]]:
     return st.lists(messages, max_size=6)
 
 
-def survives(core: Core, session: list[Message], tray: str = "tray1", undecoded: tuple[str, ...] = ()) -> None:
-    """Feed a session as the runner does; all outputs can be encoded. undecoded: see `Stage`."""
+def survives(core: Core, stage: Stage, session: Sequence[Message], tray: str = "tray1") -> list[bytes]:
+    """Feed a session as the runner does; what it has made, which is of topics that it declares to write."""
     out: list[Any] = []
     with np.errstate(all="ignore"):
         for number, message in enumerate(session):
             stamped = replace(message, header=Header("p", number, tray))
             payload, topic = encode(stamped), TOPIC_OF[type(message)]
-            item = Envelope("", topic, payload, 0) if topic in undecoded else decode(type(message), payload)
+            item = Envelope("", topic, payload, 0) if topic in stage.undecoded else decode(type(message), payload)
             out += core.step(item)
             out += core.tick(number * 50_000_000)
-            assert core.problem() is not None and core.counters() is not None
+            assert "\n" not in core.problem()
+            assert all(count >= 0 for count in core.counters().values())
         out += core.close()
-    for message in out:
-        encode(message)
-
-
-@NO_SLOW_CHECK
-@given(sessions(Raw))
-def test_the_resampler_survives_any_message(session: list[Message]) -> None:
-    survives(ResamplerCore(FANS, ResamplerConfig()), session)
+    assert {TOPIC_OF[type(message)] for message in out} <= set(stage.writes)
+    return [encode(message) for message in out]
 
 
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory: pytest.TempPathFactory) -> TwinFile:
     folder: Path = tmp_path_factory.mktemp("twin")
     return TwinFile.load(write_twin(folder / "twin.onnx", fans=FANS), FANS)
-
-
-@NO_SLOW_CHECK
-@given(session=sessions(Grid))
-def test_the_twin_integrator_survives_any_message(twin: TwinFile, session: list[Message]) -> None:
-    config = TwinIntegratorConfig(start_samples=1, warm_up_s=0.0)
-    survives(TwinIntegratorCore(twin, config, 0), session)
 
 
 LOW_LIMITS = CALIBRATION | {
@@ -113,21 +114,42 @@ LOW_LIMITS = CALIBRATION | {
 }
 
 
-def all_valid_prediction(message: Message) -> Message:
-    """The prediction with rising times and valid samples only; the scorer would refuse most others."""
+LOOSE = TwinIntegratorConfig(start_samples=1, warm_up_s=0.0)
+CORES: dict[str, Callable[[TwinFile], Core]] = {
+    "resampler": lambda _twin: ResamplerCore(FANS, ResamplerConfig()),
+    "twin_integrator": lambda twin: TwinIntegratorCore(twin, LOOSE, 0),
+    "scorer": lambda _twin: core_of(FANS, "rpm", calibration=CALIBRATION, off_delay_s=0.0),
+    "scorer of low limits": lambda _twin: core_of(FANS, "rpm", calibration=LOW_LIMITS, off_delay_s=0.0),
+    "viewer": lambda _twin: ViewerCore(TRAYS, FakeSink()),
+    "viewer of a fleet": lambda _twin: ViewerCore(TRAYS, FakeSink(), fleet()),
+}
+
+
+def fleet() -> FleetView:
+    return FleetView("site", TRAYS, PlotPlaces(FleetPlots([Fan("tray1", 0)], 1), 0), 2_000_000_000)
+
+
+def all_valid(message: Message) -> Message:
+    """A prediction with rising times and valid samples only; the scorer would refuse most others."""
     if not isinstance(message, Prediction):
         return message
-    t_ns = np.sort(message.t_ns)
-    return replace(
-        message, t_ns=t_ns, valid=np.ones_like(message.valid), invalid_reason=np.zeros_like(message.invalid_reason)
-    )
+    valid, reason = np.ones_like(message.valid), np.zeros_like(message.invalid_reason)
+    return replace(message, t_ns=np.sort(message.t_ns), valid=valid, invalid_reason=reason)
 
 
+@pytest.mark.parametrize("name", CORES)
 @NO_SLOW_CHECK
-@given(sessions(Prediction, Request), st.sampled_from([None, CALIBRATION, LOW_LIMITS]), st.booleans())
-def test_the_scorer_survives_any_message(session: list[Message], calibration: Any, all_valid: bool) -> None:
-    core = core_of(FANS, "rpm", calibration=calibration, off_delay_s=0.0)
-    survives(core, [all_valid_prediction(message) for message in session] if all_valid else session)
+@given(data=st.data())
+def test_a_core_survives_any_message_of_its_topics_and_makes_the_same_of_the_same(
+    name: str, data: st.DataObject, twin: TwinFile
+) -> None:
+    stage = load_stage(name.split(" ", maxsplit=1)[0])
+    session = data.draw(sessions(*(BY_NAME[topic].message for topic in stage.reads)))
+    if data.draw(st.booleans()):
+        session = [all_valid(message) for message in session]
+    tray = "tray1" if not stage.may_drop else data.draw(st.sampled_from(["tray1", "tray1", "elsewhere"]))
+    made, again = (survives(CORES[name](twin), stage, session, tray) for _ in range(2))
+    assert made == again
 
 
 @settings(max_examples=60, deadline=None)
@@ -143,7 +165,7 @@ def test_a_fan_of_any_speed_and_command_is_diagnosed(period_ns: int, values: lis
     arbitrary = replace(
         prediction, measured_speed_rad_s=samples[:, :1], command=samples[:, 1:], torque_balance_command=samples[:, 1:]
     )
-    survives(core, [prediction_of(np.zeros(3), first=-9, period_ns=period_ns), arbitrary])
+    survives(core, load_stage("scorer"), [prediction_of(np.zeros(3), first=-9, period_ns=period_ns), arbitrary])
 
 
 @settings(max_examples=60, deadline=None)
@@ -152,27 +174,18 @@ def test_the_scorer_survives_any_snapshot(memory: ScorerSnapshot) -> None:
     core = core_of(FANS)
     for kept in (memory, replace(memory, twin_sha256="twin")):
         core.restore(kept)
-    survives(core, [prediction_of(np.zeros((3, FANS)))])
-
-
-@NO_SLOW_CHECK
-@given(sessions(Score, Alarm, ModelCard, Health), st.sampled_from(["tray1", "tray1", "elsewhere"]), st.booleans())
-def test_the_viewer_survives_any_message(session: list[Message], tray: str, is_fleet: bool) -> None:
-    trays, plots = [TrayConfig(name="tray1", fans=FANS)], FleetPlots([Fan("tray1", 0)], 1)
-    fleet = FleetView("site", trays, PlotPlaces(plots, 0), 2_000_000_000) if is_fleet else None
-    survives(ViewerCore(trays, FakeSink(), fleet), session, tray, STAGE.undecoded)
+    survives(core, load_stage("scorer"), [prediction_of(np.zeros((3, FANS)))])
 
 
 @NO_SLOW_CHECK
 @given(session=sessions(Alarm))
-def test_the_notifier_survives_any_alarm(session: list[Message]) -> None:
+def test_the_notifier_survives_any_alarm_and_its_outbox_can_be_read_again(session: list[Message]) -> None:
     target = {"name": "hook", "url_env": "FANTWIN_TEST_URL", "quiet_hours": {"begin": "00:00", "end": "12:00"}}
     config = NotifierConfig.model_validate({"target": [target], "gather_s": 0})
     with TemporaryDirectory() as folder:
         outbox = Outbox(Path(folder) / "outbox", ["hook"])
         notifications = Notifications(config, Place("hall"), Saved(is_first=False), outbox.was_sent)
-        core = NotifierCore(config, (TrayConfig(name="tray1", fans=FANS),), notifications, outbox, {})
-        survives(core, session)
+        survives(NotifierCore(config, TRAYS, notifications, outbox, {}), load_stage("notifier"), session)
         left = Outbox(Path(folder) / "outbox", ["hook"])
         left.load()
         left.close()
@@ -217,21 +230,21 @@ class FakeLink:
     st.sampled_from(["tray1", "tray1", "elsewhere"]),
     st.lists(st.tuples(st.sampled_from(["0", "1", "9", "all", "x"]), st.binary() | st.text().map(str.encode))),
 )
-def test_the_mqtt_stage_survives_any_message(session: list[Message], tray: str, asked: list[tuple[str, bytes]]) -> None:
+def test_the_mqtt_stage_survives_any_message_and_request_and_publishes_only_json(
+    session: list[Message], tray: str, asked: list[tuple[str, bytes]]
+) -> None:
     config = MqttConfig(host="broker", accept=("acknowledge",), operator_name="desk", home_assistant="publish")
-    trays = (TrayConfig(name="tray1", fans=FANS),)
     received = [Received(f"fantwin/site/tray1/{fan}/request", payload, is_retained=False) for fan, payload in asked]
     link = FakeLink(received)
     with TemporaryDirectory() as folder:
         store = AlarmStore(Path(folder) / "alarms.sqlite")
-        model = SiteModel("site", trays, store, keeps_curves=False)
-        context = Context("site", trays, config, Path(folder), Path(folder), 0)
+        model = SiteModel("site", TRAYS, store, keeps_curves=False)
+        context = Context("site", TRAYS, config, Path(folder), Path(folder), 0)
         core = MqttCore(context, model, store, RequestDesk("p"), Topics("fantwin", "site"), link)
         core.tick(-20_000_000_000)
-        survives(core, session, tray, MQTT_STAGE.undecoded)
+        survives(core, load_stage("mqtt"), session, tray)
     for message in link.published:
         if message.text not in ("online", "offline"):
             json.loads(message.text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert len([message for message in link.published if message.topic.endswith("/answer")]) == sum(
-        bool(payload) for _, payload in asked
-    )
+    answers = [message for message in link.published if message.topic.endswith("/answer")]
+    assert len(answers) == sum(bool(payload) for _, payload in asked)

@@ -1,0 +1,49 @@
+"""Settings that would open an output to others, or that cannot work, are refused: one table for all outputs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from pydantic import BaseModel
+
+from pipeline.broker.config import MqttConfig
+from pipeline.gateway.config import GatewayConfig
+from pipeline.notification.config import NotifierConfig
+from pipeline.opcua.config import OpcuaConfig
+
+MAIL: dict[str, Any] = {"name": "mail", "url_file": "mail.url"}
+
+
+@pytest.mark.parametrize(
+    ("model", "settings", "why"),
+    [
+        (GatewayConfig, {"host": "0.0.0.0"}, "needs certificate and key"),
+        (GatewayConfig, {"host": "0.0.0.0", "certificate": "c.pem", "key": "k.pem"}, "needs users"),
+        (GatewayConfig, {"certificate": "c.pem"}, "belong together"),
+        (GatewayConfig, {"operators": ("ann",)}, "user_header"),
+        (GatewayConfig, {"user_header": "X-User", "proxies": ("proxy.plant.example",)}, "address of the proxy"),
+        (OpcuaConfig, {"host": "0.0.0.0"}, "needs users"),
+        (OpcuaConfig, {"certificate": "c.pem"}, "belong together"),
+        (MqttConfig, {"accept": ["acknowledge"]}, "belong together"),
+        (MqttConfig, {"operator_name": "desk"}, "belong together"),
+        (MqttConfig, {"accept": ["explode"], "operator_name": "desk"}, "accept"),
+        (MqttConfig, {"prefix": "a/#"}, "prefix"),
+        (MqttConfig, {"prefix": "$SYS"}, "prefix"),
+        (MqttConfig, {"password_env": "X"}, "a password needs username"),
+        (MqttConfig, {"ca": "x"}, "need tls = true"),
+        (NotifierConfig, {"target": [{"name": "a"}]}, "url"),
+        (NotifierConfig, {"target": [MAIL | {"url_env": "Y"}]}, "url"),
+        (NotifierConfig, {"target": [{"name": "a", "url": "mailto://u:p@h"}]}, "url"),
+        (NotifierConfig, {"target": [{"name": "a", "kind": "alertmanager", "url": "http://u:p@h"}]}, "url"),
+        (NotifierConfig, {"target": [MAIL | {"quiet_hours": {"begin": "25:00", "end": "22:00"}}]}, "hours"),
+        (NotifierConfig, {"target": [MAIL | {"quiet_hours": {"begin": "22:00", "end": "22:00"}}]}, "hours"),
+        (NotifierConfig, {"target": [MAIL, MAIL]}, "two targets"),
+        (NotifierConfig, {"timezone": "Moon/Sea"}, "time zone"),
+    ],
+)
+def test_settings_that_open_an_output_or_cannot_work_are_refused(
+    model: type[BaseModel], settings: dict[str, Any], why: str
+) -> None:
+    with pytest.raises(ValueError, match=why):
+        model.model_validate(({"host": "broker"} if model is MqttConfig else {}) | settings)

@@ -1,0 +1,34 @@
+"""Users of a page or an OPC UA server in tests, whose passwords are hashed in no time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from argon2 import PasswordHasher
+
+from pipeline.presenting.users import User, UserRole, write_users
+
+PASSWORD = "correct horse battery"
+OPERATOR, VIEWER = "ann", "vic"
+ROLES = {OPERATOR: UserRole.OPERATOR, VIEWER: UserRole.VIEWER}
+
+
+def quick_hasher() -> PasswordHasher:
+    return PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quickly_hashed() -> Iterator[None]:
+    """For the modules that import it: a hash that takes 64 MB and a tenth of a second is not what they test."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("pipeline.presenting.users.hasher", quick_hasher)
+        yield
+
+
+def make_users(path: Path, password: str = PASSWORD, **roles: UserRole) -> Path:
+    """A file with these users, or with the operator ann and the viewer vic."""
+    hashed = quick_hasher().hash(password)
+    write_users(path, {name: User(name, role, hashed) for name, role in (roles or ROLES).items()})
+    return path
