@@ -69,13 +69,6 @@ def test_the_supply_wanders_as_much_as_it_is_set_to() -> None:
 FOUR_PIN = replace(STILL, fan="4-pin", surroundings=Surroundings(measured=("supply_voltage_v", "temperature_c")))
 
 
-def test_without_surroundings_4_pin_fans_are_as_before() -> None:
-    plain, measured = samples(replace(FOUR_PIN, surroundings=Surroundings())), samples(FOUR_PIN)
-    for one, other in zip(plain, measured, strict=True):
-        np.testing.assert_array_equal(one.speed_rad_s, other.speed_rad_s)
-    np.testing.assert_allclose(measured[-1].auxiliary["supply_voltage_v"], 12.0, atol=0.2)
-
-
 def test_4_pin_fans_follow_a_supply_that_wanders_only_where_they_do_not_hold_their_speed() -> None:
     wanders = Surroundings(supply_wander=0.05, supply_wander_s=1e4, measured=("supply_voltage_v",))
     steady = last(replace(FOUR_PIN, surroundings=Surroundings())).speed_rad_s

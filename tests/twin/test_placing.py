@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simulation import published_fan
+from bench.training import published_fan
 from tests.support import fan_data
 from tests.support.fantwin_command import error_of
 from twin.build import evaluate, train_twin

@@ -1,7 +1,6 @@
 """Valid and invalid runs, and how a run is cut."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -26,14 +25,6 @@ def test_repeated_times_become_one_sample_with_the_mean_speed_and_the_last_comma
 def test_a_run_splits_at_a_long_gap_and_leaves_out_a_lone_sample() -> None:
     pieces = ramp([0.0, 0.1, 0.2, 0.3, 5.0, 9.0, 9.1]).split_at_gaps(1.0)
     assert [piece.t_s.tolist() for piece in pieces] == [[0.0, 0.1, 0.2, 0.3], [9.0, 9.1]]
-
-
-def test_equal_parts_follow_one_another_and_none_is_longer_than_allowed() -> None:
-    run = ramp(np.arange(1003.0).tolist())
-    parts = run.equal_parts(100)
-    assert (parts[0][0], parts[-1][1], len(parts)) == (0, 1003, 11)
-    assert all(before[1] == after[0] for before, after in pairwise(parts))
-    assert {last - first for first, last in parts} <= {91, 92}
 
 
 def test_a_slice_of_time_and_of_a_fan_keeps_the_rest() -> None:

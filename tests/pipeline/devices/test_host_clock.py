@@ -25,13 +25,6 @@ class Host:
         return self.clock.now_ns()
 
 
-def test_without_a_step_it_is_the_wall_clock() -> None:
-    host = Host()
-    times = [host.passes(0.05, set_by_ns=correction) for correction in (0, 300_000_000, -400_000, 0)]
-    assert times[-1] == host.wall_ns
-    assert host.clock.steps == 0
-
-
 def test_row_13_a_wall_clock_set_back_by_less_than_a_second_makes_the_time_slower_until_it_has_caught_up() -> None:
     host = Host()
     host.passes(1.0)
@@ -68,13 +61,6 @@ def test_row_13_a_wall_clock_set_back_does_not_take_the_time_back() -> None:
     assert host.clock.steps == 1, "it is one step, however long ago"
 
 
-def test_a_wall_clock_set_forward_is_followed() -> None:
-    host = Host()
-    before = host.passes(1.0)
-    assert host.passes(0.05, set_by_ns=HOUR_NS) == before + 50_000_000 + HOUR_NS == host.wall_ns
-    assert host.clock.last_step == ClockStep(HOUR_NS, host.wall_ns, 0)
-
-
 @pytest.mark.parametrize("more_ns", [0, HOUR_NS])
 def test_a_wall_clock_that_is_put_right_is_followed_again(more_ns: int) -> None:
     host = Host()
@@ -109,8 +95,3 @@ def test_row_13_a_clock_set_while_a_stage_starts_is_noticed_by_it(set_by_s: int)
     host.wall_ns += NS_PER_S + set_by_s * NS_PER_S
     of_stage = HostClock(lambda: host.wall_ns, lambda: host.monotonic_ns, offset_ns)
     assert of_stage.now_ns() == host.clock.now_ns() == before + NS_PER_S + max(set_by_s, 0) * NS_PER_S
-
-
-@pytest.mark.parametrize("environment", [{}, {VARIABLE: "soon"}])
-def test_a_process_that_nobody_hands_a_time_begins_with_the_wall_clock(environment: dict[str, str]) -> None:
-    assert handed_on(environment) is None

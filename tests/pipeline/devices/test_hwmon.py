@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.config.loading import parse_config
 from pipeline.devices.hwmon_config import HwmonConfig
-from pipeline.devices.hwmon_source import HwmonDevice, HwmonSource
+from pipeline.devices.hwmon_source import HwmonDevice
 from pipeline.devices.polling import DeviceError
 from pipeline.devices.sample_source import Reading, Rejected, SourceContext
 from pipeline.errors import UserError
@@ -96,19 +96,6 @@ def test_files_that_cannot_be_read_are_nan_but_without_its_command_a_reading_is_
     assert not caught.value.is_lost
 
 
-def test_a_chip_that_vanishes_is_lost_with_one_line(root: Path) -> None:
-    folder = board(root)
-    made = connected(root)
-    folder.rename(root.parent / "gone")
-    with pytest.raises(DeviceError, match="nct6798 has gone") as caught:
-        made.read()
-    assert caught.value.is_lost
-    with pytest.raises(DeviceError, match="no chip is called nct6798 in .*; there are: none; load its driver"):
-        made.connect()
-    with pytest.raises(DeviceError, match="No such file or directory; correct root"):
-        connected(root.parent / "elsewhere")
-
-
 def test_a_commanded_fan_is_taken_over_and_given_back(root: Path) -> None:
     folder = board(root)
     made = connected(root, 3, writable=True)
@@ -165,14 +152,6 @@ def test_fans_that_share_a_pwm_take_one_command(root: Path) -> None:
     with pytest.raises(DeviceError, match="pwm1 moves several fans: give them one command, not 10 and 20"):
         made.write((10.0, NAN, 20.0), ())
     assert (folder / "pwm1").read_text() == "80"
-
-
-def test_nothing_is_written_unless_the_configuration_says_so(root: Path) -> None:
-    board(root)
-    config = HwmonConfig(chip="nct6798", root=root)
-    source = HwmonSource(config, SourceContext(2, "rpm", Path()))
-    assert not source.device.is_writable and "takes no commands" in source.send((10.0, 10.0), ())
-    assert config.writable is False
 
 
 def test_an_enable_file_that_cannot_be_read_gets_the_automatic_mode_of_its_chip(root: Path) -> None:

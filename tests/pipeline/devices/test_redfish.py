@@ -12,12 +12,10 @@ import trustme
 
 from pipeline.config.loading import parse_config
 from pipeline.config.models import ConfigError
-from pipeline.devices import redfish_source
 from pipeline.devices.polling import DeviceError
 from pipeline.devices.redfish_config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
-from pipeline.devices.redfish_source import RedfishDevice, RedfishSource
+from pipeline.devices.redfish_source import RedfishDevice
 from pipeline.devices.sample_source import Reading, Rejected, SourceContext
-from pipeline.errors import UserError
 from schemas.tacho import Tacho
 from tests.support.redfish_server import Controller, redfish_server
 
@@ -104,14 +102,6 @@ def test_a_controller_that_fails_or_is_slow_is_a_failed_poll_and_one_that_is_gon
     assert caught.value.is_lost
 
 
-def test_credentials_that_are_no_utf_8_are_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "bmc.secret"
-    path.write_bytes("root\nGeh\xe4im\n".encode("latin-1"))
-    path.chmod(0o600)
-    problems = device("https://bmc", folder=tmp_path, credentials="bmc.secret").check()
-    assert problems == [f"{path}: is no text in UTF-8: save it as such"]
-
-
 def test_credentials_come_from_a_file_or_the_environment_over_a_verified_line_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -151,9 +141,3 @@ def test_the_configuration_keeps_no_password_and_states_what_is_known() -> None:
     for url, words in (("https://a:b@bmc1", "a configuration is recorded"), ("bmc1", "write the address")):
         with pytest.raises(ConfigError, match=words):
             parse_config(tray % (url, ""), Path("f"))
-
-
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(redfish_source, "is_installed", lambda _module: False)
-    with pytest.raises(UserError, match=r"needs the extra `redfish`; in the checkout: .*\[redfish\]"):
-        RedfishSource(RedfishConfig(url="https://bmc1"), SourceContext(1, "rpm", Path()))

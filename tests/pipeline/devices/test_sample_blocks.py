@@ -79,11 +79,6 @@ def test_input_without_readings_is_handed_over_after_the_time_of_a_block(blocks:
     assert [t_ms for t_ms, _ in add_all(blocks, noise)] == [1060, 1120]
 
 
-def test_without_block_time_everything_is_handed_over_at_once() -> None:
-    blocks = SampleBlocks(FakeSource(), 0)
-    assert add_all(blocks, [batch(1, readings=0), batch(2), batch(3)]) == [(1, [1]), (2, [2]), (3, [3])]
-
-
 def test_the_stage_takes_what_waits_only_after_the_time_of_a_block(blocks: SampleBlocks) -> None:
     (last,) = blocks.add(LinkUp())
     assert blocks.add(batch(1010)) == blocks.add(batch(1020)) == []
@@ -115,8 +110,3 @@ def test_what_still_waits_when_the_source_stops_is_delivered_and_none_stays() ->
     blocks.stop()
     assert [times_ms(event) for event in events] == [[980], [990, 999]]
     assert blocks.take_rest() is None
-
-
-def test_a_stage_that_ends_before_its_source_takes_the_rest(blocks: SampleBlocks) -> None:
-    blocks.add(batch(1010))
-    assert times_ms(blocks.take_rest()) == [1010]

@@ -16,11 +16,6 @@ def wandering(samples: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     return rng.uniform(0.0, 100.0, (samples, 2)), 150.0 + 50.0 * rng.normal(size=(samples, 2))
 
 
-def needed_at(speed: float, fan: int) -> float:
-    _, viscous, drag, friction = COEFFICIENTS[fan]
-    return viscous * speed + drag * speed * abs(speed) + friction
-
-
 def test_it_is_the_recursion_sample_by_sample() -> None:
     command, speed = wandering(300)
     balance = torque_balance(command, speed, STEP_S, COEFFICIENTS, LAG_S)
@@ -37,24 +32,6 @@ def test_it_is_the_recursion_sample_by_sample() -> None:
             f = a * f + (1.0 - a) * x
             assert balance[k + 1, fan] == pytest.approx(f / (1.0 - a ** (k + 1)), rel=1e-9)
     assert np.isnan(balance[0]).all()
-
-
-def test_the_balance_of_a_steady_fan_with_extra_command_is_right_from_its_first_step() -> None:
-    speed = np.tile([100.0, -80.0], (50, 1))
-    command = np.tile([needed_at(100.0, 0) + 1.5, needed_at(-80.0, 1) - 0.5], (50, 1))
-    balance = torque_balance(command, speed, STEP_S, COEFFICIENTS, LAG_S)
-    np.testing.assert_allclose(balance[1:], np.tile([1.5, -0.5], (49, 1)), rtol=1e-9)
-
-
-def test_a_torque_that_sets_in_shows_as_the_filter_lets_it() -> None:
-    speed = np.full((400, 2), 100.0)
-    command = np.full((400, 2), [needed_at(100.0, 0), needed_at(100.0, 1)])
-    command[200:, 1] += 2.0
-    balance = torque_balance(command, speed, STEP_S, COEFFICIENTS, LAG_S)
-    since_s = STEP_S * np.arange(200)
-    expected = 2.0 * (1.0 - np.exp(-FILTER_RATE_PER_S * since_s))
-    np.testing.assert_allclose(balance[200:, 1], expected, atol=0.01)
-    np.testing.assert_allclose(balance[1:, 0], 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("rate_hz", [50.0, 100.0, 400.0])

@@ -43,15 +43,6 @@ def test_the_hybrid_comes_to_the_noise_where_the_physics_stay_far_from_it(rough,
     assert times_noise(hybrid, rough[2]) < 1.05
 
 
-def test_any_seed_finds_the_way_to_the_noise(rough) -> None:
-    short = rough[0].between(0.0, 25.0)
-    errors = [
-        times_noise(train_twin([short], [], "hybrid", name="x", seed=seed, max_iterations=25), short)
-        for seed in range(3)
-    ]
-    assert max(errors) < 1.02, errors
-
-
 def test_the_mean_of_several_networks_hardly_depends_on_the_seed(rough) -> None:
     short = rough[0].between(0.0, 25.0)
     twins = [train_twin([short], [], "hybrid", name="x", seed=seed, max_iterations=25, networks=4) for seed in range(3)]
@@ -97,21 +88,6 @@ def test_fans_that_differ_share_one_network_and_keep_their_own_physics() -> None
     assert times_noise(together, test) < 1.1
 
 
-def test_several_recordings_give_a_better_twin_than_one(rough) -> None:
-    parts = [rough[0].between(0.0, 12.0), rough[0].between(30.0, 42.0), rough[0].between(60.0, 72.0)]
-    one, all_three = (
-        train_twin(runs, [rough[1]], "hybrid", name="x", max_iterations=20) for runs in (parts[:1], parts)
-    )
-    assert times_noise(all_three, rough[2]) < times_noise(one, rough[2])
-
-
-def test_irregular_samples_are_as_good_as_regular_ones(rough, part) -> None:
-    rng = np.random.default_rng(3)
-    keep = np.sort(rng.choice(part.samples, part.samples * 2 // 3, replace=False))
-    twin = train_twin([thinned(part, keep)], [], "hybrid", name="x", max_iterations=15)
-    assert times_noise(twin, rough[2]) < 1.1
-
-
 def thinned(run: Run, keep: np.ndarray) -> Run:
     """The kept samples, each with the mean of the held command until the next one."""
     command = np.add.reduceat(run.command, keep, axis=0) / np.diff(keep, append=run.samples)[:, None]
@@ -142,16 +118,6 @@ def test_without_data_the_hybrid_follows_its_physics(rough) -> None:
     upper = fan_data.rough_run(5, 60.0, low=50.0)
     twin, physical = (train_twin([upper], [], kind, name="x") for kind in ("hybrid", "physical"))
     assert times_noise(twin, rough[2]) < 1.5 * times_noise(physical, rough[2])
-
-
-def test_the_same_seed_gives_the_same_model_and_another_seed_another(rough) -> None:
-    def weights(seed: int) -> np.ndarray:
-        twin = train_twin([rough[1].between(0.0, 10.0)], [], "hybrid", name="x", seed=seed, max_iterations=3)
-        assert isinstance(twin.model, Hybrid)
-        return twin.model.network.theta
-
-    np.testing.assert_array_equal(weights(4), weights(4))
-    assert not np.array_equal(weights(4), weights(5))
 
 
 def test_progress_is_reported_of_each_part_of_the_work(rough) -> None:
@@ -186,11 +152,6 @@ def test_progress_is_reported_of_each_part_of_the_work(rough) -> None:
     assert asked_for == {5}, "as many as asked for"
     assert trained.card.training.iterations <= 2 * 5
     assert all(rmse > 0.0 for part in ("identification", "starting weights", *trainings) for *_, rmse in reported[part])
-
-
-def test_a_single_iteration_is_one(rough) -> None:
-    twin = train_twin([rough[1].between(0.0, 10.0)], [], "hybrid", name="x", max_iterations=1)
-    assert twin.card.training.iterations == 1
 
 
 def test_adam_lowers_the_free_run_error_from_the_physics_on(rough) -> None:
