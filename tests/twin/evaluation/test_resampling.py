@@ -25,7 +25,7 @@ def impulse(run: Run, stop_s: float) -> Array:
     return held_s @ run.command
 
 
-@pytest.mark.parametrize("rate_hz", [7.0, 20.0, 50.0, 100.0, 130.0, 200.0])
+@pytest.mark.parametrize("rate_hz", [7.0, 130.0])
 def test_no_impulse_of_the_command_is_lost_on_another_rate(rate_hz: float) -> None:
     run = fan_data.published_run(1, 10.0, fans=2)
     other = resampled(run, rate_hz)

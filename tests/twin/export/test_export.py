@@ -22,7 +22,6 @@ from twin.finishing import TrainedTwin
 from twin.models.hybrid import Hybrid
 from twin.models.model import Model
 from twin.models.physical import PhysicalModel
-from twin.models.physics import LAG
 
 MINUTE = 6000
 CREATED = datetime(2026, 1, 1, tzinfo=UTC)
@@ -70,14 +69,13 @@ def state_of(model: Model, command: np.ndarray) -> np.ndarray:
     return model.state_layout.initial_state(np.array([20.0, 90.0, 0.0, -40.0]), command[0] + 30.0)
 
 
-@pytest.mark.parametrize("lag_s", [0.0, 0.05])
 @every_model
 def test_the_file_runs_a_minute_in_two_blocks_as_numpy_does_in_one(
-    model: Model, lag_s: float, trained: TrainedTwin, tmp_path: Path
+    model: Model, trained: TrainedTwin, tmp_path: Path
 ) -> None:
     command, step_s = minute_of_commands()
     twin = saved(model, trained.card, tmp_path)
-    state, parameters = state_of(model, command), fleet(lag_s)
+    state, parameters = state_of(model, command), fleet(0.05)
     expected, expected_state = model.advance(state, command, step_s, parameters)
     first, middle = twin.advance(state, command[:777], step_s[:777], parameters)
     second, last = twin.advance(middle, command[777:], step_s[777:], parameters)
@@ -100,16 +98,6 @@ def test_without_a_lag_the_command_itself_acts_to_the_last_bit(
     ]
     np.testing.assert_array_equal(runs[0][0], runs[1][0])
     np.testing.assert_array_equal(runs[0][1][:, 1], command[-1])
-
-
-def test_a_step_of_zero_leaves_every_fan_where_it_is(trained: TrainedTwin, tmp_path: Path) -> None:
-    twin, parameters = saved(ALL_MODELS[2], trained.card, tmp_path), fleet(0.05)
-    state = np.array([[20.0, 5.0], [90.0, 6.0], [0.0, 7.0], [-40.0, 8.0]])
-    speed, after = twin.advance(state, np.full((3, FANS), 70.0), np.zeros(3), parameters)
-    np.testing.assert_array_equal(speed, np.tile(state[:, 0], (3, 1)))
-    lags = parameters[:, LAG] > 0.0
-    np.testing.assert_array_equal(after[lags], state[lags])
-    np.testing.assert_array_equal(after[~lags], [[90.0, 70.0]])
 
 
 def test_the_graph_keeps_the_contract(trained: TrainedTwin, tmp_path: Path) -> None:
@@ -141,10 +129,6 @@ def test_the_card_travels_in_the_file(trained: TrainedTwin, tmp_path: Path) -> N
     calibrated = replace(card, calibration={"false_alarms_per_day": 1.0, "limits": [3.0, None]})
     assert TwinCard.from_json(calibrated.to_json()) == calibrated
     np.testing.assert_array_equal(card.parameters, trained.parameters)
-
-
-def test_the_same_model_and_card_give_the_same_bytes(trained: TrainedTwin) -> None:
-    assert export_onnx(trained.model, trained.card) == export_onnx(trained.model, trained.card)
 
 
 def foreign_model(path: Path) -> None:
@@ -208,7 +192,7 @@ def test_a_graph_of_single_precision_is_refused(trained: TrainedTwin, tmp_path: 
 
 def test_a_truncated_file_is_refused_wherever_it_was_cut(trained: TrainedTwin, tmp_path: Path) -> None:
     whole, path = trained.save(tmp_path / "twin.onnx").read_bytes(), tmp_path / "cut.onnx"
-    for length in np.linspace(0, len(whole) - 1, 60).astype(int):
+    for length in np.linspace(0, len(whole) - 1, 12).astype(int):
         path.write_bytes(whole[:length])
         refusal(path)
 

@@ -128,10 +128,9 @@ def test_settled_speeds_determine_the_drag_but_not_the_inertia() -> None:
     assert not has_line_with(lines, "cannot be distinguished")
 
 
-@pytest.mark.parametrize("noise_rad_s", [fan_data.NOISE_RAD_S, 0.1])
-def test_commands_from_outside_are_called_a_loop_less_than_twice_in_a_hundred(noise_rad_s) -> None:
+def test_commands_from_outside_are_called_a_loop_less_than_twice_in_a_hundred() -> None:
     kinds = open_loop_commands(1500, 100)
-    run = commanded(np.hstack(list(kinds.values())), seed=2, noise_rad_s=noise_rad_s)
+    run = commanded(np.hstack(list(kinds.values())), seed=2, noise_rad_s=0.1)
     raised = np.array([feedback_share([run], fan) > 0.0 for fan in range(run.fans)])
     false_alarms = dict(zip(kinds, raised.reshape(len(kinds), -1).mean(axis=1), strict=True))
     assert all(share < 0.02 for share in false_alarms.values()), false_alarms
@@ -146,16 +145,10 @@ def test_a_speed_measured_after_its_command_is_no_feedback() -> None:
 @pytest.mark.parametrize(
     "controller",
     [
-        {},
-        {"proportional": 0.02, "integral_per_s": 0.05},
         {"proportional": 1.0, "integral_per_s": 0.0},
-        {"proportional": 0.0},
         {"proportional": 0.0, "delay": 1},
-        {"delay": 3},
         {"every": 10},
-        {"smoothing": 0.9},
-        {"noise_rad_s": 0.05},
-        {"dither": 1.0},
+        {"smoothing": 0.9, "noise_rad_s": 0.05},
     ],
     ids=named,
 )

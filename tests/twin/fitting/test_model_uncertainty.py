@@ -45,12 +45,6 @@ def test_beyond_its_data_it_says_how_wrong_a_twin_may_be_and_within_them_that_it
     assert np.mean(np.abs(error[beyond]) <= 2.0 * np.hypot(sigma, std_rad_s[beyond])) > 0.95
 
 
-def test_only_hybrids_have_one() -> None:
-    run = fan_data.rough_run(5, 10.0)
-    for kind in ("physical", "narx", "neural-ode"):
-        assert train_twin([run], [], kind, name="x", max_iterations=1).card.model_uncertainty is None
-
-
 def two_fans(first: Run, second: Run) -> Run:
     count = min(first.samples, second.samples)
     command, speed_rad_s = (
@@ -118,9 +112,8 @@ def at_levels(table: ModelUncertainty, unit: float = 1.0) -> tuple[Array, Array]
     return table.std_at(*pairs)[:, 0], table.unseen_std_at(*pairs)[:, 0]
 
 
-@pytest.mark.parametrize("standing", [0, 2, 9])
-def test_what_is_held_is_known_however_long_a_fan_stands(standing: int) -> None:
-    twin = train_twin([held_run(standing)], [], "hybrid", name="x", max_iterations=5)
+def test_what_is_held_is_known_however_long_a_fan_stands() -> None:
+    twin = train_twin([held_run(standing=9)], [], "hybrid", name="x", max_iterations=5)
     std_rad_s, unseen_rad_s = at_levels(known(twin))
     assert std_rad_s.max() < 0.3 * twin.card.sigma_rad_s[0]
     assert unseen_rad_s.max() < 0.3 * twin.card.sigma_rad_s[0]

@@ -13,7 +13,7 @@ STEP_S = 0.01
 def wandering(samples: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Commands and speeds of two fans that are independent of each other."""
     rng = np.random.default_rng(seed)
-    return rng.uniform(0.0, 100.0, (samples, 2)), 150.0 + 50.0 * rng.normal(size=(samples, 2))
+    return rng.uniform(0.0, 100.0, (samples, 2)), 50.0 + 80.0 * rng.normal(size=(samples, 2))
 
 
 def test_it_is_the_recursion_sample_by_sample() -> None:
@@ -34,7 +34,7 @@ def test_it_is_the_recursion_sample_by_sample() -> None:
     assert np.isnan(balance[0]).all()
 
 
-@pytest.mark.parametrize("rate_hz", [50.0, 100.0, 400.0])
+@pytest.mark.parametrize("rate_hz", [50.0, 400.0])
 def test_tacho_noise_gives_inertia_times_lambda_times_noise_at_every_rate(rate_hz: float) -> None:
     noise_rad_s = 3.0
     speed = 100.0 + np.random.default_rng(2).normal(0.0, noise_rad_s, (round(60 * rate_hz), 2))
