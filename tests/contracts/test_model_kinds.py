@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 
 from schemas.twin_card import TwinCard
 from tests.support import fan_data
+from tests.support.trained_once import TrainedOnce
 from twin.build import evaluate, train_twin
 from twin.export.onnx_export import export_onnx
 from twin.export.onnx_twin import OnnxTwin
@@ -24,10 +24,10 @@ every_kind = pytest.mark.parametrize("kind", [row.name for row in KINDS])
 Advance = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 
 
-@cache
-def trained(kind: str, seed: int = 0) -> TrainedTwin:
-    """A twin of two fans."""
-    return train_twin([RUN], [], kind, name="x", seed=seed, max_iterations=MOST_ITERATIONS)
+@pytest.fixture
+def trained(trained_once: TrainedOnce) -> Callable[..., TrainedTwin]:
+    """A twin of two fans, of a kind and a seed."""
+    return lambda kind, seed=0: trained_once([RUN], [], kind, name="x", seed=seed, max_iterations=MOST_ITERATIONS)
 
 
 def in_pieces(advance: Advance, ends: list[int], state: Array, parameters: Array) -> tuple[Array, Array]:
@@ -41,7 +41,7 @@ def in_pieces(advance: Advance, ends: list[int], state: Array, parameters: Array
 
 @every_kind
 def test_a_run_that_is_cut_anywhere_goes_on_as_if_it_were_not_in_memory_and_in_the_file(
-    kind: str, tmp_path: Path
+    kind: str, trained: Callable[..., TrainedTwin], tmp_path: Path
 ) -> None:
     twin = trained(kind)
     state = twin.model.state_layout.initial_state(np.array([5.0, 50.0]), RUN.command[0])
@@ -60,7 +60,9 @@ def test_a_run_that_is_cut_anywhere_goes_on_as_if_it_were_not_in_memory_and_in_t
 
 
 @every_kind
-def test_its_card_says_what_it_is_and_its_file_is_as_good_as_itself(kind: str, tmp_path: Path) -> None:
+def test_its_card_says_what_it_is_and_its_file_is_as_good_as_itself(
+    kind: str, trained: Callable[..., TrainedTwin], tmp_path: Path
+) -> None:
     twin = trained(kind)
     file = OnnxTwin(twin.save(tmp_path / "x.onnx"))
     assert file.card == twin.card == TwinCard.from_json(twin.card.to_json())
@@ -73,7 +75,9 @@ def test_its_card_says_what_it_is_and_its_file_is_as_good_as_itself(kind: str, t
 
 
 @every_kind
-def test_the_same_seed_gives_the_same_model_and_another_seed_another_network(kind: str) -> None:
+def test_the_same_seed_gives_the_same_model_and_another_seed_another_network(
+    kind: str, trained: Callable[..., TrainedTwin]
+) -> None:
     twin = trained(kind)
     again = train_twin([RUN], [], kind, name="x", max_iterations=MOST_ITERATIONS)
     np.testing.assert_array_equal(again.parameters, twin.parameters)
@@ -83,7 +87,9 @@ def test_the_same_seed_gives_the_same_model_and_another_seed_another_network(kin
 
 
 @pytest.mark.parametrize("kind", [row.name for row in KINDS if row.predicts == "speed"])
-def test_a_step_of_no_time_leaves_the_fans_where_they_are(kind: str, tmp_path: Path) -> None:
+def test_a_step_of_no_time_leaves_the_fans_where_they_are(
+    kind: str, trained: Callable[..., TrainedTwin], tmp_path: Path
+) -> None:
     twin = trained(kind)
     state = twin.model.state_layout.initial_state(np.array([7.0, 70.0]), np.full(2, 50.0))
     for model in (twin.model, OnnxTwin(twin.save(tmp_path / "x.onnx"))):

@@ -178,7 +178,7 @@ def test_settings_are_frozen_and_an_unknown_one_is_refused_by_name(kind: str, ma
     with pytest.raises(ValueError, match="no_such_key"):
         parse_source({**settings, "no_such_key": 1})
     with pytest.raises(ValueError, match="frozen"):
-        config.kind = "other"
+        config.kind = "other"  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def modules_of(kind: str) -> list[ModuleType]:

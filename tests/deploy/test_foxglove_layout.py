@@ -79,3 +79,12 @@ def test_every_path_leads_to_a_field_of_the_schema() -> None:
     for path in paths(document["configById"]["StateTransitions!states"]):
         field = leads_to[path]
         assert isinstance(field, FieldDescriptor) and field.enum_type is not None, "shown by its name"
+
+
+def panels(node: Any) -> list[str]:
+    return [node] if isinstance(node, str) else [*panels(node["first"]), *panels(node["second"])]
+
+
+def test_every_panel_is_placed_once_and_has_a_configuration() -> None:
+    document = layout()
+    assert sorted(panels(document["layout"])) == sorted(document["configById"])

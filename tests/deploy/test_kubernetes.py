@@ -190,3 +190,9 @@ def test_without_certificates_every_command_says_that_it_is_insecure():
         words = container(pods)["args"]
         assert "--insecure" in words
         assert not any("certs" in word or "tls" in word for word in words)
+
+
+def test_the_pods_of_the_scorer_ask_for_the_snapshots_of_those_before_them(stages):
+    for stage, stateful_set in stages.items():
+        words = container(stateful_set)["args"]
+        assert ("--set=scorer.asks_for_snapshots=true" in words) == (stage == "scorer")

@@ -134,6 +134,8 @@ def test_what_cannot_be_a_sample_of_the_tray_is_refused_at_once(
         tray.restart_time()
         tray.publish(T_S - 100, [0.5, 0.5], [1.0, 1.0])
         assert tray.check().received == 3
+        tray.publish(T_S - 99, [0.5, 0.5], [30_000.0, 1.0])
+        assert tray.check().absurd_speeds == 1, "no sample is lost by that"
 
 
 def test_what_ends_the_thread_is_raised_by_publish_and_check(

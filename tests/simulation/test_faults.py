@@ -142,3 +142,7 @@ def test_a_wrong_fault_is_a_one_line_error_that_names_the_part(text: str, messag
 def test_a_fault_that_does_not_fit_the_tray_is_refused(text: str, message: str) -> None:
     with pytest.raises(SimulationError, match=message):
         check_schedule([parse_fault(text)], fans=2, duration_s=10.0)
+
+
+def test_a_dropping_tacho_without_a_size_gives_no_reading_at_all() -> None:
+    assert np.isnan(speeds("tacho-dropout:fan=0,start=2")[200:, 0]).all()

@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from simulation.errors import SimulationError
+from simulation.fans import FanKind
 from simulation.plant import (
     DeviceClock,
     Disturbance,
@@ -15,13 +16,18 @@ from simulation.plant import (
     at_rest,
     drive,
     fan,
-    friction_v,
     tray_of_fans,
 )
 from simulation.tacho import NoisyTacho
 from simulation.tray import SimulatedTray, TraySettings
 
 ONE = tray_of_fans(1, seed=0, fan_variation=0.0)
+
+
+def friction_v(speed_rad_s: np.ndarray, parameters: FanParameters) -> np.ndarray | float:
+    """(fans,) magnitude of Coulomb and Stribeck friction, V; at standstill its largest value."""
+    rise = np.exp(-np.square(speed_rad_s / parameters.stribeck_rad_s))
+    return parameters.coulomb_v + (parameters.breakaway_v - parameters.coulomb_v) * rise
 
 
 def settle(duty: float, parameters: FanParameters = ONE, disturbance: Disturbance | None = None) -> float:
@@ -151,9 +157,10 @@ def samples_of(settings: TraySettings) -> list:
     return samples
 
 
-def test_the_same_seed_gives_the_same_samples_and_another_gives_others() -> None:
+@pytest.mark.parametrize("fan", ["dc", "4-pin"])
+def test_the_same_seed_gives_the_same_samples_and_another_gives_others(fan: FanKind) -> None:
     one, same, other = (
-        np.array([s.speed_rad_s for s in samples_of(TraySettings(fans=3, seed=seed, duration_s=1.0))])
+        np.array([s.speed_rad_s for s in samples_of(TraySettings(fan=fan, fans=3, seed=seed, duration_s=3.0))])
         for seed in (5, 5, 6)
     )
     assert np.array_equal(one, same)

@@ -78,6 +78,7 @@ def values_of(draw: st.DrawFn, column: Column, shape: tuple[int, ...]) -> Any:
         values = drawn.astype(np.int64) % (2 * FURTHEST_T_NS - 1) + (1 - FURTHEST_T_NS)
     elif dtype.kind == "f":
         values = np.resize(drawn.view(dtype), size)
+        values[np.isnan(values)] = np.nan  # others are not the same after a conversion
         values[:1] = draw(st.sampled_from((*SPECIAL, *values[:1].tolist())))
     else:
         values = (drawn % 2 if dtype.kind == "b" else drawn).astype(dtype)

@@ -250,7 +250,8 @@ class RedfishWorld(World):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.controller = Controller(is_new=True)
-        self.controller.percent, self.controller.status = [40, 40], 503
+        self.controller.percent = [40, 40]
+        self.controller.status = 503
         self.settings = {"url": self.stack.enter_context(redfish_server(self.controller)), **POLLED}
 
     def plug_in(self) -> None:
@@ -260,7 +261,8 @@ class RedfishWorld(World):
         self.controller.status = 503
 
     def show(self, number: int, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
-        self.controller.rpm, self.controller.percent = list(map(round, speeds_of(number))), [40, 40]
+        self.controller.rpm = [round(speed) for speed in speeds_of(number)]
+        self.controller.percent = [40, 40]
 
     def garble(self, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
         self.controller.percent = [None, None]

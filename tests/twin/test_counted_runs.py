@@ -7,6 +7,7 @@ import pytest
 
 from schemas.tacho import INSTANTANEOUS, Tacho
 from tests.support.fan_data import PUBLISHED_PARAMETERS, counted_run, published_run
+from tests.support.trained_once import TrainedOnce
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.finishing import TrainedTwin
@@ -24,8 +25,8 @@ def runs() -> tuple[Run, Run]:
 
 
 @pytest.fixture(scope="module")
-def twin(runs: tuple[Run, Run]) -> TrainedTwin:
-    return train_twin(runs[:1], runs[1:], "physical", name="counted")
+def twin(runs: tuple[Run, Run], trained_once: TrainedOnce) -> TrainedTwin:
+    return trained_once(runs[:1], runs[1:], "physical", name="counted")
 
 
 def taken_as_instantaneous(run: Run) -> Run:

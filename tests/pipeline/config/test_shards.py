@@ -132,3 +132,13 @@ def test_shards_that_cannot_be_are_refused_in_one_line(value, line):
     with pytest.raises(ConfigError) as refused:
         site(f"launcher.shards={value}")
     assert str(refused.value) == f"site.toml: {line}"
+
+
+def test_a_tray_that_is_added_at_the_end_moves_no_other_one():
+    before, after = (shards_of("scorer", site("launcher.shards=3", names=names)) for names in (NAMES, (*NAMES, "f")))
+    assert [set(old.trays) <= set(new.trays) for old, new in zip(before, after, strict=True)] == [True] * 3
+
+
+def test_the_files_of_a_shard_are_taken_for_no_part_of_another_recording():
+    assert own_file("all", Path("recording.mcap")) == Path("recording.mcap")
+    assert own_file("2-of-8", Path("there/recording.mcap")) == Path("there/2-of-8.recording.mcap")

@@ -95,3 +95,8 @@ def test_row_13_a_clock_set_while_a_stage_starts_is_noticed_by_it(set_by_s: int)
     host.wall_ns += NS_PER_S + set_by_s * NS_PER_S
     of_stage = HostClock(lambda: host.wall_ns, lambda: host.monotonic_ns, offset_ns)
     assert of_stage.now_ns() == host.clock.now_ns() == before + NS_PER_S + max(set_by_s, 0) * NS_PER_S
+
+
+@pytest.mark.parametrize("environment", [{}, {VARIABLE: "soon"}])
+def test_a_process_that_nobody_hands_a_time_begins_with_the_wall_clock(environment: dict[str, str]) -> None:
+    assert handed_on(environment) is None

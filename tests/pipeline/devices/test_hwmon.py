@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.config.loading import parse_config
 from pipeline.devices.hwmon_config import HwmonConfig
-from pipeline.devices.hwmon_source import HwmonDevice
+from pipeline.devices.hwmon_source import HwmonDevice, HwmonSource
 from pipeline.devices.polling import DeviceError
 from pipeline.devices.sample_source import Reading, Rejected, SourceContext
 from pipeline.errors import UserError
@@ -203,3 +203,11 @@ def test_what_a_source_cannot_do_is_said_before_it_starts(root: Path) -> None:
 def test_the_driver_says_what_is_measured(chip: str, tacho: Tacho) -> None:
     text = f'[[tray]]\nname = "a"\nfans = 2\nsource = {{ kind = "hwmon", chip = "{chip}" }}\n'
     assert parse_config(text, Path("fantwin.toml")).trays[0].tachos == (tacho,)
+
+
+def test_nothing_is_written_unless_the_configuration_says_so(root: Path) -> None:
+    board(root)
+    config = HwmonConfig(chip="nct6798", root=root)
+    source = HwmonSource(config, SourceContext(2, "rpm", Path()))
+    assert not source.device.is_writable and "takes no commands" in source.send((10.0, 10.0), ())
+    assert config.writable is False

@@ -167,3 +167,22 @@ def test_the_registers_say_what_is_measured_where_the_averaging_time_is_known() 
         with pytest.raises(ConfigError, match=words) as caught:
             parse_config((tray % ("", fan)).replace(*change), Path("fantwin.toml"))
         assert "\n" not in str(caught.value)
+
+
+def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_one_works() -> None:
+    slow = drive()
+    with modbus_line({3: slow}) as line:
+        made = ModbusDevice(*over_serial(line))
+        made.connect()
+        made.read()  # the first one waits for the simulation
+        made.disconnect()
+        made = ModbusDevice(*over_serial(line, timeout_s=0.2))
+        made.connect()
+        slow.delay_s = 0.4
+        with pytest.raises(DeviceError, match=r"unit 3 does not answer within 0.2 s; check unit and wiring") as caught:
+            made.read()
+        assert not caught.value.is_lost
+        slow.delay_s = 0.0
+        time.sleep(0.4)
+        assert made.read().supply_voltage_v == pytest.approx((540.25,))
+        made.disconnect()

@@ -19,6 +19,7 @@ from pwdlib import PasswordHash
 from pwdlib.hashers.argon2 import Argon2Hasher
 from pydantic import ValidationError
 
+from pipeline.devices import mqtt_source
 from pipeline.devices.fan_values import FanValues
 from pipeline.devices.mqtt_config import MqttConfig
 from pipeline.devices.mqtt_source import MqttSource
@@ -97,6 +98,23 @@ def test_a_message_that_the_broker_sends_again_is_left_out(broker: MqttBroker) -
         for item in batch.items
     ]
     assert [getattr(item, "kind", "reading") for item in items] == ["reading", "repeated", "reading"]
+    ((retained,),) = (batch.items for batch in source.batches("plant/tray1", SAMPLE.encode(), 0, is_retained=True))
+    assert isinstance(retained, Rejected) and (retained.kind, retained.harmless) == ("retained", True)
+
+
+def test_an_error_that_no_code_expects_costs_one_message_and_not_the_source(
+    broker: MqttBroker, publish: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(source_of(broker.port)) as events:
+        with monkeypatch.context() as broken:
+            broken.setattr(mqtt_source, "parse_samples", lambda _payload: 1 / 0)
+            publish("plant/tray1", SAMPLE)
+            eventually(lambda: events.items, "it is refused")
+        publish("plant/tray1", SAMPLE.replace("1.0", "2.0"))
+        eventually(lambda: len(events.items) == 2, "the next is read")
+    refused, reading = events.items
+    assert isinstance(refused, Rejected) and refused.kind == "malformed" and "ZeroDivisionError" in refused.detail
+    assert isinstance(reading, Reading)
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,10 @@ import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import pytest
+import serial
 
 from pipeline.config.models import TrayConfig
 from pipeline.devices.sample_source import LinkDown, LinkUp
@@ -220,3 +221,23 @@ def test_samples_continue_after_the_device_was_away_and_health_reports_it_meanwh
     assert line.write(encode("binary", CommandFrame((0.25,))))
     command = encode("binary", CommandFrame((0.25,)))
     assert Decoder("binary", 1, "device").feed(device.receive(len(command))) == [CommandFrame((0.25,))]
+
+
+def test_a_byte_that_came_just_before_the_device_was_disconnected_is_delivered():
+    class Unplugged:
+        """A pipe whose far end has been closed."""
+
+        def __init__(self) -> None:
+            self.near, far = os.pipe()
+            os.write(far, b"x")
+            os.close(far)
+
+        def fileno(self) -> int:
+            return self.near
+
+    delivered: list[ReceivedBytes] = []
+    unplugged = Unplugged()
+    port = cast("serial.Serial", unplugged)
+    assert SerialPort("unused", 115200)._read_until_disconnected(port, delivered.append)
+    os.close(unplugged.near)
+    assert [each.data for each in delivered] == [b"x"]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.learning.healthy_history import (
+    LONGEST_LAG_NS,
     HealthyHistory,
     healthy_recordings,
     recorded_raws,
@@ -304,3 +305,31 @@ def test_recordings_that_were_finished_and_not_named_get_their_names_at_start(tm
     assert kept_s(tmp_path) == [(0, 299), (1000, 1299)]
     assert second.seconds == 598.0
     assert sorted(place.iterdir()) == [each.path for each in healthy_recordings(tmp_path)]
+
+
+def test_where_an_excluded_time_span_ends_a_new_recording_begins(tmp_path: Path) -> None:
+    history = history_in(tmp_path, hold_back_s=0.0)
+    history.exclude([(START_S * NS_PER_S, (START_S + 300) * NS_PER_S)])
+    add(history, 0, 600)
+    assert history.seconds == 289.0
+    history.finish()
+    assert kept_s(tmp_path) == [(0, 309), (310, 599)]
+
+
+def test_rows_of_one_score_may_have_a_pause_between_them(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    for second in range(0, 1000, 10):
+        history.add(raw(second), has_alarm=False, is_watched=True)
+    rows_s = np.concatenate((np.arange(300), np.arange(400, 1000)))
+    history.judged((START_S + rows_s) * NS_PER_S, had_alarm=False)
+    history.finish()
+    assert kept_s(tmp_path) == [(410, 899)]
+
+
+def test_what_was_not_judged_for_long_is_given_up_so_that_memory_stays_bounded(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    for second in range(0, 20_000, 10):
+        history.add(raw(second), has_alarm=False, is_watched=True)
+    judge(history, 0, 20_000)
+    history.finish()
+    assert kept_s(tmp_path)[0][0] >= 20_000 - LONGEST_LAG_NS // NS_PER_S - 110

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from schemas.tacho import Tacho
 from tests.support import fan_data
 from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluate_model
@@ -152,3 +153,20 @@ def test_a_thinned_run_keeps_its_readings_and_loses_no_impulse() -> None:
         assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
     assert thinned(run, 1) is run
     assert thinned(run.rows(0, 4), 7).samples == 4, "a single sample is no run"
+
+
+def test_no_impulse_is_lost_on_irregular_steps_of_an_irregular_run() -> None:
+    rng = np.random.default_rng(2)
+    run = Run("jittered", np.cumsum(rng.uniform(0.005, 0.02, 500)), rng.uniform(0, 100, 500), rng.normal(size=500))
+    thin = irregular(run, seed=3)
+    for stop_s in thin.t_s[[1, 50, -1]]:
+        assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
+
+
+def test_the_readings_of_a_tacho_that_counts_are_predicted_as_well_when_thinned() -> None:
+    run = fan_data.counted_run(6, Tacho(kind="count", window_s=1.0, update_s=0.25), rate_hz=100.0)
+    model, parameters = PhysicalModel(), np.array([[*fan_data.PUBLISHED_PARAMETERS, 0.0]])
+    whole, thin = (
+        evaluate_model(model, parameters, np.ones(1), [each]).pooled.rmse_rad_s for each in (run, thinned(run, 10))
+    )
+    assert thin == pytest.approx(whole, rel=0.05)

@@ -182,7 +182,7 @@ def test_the_autocorrelation_time_is_that_of_an_exponential_with_and_without_los
     rng = np.random.default_rng(11)
     for missing in (np.zeros(SAMPLES, dtype=bool), rng.random(SAMPLES) < 0.5, np.arange(SAMPLES) % 2 == 1):
         times = [
-            analysed(np.where(missing, np.nan, slow(rng)), np.zeros(SAMPLES)).autocorrelation_time_s for _ in range(20)
+            analysed(np.where(missing, np.nan, slow(rng)), np.zeros(SAMPLES)).autocorrelation_time_s for _ in range(60)
         ]
         assert np.mean(times) == pytest.approx(0.5, rel=0.15)
 

@@ -13,8 +13,8 @@ from onnx import helper
 
 from schemas.twin_card import CARD_PROPERTY, GRAPH_INPUTS, GRAPH_OUTPUTS, CardError, DataCard, TwinCard
 from tests.support import fan_data
+from tests.support.trained_once import TrainedOnce
 from tests.twin.models.test_models import ALL_MODELS, random_network
-from twin.build import train_twin
 from twin.errors import TwinError
 from twin.export.onnx_export import export_onnx
 from twin.export.onnx_twin import OnnxTwin
@@ -28,10 +28,10 @@ CREATED = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 @pytest.fixture(scope="module")
-def trained() -> TrainedTwin:
+def trained(trained_once: TrainedOnce) -> TrainedTwin:
     run = fan_data.published_run(1, 20.0, fans=2)
     data = [DataCard("bench.csv", "ab" * 32, run.fans, run.samples)]
-    return train_twin([run], [], "physical", name="bench", command_unit="%", data=data, created=CREATED)
+    return trained_once([run], [], "physical", name="bench", command_unit="%", data=data, created=CREATED)
 
 
 def saved(model: Model, card: TwinCard, folder: Path) -> OnnxTwin:

@@ -1,5 +1,6 @@
 """Warnings: none for recordings that determine every parameter, and the right one for each that does not."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -273,3 +274,26 @@ def counted(gain_per_rad_s: float) -> Run:
 def test_a_loop_through_a_tacho_that_counts_is_noticed_and_none_where_there_is_none() -> None:
     assert feedback_share([counted(0.5)], 0) > 0.2
     assert feedback_share([counted(0.0)], 0) == 0.0
+
+
+def test_a_narrow_range_of_speed_determines_only_the_sum_of_alpha_and_drag() -> None:
+    stairs = fan_data.stairs(np.random.default_rng(9), 4500, 4, 50.0, 70.0)
+    apart = [
+        line for line in warnings_of(commanded(stairs, seed=1, warm_up_s=5.0)) if "cannot be distinguished" in line
+    ]
+    assert len(apart) == 4
+    for line in apart:
+        value, error, speed = (float(part.split()[0]) for part in re.split(" = | ± ", line)[1:])
+        assert abs(value - (VISCOUS + DRAG * speed)) < 2.0 * error
+        assert 130.0 < speed < 170.0
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [{"proportional": 0.1, "integral_per_s": 0.2}, {"delay": 3}, {"smoothing": 0.9}],
+    ids=named,
+)
+def test_every_proportional_loop_is_noticed_behind_steps_of_its_set_point(controller) -> None:
+    stairs = fan_data.stairs(np.random.default_rng(6), 3000, 20, 60.0, 180.0)
+    run = controlled(stairs, seed=3, **controller)
+    assert all(feedback_share([run], fan) > 0.0 for fan in range(run.fans))

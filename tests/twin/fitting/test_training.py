@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.support import fan_data
+from tests.support.trained_once import TrainedOnce
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.finishing import TrainedTwin
@@ -29,8 +30,8 @@ def part(rough) -> Run:
 
 
 @pytest.fixture(scope="module")
-def hybrid(rough, part) -> TrainedTwin:
-    return train_twin([part], [rough[1]], "hybrid", name="hybrid", max_iterations=10)
+def hybrid(rough, part, trained_once: TrainedOnce) -> TrainedTwin:
+    return trained_once([part], [rough[1]], "hybrid", name="hybrid", max_iterations=10)
 
 
 def times_noise(twin: TrainedTwin, run: Run) -> float:
@@ -45,7 +46,7 @@ def test_the_hybrid_comes_to_the_noise_where_the_physics_stay_far_from_it(rough,
 
 def test_the_mean_of_several_networks_hardly_depends_on_the_seed(rough) -> None:
     short = rough[0].between(0.0, 25.0)
-    twins = [train_twin([short], [], "hybrid", name="x", seed=seed, max_iterations=25, networks=4) for seed in range(3)]
+    twins = [train_twin([short], [], "hybrid", name="x", seed=seed, max_iterations=25, networks=4) for seed in range(2)]
     errors = [times_noise(twin, rough[2]) for twin in twins]
     assert max(errors) < 1.03 * min(errors), "that of a single network differs by 5 %"
     assert all(twin.card.training.networks == 4 for twin in twins)
@@ -113,10 +114,10 @@ def test_a_fan_that_was_not_measured_in_the_held_out_run_is_refused(rough) -> No
         train_twin([run], [Run("blind", run.t_s, run.command, speed)], "physical", name="x")
 
 
-def test_without_data_the_hybrid_follows_its_physics(rough) -> None:
+def test_without_data_the_hybrid_follows_its_physics(rough, trained_once: TrainedOnce) -> None:
     """Trained on the upper half of the commands alone, run from rest through the lower half."""
     upper = fan_data.rough_run(5, 60.0, low=50.0)
-    twin, physical = (train_twin([upper], [], kind, name="x") for kind in ("hybrid", "physical"))
+    twin, physical = (trained_once([upper], [], kind, name="x") for kind in ("hybrid", "physical"))
     assert times_noise(twin, rough[2]) < 1.5 * times_noise(physical, rough[2])
 
 
@@ -181,3 +182,10 @@ def test_adam_lowers_the_free_run_error_from_the_physics_on(rough) -> None:
 def test_an_impossible_request_is_refused_in_one_line(rough, options: dict, words: str) -> None:
     with pytest.raises(TwinError, match=words):
         train_twin([rough[1]], [], name="x", **options)
+
+
+def test_irregular_samples_are_as_good_as_regular_ones(rough, part) -> None:
+    rng = np.random.default_rng(3)
+    keep = np.sort(rng.choice(part.samples, part.samples * 2 // 3, replace=False))
+    twin = train_twin([thinned(part, keep)], [], "hybrid", name="x", max_iterations=15)
+    assert times_noise(twin, rough[2]) < 1.1
