@@ -86,12 +86,6 @@ def drive(duty: Array, parameters: FanParameters) -> Array:
     return np.clip((duty - parameters.duty_dead) / (parameters.duty_full - parameters.duty_dead), 0.0, 1.0)
 
 
-def friction_v(speed_rad_s: Array, parameters: FanParameters) -> Array:
-    """(fans,) magnitude of Coulomb and Stribeck friction, V; at standstill its largest value."""
-    rise = np.exp(-np.square(speed_rad_s / parameters.stribeck_rad_s))
-    return parameters.coulomb_v + (parameters.breakaway_v - parameters.coulomb_v) * rise
-
-
 @dataclass(frozen=True)
 class Disturbance:
     """External influences and damage; each field (fans,). The defaults are those of a healthy fan."""

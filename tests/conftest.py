@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.support.small_disk import mount, unmount
+from tests.support.trained_once import TrainedOnce
 
 # The same examples on every run, and no judgement of how long one takes: machines differ.
 settings.register_profile("house", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -33,6 +34,15 @@ def endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture(scope="session")
+def trained_once(tmp_path_factory: pytest.TempPathFactory) -> TrainedOnce:
+    """Twins that are trained once in a session, whichever worker needs them first."""
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "trained-once"
+    folder.mkdir(exist_ok=True)
+    return TrainedOnce(folder)
 
 
 @pytest.fixture

@@ -15,12 +15,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench.detection.tray_run import run_of
 from schemas.reference_conditions import ReferenceConditions
 from schemas.tacho import Tacho
 from simulation.surroundings import Surroundings
 from simulation.tacho import TachoSettings
 from simulation.tray import TraySettings
-from simulation.tray_run import run_of
 from twin.build import evaluate, train_twin
 from twin.finishing import TrainedTwin
 from twin.fitting.identification import identify

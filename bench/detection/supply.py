@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.detection.tray_run import run_of
 from pipeline.config.loading import parse_config
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.building import build_parts
@@ -35,7 +36,6 @@ from simulation.faults import Fault
 from simulation.surroundings import Measured, Surroundings
 from simulation.tacho import NoisyTacho, TachoSettings
 from simulation.tray import TraySettings
-from simulation.tray_run import run_of
 from twin.build import evaluate, train_twin
 from twin.runs import Run
 

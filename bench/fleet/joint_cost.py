@@ -22,12 +22,12 @@ from bench.fleet.hall import Hall
 from bench.fleet.stage_cost import SITE, STAGES, calibrated_twin
 from bench.printing import JsonOption, progress, show
 from bench.stage_context import stage_context
+from bench.training.published_fan import RATE_HZ
 from pipeline.config.loading import parse_config
 from pipeline.runtime.building import build_parts
 from pipeline.runtime.joint_step import step_together
 from pipeline.runtime.stage import Core, load_stage
 from schemas.messages import Grid, Message, Prediction
-from simulation.published_fan import RATE_HZ
 
 BEGINNING_S = 25.0
 """in which baselines are found; it is not measured"""

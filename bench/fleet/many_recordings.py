@@ -22,7 +22,7 @@ import typer
 from distributed import LocalCluster
 
 from bench.printing import JsonOption, progress, show
-from simulation.published_fan import rough_run
+from bench.training.published_fan import rough_run
 from tests.support.but_for_times import but_for_times, content_of
 from tests.support.written_recordings import write_run
 

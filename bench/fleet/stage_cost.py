@@ -24,6 +24,7 @@ import typer
 from bench.detection.plant import START_NS
 from bench.printing import JsonOption, progress, show
 from bench.stage_context import stage_context
+from bench.training.published_fan import RATE_HZ, rough_run
 from pipeline.cli.twins.calibrate import calibrate
 from pipeline.config.loading import parse_config
 from pipeline.recordings.writing import RecordingWriter
@@ -33,7 +34,6 @@ from schemas.header import Header
 from schemas.messages import Alarm, Grid, Prediction, Raw, Score
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
-from simulation.published_fan import RATE_HZ, rough_run
 from twin.build import train_twin
 from twin.runs import Run
 

@@ -26,6 +26,7 @@ from bench.fleet.hall import FAULT_S, PRODUCER, SITE, Hall, HallFault
 from bench.fleet.stage_cost import calibrated_twin
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint, memory_mb
+from bench.training.published_fan import RATE_HZ
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from pipeline.launch.site_watcher import SiteWatcher
@@ -37,7 +38,6 @@ from schemas.envelope import Envelope
 from schemas.messages import Alarm, Raw, Score
 from schemas.topics import BY_NAME, tray_key
 from schemas.units import NS_PER_S
-from simulation.published_fan import RATE_HZ
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from bench.printing import progress
 from bench.runtime.stage_memory import free_endpoint, memory_mb
+from bench.training.published_fan import RATE_HZ, ROUGH_RANGE, published_fan, random_stairs
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from pipeline.launch.site_watcher import SiteWatcher
@@ -33,7 +34,6 @@ from pipeline.selftest.scratch_site import FANTWIN
 from schemas.header import Header
 from schemas.messages import Raw
 from schemas.units import NS_PER_S
-from simulation.published_fan import RATE_HZ, ROUGH_RANGE, published_fan, random_stairs
 
 FANS, SITE, TRAY = 8, "site", "tray1"
 HISTORY_S = 600.0

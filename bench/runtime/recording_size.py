@@ -26,6 +26,7 @@ from bench.printing import JsonOption, progress, show
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from bench.training.published_fan import RATE_HZ, rough_run
 from pipeline.config.loading import parse_config
 from pipeline.recordings.reading import read_recording
 from pipeline.recordings.recorder_config import FLUSH_BYTES, FLUSH_S, SAMPLES, RecorderConfig
@@ -35,7 +36,6 @@ from schemas.messages import ScorerSnapshot
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 from scoring.wear.trend import WearSeries
-from simulation.published_fan import RATE_HZ, rough_run
 from tests.support.killed_site import CHAIN, Stages
 from twin.runs import Run
 

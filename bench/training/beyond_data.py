@@ -16,8 +16,8 @@ import typer
 
 from bench.printing import JsonOption, progress, show
 from bench.training.measured_sets import esc_test
+from bench.training.published_fan import random_stairs
 from bench.training.rough_table import DUTY_RANGE, simulated_plant
-from simulation.published_fan import random_stairs
 from twin.build import train_twin
 from twin.evaluation.accuracy import compared_readings, evaluation_pieces, free_run_readings
 from twin.finishing import TrainedTwin

@@ -19,9 +19,9 @@ import numpy as np
 import typer
 
 from bench.printing import JsonOption, progress, show
+from bench.training.published_fan import SimulatedRun, random_stairs
 from bench.training.rough_table import DUTY_RANGE, simulated_plant
 from simulation.plant import FanParameters, tray_of_fans
-from simulation.published_fan import SimulatedRun, random_stairs
 from twin.build import evaluate, train_twin
 from twin.evaluation.accuracy import Evaluation, evaluate_model
 from twin.finishing import TrainedTwin

@@ -13,8 +13,7 @@ import numpy as np
 import typer
 
 from bench.printing import JsonOption, progress, show
-from simulation.excitation import Chirp, Staircase
-from simulation.published_fan import (
+from bench.training.published_fan import (
     DRAG,
     INERTIA,
     RATE_HZ,
@@ -25,6 +24,7 @@ from simulation.published_fan import (
     random_stairs,
     sum_of_sines,
 )
+from simulation.excitation import Chirp, Staircase
 from twin.fitting.identification import identify
 from twin.runs import Array
 

@@ -28,7 +28,7 @@ from scipy.integrate import solve_ivp
 
 from bench.printing import JsonOption, progress, show
 from bench.training import race_diffrax, race_torchdiffeq
-from simulation.published_fan import RATE_HZ, ROUGH_RANGE, random_stairs, rough_run
+from bench.training.published_fan import RATE_HZ, ROUGH_RANGE, random_stairs, rough_run
 from twin.build import train_twin
 from twin.export.onnx_twin import OnnxTwin
 from twin.finishing import TrainedTwin

@@ -1,6 +1,6 @@
 """The published simulated fan: test error of each model beside the published one, and the parameters recovered.
 
-Several independent pairs of training and test runs, 40 s each (simulation.published_fan); every figure is a median
+Several independent pairs of training and test runs, 40 s each (bench.training.published_fan); every figure is a median
 over them
 and its worst. The floor is the noise: the error of a perfect model, sqrt(10) on average and a little more or less in
 each run, so errors are given as multiples of both.
@@ -15,7 +15,7 @@ import typer
 
 from bench.printing import JsonOption, progress, show
 from bench.training.four_models import held_out_figures
-from simulation.published_fan import (
+from bench.training.published_fan import (
     DRAG,
     INERTIA,
     NOISE_RAD_S,

@@ -14,9 +14,9 @@ import typer
 
 from bench.printing import JsonOption, progress, show
 from bench.training.four_models import held_out_figures, trained_in_s
+from bench.training.published_fan import RATE_HZ, SimulatedRun, random_stairs
 from simulation.excitation import Manual
 from simulation.plant import FanParameters, advance, at_rest
-from simulation.published_fan import RATE_HZ, SimulatedRun, random_stairs
 from simulation.tacho import NoisyTacho
 from twin.comparison import Contender, all_candidates, contend
 from twin.runs import Array, Run

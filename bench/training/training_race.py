@@ -29,8 +29,8 @@ import typer
 
 from bench.printing import JsonOption, progress, show
 from bench.training import race_diffrax, race_published, race_torchdiffeq
+from bench.training.published_fan import SimulatedRun, rough_run
 from bench.training.race_problem import Phase, TimedEvaluation, problem
-from simulation.published_fan import SimulatedRun, rough_run
 from twin.build import train_twin
 from twin.finishing import TrainedTwin
 from twin.fitting.identification import Identification, identify

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from schemas import fan_pb2
@@ -38,10 +37,6 @@ def paths(value: Any) -> Iterator[str]:
     elif isinstance(value, list):
         for inner in value:
             yield from paths(inner)
-
-
-def panels(node: Any) -> list[str]:
-    return [node] if isinstance(node, str) else [*panels(node["first"]), *panels(node["second"])]
 
 
 def resolve(path: str, variables: set[str]) -> FieldDescriptor | Descriptor:
@@ -86,24 +81,10 @@ def test_every_path_leads_to_a_field_of_the_schema() -> None:
         assert isinstance(field, FieldDescriptor) and field.enum_type is not None, "shown by its name"
 
 
+def panels(node: Any) -> list[str]:
+    return [node] if isinstance(node, str) else [*panels(node["first"]), *panels(node["second"])]
+
+
 def test_every_panel_is_placed_once_and_has_a_configuration() -> None:
     document = layout()
     assert sorted(panels(document["layout"])) == sorted(document["configById"])
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        "fantwin/demo/tray1/score.speed[$fan]",
-        "fantwin/demo/tray1/scores.score[$fan]",
-        "/fantwin/demo/tray1/score.score[$fan]",
-        "fantwin/demo/tray1/score.score",
-        "fantwin/demo/tray1/score.score[$tray]",
-        "fantwin/demo/tray1/score.score[$fan].value",
-        "fantwin/demo/tray1/score.score[$fan].@root",
-        "fantwin/demo/tray1/alarm{fans==$fan}.severity",
-    ],
-)
-def test_a_path_that_leads_nowhere_is_found(path: str) -> None:
-    with pytest.raises(LookupError):
-        resolve(path, {"fan"})

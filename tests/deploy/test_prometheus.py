@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from prometheus_client.parser import text_string_to_metric_families
 
 from schemas.enums import FanState, StageStatus
 from schemas.fields import columns
@@ -31,7 +30,6 @@ from tests.support.running_prometheus import DEPLOY, RunningPrometheus, needs_pr
 RULES = DEPLOY / "prometheus" / "fantwin.rules.yml"
 RULE_TESTS = RULES.with_name("fantwin.rules.test.yml")
 BOARD = DEPLOY / "grafana" / "fantwin.json"
-DOCUMENT = DEPLOY.parent / "docs" / "how-to" / "metrics.md"
 VARIABLES = {"$site": SITE, "$tray": TRAY, "$fan": "2", "$__rate_interval": "5m"}
 ALL_FANS = 2 * FANS
 EMPTY_WHILE_HEALTHY = ["Fans in alarm"]
@@ -191,17 +189,3 @@ def test_prometheus_finds_nothing_to_say_against_the_metrics_whatever_another_pr
 
 def test_the_board_is_one_of_grafanas_schema():
     assert problems_of(json.loads(BOARD.read_text())) == []
-
-
-def test_the_document_has_every_metric_with_its_labels(gateway):
-    gateway.feed(judged(1.0), alarm(), health("scorer", 100, 10.0))
-    families = [*text_string_to_metric_families(Client(gateway).ask("GET", "/metrics")[1])]
-    labels = {
-        (f"{family.name}_total" if family.type == "counter" else family.name): sorted(
-            family.samples[0].labels.keys() - {"le"}
-        )
-        for family in families
-        if family.name.startswith("fantwin_")
-    }
-    rows = re.findall(r"^\| `(fantwin_\w+)` \| ([^|]*) \|", DOCUMENT.read_text(), re.MULTILINE)
-    assert {name: sorted(words.split(", ")) for name, words in rows} == labels

@@ -86,12 +86,6 @@ def test_samples_are_joined_in_the_order_given_under_the_first_header() -> None:
     }
 
 
-def test_samples_are_counted_as_in_python_slices() -> None:
-    part = cut(raw(5), 1, 3)
-    assert (part.host_receive_t_ns.tolist(), part.device_clock_us.tolist()) == ([1, 2], [1, 2])
-    assert cut(raw(5, clock=False), 1, 3).device_clock_us.tolist() == []
-
-
 @pytest.mark.parametrize(
     ("one", "other"),
     [

@@ -11,24 +11,6 @@ from schemas.health import Health, Input, Output
 from schemas.streams import StreamState, input_streams, output_streams, stage_losses
 
 
-def test_messages_before_the_first_one_seen_are_history_and_not_missing():
-    state = StreamState()
-    assert state.accept(500)
-    assert (state.received, state.missing, state.first_sequence, state.next_sequence) == (1, 0, 500, 501)
-
-
-def test_a_gap_counts_as_missing():
-    state = StreamState()
-    assert [state.accept(sequence) for sequence in (0, 1, 5)] == [True] * 3
-    assert (state.received, state.missing, state.next_sequence) == (3, 3, 6)
-
-
-def test_a_message_that_comes_again_counts_as_duplicated_only():
-    state = StreamState()
-    assert [state.accept(sequence) for sequence in (0, 1, 0)] == [True, True, False]
-    assert (state.received, state.missing, state.duplicated) == (2, 0, 1)
-
-
 def test_skipping_counts_published_messages_that_never_came():
     state = StreamState()
     assert state.skip_to(3) == 0, "nothing was known of the stream: this is history"

@@ -1,7 +1,5 @@
 """The table of topics: complete, consistent, and invertible."""
 
-from pathlib import Path
-
 import pytest
 
 from pipeline.config.registry import STAGES
@@ -13,12 +11,9 @@ from schemas.topics import (
     TOPICS,
     alive_key,
     health_key,
-    key_in_words,
     topic_of,
     tray_key,
 )
-
-CONTRACT = Path(__file__).parents[2] / "docs" / "reference" / "messages.md"
 
 
 def test_every_message_type_has_exactly_one_topic():
@@ -51,11 +46,6 @@ def test_a_foreign_key_is_no_topic(key):
         topic_of(key)
 
 
-def test_a_key_is_told_in_words_and_what_is_none_stays_as_it_is():
-    assert key_in_words(tray_key("lab", "tray1", "grid")) == "grid of tray1"
-    assert (key_in_words("grid"), key_in_words("")) == ("grid", "")
-
-
 def test_the_fixed_parts_of_keys_are_reserved_tray_names():
     assert health_key("s", "x", "y").split("/")[2] in RESERVED_TRAY_NAMES
     assert alive_key("s", "x", "y").split("/")[2] in RESERVED_TRAY_NAMES
@@ -70,10 +60,3 @@ def test_a_stage_reads_and_writes_topics_of_the_table(name):
 
 def test_the_recorder_reads_every_recorded_topic():
     assert set(load_stage("recorder").reads) == {topic.name for topic in TOPICS if topic.recorded}
-
-
-@pytest.mark.parametrize("topic", TOPICS, ids=lambda t: t.name)
-def test_every_topic_is_in_the_reference(topic):
-    text = CONTRACT.read_text(encoding="utf-8")
-    assert f"`{topic.name}`" in text
-    assert topic.message.__name__ in text

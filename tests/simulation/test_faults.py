@@ -51,12 +51,6 @@ def test_an_opened_inlet_and_a_raised_supply_speed_the_fan_up() -> None:
     assert speeds("supply:fan=0,size=1.1")[-1, 0] > speeds()[-1, 0] + 20.0
 
 
-def test_the_size_orders_the_effect() -> None:
-    ends = [speeds(f"inlet:fan=0,size={size}")[-1, 0] for size in (1.0, 1.3, 1.6, 2.0)]
-    assert ends == sorted(ends, reverse=True)
-    assert ends[0] == speeds()[-1, 0]
-
-
 def test_a_brake_does_not_drive_a_standing_fan_backwards() -> None:
     assert np.all(speeds("rotor:fan=0,size=20", duty=0.5)[:, 0] == 0.0)
 
@@ -81,10 +75,6 @@ def test_a_dropping_tacho_gives_no_reading_for_its_share_of_samples() -> None:
     assert not missing[:, 1].any()
     there = ~missing[:, 0]
     assert np.array_equal(run[there, 0], run[there, 1])  # the fan itself is well
-
-
-def test_a_dropping_tacho_without_a_size_gives_no_reading_at_all() -> None:
-    assert np.isnan(speeds("tacho-dropout:fan=0,start=2")[200:, 0]).all()
 
 
 def test_several_faults_of_one_fan_add_up() -> None:
@@ -152,3 +142,7 @@ def test_a_wrong_fault_is_a_one_line_error_that_names_the_part(text: str, messag
 def test_a_fault_that_does_not_fit_the_tray_is_refused(text: str, message: str) -> None:
     with pytest.raises(SimulationError, match=message):
         check_schedule([parse_fault(text)], fans=2, duration_s=10.0)
+
+
+def test_a_dropping_tacho_without_a_size_gives_no_reading_at_all() -> None:
+    assert np.isnan(speeds("tacho-dropout:fan=0,start=2")[200:, 0]).all()

@@ -166,14 +166,6 @@ def test_a_tray_shows_a_blocked_rotor_no_power_and_a_loose_wire_of_their_fans_al
     assert speed[500:, :2] == pytest.approx(healthy[500:, :2], rel=0.06)
 
 
-def test_the_same_seed_gives_the_same_rack_and_another_another() -> None:
-    one, same, other = (samples(replace(RACK, seed=seed)) for seed in (5, 5, 6))
-    assert np.array_equal(one[0], same[0])
-    assert np.array_equal(one[1], same[1])
-    assert not np.array_equal(one[0], other[0])
-    assert not np.array_equal(one[1], other[1])
-
-
 def test_the_readings_of_a_rack_do_not_depend_on_how_often_they_are_reported() -> None:
     steady = replace(RACK, jitter_us=0.0, duration_s=25.0, tacho=TachoSettings((Tacho(kind="count", window_s=1.0),)))
     _, ten = samples(steady, duty=0.5)

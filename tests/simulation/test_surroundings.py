@@ -60,20 +60,13 @@ def test_more_drag_takes_more_current_and_a_weak_supply_less() -> None:
 
 
 def test_the_supply_wanders_as_much_as_it_is_set_to() -> None:
-    settings = replace(STILL, duration_s=600.0, rate_hz=2.0, surroundings=Surroundings(0.05, 5.0, measured=ALL))
+    settings = replace(STILL, duration_s=300.0, rate_hz=2.0, surroundings=Surroundings(0.05, 5.0, measured=ALL))
     volts = np.array([sample.auxiliary["supply_voltage_v"][0] for sample in samples(settings)])
     assert volts.std() == pytest.approx(0.6, rel=0.3)
     assert volts.mean() == pytest.approx(12.0, rel=0.03)
 
 
 FOUR_PIN = replace(STILL, fan="4-pin", surroundings=Surroundings(measured=("supply_voltage_v", "temperature_c")))
-
-
-def test_without_surroundings_4_pin_fans_are_as_before() -> None:
-    plain, measured = samples(replace(FOUR_PIN, surroundings=Surroundings())), samples(FOUR_PIN)
-    for one, other in zip(plain, measured, strict=True):
-        np.testing.assert_array_equal(one.speed_rad_s, other.speed_rad_s)
-    np.testing.assert_allclose(measured[-1].auxiliary["supply_voltage_v"], 12.0, atol=0.2)
 
 
 def test_4_pin_fans_follow_a_supply_that_wanders_only_where_they_do_not_hold_their_speed() -> None:

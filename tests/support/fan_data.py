@@ -1,11 +1,11 @@
-"""The simulated fans of simulation.published_fan as most tests want them: what was measured, under stairs from 0 to
+"""The simulated fans of bench.training.published_fan as most tests want them: what was measured, under stairs from 0 to
 100."""
 
 import numpy as np
 
+from bench.training import published_fan
+from bench.training.published_fan import DRAG, INERTIA, NOISE_RAD_S, RATE_HZ, ROUGH_RANGE, VISCOUS
 from schemas.tacho import Tacho
-from simulation import published_fan
-from simulation.published_fan import DRAG, INERTIA, NOISE_RAD_S, RATE_HZ, ROUGH_RANGE, VISCOUS
 from twin.runs import Array, Run
 
 __all__ = ["NOISE_RAD_S", "PUBLISHED_PARAMETERS", "RATE_HZ", "counted_run", "published_run", "rough_run", "stairs"]

@@ -1,10 +1,10 @@
 """Hypothesis strategies: any message of any type, whose columns agree on their samples and fans."""
 
+import math
 from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as st_numpy
 
 from schemas.fields import LARGEST_ENUM_VALUE, Column, OpenEnum, columns, other_fields
 from schemas.header import Header, InputPosition
@@ -65,11 +65,25 @@ def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
     return OF_TYPE[hint]
 
 
-def values_of(column: Column, shape: tuple[int, ...]) -> st.SearchStrategy[Any]:
-    elements = None
-    if column.limits is not None:
-        elements = st.integers(0, LARGEST_ENUM_VALUE) if column.enum else TIME_NS
-    return st_numpy.arrays(column.dtype, shape, elements=elements)
+SPECIAL = (0.0, -0.0, np.nan, np.inf, -np.inf)
+
+
+@st.composite
+def values_of(draw: st.DrawFn, column: Column, shape: tuple[int, ...]) -> Any:
+    """An array of any bits that a column may hold, drawn at once; its first float may be a special one."""
+    dtype, size = np.dtype(column.dtype), math.prod(shape)
+    drawn = np.frombuffer(draw(st.binary(min_size=8 * size, max_size=8 * size)), np.uint64)
+    if column.enum:
+        values = (drawn % (LARGEST_ENUM_VALUE + 1)).astype(dtype)
+    elif column.limits is not None:
+        values = drawn.astype(np.int64) % (2 * FURTHEST_T_NS - 1) + (1 - FURTHEST_T_NS)
+    elif dtype.kind == "f":
+        values = np.resize(drawn.view(dtype), size)
+        values[np.isnan(values)] = np.nan  # others are not the same after a conversion
+        values[:1] = draw(st.sampled_from((*SPECIAL, *values[:1].tolist())))
+    else:
+        values = (drawn % 2 if dtype.kind == "b" else drawn).astype(dtype)
+    return values.reshape(shape)
 
 
 @st.composite

@@ -7,12 +7,11 @@ import pytest
 
 from schemas.tacho import INSTANTANEOUS, Tacho
 from tests.support.fan_data import PUBLISHED_PARAMETERS, counted_run, published_run
+from tests.support.trained_once import TrainedOnce
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.finishing import TrainedTwin
 from twin.fitting.identification import identify
-from twin.fitting.trajectories import cut_into_trajectories
-from twin.kinds import find_kind
 from twin.measurement import measurement_of
 from twin.runs import Run
 
@@ -26,8 +25,8 @@ def runs() -> tuple[Run, Run]:
 
 
 @pytest.fixture(scope="module")
-def twin(runs: tuple[Run, Run]) -> TrainedTwin:
-    return train_twin(runs[:1], runs[1:], "physical", name="counted")
+def twin(runs: tuple[Run, Run], trained_once: TrainedOnce) -> TrainedTwin:
+    return trained_once(runs[:1], runs[1:], "physical", name="counted")
 
 
 def taken_as_instantaneous(run: Run) -> Run:
@@ -104,25 +103,6 @@ def test_all_readings_of_a_tacho_that_does_not_count_count_alike_whatever_the_fa
     of_both = identify([beside], with_lag=False).parameters
     np.testing.assert_allclose(of_both[0], identify([alone], with_lag=False).parameters[0], rtol=1e-2)
     np.testing.assert_allclose(of_both[1], identify([counted], with_lag=False).parameters[0], rtol=1e-2)
-
-
-def test_stretches_overlap_by_what_their_first_readings_show_and_compare_each_reading_once(
-    runs: tuple[Run, Run],
-) -> None:
-    one = runs[0]
-    both = np.hstack((one.speed_rad_s, one.speed_rad_s))
-    run = Run("two", one.t_s, np.hstack((one.command, one.command)), both, (TACHO, Tacho(kind="count", window_s=1.7)))
-    stretches = cut_into_trajectories([run], 250)
-    assert len(stretches.fan) == 16
-    comparable = np.isfinite(run.speed_rad_s) & measurement_of(run).comparable
-    assert np.count_nonzero(stretches.compared) == np.count_nonzero(comparable)
-
-
-def test_a_narx_predicts_readings_as_they_are(runs: tuple[Run, Run]) -> None:
-    part = runs[0].rows(0, 500)
-    twin = train_twin([part], [], "narx", name="narx", max_iterations=2)
-    assert find_kind("narx").predicts == "readings"
-    assert twin.card.tacho == INSTANTANEOUS
 
 
 def test_runs_that_are_measured_differently_and_the_published_trainer_are_refused(runs: tuple[Run, Run]) -> None:

@@ -68,15 +68,6 @@ def test_derivatives_and_parts_of_the_batch_give_the_same_numbers_and_padding_do
     np.testing.assert_allclose(measurement.of_speed(signals)[:51, 1], whole[:51, 1], atol=1e-6)
 
 
-def test_instantaneous_tachos_leave_the_arrays_themselves() -> None:
-    times = uneven_times(20, 2)
-    signals = np.random.default_rng(6).standard_normal(times.shape)
-    measurement = Measurement(times, [Tacho(), Tacho(kind="period")])
-    assert measurement.of_speed(signals) is signals
-    assert measurement.of_command(signals) is signals
-    assert measurement.comparable.all()
-
-
 @pytest.mark.parametrize("tacho", TACHOS[:2], ids=str)
 def test_the_runtime_averages_commands_as_the_maker_does(tacho: Tacho) -> None:
     period_s = 0.1

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simulation import published_fan
+from bench.training import published_fan
 from tests.support import fan_data
 from tests.support.fantwin_command import error_of
+from tests.support.trained_once import TrainedOnce
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.export.onnx_twin import OnnxTwin
@@ -22,10 +23,10 @@ OWN_S, TEST_S = 20.0, 40.0
 
 
 @pytest.fixture(scope="module")
-def type_twin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def type_twin(tmp_path_factory: pytest.TempPathFactory, trained_once: TrainedOnce) -> Path:
     """Five rough fans, whose physics differ by up to 10 %."""
     run = fan_data.rough_run(1, 60.0, 5)
-    twin = train_twin([run], [], "hybrid", name="type", max_iterations=25)
+    twin = trained_once([run], [], "hybrid", name="type", max_iterations=25)
     return twin.save(tmp_path_factory.mktemp("type") / "type.onnx")
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from bench.detection.tray_run import run_of
 from schemas.reference_conditions import ReferenceConditions
 from simulation.surroundings import Surroundings
 from simulation.tacho import NoisyTacho, TachoSettings
 from simulation.tray import TraySettings
-from simulation.tray_run import run_of
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.evaluation.resampling import resampled
@@ -65,12 +64,6 @@ def test_a_twin_that_knows_supply_and_air_is_exact_where_they_wander(runs: tuple
     assert on_another_grid is not None and on_another_grid < 2.5 * NOISE_RAD_S
 
 
-def test_a_run_without_a_column_that_the_twin_needs_is_refused(runs: tuple[Run, Run]) -> None:
-    needs = ReferenceConditions(supply_voltage_v=12.0)
-    with pytest.raises(TwinError, match="has no supply_voltage_v, which the twin needs"):
-        at_reference([replace(runs[0], auxiliary={})], needs)
-
-
 def test_only_what_all_runs_know_nearly_throughout_is_used(runs: tuple[Run, Run]) -> None:
     one, other = runs
     assert reference_of([one, replace(other, auxiliary={})]) is None
@@ -98,18 +91,6 @@ def test_a_column_that_the_fans_do_not_follow_is_left_out(runs: tuple[Run, Run])
     np.testing.assert_array_equal(left_out.identification.parameters, by_air.parameters)
 
 
-def test_a_column_that_hardly_varies_is_kept_without_a_comparison(
-    runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[Sequence[Run]] = []
-    monkeypatch.setattr("twin.fitting.reference_choice.identify", lambda runs, **_: made.append(runs) or identify(runs))
-    volts = 12.0 + 0.02 * np.random.default_rng(1).normal(size=runs[0].command.shape)
-    kept = identify_at_reference([replace(runs[0], auxiliary={"supply_voltage_v": volts})])
-    assert kept.conditions is not None
-    assert not kept.notes
-    assert len(made) == 1
-
-
 def test_a_twin_behind_a_drive_allows_for_nothing_and_says_so(
     runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,3 +110,9 @@ def test_speeds_are_missing_where_the_conditions_are_not_known(runs: tuple[Run, 
     known = np.isfinite(converted.speed_rad_s[:, 0])
     assert known[: 100 + 240].all()
     assert not known[100 + 260 :].any()
+
+
+def test_a_run_without_a_column_that_the_twin_needs_is_refused(runs: tuple[Run, Run]) -> None:
+    needs = ReferenceConditions(supply_voltage_v=12.0)
+    with pytest.raises(TwinError, match="has no supply_voltage_v, which the twin needs"):
+        at_reference([replace(runs[0], auxiliary={})], needs)

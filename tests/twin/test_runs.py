@@ -28,14 +28,6 @@ def test_a_run_splits_at_a_long_gap_and_leaves_out_a_lone_sample() -> None:
     assert [piece.t_s.tolist() for piece in pieces] == [[0.0, 0.1, 0.2, 0.3], [9.0, 9.1]]
 
 
-def test_equal_parts_follow_one_another_and_none_is_longer_than_allowed() -> None:
-    run = ramp(np.arange(1003.0).tolist())
-    parts = run.equal_parts(100)
-    assert (parts[0][0], parts[-1][1], len(parts)) == (0, 1003, 11)
-    assert all(before[1] == after[0] for before, after in pairwise(parts))
-    assert {last - first for first, last in parts} <= {91, 92}
-
-
 def test_a_slice_of_time_and_of_a_fan_keeps_the_rest() -> None:
     tachos = tuple(Tacho(kind="count", window_s=window_s) for window_s in (1.0, 0.5))
     run = Run("two", np.arange(4.0), np.arange(8.0).reshape(4, 2), np.zeros((4, 2)), tachos)
@@ -70,3 +62,11 @@ def test_a_bad_run_is_refused_in_one_line(t_s: list, command: list, speed: list,
 def test_the_starting_speed_skips_missing_samples() -> None:
     speed = np.array([[np.nan, np.nan], [2.0, np.nan], [4.0, np.nan]])
     np.testing.assert_array_equal(starting_speed_rad_s(speed), [3.0, np.nan])
+
+
+def test_equal_parts_follow_one_another_and_none_is_longer_than_allowed() -> None:
+    run = ramp(np.arange(1003.0).tolist())
+    parts = run.equal_parts(100)
+    assert (parts[0][0], parts[-1][1], len(parts)) == (0, 1003, 11)
+    assert all(before[1] == after[0] for before, after in pairwise(parts))
+    assert {last - first for first, last in parts} <= {91, 92}

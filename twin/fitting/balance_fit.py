@@ -69,11 +69,6 @@ class BalanceFit:
     lowest_speed_rad_s: Array
     sources: tuple[BalanceSource, ...]
 
-    @property
-    def std_errors(self) -> Array:
-        """(fans, 4)"""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-
 
 @dataclass(frozen=True, eq=False)
 class _Stretch:

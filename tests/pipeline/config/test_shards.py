@@ -54,11 +54,6 @@ def test_a_tray_called_all_is_one_tray():
     assert not sessions[0].shares_a_tray_with(sessions[1])
 
 
-def test_a_tray_that_is_added_at_the_end_moves_no_other_one():
-    before, after = (shards_of("scorer", site("launcher.shards=3", names=names)) for names in (NAMES, (*NAMES, "f")))
-    assert [set(old.trays) <= set(new.trays) for old, new in zip(before, after, strict=True)] == [True] * 3
-
-
 def test_what_the_launcher_starts_is_what_the_options_of_run_choose():
     config = site("launcher.shards={ scorer = 2, resampler = 5 }")
     for row in process_list(config):
@@ -87,11 +82,6 @@ def test_the_name_of_a_process_with_many_trays_fits_a_file_name_and_is_its_own()
     one, other = (chosen_shard("scorer", site(names=names), ",".join(chosen)) for chosen in (names[:5], names[:6]))
     assert one.name != other.name
     assert len(own_file(one.name, Path("recording.mcap")).name) < 100
-
-
-def test_the_files_of_a_shard_are_taken_for_no_part_of_another_recording():
-    assert own_file("all", Path("recording.mcap")) == Path("recording.mcap")
-    assert own_file("2-of-8", Path("there/recording.mcap")) == Path("there/2-of-8.recording.mcap")
 
 
 def test_hosts_that_share_the_trays_start_every_process_once():
@@ -142,3 +132,13 @@ def test_shards_that_cannot_be_are_refused_in_one_line(value, line):
     with pytest.raises(ConfigError) as refused:
         site(f"launcher.shards={value}")
     assert str(refused.value) == f"site.toml: {line}"
+
+
+def test_a_tray_that_is_added_at_the_end_moves_no_other_one():
+    before, after = (shards_of("scorer", site("launcher.shards=3", names=names)) for names in (NAMES, (*NAMES, "f")))
+    assert [set(old.trays) <= set(new.trays) for old, new in zip(before, after, strict=True)] == [True] * 3
+
+
+def test_the_files_of_a_shard_are_taken_for_no_part_of_another_recording():
+    assert own_file("all", Path("recording.mcap")) == Path("recording.mcap")
+    assert own_file("2-of-8", Path("there/recording.mcap")) == Path("there/2-of-8.recording.mcap")

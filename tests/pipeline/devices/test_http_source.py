@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
 import socket
 import ssl
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -20,13 +18,11 @@ import pytest
 import trustme
 from pydantic import ValidationError
 
-from pipeline.devices import http_source
 from pipeline.devices.http_config import HttpConfig
 from pipeline.devices.http_protocol import LimitedProtocol
 from pipeline.devices.http_source import MOST_CONNECTIONS, MOST_WAITING, HttpSource
 from pipeline.devices.json_samples import LARGEST_BYTES
 from pipeline.devices.sample_source import (
-    LinkDown,
     LinkUp,
     Reading,
     ReadingBatch,
@@ -39,12 +35,11 @@ from pipeline.errors import UserError
 from pipeline.runtime.stage import Context
 from stages.acquisition import STAGE
 from tests.support.mqtt_broker import free_port
-from tests.support.running_acquisition import Raws, acquisition, push_config, raws_of
+from tests.support.running_acquisition import push_config
 from tests.support.running_chain import eventually
 
 SAMPLE = {"t": 1.0, "command": [0.5, 0.5], "speed": [100, 200]}
 PATH = "/v1/trays/tray1"
-DOCUMENT = Path(__file__).parents[3] / "docs" / "how-to" / "sources.md"
 
 
 def source_of(folder: Path = Path(), **settings: Any) -> HttpSource:
@@ -189,20 +184,6 @@ def test_beyond_loopback_a_token_is_required() -> None:
     assert HttpConfig(host="::1").is_local and HttpConfig(host="localhost").is_local
 
 
-def test_a_port_that_is_taken_is_reported_and_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_source, "RETRY_S", 0.05)
-    source = source_of()
-    with socket.create_server(("127.0.0.1", source._config.port)):
-        (problem,) = source.check()
-        source_events: list[SourceEvent] = []
-        source.start(source_events.append)
-        eventually(lambda: source_events, "it says so")
-    assert f"cannot listen on 127.0.0.1:{source._config.port}: Address already in use" in problem
-    assert source_events[0] == LinkDown(problem)
-    eventually(lambda: isinstance(source_events[-1], LinkUp), "it listens once the port is free")
-    source.stop()
-
-
 def test_a_check_does_not_mind_the_port_that_its_own_acquisition_has(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -226,23 +207,3 @@ def test_https(tmp_path: Path) -> None:
         connection.request("POST", f"{PATH}/samples", json.dumps(SAMPLE))
         assert connection.getresponse().status == 200
         connection.close()
-
-
-@pytest.fixture
-def raws(endpoint: str) -> Iterator[Raws]:
-    with raws_of(endpoint) as raws:
-        yield raws
-
-
-@pytest.mark.skipif(shutil.which("curl") is None, reason="needs curl")
-def test_the_example_of_the_document_puts_a_sample_on_the_bus(endpoint: str, raws: Raws, tmp_path: Path) -> None:
-    example = DOCUMENT.read_text().split("    curl", 1)[1].split("\n\n")[0]
-    port = free_port()
-    config = push_config(endpoint, tmp_path, source=f'{{ kind = "http", port = {port} }}')
-    with acquisition(config) as running:
-        eventually(lambda: running.counter("line_up"), "it listens")
-        words = f"curl --silent{example}".replace("8765", str(port))
-        done = subprocess.run(["sh", "-c", words], capture_output=True, text=True, check=True)
-        assert json.loads(done.stdout) == {"accepted": 1, "refused": 0}
-        raws.wait_for(1)
-    assert raws.column("command").tolist() == [[0.4, 0.6]]

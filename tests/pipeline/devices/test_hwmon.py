@@ -96,19 +96,6 @@ def test_files_that_cannot_be_read_are_nan_but_without_its_command_a_reading_is_
     assert not caught.value.is_lost
 
 
-def test_a_chip_that_vanishes_is_lost_with_one_line(root: Path) -> None:
-    folder = board(root)
-    made = connected(root)
-    folder.rename(root.parent / "gone")
-    with pytest.raises(DeviceError, match="nct6798 has gone") as caught:
-        made.read()
-    assert caught.value.is_lost
-    with pytest.raises(DeviceError, match="no chip is called nct6798 in .*; there are: none; load its driver"):
-        made.connect()
-    with pytest.raises(DeviceError, match="No such file or directory; correct root"):
-        connected(root.parent / "elsewhere")
-
-
 def test_a_commanded_fan_is_taken_over_and_given_back(root: Path) -> None:
     folder = board(root)
     made = connected(root, 3, writable=True)
@@ -167,14 +154,6 @@ def test_fans_that_share_a_pwm_take_one_command(root: Path) -> None:
     assert (folder / "pwm1").read_text() == "80"
 
 
-def test_nothing_is_written_unless_the_configuration_says_so(root: Path) -> None:
-    board(root)
-    config = HwmonConfig(chip="nct6798", root=root)
-    source = HwmonSource(config, SourceContext(2, "rpm", Path()))
-    assert not source.device.is_writable and "takes no commands" in source.send((10.0, 10.0), ())
-    assert config.writable is False
-
-
 def test_an_enable_file_that_cannot_be_read_gets_the_automatic_mode_of_its_chip(root: Path) -> None:
     folder = add_chip(
         root, 0, "dell_smm", "platform/dell_smm_hwmon", {"fan1_input": 2500, "pwm1": 128, "pwm1_enable": ""}
@@ -224,3 +203,11 @@ def test_what_a_source_cannot_do_is_said_before_it_starts(root: Path) -> None:
 def test_the_driver_says_what_is_measured(chip: str, tacho: Tacho) -> None:
     text = f'[[tray]]\nname = "a"\nfans = 2\nsource = {{ kind = "hwmon", chip = "{chip}" }}\n'
     assert parse_config(text, Path("fantwin.toml")).trays[0].tachos == (tacho,)
+
+
+def test_nothing_is_written_unless_the_configuration_says_so(root: Path) -> None:
+    board(root)
+    config = HwmonConfig(chip="nct6798", root=root)
+    source = HwmonSource(config, SourceContext(2, "rpm", Path()))
+    assert not source.device.is_writable and "takes no commands" in source.send((10.0, 10.0), ())
+    assert config.writable is False

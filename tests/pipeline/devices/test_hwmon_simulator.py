@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -12,8 +10,8 @@ import pytest
 from pipeline.cli.simulation.simulated_hwmon import InjectedFaults, tachos_of
 from pipeline.devices.hwmon_config import HwmonConfig
 from pipeline.devices.hwmon_simulator import HwmonTree, play_hwmon
-from pipeline.devices.hwmon_source import HwmonDevice, HwmonSource
-from pipeline.devices.sample_source import Reading, ReadingBatch, SourceContext, SourceEvent
+from pipeline.devices.hwmon_source import HwmonDevice
+from pipeline.devices.sample_source import Reading, SourceContext
 from pipeline.errors import UserError
 from schemas.tacho import Tacho
 from simulation.tacho import TachoSettings
@@ -60,27 +58,6 @@ def test_a_driver_drives_its_fans_until_they_are_taken_over(tmp_path: Path) -> N
     assert int((root / "hwmon0" / "pwm1_enable").read_text()) == 2, "the profile of the driver goes on"
     tree.close()
     assert not root.exists()
-
-
-def test_the_source_polls_the_driver_in_real_time(tmp_path: Path) -> None:
-    root, stop = tmp_path / "hwmon", threading.Event()
-    tree = HwmonTree(root, "nct6798", 2)
-    driver = threading.Thread(target=play_hwmon, args=(tray(), tree, stop))
-    driver.start()
-    source = HwmonSource(HwmonConfig(chip="nct6798", root=root, period_s=0.02), SourceContext(2, "rpm", Path()))
-    events: list[SourceEvent] = []
-    source.start(events.append)
-    deadline_s = time.monotonic() + 10.0
-    while len(events) < 30 and time.monotonic() < deadline_s:
-        time.sleep(0.01)
-    source.stop()
-    stop.set()
-    driver.join()
-    tree.close()
-    readings = [item for event in events if isinstance(event, ReadingBatch) for item in event.items]
-    found = [item for item in readings if isinstance(item, Reading)]
-    assert len(found) >= 25
-    assert not any(math.isnan(speed) for each in found for speed in each.speed), "no file is read half written"
 
 
 def test_a_fault_in_the_file_begins_when_it_is_written_and_ends_when_it_is_gone(

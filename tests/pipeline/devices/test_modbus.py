@@ -12,9 +12,9 @@ import pytest
 from pipeline.config.loading import parse_config
 from pipeline.config.models import ConfigError
 from pipeline.devices.modbus_config import ModbusConfig
-from pipeline.devices.modbus_source import ModbusDevice, ModbusSource
+from pipeline.devices.modbus_source import ModbusDevice
 from pipeline.devices.polling import DeviceError
-from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceContext, SourceEvent
+from pipeline.devices.sample_source import SourceContext
 from schemas.tacho import Tacho
 from simulation.tray import SimulatedTray, TraySettings
 from tests.support.modbus_server import (
@@ -30,7 +30,6 @@ from tests.support.modbus_server import (
     modbus_line,
     modbus_server,
 )
-from tests.support.running_chain import eventually
 
 FAN: dict[str, Any] = {
     "unit": 3,
@@ -116,28 +115,6 @@ def test_a_unit_that_does_not_answer_is_a_failed_poll_and_a_server_that_ends_is_
     assert caught.value.is_lost
 
 
-def test_the_source_polls_and_comes_back_when_the_server_does() -> None:
-    events: list[SourceEvent] = []
-
-    def wait_for(kind: type[SourceEvent], count: int) -> None:
-        until_s = time.monotonic() + 15.0
-        while sum(isinstance(event, kind) for event in events) < count:
-            assert time.monotonic() < until_s, events[-3:]
-            time.sleep(0.01)
-
-    with modbus_server({3: drive()}) as port:
-        source = ModbusSource(config(port, period_s=0.02, timeout_s=0.2), SourceContext(1, "rpm", Path()))
-        source.start(events.append)
-        wait_for(ReadingBatch, 5)
-    wait_for(LinkDown, 1)
-    with modbus_server({3: drive()}, port):
-        wait_for(LinkUp, 2)
-        source.stop()
-    assert isinstance(events[0], LinkUp)
-    (first,) = next(event for event in events if isinstance(event, ReadingBatch)).items
-    assert isinstance(first, Reading) and first.clock_us is not None and first.sequence == 0
-
-
 def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = ModbusConfig.model_validate({"port": "/dev/ttyUSB7", "baud": 9600, "parity": "O", "fan": (FAN,)})
     made = ModbusDevice(settings, SourceContext(1, "rpm", Path()))
@@ -175,6 +152,23 @@ def test_frames_of_modbus_rtu_go_over_a_serial_line_both_ways() -> None:
     )
 
 
+def test_the_registers_say_what_is_measured_where_the_averaging_time_is_known() -> None:
+    tray = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "modbus", host = "drive", %s fan = [ %s ] }\n'
+    fan = "{ speed = { address = 1, scale = 2.0 }, command = { address = 2 } }"
+    (known,) = parse_config(tray % ("average_s = 0.5,", fan), Path("fantwin.toml")).trays
+    assert known.tachos == (Tacho(kind="average", window_s=0.5, step_rad_s=2.0 * math.pi / 30.0),)
+    assert parse_config(tray % ("", fan), Path("fantwin.toml")).trays[0].tachos == (Tacho(),)
+    for change, words in (
+        (("address = 1,", "adress = 1,"), r"fan.0.speed.adress'; did you mean 'address'\?"),
+        (("scale = 2.0", "scale = 0"), "scale is 0"),
+        (('host = "drive",', ""), "give either host"),
+        (("fans = 1", "fans = 2"), "carries at most 1 fans"),
+    ):
+        with pytest.raises(ConfigError, match=words) as caught:
+            parse_config((tray % ("", fan)).replace(*change), Path("fantwin.toml"))
+        assert "\n" not in str(caught.value)
+
+
 def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_one_works() -> None:
     slow = drive()
     with modbus_line({3: slow}) as line:
@@ -192,44 +186,3 @@ def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_
         time.sleep(0.4)
         assert made.read().supply_voltage_v == pytest.approx((540.25,))
         made.disconnect()
-
-
-def test_a_serial_line_that_is_unplugged_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    events: list[SourceEvent] = []
-    attempts: list[float] = []
-    connect = ModbusDevice.connect
-
-    def counted(device: ModbusDevice) -> None:
-        attempts.append(time.monotonic())
-        connect(device)
-
-    monkeypatch.setattr(ModbusDevice, "connect", counted)
-    with modbus_line({3: drive()}) as line:
-        source = ModbusSource(*over_serial(line, period_s=0.02))
-        source.start(events.append)
-        eventually(lambda: sum(isinstance(event, ReadingBatch) for event in events) >= 5, "readings come")
-        line.unplug()
-        eventually(lambda: len(attempts) >= 4, "it has tried to open the port again, twice or more")
-        source.stop()
-    assert [type(event) for event in events if not isinstance(event, ReadingBatch)] == [LinkUp, LinkDown]
-    assert events[-1] == LinkDown("no such port, is it unplugged?; waiting for it")
-    items = [item for event in events if isinstance(event, ReadingBatch) for item in event.items]
-    refused = {item.kind for item in items if isinstance(item, Rejected)}
-    assert refused <= {"skipped_polls"}, "a busy machine skips polls; nothing else is refused"
-
-
-def test_the_registers_say_what_is_measured_where_the_averaging_time_is_known() -> None:
-    tray = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "modbus", host = "drive", %s fan = [ %s ] }\n'
-    fan = "{ speed = { address = 1, scale = 2.0 }, command = { address = 2 } }"
-    (known,) = parse_config(tray % ("average_s = 0.5,", fan), Path("fantwin.toml")).trays
-    assert known.tachos == (Tacho(kind="average", window_s=0.5, step_rad_s=2.0 * math.pi / 30.0),)
-    assert parse_config(tray % ("", fan), Path("fantwin.toml")).trays[0].tachos == (Tacho(),)
-    for change, words in (
-        (("address = 1,", "adress = 1,"), r"fan.0.speed.adress'; did you mean 'address'\?"),
-        (("scale = 2.0", "scale = 0"), "scale is 0"),
-        (('host = "drive",', ""), "give either host"),
-        (("fans = 1", "fans = 2"), "carries at most 1 fans"),
-    ):
-        with pytest.raises(ConfigError, match=words) as caught:
-            parse_config((tray % ("", fan)).replace(*change), Path("fantwin.toml"))
-        assert "\n" not in str(caught.value)

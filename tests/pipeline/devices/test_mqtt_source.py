@@ -19,7 +19,7 @@ from pwdlib import PasswordHash
 from pwdlib.hashers.argon2 import Argon2Hasher
 from pydantic import ValidationError
 
-from pipeline.devices import broker_client, mqtt_source
+from pipeline.devices import mqtt_source
 from pipeline.devices.fan_values import FanValues
 from pipeline.devices.mqtt_config import MqttConfig
 from pipeline.devices.mqtt_source import MqttSource
@@ -89,21 +89,6 @@ def running(source: MqttSource) -> Iterator[Events]:
     source.stop()
 
 
-def test_json_samples_arrive_and_what_is_none_is_refused(broker: MqttBroker, publish: Callable[..., None]) -> None:
-    publish("plant/tray1", SAMPLE, retain=True)
-    with running(source_of(broker.port)) as events:
-        for text in (SAMPLE, '{"t": 1.0', '{"command": [1]}'):
-            publish("plant/tray1", text)
-        eventually(lambda: len(events.items) == 4, "all have arrived")
-    assert isinstance(events[0], LinkUp)
-    retained, reading, broken, incomplete = events.items
-    assert isinstance(retained, Rejected) and (retained.kind, retained.harmless) == ("retained", True)
-    assert isinstance(reading, Reading) and (reading.speed, reading.clock_us) == ((100.0, 200.0), 1_000_000)
-    assert isinstance(broken, Rejected) and broken.kind == "malformed" and "no JSON" in broken.detail
-    assert isinstance(incomplete, Rejected) and incomplete.detail == "'speed' is missing"
-    publish("plant/tray1", "", retain=True)
-
-
 def test_a_message_that_the_broker_sends_again_is_left_out(broker: MqttBroker) -> None:
     source = source_of(broker.port)
     items = [
@@ -113,6 +98,23 @@ def test_a_message_that_the_broker_sends_again_is_left_out(broker: MqttBroker) -
         for item in batch.items
     ]
     assert [getattr(item, "kind", "reading") for item in items] == ["reading", "repeated", "reading"]
+    ((retained,),) = (batch.items for batch in source.batches("plant/tray1", SAMPLE.encode(), 0, is_retained=True))
+    assert isinstance(retained, Rejected) and (retained.kind, retained.harmless) == ("retained", True)
+
+
+def test_an_error_that_no_code_expects_costs_one_message_and_not_the_source(
+    broker: MqttBroker, publish: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(source_of(broker.port)) as events:
+        with monkeypatch.context() as broken:
+            broken.setattr(mqtt_source, "parse_samples", lambda _payload: 1 / 0)
+            publish("plant/tray1", SAMPLE)
+            eventually(lambda: events.items, "it is refused")
+        publish("plant/tray1", SAMPLE.replace("1.0", "2.0"))
+        eventually(lambda: len(events.items) == 2, "the next is read")
+    refused, reading = events.items
+    assert isinstance(refused, Rejected) and refused.kind == "malformed" and "ZeroDivisionError" in refused.detail
+    assert isinstance(reading, Reading)
 
 
 @pytest.mark.parametrize(
@@ -135,15 +137,6 @@ def test_a_topic_of_a_former_subscription_is_refused_and_unsubscribed(
     kinds = [item.kind for item in events.items if isinstance(item, Rejected)]
     assert kinds.count("foreign_topic") == 2 and "malformed" not in kinds
     assert unsubscribed == [foreign], "once"
-
-
-def test_no_message_ends_the_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    source, events = source_of(1), Events()
-    source._deliver = events.append
-    monkeypatch.setattr(mqtt_source, "parse_samples", lambda _payload: 1 / 0)
-    source._on_message(None, None, message_of("plant/tray1", b"{}"))
-    source._on_message(None, None, paho.MQTTMessage(topic=b"\xff"))
-    assert [item.kind for item in events.items if isinstance(item, Rejected)] == ["malformed", "malformed"]
 
 
 def test_numbers_of_single_fans_become_readings_of_the_tray(broker: MqttBroker, publish: Callable[..., None]) -> None:
@@ -174,26 +167,6 @@ def test_a_changed_command_ends_the_reading_that_waits() -> None:
     ended = values.set_command(0, 0.7)
     assert ended is not None and ended.command == (0.5, 0.5) and ended.speed[0] == 10.0
     assert values.set_command(0, 0.7) is None, "the same again changes nothing"
-
-
-def test_a_broker_that_is_restarted_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(broker_client, "RECONNECT_DELAY_MAX_S", 1)
-    broker = MqttBroker()
-    broker.start()
-    with running(source_of(broker.port)) as events:
-        broker.stop()
-        eventually(lambda: events.of(LinkDown), "it is gone")
-        broker.start()
-        eventually(lambda: len(events.of(LinkUp)) == 2, "it is back")
-        client = paho.Client(CallbackAPIVersion.VERSION2)
-        client.connect("127.0.0.1", broker.port)
-        client.loop_start()
-        client.publish("plant/tray1", SAMPLE, qos=1).wait_for_publish(10)
-        client.disconnect()
-        client.loop_stop()
-        eventually(lambda: len(events.items) == 1, "samples come again")
-    assert "ended" in events.of(LinkDown)[0].reason
-    broker.close()
 
 
 @pytest.mark.parametrize(
@@ -257,14 +230,6 @@ def test_a_user_and_a_broker_that_proves_itself(tmp_path: Path, monkeypatch: pyt
     ):
         source_of(broker.port, tmp_path, topic="a", tls=True, ca="none.pem")
     broker.close()
-
-
-def test_a_broker_that_is_not_there_is_one_line() -> None:
-    port = free_port()
-    (problem,) = source_of(port).check()
-    assert problem == f"mqtt 127.0.0.1:{port} plant/tray1: cannot be reached: Connection refused; check host and port"
-    with running(source_of(port)) as events:
-        assert events == [LinkDown("the broker cannot be reached; check host and port, and whether it runs")]
 
 
 @pytest.mark.parametrize(

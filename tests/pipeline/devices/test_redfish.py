@@ -102,14 +102,6 @@ def test_a_controller_that_fails_or_is_slow_is_a_failed_poll_and_one_that_is_gon
     assert caught.value.is_lost
 
 
-def test_credentials_that_are_no_utf_8_are_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "bmc.secret"
-    path.write_bytes("root\nGeh\xe4im\n".encode("latin-1"))
-    path.chmod(0o600)
-    problems = device("https://bmc", folder=tmp_path, credentials="bmc.secret").check()
-    assert problems == [f"{path}: is no text in UTF-8: save it as such"]
-
-
 def test_credentials_come_from_a_file_or_the_environment_over_a_verified_line_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

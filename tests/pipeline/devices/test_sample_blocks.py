@@ -79,11 +79,6 @@ def test_input_without_readings_is_handed_over_after_the_time_of_a_block(blocks:
     assert [t_ms for t_ms, _ in add_all(blocks, noise)] == [1060, 1120]
 
 
-def test_without_block_time_everything_is_handed_over_at_once() -> None:
-    blocks = SampleBlocks(FakeSource(), 0)
-    assert add_all(blocks, [batch(1, readings=0), batch(2), batch(3)]) == [(1, [1]), (2, [2]), (3, [3])]
-
-
 def test_the_stage_takes_what_waits_only_after_the_time_of_a_block(blocks: SampleBlocks) -> None:
     (last,) = blocks.add(LinkUp())
     assert blocks.add(batch(1010)) == blocks.add(batch(1020)) == []

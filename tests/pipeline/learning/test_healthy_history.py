@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.learning import history_recordings
 from pipeline.learning.healthy_history import (
     LONGEST_LAG_NS,
     HealthyHistory,
@@ -159,24 +158,6 @@ def test_recordings_in_excluded_time_spans_are_left_out(tmp_path: Path) -> None:
     assert history.seconds == 598.0
 
 
-def test_an_open_recording_in_an_excluded_time_span_does_not_count(tmp_path: Path) -> None:
-    history = history_in(tmp_path, hold_back_s=0.0)
-    add(history, 0, 300)
-    history.exclude([((START_S + 200) * NS_PER_S, (START_S + 5000) * NS_PER_S)])
-    assert history.seconds == 0.0
-    history.exclude([])
-    assert history.seconds == 299.0
-
-
-def test_where_an_excluded_time_span_ends_a_new_recording_begins(tmp_path: Path) -> None:
-    history = history_in(tmp_path, hold_back_s=0.0)
-    history.exclude([(START_S * NS_PER_S, (START_S + 300) * NS_PER_S)])
-    add(history, 0, 600)
-    assert history.seconds == 289.0
-    history.finish()
-    assert kept_s(tmp_path) == [(0, 309), (310, 599)]
-
-
 def test_the_oldest_are_deleted_but_for_the_first(tmp_path: Path) -> None:
     history = history_in(tmp_path, hold_back_s=0.0, kept_s=650.0)
     for first_s in range(0, 5000, 1000):
@@ -229,16 +210,6 @@ def test_samples_that_nobody_judged_are_never_kept(tmp_path: Path) -> None:
     assert after[1] <= 1400
 
 
-def test_rows_of_one_score_may_have_a_pause_between_them(tmp_path: Path) -> None:
-    history = history_in(tmp_path)
-    for second in range(0, 1000, 10):
-        history.add(raw(second), has_alarm=False, is_watched=True)
-    rows_s = np.concatenate((np.arange(300), np.arange(400, 1000)))
-    history.judged((START_S + rows_s) * NS_PER_S, had_alarm=False)
-    history.finish()
-    assert kept_s(tmp_path) == [(410, 899)]
-
-
 def test_an_alarm_that_began_and_ended_in_one_score_discards_what_is_held(tmp_path: Path) -> None:
     history = history_in(tmp_path)
     watch(history, 0, 500)
@@ -248,13 +219,6 @@ def test_an_alarm_that_began_and_ended_in_one_score_discards_what_is_held(tmp_pa
     (before, after) = kept_s(tmp_path)
     assert before == (10, 399)
     assert after[0] >= 590
-
-
-def test_samples_that_are_never_judged_do_not_fill_the_memory(tmp_path: Path) -> None:
-    history = history_in(tmp_path)
-    for second in range(0, 20_000, 10):
-        history.add(raw(second), has_alarm=False, is_watched=True)
-    assert len(history._waiting) <= (LONGEST_LAG_NS // NS_PER_S + 100) / 10 + 1
 
 
 @pytest.mark.parametrize("had_alarm", [False, True])
@@ -274,14 +238,6 @@ def test_a_clock_that_is_set_back_discards_what_is_held_and_begins_a_new_recordi
     assert before == (100_010, 100_399)
     assert after[0] <= 120, "the alarm does not end only at its former time"
     assert 850 <= after[1] <= 900
-
-
-def test_the_folder_is_not_read_for_each_sum(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    history = history_in(tmp_path, hold_back_s=0.0)
-    add(history, 0, 300)
-    history.finish()
-    monkeypatch.setattr(history_recordings, "recordings_in", lambda *_: pytest.fail("the folder is read"))
-    assert history.seconds == history.seconds_since(0) == 299.0
 
 
 def refuse_writes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -313,24 +269,6 @@ def test_what_a_full_disk_has_is_kept_and_said_until_samples_are_on_the_disk_aga
     assert kept_s(tmp_path) == [(0, 299), (400, 699)]
 
 
-def test_a_recording_that_a_full_disk_refused_to_finish_is_kept_and_said_until_the_next_one_is_finished(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    history = history_in(tmp_path, hold_back_s=0.0)
-    add(history, 0, 300)
-    history.flush()
-    with monkeypatch.context() as full:
-        refuse_writes(full)
-        history.finish()
-    assert kept_s(tmp_path) == [(0, 299)]
-    add(history, 400, 700)
-    history.flush()
-    assert "the history cannot be kept" in history.problem
-    history.finish()
-    assert history.problem == ""
-    assert kept_s(tmp_path) == [(0, 299), (400, 699)]
-
-
 def test_what_could_not_be_kept_near_an_alarm_is_said_until_healthy_running_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -346,17 +284,6 @@ def test_what_could_not_be_kept_near_an_alarm_is_said_until_healthy_running_is_k
         history.flush()
     assert "samples are not kept for learning" in history.problem
     watch(history, 750, 3000)
-    history.finish()
-    assert history.problem == ""
-
-
-def test_a_recording_that_could_not_be_repaired_is_said_until_the_next_one_is_finished(tmp_path: Path) -> None:
-    (tmp_path / "healthy").mkdir()
-    (tmp_path / "healthy" / OPEN_NAME).write_bytes(b"no recording")
-    history = history_in(tmp_path, hold_back_s=0.0)
-    add(history, 0, 300)
-    history.flush()
-    assert "cannot be repaired" in history.problem
     history.finish()
     assert history.problem == ""
 
@@ -378,3 +305,31 @@ def test_recordings_that_were_finished_and_not_named_get_their_names_at_start(tm
     assert kept_s(tmp_path) == [(0, 299), (1000, 1299)]
     assert second.seconds == 598.0
     assert sorted(place.iterdir()) == [each.path for each in healthy_recordings(tmp_path)]
+
+
+def test_where_an_excluded_time_span_ends_a_new_recording_begins(tmp_path: Path) -> None:
+    history = history_in(tmp_path, hold_back_s=0.0)
+    history.exclude([(START_S * NS_PER_S, (START_S + 300) * NS_PER_S)])
+    add(history, 0, 600)
+    assert history.seconds == 289.0
+    history.finish()
+    assert kept_s(tmp_path) == [(0, 309), (310, 599)]
+
+
+def test_rows_of_one_score_may_have_a_pause_between_them(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    for second in range(0, 1000, 10):
+        history.add(raw(second), has_alarm=False, is_watched=True)
+    rows_s = np.concatenate((np.arange(300), np.arange(400, 1000)))
+    history.judged((START_S + rows_s) * NS_PER_S, had_alarm=False)
+    history.finish()
+    assert kept_s(tmp_path) == [(410, 899)]
+
+
+def test_what_was_not_judged_for_long_is_given_up_so_that_memory_stays_bounded(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    for second in range(0, 20_000, 10):
+        history.add(raw(second), has_alarm=False, is_watched=True)
+    judge(history, 0, 20_000)
+    history.finish()
+    assert kept_s(tmp_path)[0][0] >= 20_000 - LONGEST_LAG_NS // NS_PER_S - 110

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -113,12 +112,6 @@ def test_an_offer_waits_until_it_is_used_or_the_fans_are_as_they_were(versions: 
     versions.add_check(found)
     versions.use("tray1-2")
     assert versions.read().waiting is None
-
-
-def test_the_spans_that_a_version_was_learned_from_are_stored_as_periods(versions: TwinVersions) -> None:
-    versions.add(version("tray1-1", 2))
-    stored = json.loads((versions.folder / "versions.json").read_text())["versions"][0]
-    assert stored["periods"] == [[DAY_NS, 2 * DAY_NS - 1]]
 
 
 def test_an_unknown_version_and_a_damaged_list_are_refused_in_one_line(versions: TwinVersions) -> None:

@@ -5,14 +5,11 @@ import pytest
 
 from schemas.tacho import Tacho
 from tests.support import fan_data
-from twin.build import train_twin
 from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluate_model
 from twin.evaluation.resampling import Grid, irregular, on_grid, resampled, thinned
 from twin.models.hybrid import UNITS, Hybrid
 from twin.models.model import TwinModel
-from twin.models.narx import INPUTS, ORDER, Narx
-from twin.models.narx import UNITS as NARX_UNITS
 from twin.models.network import Scaling, TanhNetwork
 from twin.models.physical import PhysicalModel
 from twin.models.physics import PARAMETER_NAMES
@@ -29,21 +26,13 @@ def impulse(run: Run, stop_s: float) -> Array:
     return held_s @ run.command
 
 
-@pytest.mark.parametrize("rate_hz", [7.0, 20.0, 50.0, 100.0, 130.0, 200.0])
+@pytest.mark.parametrize("rate_hz", [7.0, 130.0])
 def test_no_impulse_of_the_command_is_lost_on_another_rate(rate_hz: float) -> None:
     run = fan_data.published_run(1, 10.0, fans=2)
     other = resampled(run, rate_hz)
     assert np.diff(other.t_s) == pytest.approx(1.0 / rate_hz)
     for stop_s in other.t_s[[1, 5, len(other.t_s) // 2, -1]]:
         assert impulse(other, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
-
-
-def test_no_impulse_is_lost_on_irregular_steps_of_an_irregular_run() -> None:
-    rng = np.random.default_rng(2)
-    run = Run("jittered", np.cumsum(rng.uniform(0.005, 0.02, 500)), rng.uniform(0, 100, 500), rng.normal(size=500))
-    thin = irregular(run, seed=3)
-    for stop_s in thin.t_s[[1, 50, -1]]:
-        assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
 
 
 def test_speeds_are_the_measured_ones_wherever_the_grids_meet() -> None:
@@ -116,7 +105,6 @@ def parameters_of(**values: float) -> Array:
 
 
 PUBLISHED = dict(zip(("J", "alpha", "C_D"), fan_data.PUBLISHED_PARAMETERS.tolist(), strict=True))
-LINEAR = {"J": 0.15, "alpha": 0.3}
 
 
 def simulated(model: TwinModel, parameters: Array, seed: int = 8) -> Run:
@@ -157,33 +145,6 @@ def test_a_hybrid_is_as_good_on_every_grid(inputs: tuple[str, ...]) -> None:
     assert errors_in_noise(PhysicalModel(), parameters, run)["own"] > 2.0
 
 
-def test_narx_has_no_time_step_and_fails_on_every_grid_but_its_own() -> None:
-    parameters = parameters_of(**LINEAR)
-    run = simulated(PhysicalModel(), parameters)
-    narx = exact_narx_of_the_linear_fan()
-    errors = errors_in_noise(narx, parameters, run)
-    assert errors.pop("own") == pytest.approx(1.0, abs=0.03)
-    assert min(errors.values()) > 3.0
-    assert max(errors_in_noise(PhysicalModel(), parameters, run).values()) < 1.06
-
-
-def exact_narx_of_the_linear_fan() -> Narx:
-    """w[k+1] = a w[k] + b u[k] at 100 Hz, by one hidden unit that stays in its linear range."""
-    a = np.exp(-LINEAR["alpha"] / LINEAR["J"] / fan_data.RATE_HZ)
-    small = 1e-6
-    rows = np.zeros((INPUTS + 2, NARX_UNITS))
-    rows[0, 0], rows[ORDER, 0], rows[-1, 0] = small * a, small * (1.0 - a) / LINEAR["alpha"], 1.0 / small
-    return Narx(np.append(rows.ravel(), 0.0), Scaling(0.0, 1.0, 0.0, 1.0, 1.0))
-
-
-@pytest.mark.slow
-def test_a_trained_hybrid_holds_on_grids_that_it_was_not_trained_on() -> None:
-    twin = train_twin([fan_data.rough_run(1, 30.0)], [], "hybrid", name="hybrid", max_iterations=8)
-    held_out = fan_data.rough_run(2, 30.0)
-    errors = errors_in_noise(twin.model, twin.parameters, held_out)
-    assert max(errors.values()) < 1.1 * errors["own"] < 2.0
-
-
 def test_a_thinned_run_keeps_its_readings_and_loses_no_impulse() -> None:
     run = fan_data.published_run(5, 10.0, fans=2)
     thin = thinned(run, 7)
@@ -194,9 +155,16 @@ def test_a_thinned_run_keeps_its_readings_and_loses_no_impulse() -> None:
     assert thinned(run.rows(0, 4), 7).samples == 4, "a single sample is no run"
 
 
-@pytest.mark.parametrize("tacho", [Tacho(kind="count", window_s=0.5), Tacho(kind="count", window_s=1.0, update_s=0.25)])
-def test_the_readings_of_a_tacho_that_counts_are_predicted_as_well_when_thinned(tacho: Tacho) -> None:
-    run = fan_data.counted_run(6, tacho, rate_hz=100.0)
+def test_no_impulse_is_lost_on_irregular_steps_of_an_irregular_run() -> None:
+    rng = np.random.default_rng(2)
+    run = Run("jittered", np.cumsum(rng.uniform(0.005, 0.02, 500)), rng.uniform(0, 100, 500), rng.normal(size=500))
+    thin = irregular(run, seed=3)
+    for stop_s in thin.t_s[[1, 50, -1]]:
+        assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
+
+
+def test_the_readings_of_a_tacho_that_counts_are_predicted_as_well_when_thinned() -> None:
+    run = fan_data.counted_run(6, Tacho(kind="count", window_s=1.0, update_s=0.25), rate_hz=100.0)
     model, parameters = PhysicalModel(), np.array([[*fan_data.PUBLISHED_PARAMETERS, 0.0]])
     whole, thin = (
         evaluate_model(model, parameters, np.ones(1), [each]).pooled.rmse_rad_s for each in (run, thinned(run, 10))

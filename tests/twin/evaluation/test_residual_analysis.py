@@ -65,34 +65,24 @@ def test_white_noise_leaves_the_95_percent_bound_at_5_percent_of_the_lags() -> N
     assert np.mean(outside) == pytest.approx(0.05, abs=0.01)
 
 
-@pytest.mark.parametrize("missing", [0.0, 0.4])
-def test_the_whiteness_test_rejects_as_much_white_noise_as_it_says(missing: float) -> None:
+def test_the_whiteness_test_rejects_as_much_white_noise_as_it_says() -> None:
     rng = np.random.default_rng(2)
     p = []
     for _ in range(400):
-        residual = np.where(rng.random(SAMPLES) < missing, np.nan, white(rng))
+        residual = np.where(rng.random(SAMPLES) < 0.4, np.nan, white(rng))
         p.append(analysed(residual, np.zeros(SAMPLES)).ljung_box_p)
     # three standard deviations of a share of 400
     assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.033)
     assert np.mean(np.array(p) < 0.5) == pytest.approx(0.5, abs=0.075)
 
 
-def test_weak_autocorrelation_is_found_and_white_noise_is_white() -> None:
-    rng = np.random.default_rng(3)
-    drawn = white(rng)
-    residual = drawn + 0.1 * np.roll(drawn, 1)
-    assert analysed(residual, stairs(rng)).white is False
-    assert analysed(drawn, stairs(rng)).white
-
-
-@pytest.mark.parametrize("command", [stairs, binary])
-@pytest.mark.parametrize("residual", [white, slow, oscillating])
+@pytest.mark.parametrize(("residual", "command"), [(slow, stairs), (oscillating, binary)])
 def test_unrelated_signals_leave_the_cross_bound_at_5_percent_of_the_lags(
     residual: Callable[[np.random.Generator], Array], command: Callable[[np.random.Generator], Array]
 ) -> None:
     rng = np.random.default_rng(4)
     outside, largest = [], []
-    for _ in range(80):
+    for _ in range(60):
         analysis = analysed(residual(rng), command(rng))
         outside.append(np.mean(np.abs(analysis.cross_correlation) > analysis.cross_bound_95))
         largest.append(abs(analysis.cross_over_bound))
@@ -100,18 +90,8 @@ def test_unrelated_signals_leave_the_cross_bound_at_5_percent_of_the_lags(
     assert np.mean(np.array(largest) > 2.0) < 0.1
 
 
-def test_a_bound_for_white_signals_would_be_wrong_for_slow_ones() -> None:
-    rng = np.random.default_rng(4)
-    outside = []
-    for _ in range(40):
-        analysis = analysed(slow(rng), stairs(rng))
-        outside.append(np.mean(np.abs(analysis.cross_correlation) > 1.96 / np.sqrt(SAMPLES)))
-    assert np.mean(outside) > 0.5
-
-
-@pytest.mark.parametrize("gain", [0.3, -0.3])
-def test_a_residual_that_follows_the_command_peaks_at_its_lag_with_its_sign(gain: float) -> None:
-    rng = np.random.default_rng(5)
+def test_a_residual_that_follows_the_command_peaks_at_its_lag_with_its_sign() -> None:
+    gain, rng = -0.3, np.random.default_rng(5)
     command = rng.normal(size=SAMPLES)
     analysis = analysed(white(rng) + gain * np.roll(command, 25), command)
     assert analysis.cross_peak_lag_s == pytest.approx(0.25)
@@ -191,13 +171,9 @@ def test_a_gap_within_a_run_is_time_in_which_nothing_was_measured() -> None:
     assert lossy.ljung_box_p == pytest.approx(marked.ljung_box_p)
 
 
-@pytest.mark.parametrize("missing", [0.0, 0.5])
-@pytest.mark.parametrize("residual", [white, slow])
-def test_independent_samples_say_how_far_the_mean_scatters(
-    residual: Callable[[np.random.Generator], Array], missing: float
-) -> None:
+def test_independent_samples_say_how_far_the_mean_scatters() -> None:
     rng = np.random.default_rng(10)
-    drawn = [np.where(rng.random(SAMPLES) < missing, np.nan, residual(rng)) for _ in range(200)]
+    drawn = [np.where(rng.random(SAMPLES) < 0.5, np.nan, slow(rng)) for _ in range(200)]
     claimed = [np.nanstd(one) / np.sqrt(analysed(one, np.zeros(SAMPLES)).independent_samples) for one in drawn]
     assert np.mean(claimed) == pytest.approx(np.std([np.nanmean(one) for one in drawn]), rel=0.2)
 

@@ -9,34 +9,29 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-import torch
 from onnx import helper
 
 from schemas.twin_card import CARD_PROPERTY, GRAPH_INPUTS, GRAPH_OUTPUTS, CardError, DataCard, TwinCard
 from tests.support import fan_data
+from tests.support.trained_once import TrainedOnce
 from tests.twin.models.test_models import ALL_MODELS, random_network
-from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.export.onnx_export import export_onnx
 from twin.export.onnx_twin import OnnxTwin
 from twin.finishing import TrainedTwin
-from twin.fitting.torch_reference import torch_free_run
 from twin.models.hybrid import Hybrid
-from twin.models.lag import effective_command
-from twin.models.model import Model, NetworkOde
-from twin.models.neural_ode import NeuralOde
+from twin.models.model import Model
 from twin.models.physical import PhysicalModel
-from twin.models.physics import LAG
 
 MINUTE = 6000
 CREATED = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 @pytest.fixture(scope="module")
-def trained() -> TrainedTwin:
+def trained(trained_once: TrainedOnce) -> TrainedTwin:
     run = fan_data.published_run(1, 20.0, fans=2)
     data = [DataCard("bench.csv", "ab" * 32, run.fans, run.samples)]
-    return train_twin([run], [], "physical", name="bench", command_unit="%", data=data, created=CREATED)
+    return trained_once([run], [], "physical", name="bench", command_unit="%", data=data, created=CREATED)
 
 
 def saved(model: Model, card: TwinCard, folder: Path) -> OnnxTwin:
@@ -74,54 +69,19 @@ def state_of(model: Model, command: np.ndarray) -> np.ndarray:
     return model.state_layout.initial_state(np.array([20.0, 90.0, 0.0, -40.0]), command[0] + 30.0)
 
 
-@pytest.mark.parametrize("lag_s", [0.0, 0.05])
 @every_model
 def test_the_file_runs_a_minute_in_two_blocks_as_numpy_does_in_one(
-    model: Model, lag_s: float, trained: TrainedTwin, tmp_path: Path
+    model: Model, trained: TrainedTwin, tmp_path: Path
 ) -> None:
     command, step_s = minute_of_commands()
     twin = saved(model, trained.card, tmp_path)
-    state, parameters = state_of(model, command), fleet(lag_s)
+    state, parameters = state_of(model, command), fleet(0.05)
     expected, expected_state = model.advance(state, command, step_s, parameters)
     first, middle = twin.advance(state, command[:777], step_s[:777], parameters)
     second, last = twin.advance(middle, command[777:], step_s[777:], parameters)
     assert np.ptp(expected, axis=0).min() > 50.0
     np.testing.assert_allclose(np.concatenate((first, second)), expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(last, expected_state, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "model",
-    [Hybrid(random_network(10)), Hybrid(random_network(10, ("speed",))), NeuralOde(random_network(20))],
-    ids=["hybrid", "hybrid on speed alone", "neural-ode"],
-)
-def test_the_file_runs_a_minute_as_torch_does(model: NetworkOde, trained: TrainedTwin, tmp_path: Path) -> None:
-    command, step_s = minute_of_commands()
-    state, parameters = state_of(model, command), fleet(0.05)
-    acting, _ = effective_command(command, step_s[:, np.newaxis], parameters[:, LAG], state[:, 1])
-    with torch.no_grad():
-        arrays = (model.network.theta, parameters, state[:, 0], acting, step_s)
-        expected = torch_free_run(model, *(torch.from_numpy(array) for array in arrays)).numpy()
-    speed, _ = saved(model, trained.card, tmp_path).advance(state, command, step_s, parameters)
-    np.testing.assert_allclose(speed, expected, rtol=1e-5)
-
-
-@every_model
-def test_the_numbers_do_not_depend_on_how_a_run_is_cut_into_blocks(
-    model: Model, trained: TrainedTwin, tmp_path: Path
-) -> None:
-    command, step_s = (values[:300] for values in minute_of_commands())
-    twin, parameters = saved(model, trained.card, tmp_path), fleet(0.05)
-    start = state_of(model, command)
-    whole, last = twin.advance(start, command, step_s, parameters)
-    for size in (1, 7, 299):
-        parts, state = [], start
-        for first in range(0, 300, size):
-            block = slice(first, first + size)
-            speed, state = twin.advance(state, command[block], step_s[block], parameters)
-            parts.append(speed)
-        np.testing.assert_array_equal(np.concatenate(parts), whole)
-        np.testing.assert_array_equal(state, last)
 
 
 @pytest.mark.parametrize("model", [PhysicalModel(), Hybrid(random_network(10))], ids=["physical", "hybrid"])
@@ -138,26 +98,6 @@ def test_without_a_lag_the_command_itself_acts_to_the_last_bit(
     ]
     np.testing.assert_array_equal(runs[0][0], runs[1][0])
     np.testing.assert_array_equal(runs[0][1][:, 1], command[-1])
-
-
-def test_a_step_of_zero_leaves_every_fan_where_it_is(trained: TrainedTwin, tmp_path: Path) -> None:
-    twin, parameters = saved(ALL_MODELS[2], trained.card, tmp_path), fleet(0.05)
-    state = np.array([[20.0, 5.0], [90.0, 6.0], [0.0, 7.0], [-40.0, 8.0]])
-    speed, after = twin.advance(state, np.full((3, FANS), 70.0), np.zeros(3), parameters)
-    np.testing.assert_array_equal(speed, np.tile(state[:, 0], (3, 1)))
-    lags = parameters[:, LAG] > 0.0
-    np.testing.assert_array_equal(after[lags], state[lags])
-    np.testing.assert_array_equal(after[~lags], [[90.0, 70.0]])
-
-
-@every_model
-def test_a_step_of_the_model_is_few_nodes(model: Model, trained: TrainedTwin, tmp_path: Path) -> None:
-    graph = onnx.load(saved(model, trained.card, tmp_path).path).graph
-    scan = next(node for node in graph.node if node.op_type == "Scan")
-    body = next(attribute.g for attribute in scan.attribute if attribute.name == "body")
-    most = {"physical": 37, "neural-ode": 29, "hybrid": 51, "narx": 13}
-    assert len(body.node) <= most[model.kind]
-    assert len(graph.node) <= 14
 
 
 def test_the_graph_keeps_the_contract(trained: TrainedTwin, tmp_path: Path) -> None:
@@ -189,17 +129,6 @@ def test_the_card_travels_in_the_file(trained: TrainedTwin, tmp_path: Path) -> N
     calibrated = replace(card, calibration={"false_alarms_per_day": 1.0, "limits": [3.0, None]})
     assert TwinCard.from_json(calibrated.to_json()) == calibrated
     np.testing.assert_array_equal(card.parameters, trained.parameters)
-
-
-def test_evaluating_the_file_is_evaluating_the_twin(trained: TrainedTwin, tmp_path: Path) -> None:
-    run = fan_data.published_run(2, 10.0, fans=2)
-    from_file, from_memory = evaluate(trained.save(tmp_path / "twin.onnx"), [run]), evaluate(trained, [run])
-    assert from_file.pooled.rmse_rad_s == pytest.approx(from_memory.pooled.rmse_rad_s, rel=1e-9)
-    assert from_file.pooled.one_step_rmse_rad_s == pytest.approx(from_memory.pooled.one_step_rmse_rad_s, rel=1e-9)
-
-
-def test_the_same_model_and_card_give_the_same_bytes(trained: TrainedTwin) -> None:
-    assert export_onnx(trained.model, trained.card) == export_onnx(trained.model, trained.card)
 
 
 def foreign_model(path: Path) -> None:
@@ -262,7 +191,7 @@ def test_a_graph_of_single_precision_is_refused(trained: TrainedTwin, tmp_path: 
 
 def test_a_truncated_file_is_refused_wherever_it_was_cut(trained: TrainedTwin, tmp_path: Path) -> None:
     whole, path = trained.save(tmp_path / "twin.onnx").read_bytes(), tmp_path / "cut.onnx"
-    for length in np.linspace(0, len(whole) - 1, 60).astype(int):
+    for length in np.linspace(0, len(whole) - 1, 12).astype(int):
         path.write_bytes(whole[:length])
         refusal(path)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import cholesky
 
-from simulation.published_fan import rough_run
+from bench.training.published_fan import rough_run
 from twin.fitting import identification, model_uncertainty
 from twin.fitting.free_run_problem import FreeRunProblem, sums_by_fan
 from twin.fitting.identification import Identification, identify

@@ -73,18 +73,6 @@ def test_a_hybrid_with_a_silent_network_is_the_physical_model() -> None:
     )
 
 
-@pytest.mark.parametrize("model", ALL_MODELS, ids=lambda model: model.kind)
-def test_two_blocks_with_the_state_carried_are_one_block(model) -> None:
-    command = np.random.default_rng(0).uniform(0.0, 100.0, (60, 2))
-    step_s = np.full(60, 0.01)
-    state = model.state_layout.initial_state(np.array([50.0, 60.0]), command[0])
-    whole, whole_state = model.advance(state, command, step_s, PARAMETERS)
-    first, middle = model.advance(state, command[:23], step_s[:23], PARAMETERS)
-    second, last = model.advance(middle, command[23:], step_s[23:], PARAMETERS)
-    np.testing.assert_allclose(np.concatenate((first, second)), whole, rtol=1e-12)
-    np.testing.assert_allclose(last, whole_state, rtol=1e-12)
-
-
 def test_an_initial_state_repeats_the_measured_speed_and_the_command() -> None:
     state = StateLayout(2, 3).initial_state(np.array([5.0, 6.0]), np.array([1.0, 2.0]))
     np.testing.assert_array_equal(state, [[5, 5, 1, 1, 1], [6, 6, 2, 2, 2]])
