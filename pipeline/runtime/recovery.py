@@ -20,7 +20,7 @@ from schemas.topics import topic_of
 MOST_AT_A_TIME = 8
 MOST_QUEUED = 4096
 BACK_OFF_S = 10.0
-"""how long a producer that did not answer in time is not asked again"""
+"""how long a producer that did not answer at all in time is not asked again"""
 MOST_BACKED_OFF = 256
 IMPATIENT_S = 0.5
 """how long further catch-ups wait once one was not answered in time; a complete answer usually comes much sooner"""
@@ -97,7 +97,7 @@ class Recovery:
             if item.answer.timed_out:
                 self._catch_up_timeout_s = min(self._timeout_s, IMPATIENT_S)
             self._catch_up_next()
-        elif item.answer.timed_out and item.answer.published is None:
+        elif item.answer.timed_out and item.answer.published is None and not item.answer.messages:
             self._asked_again_s.pop((item.request.key, item.request.producer), None)
             self._asked_again_s[item.request.key, item.request.producer] = self._now_s() + BACK_OFF_S
             if len(self._asked_again_s) > MOST_BACKED_OFF:

@@ -211,6 +211,22 @@ def test_row_11_a_producer_that_did_not_answer_is_left_alone_for_a_while():
     assert asker.recovery.ask(request()) is None
 
 
+def test_row_11_a_producer_that_answers_in_part_as_on_a_busy_machine_is_asked_until_all_has_come():
+    asker = Asker()
+    tracker = SequenceTracker(asker.recovery.ask, now_s=lambda: asker.now_s)
+    tracker.accept(packet(0))
+    due = sequences(tracker.accept(packet(5)))
+    for number in range(1, 5):
+        asker.now_s += 5.0
+        asker.bus.answer[-1](Answer([(KEY, packet(number).payload)], timed_out=True))
+        item = asker.inbox.get(0.0)
+        assert isinstance(item, Recovered)
+        due += sequences(tracker.answer(item.request, Found([packet(number)])))
+        asker.recovery.finish(item)
+    assert due == [1, 2, 3, 4, 5]
+    assert tracker.inputs()[0].missing == 0
+
+
 def test_row_11_few_requests_run_at_a_time_and_one_that_waited_too_long_is_not_sent():
     asker = Asker()
     requests = [request(f"p{number}") for number in range(MOST_AT_A_TIME + 2)]
