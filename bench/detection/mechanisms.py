@@ -402,7 +402,7 @@ MECHANISMS: Sequence[Mechanism] = (
     Mechanism(
         "return-growth",
         "the longer an alarm has stood, the longer it must be gone",
-        (("scoring.alarms.holding:RETURN_SHARE", _by(0.0)),),
+        (("scoring.alarms.return_rule:LONGEST_RETURN_NS", _by(0)),),
     ),
     Mechanism(
         "return-where-it-shows",

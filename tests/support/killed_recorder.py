@@ -20,7 +20,7 @@ from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.scan import Scan, scan
 from schemas.enums import StageStatus
-from tests.support.recorder_feed import PRODUCER, SITE
+from tests.support.recorder_feed import PRODUCER, SITE, TOPICS
 from tests.support.running_chain import DEADLINE_S, FANTWIN, eventually
 
 FLUSH_S = 1.0
@@ -71,7 +71,7 @@ class Kills:
         tables = "".join(f'[[tray]]\nname = "tray{number + 1}"\nfans = {fans}\n' for number in range(trays))
         self._config.write_text(
             f'site = "{SITE}"\nrun_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n'
-            f"[recorder]\nflush_interval_s = {FLUSH_S}\n{tables}"
+            f"[recorder]\nflush_interval_s = {FLUSH_S}\ntopics = {list(TOPICS)}\n{tables}"
         )
         self._sent = folder / "sent.json"
         words = [sys.executable, str(Path(__file__).with_name("recorder_feed.py"))]

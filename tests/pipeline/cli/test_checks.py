@@ -55,7 +55,9 @@ def test_a_viewer_with_its_ports_taken_says_so(tmp_path):
         config = viewer.ViewerConfig(grpc_port=taken.getsockname()[1], web_port=0)
         (problem,) = viewer.STAGE.check(context(tmp_path, config))
         assert "viewer.grpc_port" in problem and "is taken" in problem
-        assert viewer.STAGE.check(context(tmp_path, config.model_copy(update={"serve": False}))) == []
+        assert (
+            viewer.STAGE.check(context(tmp_path, config.model_copy(update={"serve": False, "file": "view.rrd"}))) == []
+        )
     free = viewer.ViewerConfig(grpc_port=free_port(), web_port=0)
     assert viewer.STAGE.check(context(tmp_path, free)) == []
 

@@ -177,6 +177,8 @@ def test_without_the_report_of_the_simulated_tray_there_is_no_summary(tmp_path):
 
 def test_paths_that_are_to_be_copied_are_not_broken_into_lines(tmp_path):
     narrow = StringIO()
+    for name in ("bands.png", "view.rrd"):
+        (tmp_path / name).touch()
     _print_report(Run(tmp_path).summary(), tmp_path, 60.0, Console(file=narrow, width=40))
     results, picture = narrow.getvalue().splitlines()[-2:]
     assert results.startswith("results: ") and results.endswith("recording.mcap")

@@ -291,7 +291,7 @@ def test_row_13_after_a_step_of_the_clock_the_samples_that_are_counted_are_those
 
 
 @pytest.mark.parametrize("restored_s_before_data", [0.0, 0.1])
-def test_row_13_alarms_that_end_because_the_clock_of_the_stages_before_was_set_back_end_in_a_replay(
+def test_row_13_alarms_stand_where_the_clock_of_the_stages_before_was_set_back_and_a_replay_decides_the_same(
     tmp_path, restored_s_before_data
 ):
     site = Site(tmp_path, seed=1, calibrated=True)
@@ -305,9 +305,11 @@ def test_row_13_alarms_that_end_because_the_clock_of_the_stages_before_was_set_b
     site.run(50)
     found = verified(site.finished()).comparison
     alarms = alarms_of(site.path)
-    assert "fan 0: no alarm" in [alarm.message for alarm in alarms]
+    last = {alarm.fan: alarm for alarm in alarms}
+    assert last and all(alarm.active for alarm in last.values())
     assert found and found.is_equal, found
-    assert found.alarms_equal == len(alarms)
+    judged = [alarm for alarm in alarms if alarm.transition != Transition.REPUBLISHED]
+    assert found.alarms_equal == len(judged) > 0, "its successor has judged nothing, so there is nothing to replay"
 
 
 @pytest.mark.parametrize("set_back_s", [2, 20, 60, 3600])
