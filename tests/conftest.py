@@ -28,6 +28,15 @@ def _without_power_cuts() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _one_process_for_each_command() -> Iterator[None]:
+    """A command works in the process of its test unless it is given --jobs: the tests themselves share the cores, and
+    the start of a worker costs more than the work on a short recording."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LOKY_MAX_CPU_COUNT", "1")
+        yield
+
+
 @pytest.fixture
 def endpoint() -> str:
     """A bus endpoint on loopback that nothing else uses."""
