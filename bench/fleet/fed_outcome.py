@@ -28,6 +28,9 @@ from schemas.messages import Alarm, Message, Raw, Score
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 
+RECORDS_SCORES = '[recorder]\ntopics = ["raw", "score"]\n'
+"""section of a configuration: what an outcome is read from"""
+
 
 @dataclass
 class Outcome:

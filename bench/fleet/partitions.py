@@ -26,7 +26,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bench.fleet.fed_outcome import Outcome, outcome_of
+from bench.fleet.fed_outcome import RECORDS_SCORES, Outcome, outcome_of
 from bench.fleet.network_hosts import ALONE, Host, Process, bridge
 from bench.printing import JsonOption, progress, show
 from pipeline.bus.session import Bus
@@ -204,7 +204,8 @@ class _Site:
         endpoint = json.dumps(self._routers if routers > 1 else self._routers[0])
         (folder / "site.toml").write_text(
             f'site = "{SITE}"\n[launcher]\nrestart_delay_max_s = 0.5\nstop_timeout_s = 60\n'
-            f'[bus]\nmode = "client"\nendpoint = {endpoint}\n[resampler]\nrate_hz = 100\n[[tray]]\nname = "{TRAY}"\n'
+            f'[bus]\nmode = "client"\nendpoint = {endpoint}\n[resampler]\nrate_hz = 100\n'
+            f'{RECORDS_SCORES}[[tray]]\nname = "{TRAY}"\n'
             f'fans = {FANS}\nport = "{folder / "tray"}"\nprotocol = "binary"\nspeed_unit = "rpm"\nspeed_max = 20000\n'
             f'twin = "{DEMO}"\n'
         )

@@ -26,7 +26,7 @@ from typing import Annotated
 
 import typer
 
-from bench.fleet.fed_outcome import Outcome, outcome_of
+from bench.fleet.fed_outcome import RECORDS_SCORES, Outcome, outcome_of
 from bench.fleet.fed_trays import BUSY, FREE_RUN_BEGINS_AGAIN_S, SITE, Feed, Load, NewestScores
 from bench.printing import JsonOption, progress, show
 from pipeline.bus.session import Bus
@@ -86,7 +86,7 @@ def run(
     configuration = folder / "site.toml"
     configuration.write_text(
         f'site = "{SITE}"\nrun_folder = "runs"\n[launcher]\nstages = {json.dumps(STAGES)}\n'
-        f'shards = {kills.shards}\n{BUSY}[bus]\nendpoint = "{endpoint}"\n{load.tables}'
+        f'shards = {kills.shards}\n{BUSY}[bus]\nendpoint = "{endpoint}"\n{RECORDS_SCORES}{load.tables}'
     )
     with Bus(BusConfig(endpoint=endpoint)) as bus:
         watcher, ends = SiteWatcher(bus, SITE), NewestScores(bus)

@@ -23,7 +23,7 @@ from typing import Annotated
 
 import typer
 
-from bench.fleet.fed_outcome import Outcome, outcome_of
+from bench.fleet.fed_outcome import RECORDS_SCORES, Outcome, outcome_of
 from bench.fleet.fed_trays import BUSY, SITE, Feed, Load, NewestScores
 from bench.fleet.network_hosts import ALONE, Host, Process, bridge
 from bench.printing import JsonOption, progress, show
@@ -68,7 +68,7 @@ def run(load: Load, folder: Path, say: Callable[[str], None]) -> Outcome:
     shards = ", ".join(f"{stage} = {number}" for stage, number in SHARDS.items())
     (folder / "site.toml").write_text(
         f'site = "{SITE}"\n[launcher]\nshards = {{ {shards} }}\n{BUSY}'
-        f'[bus]\nmode = "client"\nendpoint = "{ENDPOINT}"\n{load.tables}'
+        f'[bus]\nmode = "client"\nendpoint = "{ENDPOINT}"\n{RECORDS_SCORES}{load.tables}'
     )
     bridge(ROUTER)
     site = _Site(folder)

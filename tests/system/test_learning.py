@@ -25,7 +25,8 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
     path = tmp_path / "fantwin.toml"
     path.write_text(
         f'run_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "tray1"\nfans = {FANS}\n'
-        f'command_max = 100\nport = "{tmp_path / "line"}"\n[learner]\nfirst_minutes = 2\n[viewer]\nserve = false\n',
+        f'command_max = 100\nport = "{tmp_path / "line"}"\n[learner]\nfirst_minutes = 2\n'
+        '[recorder]\ntopics = ["raw", "score"]\n',
         encoding="utf-8",
     )
     folder = learning_folder(tmp_path / "runs", "tray1")
