@@ -108,7 +108,7 @@ class ScorerCore(Core):
         self._at_start = self.restore(stored) if stored else self._continued(continues) if continues else []
         """messages to be emitted first"""
         is_ahead = started_t_ns is not None and self._last_t_ns > started_t_ns + SET_BACK_NS
-        self._may_be_set_back = is_ahead and self._is_restored and not self._not_restored
+        self._may_be_set_back = is_ahead and self._is_restored
         """the snapshot is of later times than now: the first prediction shows whether all times have gone back"""
 
     def _start_new(self) -> None:

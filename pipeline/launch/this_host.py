@@ -5,6 +5,7 @@ What is chosen is added to the overrides, so that each stage and the recording k
 
 from __future__ import annotations
 
+import errno
 import json
 import socket
 from collections.abc import Collection, Sequence
@@ -38,13 +39,15 @@ class ThisHost:
     left_out: tuple[str, ...]
 
 
-def load_for_this_host(path: Path, overrides: Sequence[str] = ()) -> ThisHost:
+def load_for_this_host(path: Path, overrides: Sequence[str] = (), stages: Sequence[str] | None = None) -> ThisHost:
     """Load a configuration without the stages whose extra is missing, unless `launcher.stages` names them.
+
+    stages: those whose sections are checked, see `load_config`.
 
     Raises:
         ConfigError: see `load_config`.
     """
-    config = load_config(path, overrides)
+    config = load_config(path, overrides, stages)
     names_stages = config.launcher.stages is not None
     missing = {} if names_stages else {name: _missing(name) for name in config.stages}
     lines = tuple(filter(None, missing.values()))
@@ -52,7 +55,7 @@ def load_for_this_host(path: Path, overrides: Sequence[str] = ()) -> ThisHost:
         return ThisHost(config, tuple(overrides), ())
     without = [*config.launcher.without, *(name for name, line in missing.items() if line)]
     chosen = (*overrides, f"launcher.without={json.dumps(without)}")
-    return ThisHost(load_config(path, chosen), chosen, lines)
+    return ThisHost(load_config(path, chosen, stages), chosen, lines)
 
 
 def _missing(stage: str) -> str:
@@ -102,6 +105,8 @@ def _are_free(host: str, ports: Sequence[int]) -> bool:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
                 probe.listen()
-        except OSError:
-            return False
+        except OSError as error:
+            return (
+                error.errno != errno.EADDRINUSE
+            )  # any other reason is the same for every port, and the stage names it
     return True

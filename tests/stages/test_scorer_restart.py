@@ -380,6 +380,19 @@ def test_only_a_replay_of_earlier_samples_makes_a_snapshot_be_discarded(
         assert not scores or scores[0].t_ns[0] > prediction_of(np.zeros(1), first=99).t_ns[0]
 
 
+@pytest.mark.parametrize("twin", ["twin", "another"])
+def test_row_13_a_snapshot_that_is_ahead_of_a_clock_that_was_set_back_keeps_no_fan_from_being_judged(
+    tmp_path: Path, twin: str
+) -> None:
+    store = SnapshotStore(tmp_path / "scorer.snapshot")
+    store.save(snapshot_of(raised()))
+    day = 24 * 3600 * 100
+    made = prediction_of(np.zeros((20, 3)), first=-day, producer="integrator-new")
+    successor = core_of(3, sha256=twin, snapshot_store=store, started_t_ns=int(made.t_ns[0]))
+    assert [len(message.t_ns) for message in successor.step(made) if isinstance(message, Score)] == [20]
+    assert not successor.counters().get("repeated")
+
+
 def test_alarms_of_a_discarded_snapshot_are_no_longer_current() -> None:
     successor = core_of(3, is_replayed=True)
     republished = successor.restore(snapshot_of(raised()))

@@ -74,13 +74,16 @@ def core_of(
     snapshot_store: SnapshotStore | None = None,
     tachos: tuple[Tacho, ...] = INSTANTANEOUS,
     is_replayed: bool = False,
+    started_t_ns: int | None = None,
     **config: Any,
 ) -> ScorerCore:
     """Without a calibration: limits on the speed residual alone, 2 SIGMA."""
     settings = ScorerConfig.model_validate(config)
     limits = limits_in_force(settings, calibration)
     twin = HealthyTwin(sha256, limits, [balance_of_a_fan()] * fans, "%", tachos=tachos)
-    return ScorerCore(fans, unit, settings, twin, snapshot_store, is_replayed=lambda: is_replayed)
+    return ScorerCore(
+        fans, unit, settings, twin, snapshot_store, started_t_ns=started_t_ns, is_replayed=lambda: is_replayed
+    )
 
 
 def prediction_of(

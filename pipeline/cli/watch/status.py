@@ -18,7 +18,6 @@ from rich.text import Text
 
 from pipeline.bus.session import Bus, join_bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.config.roles import READERS, role_names, roles_of
@@ -30,6 +29,7 @@ from pipeline.launch.refused_input import refused_lines
 from pipeline.launch.site_state import AT_WORK, StageState, Word, site_states
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.launch.stage_notes import note_lines, notes_as_json
+from pipeline.launch.this_host import load_for_this_host
 from pipeline.runtime.signals import stop_on_signals
 from schemas.enums import Severity
 from schemas.streams import LOSS_PREFIX
@@ -74,7 +74,7 @@ def status(
 
     Example: fantwin status -c fantwin.toml --stage scorer --shard 2/8
     """
-    settings = load_config(config, overrides or (), stages=())
+    settings = load_for_this_host(config, overrides or (), stages=()).config
     stop = threading.Event()
     stop_on_signals(stop)
     if stage is not None:

@@ -27,8 +27,11 @@ RATIO = 1e-9
 """absolute, of all other numbers: scores, probabilities, sizes of faults"""
 FIXED_POINT = 4
 """absolute, of integer sums: a number that lies halfway between two of their units is rounded to either"""
-FIXED_POINT_SUMS = frozenset({"sums", "squares", "scaling_squares", "motions", "speeds"})
+FIXED_POINT_SUMS = frozenset({"sums", "products", "squares", "scaling_squares", "motions", "speeds"})
 """entries of snapshots that hold integer sums of numbers; all other integers are compared exactly"""
+
+SENTENCES = frozenset({"message", "evidence"})
+"""texts with numbers that are rounded from other fields; all other texts are compared exactly"""
 
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
@@ -80,7 +83,7 @@ def differences(one: Any, other: Any, note: Callable[[Apart], None], path: tuple
 
 def _apart(path: tuple[str, ...], one: Any, other: Any) -> Apart:
     name = next((key for key in reversed(path) if not key.isdigit()), "")
-    if isinstance(one, str) and isinstance(other, str):
+    if isinstance(one, str) and isinstance(other, str) and name in SENTENCES:
         is_alike = _NUMBER.sub("#", one) == _NUMBER.sub("#", other)
         return Apart(0.0 if is_alike else math.inf)
     if isinstance(one, float) and isinstance(other, float):

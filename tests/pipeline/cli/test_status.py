@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from pipeline import extras
 from pipeline.bus.publisher import Publisher
 from pipeline.bus.session import Bus
 from pipeline.cli.watch import status as status_command
@@ -26,6 +27,7 @@ from pipeline.config.models import BusConfig
 from pipeline.launch.judged_fans import JudgedFans
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher, StageView
+from pipeline.launch.this_host import load_for_this_host
 from schemas.codec import encode, type_name
 from schemas.enums import InvalidReason, Severity, StageStatus, Transition
 from schemas.header import Header
@@ -262,6 +264,14 @@ def test_row_01_every_stage_that_the_configuration_asks_for_has_a_row(site):
     text = shown(watcher, site.judged(), 'launcher.stages=["resampler", "scorer"]')
     assert re.search(r"resampler +missing", text)
     assert "resampler: not seen on the bus" in text
+
+
+def test_a_viewer_that_is_left_out_for_want_of_its_extra_is_not_missing(site, monkeypatch):
+    monkeypatch.setattr(extras, "is_installed", lambda module: module != "rerun")
+    watcher = SiteWatcher(site.outside, SITE)
+    here = load_for_this_host(DEMO / "demo.toml", stages=()).config
+    stages = [stage["stage"] for stage in as_json(watcher, here, site.judged())["stages"]]
+    assert "recorder" in stages and "viewer" not in stages
 
 
 def test_row_01_no_alarms_is_not_said_while_a_fan_is_not_judged(site):

@@ -12,7 +12,10 @@ from pipeline.replay.offline.tolerance import Apart
 from schemas.messages import ScorerSnapshot
 
 STATE: dict[str, Any] = {
-    "scorer": {"speed": {"drift": [0.1, 0.2], "sums": [107439, 0], "counts": [107, 0]}},
+    "scorer": {
+        "speed": {"drift": [0.1, 0.2], "sums": [107439, 0], "counts": [107, 0], "shared": {"products": [10**6]}},
+        "input_producer": "twin_integrator-1-00aa",
+    },
     "alarms": {
         "last_emitted": {"3": {"active": True, "message": "takes 0.046 more", "causes": [{"probability": 0.75}]}}
     },
@@ -48,6 +51,9 @@ def changed(where: str, value: object) -> dict[str, Any]:
         ("scorer.speed.drift", [0.1], "scorer.speed.drift"),
         ("scorer.speed.sums.0", 107440, ""),
         ("scorer.speed.sums.0", 107449, "scorer.speed.sums.0"),
+        ("scorer.speed.shared.products.0", 10**6 + 1, ""),
+        ("scorer.speed.shared.products.0", 10**6 + 9, "scorer.speed.shared.products.0"),
+        ("scorer.input_producer", "twin_integrator-2-99aa", "scorer.input_producer"),
         ("scorer.speed.counts.0", 108, "scorer.speed.counts.0"),
         ("alarms.last_emitted.3.active", False, "alarms.last_emitted.3.active"),
         ("alarms.last_emitted.3.message", "takes 0.047 more", ""),
