@@ -106,7 +106,5 @@ def _are_free(host: str, ports: Sequence[int]) -> bool:
                 probe.bind(address)
                 probe.listen()
         except OSError as error:
-            return (
-                error.errno != errno.EADDRINUSE
-            )  # any other reason is the same for every port, and the stage names it
+            return error.errno != errno.EADDRINUSE  # other reasons hold for every port, and the stage names them
     return True

@@ -231,7 +231,7 @@ def compare_alarms(
     left = {(alarm.fan, alarm.t_ns, alarm.transition, alarm.request): alarm for alarm in recorded}
     for alarm in made:
         other = left.pop((alarm.fan, alarm.t_ns, alarm.transition, alarm.request), None)
-        where = first_difference(alarm, other, found.note, _reworded(alarm)) if other is not None else ""
+        where = first_difference(alarm, other, found.note) if other is not None else ""
         if other is not None and not where:
             found.alarms_equal += 1
         elif limit is not None and alarm.t_ns > limit.t_ns:
@@ -280,11 +280,6 @@ def first_difference(alarm: Alarm, other: Alarm, note: Callable[[Apart], None], 
         for each in (alarm, other)
     )
     return next(differences(one, beside, note), "")
-
-
-def _reworded(alarm: Alarm) -> tuple[str, ...]:
-    """Fields that may differ: the line of a republished alarm follows from its flags, and was worded otherwise."""
-    return ("message",) if alarm.transition == Transition.REPUBLISHED else ()
 
 
 def _describe(alarm: Alarm) -> str:

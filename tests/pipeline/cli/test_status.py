@@ -270,7 +270,8 @@ def test_a_viewer_that_is_left_out_for_want_of_its_extra_is_not_missing(site, mo
     monkeypatch.setattr(extras, "is_installed", lambda module: module != "rerun")
     watcher = SiteWatcher(site.outside, SITE)
     here = load_for_this_host(DEMO / "demo.toml", stages=()).config
-    stages = [stage["stage"] for stage in as_json(watcher, here, site.judged())["stages"]]
+    seen: Any = as_json(watcher, here, site.judged())
+    stages = [stage["stage"] for stage in seen["stages"]]
     assert "recorder" in stages and "viewer" not in stages
 
 
