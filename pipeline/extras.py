@@ -24,11 +24,11 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "logs": ("orangebox", "pyarrow", "pyulog", "rosbags"),
     "remote": ("distributed", "fsspec", "s3fs"),
 }
-"""extra of pyproject.toml -> the modules that the code imports of it"""
+"""extra of pyproject.toml -> those of its modules that the code imports"""
 
 
 def is_installed(module: str) -> bool:
-    """Whether a module is there, without importing it."""
+    """Whether a module is installed; it is not imported."""
     try:
         return find_spec(module) is not None
     except ValueError:  # an entry None of sys.modules
@@ -38,7 +38,7 @@ def is_installed(module: str) -> bool:
 def missing_extra(what: str, extra: str, *modules: str) -> str:
     """One line that says that `what` needs an extra and how to install it; empty if it is installed.
 
-    modules: those that are needed of the extra; without them, all.
+    modules: the modules of the extra that are needed; without them, all.
     """
     if all(map(is_installed, modules or EXTRAS[extra])):
         return ""
@@ -46,7 +46,7 @@ def missing_extra(what: str, extra: str, *modules: str) -> str:
 
 
 def require(what: str, extra: str, *modules: str) -> None:
-    """The same as an error.
+    """Raise an error if `what` lacks its extra, see `missing_extra`.
 
     Raises:
         UserError: the extra is not installed.
@@ -72,7 +72,7 @@ def how_to_install(requirement: str) -> str:
 
 
 def _origin() -> dict[str, Any]:
-    """What the installer noted about where fantwin came from (PEP 610); as for a checkout if it is not installed."""
+    """The installer's record of where fantwin came from (PEP 610); that of a checkout if fantwin is not installed."""
     try:
         noted = distribution("fantwin").read_text("direct_url.json")
     except PackageNotFoundError:
@@ -81,7 +81,7 @@ def _origin() -> dict[str, Any]:
 
 
 def _pip(folder: Path | None = None) -> str:
-    """`pip install` of this environment, as short as it can be typed in `folder`; without pip, that of uv."""
+    """The shortest `pip install` for this environment, as typed in `folder`; that of uv if there is no pip."""
     program = Path(sys.prefix) / "bin" / "pip"
     if not is_installed("pip"):
         return f"uv pip install --python {sys.executable}"
@@ -92,7 +92,7 @@ def _pip(folder: Path | None = None) -> str:
 
 
 def _uv_tool(requirement: str, url: str) -> str:
-    """uv replaces a tool as a whole: its own requirement is named again, with where it came from."""
+    """The command for a tool of uv. uv replaces a tool as a whole, so fantwin itself is named again with its origin."""
     if requirement.startswith("fantwin"):
         return f"uv tool install {_quoted(requirement + (f' @ {url}' if url else ''))}"
     return f"uv tool install {_quoted('fantwin' + (f' @ {url}' if url else ''))} --with {_quoted(requirement)}"

@@ -290,7 +290,7 @@ def decode_columns(message_type: type[AnyMessage], data: bytes, names: Collectio
 
 
 class _PackedOtherwiseError(Exception):
-    """A message that another encoder packed otherwise, which only `decode` can read."""
+    """A message with columns that another encoder packed in a different way; only `decode` can read it."""
 
 
 def _views(layout: _Layout, data: bytes, names: AbstractSet[str | None]) -> tuple[Any, dict[str, Array]]:

@@ -63,7 +63,7 @@ class Column:
         shape: `samples` (n,), `samples x fans` (n, fans) or `fans` (fans,).
         dtype: of the array, and of its packed bytes.
         enum: what the values mean; None for quantities.
-        optional: the array may be empty although the message has samples, as a column that a recording lacks.
+        optional: whether the array may be empty although the message has samples, because a recording lacks it.
         limits: the smallest and the largest value accepted; None for any.
     """
 

@@ -99,7 +99,7 @@ class Health:
         latency_p50_ms: of the outputs of the last ten seconds, as latency_p99_ms.
         latencies: a histogram of all outputs of its session, whose latencies add up to latency_sum_s; a stage without
             outputs sends none.
-        trays: those that it has, separated by commas; empty: all of the site.
+        trays: names of its trays, separated by commas; empty: all of the site.
         is_last: the last message of its session, whatever its status.
     """
 

@@ -255,7 +255,7 @@ class Request:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScorerSnapshot:
-    """State that a scorer needs to continue after a restart. format: of `state_json`; 0 where none was stated."""
+    """State that a scorer needs to continue after a restart. format: number of `state_json`; 0: none."""
 
     header: Header = Header()
     t_ns: int
@@ -315,8 +315,8 @@ class Consumed:
     """What a session of a stage had consumed when it made an output: the input position of the header is the output's.
 
     Attributes:
-        topic: of the output.
-        first_t_ns, t_ns: its first and its newest sample.
+        topic: topic of the output.
+        first_t_ns, t_ns: times of its first and its newest sample.
     """
 
     header: Header = Header()

@@ -187,8 +187,10 @@ def sessions_key(site: str, stage: str = "*", instance: str = "*") -> str:
 
 
 def session_key(site: str, stage: str, instance: str, *parts: object) -> str:
-    """Key of the token of one session. parts: when it started, its producer, its host, its process id; and its trays,
-    unless it has all."""
+    """Key of the token of one session.
+
+    parts: its start, producer, host and process id, and its trays unless it has all.
+    """
     return "/".join((sessions_key(site, stage, instance).removesuffix("/**"), *map(str, parts)))
 
 

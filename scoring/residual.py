@@ -112,8 +112,10 @@ class Residual:
         )
 
     def over(self, of: ResidualSamples, intervals: Intervals, moving: Array | None) -> SampledResidual:
-        """Samples of the present interval and later ones. moving: (intervals, fans) see Movement; None for a single
-        interval, which does not end here."""
+        """The residual over samples of the present interval and later ones.
+
+        moving: (intervals, fans), see Movement; None for a single interval, which does not end here.
+        """
         baseline, scaling, commissioned = self.baseline, of.scaling, self._commissioned
         learned = of.valid & (of.seen | baseline.is_commissioning)
         if self._sharing is None:

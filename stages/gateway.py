@@ -177,7 +177,7 @@ def build(context: Context) -> BuiltStage:
 
 
 def check(context: Context) -> list[str]:
-    """Report a port that another program has taken, and files that cannot be read."""
+    """Problems with the gateway: its port is taken by another program, or a file cannot be read."""
     from pipeline.gateway.server import check_certificate, check_files, listen  # noqa: PLC0415  slow to import
     from pipeline.presenting.users import read_users  # noqa: PLC0415
 

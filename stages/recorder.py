@@ -1,11 +1,11 @@
 """Recorder: writes the messages on the bus to MCAP files.
 
 Reads   every topic marked as recorded in schemas/topics.py, of all trays, and the health of all stages; of the topics
-        of samples those of `topics`, in a large site only raw samples
+        of samples those of `topics`, by default only raw samples
 Writes  nothing on the bus; a recording of one or more parts, docs/reference/recordings.md
 Units   as in the messages: their bytes are not changed
-Timing  a message survives a crash, also of the machine, at most `flush_interval_s` after its receipt; earlier where
-        much is received, or something happens. Of healths those are recorded that report something new
+Timing  a message survives a crash, also of the machine, at most `flush_interval_s` after its receipt; earlier if much
+        is received, or if something happens. Health messages are recorded if they report something new
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ TICK_NS = 50_000_000
 DISK_CHECK_NS = NS_PER_S
 """how often the free space is checked"""
 LIMITS_CHECK_NS = 10 * NS_PER_S
-"""how often the limits of days and bytes are checked; and before each part"""
+"""how often the limits on age and size are checked; they are also checked before each part"""
 URGENT = ("alarm", "request", "twin")
 """topics whose messages are on the disk within FLUSH_S"""
 CLIP_SETTLED_S = 2.0
@@ -75,8 +75,8 @@ class Recorder(Core):
         left_out: Collection[str] = (),
         clips: AlarmClips | None = None,
     ) -> None:
-        """Begin the first part, at `now_ns`. If the disk is full or gone, wait for it. left_out: topics that are not
-        recorded on purpose. clips: of alarms; None: no clips are kept.
+        """Begin the first part, at `now_ns`. If the disk is full or gone, wait for it. left_out: topics that are left
+        out on purpose. clips: of alarms; None: no clips are kept.
 
         Raises:
             RecordingError: nothing can be recorded there.
@@ -107,7 +107,7 @@ class Recorder(Core):
         """time of receipt of the oldest message that may not be on the disk yet"""
         self._unflushed_bytes = 0
         self._is_urgent = False
-        """something has happened that is to be on the disk soon"""
+        """whether a message must be on the disk soon"""
         try:
             self._keep_limits()
             shortage = self._room.shortage(0)
@@ -199,7 +199,7 @@ class Recorder(Core):
         return {**written, **self._counts, **self._room.counts, **self._interference.counts, **of_clips}
 
     def notes(self) -> Sequence[str]:
-        """What recordings take of what they may, and which topics are left out on purpose."""
+        """The space and days that recordings take of their limits, and the topics that are left out on purpose."""
         left_out = ", ".join(self._ledger.left_out)
         of_topics = [f"not recorded: {left_out} (recorder.topics)"] if left_out else []
         return [*self._room.notes(), *of_topics]

@@ -51,7 +51,7 @@ NEW_START = "baselines, alarms and wear start from the beginning"
 OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
 ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
 EARLIER_TWIN = (
-    "the snapshot is of the twin before: baselines and alarms start from the beginning, wear continues; "
+    "the snapshot is of the previous twin: baselines and alarms start from the beginning, wear continues; "
     f"{OPERATORS_KEPT}"
 )
 READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
@@ -298,10 +298,9 @@ class ScorerCore(Core):
         )
 
     def _discard_if_replayed(self, item: Prediction) -> list[Alarm]:
-        """Discard a restored snapshot if a replay plays samples from before it. Returns the messages on alarms that are
-        discarded.
+        """Discard a restored snapshot if a replay plays samples from before it; the messages on discarded alarms.
 
-        Of a live site, older samples are no reason: a restarted producer repeats all that those before it have kept.
+        On a live site a snapshot stays valid with older samples: a restarted producer repeats all that was kept.
         """
         if not self._is_restored or not len(item.t_ns):
             return []

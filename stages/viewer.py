@@ -36,10 +36,10 @@ class ViewerConfig(StageConfig):
 
     file: str = Field(
         default="",
-        description='file in run_folder for the view, such as "view.rrd"; an older file is kept, and view-2.rrd is '
-        'written; "": no file, `fantwin view` makes one from a recording',
+        description='file in run_folder for the view, such as "view.rrd"; if it exists, it is kept, and view-2.rrd is '
+        'written. "": no file; `fantwin view` makes one from a recording',
     )
-    file_bytes: int = Field(default=1_000_000_000, ge=1_000_000, description="the file of the view ends at this size")
+    file_bytes: int = Field(default=1_000_000_000, ge=1_000_000, description="size at which the view's file ends")
     serve: bool = Field(default=True, description="serve live viewers on this host (127.0.0.1)")
     grpc_port: int = Field(
         default=9876,
@@ -159,7 +159,7 @@ def topics_read(config: ViewerConfig, trays: Sequence[TrayConfig]) -> tuple[str,
 
 STAGE = Stage(
     name="viewer",
-    about="shows measured speed, twin, band, alarms and states live in Rerun, and in a file if one is asked for",
+    about="shows measured speed, twin, band, alarms and states live in Rerun, and in a file if `file` names one",
     reads=READS,
     writes=(),
     config=ViewerConfig,

@@ -45,11 +45,11 @@ class HomeAssistant:
 
     @property
     def pattern(self) -> str:
-        """Pattern of the topics of all its devices, of earlier configurations too."""
+        """Pattern of the topics of all its devices, including those of earlier configurations."""
         return f"{self._path}/+/config"
 
     def is_own(self, topic: str) -> bool:
-        """Whether a topic is that of one of its devices, of an earlier configuration too."""
+        """Whether a topic is that of one of its devices, or of a device of an earlier configuration."""
         return topic.startswith(f"{self._path}/") and topic.endswith("/config")
 
     def messages(self) -> Mapping[str, str]:

@@ -73,7 +73,7 @@ class Topics:
         return self.request(tray, "+")
 
     def of_fans(self) -> tuple[str, ...]:
-        """Patterns of the retained topics of all fans, of earlier configurations too."""
+        """Patterns of the retained topics of all fans, including those of earlier configurations."""
         return f"{self.root}/+/+/{STATE}", f"{self.root}/+/+/{ALARM}"
 
     def parts(self, topic: str) -> tuple[str, str, str] | None:

@@ -102,10 +102,10 @@ class Publisher:
         return is_full and len(self._kept) > 1  # the newest is kept, however large it is
 
     def _answer(self, query: zenoh.Query) -> None:
-        """Answer with what is kept of a range, and at the end with the number of published messages.
+        """Answer with the kept messages of a range, and at the end with the number of published messages.
 
-        A consumer that begins asks for the newest ones only, and gets no number. If more is kept than a consumer takes
-        in one answer, the number is left out: the consumer then asks for the rest.
+        A consumer that starts asks only for the newest messages, and gets no number. The number is also left out if
+        more is kept than a consumer takes in one answer: the consumer then asks for the rest.
         """
         first, last, newest = (number_in(query.parameters.get(name) or "") for name in ("first", "last", "newest"))
         first, last = first or 0, LAST_SEQUENCE if last is None else last

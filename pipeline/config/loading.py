@@ -43,7 +43,7 @@ MOST_SHOWN = 5
 
 
 class _File(Section):
-    format: int = Field(default=CONFIGURATION.written, description="number of the format of this file")
+    format: int = Field(default=CONFIGURATION.written, description="format number of this file")
     site: Name = Field(default="site", description="name of the site: it begins the keys on the bus")
     run_folder: Path = Field(default=Path("runs"), description="where recordings, snapshots and logs are written")
     bus: BusConfig = BusConfig()

@@ -172,7 +172,7 @@ class LauncherConfig(Section):
         default=None, description="which stages run, in any order; without it, all that the configuration enables"
     )
     without: tuple[str, ...] = Field(
-        default=(), description='stages that do not run although they are enabled, as ["gateway"]: no operators\' page'
+        default=(), description='stages that do not run although they are enabled: ["gateway"] for no operators\' page'
     )
     shards: int | dict[str, int] | None = Field(
         default=None,

@@ -82,7 +82,7 @@ def page() -> str:
             "tray without twin": " It runs if a tray names no twin, or if the file has this section.",
         }[row.enabled_by]
         if row.extra:
-            start += f" Where the extra `{row.extra}` is not installed, `fantwin up` leaves it out and says so."
+            start += f" If the extra `{row.extra}` is not installed, `fantwin up` leaves out this stage and says so."
         parts += [
             f"## `[{name}]`\n",
             f"{stage.about[0].upper()}{stage.about[1:]}.{start}\n",

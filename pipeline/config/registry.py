@@ -22,8 +22,8 @@ class StageRow:
         declaration: import string of its `pipeline.runtime.stage.Stage`, `module:attribute`.
         enabled_by: what enables it where `launcher.stages` is not given. "default": always; "section": a section
             `[name]` in the configuration; "tray without twin": a tray that names no twin.
-        extra: of the installation; where it is missing, `fantwin up` leaves out the stage, unless `launcher.stages`
-            names it.
+        extra: the extra of the installation that it needs. If it is missing, `fantwin up` leaves out the stage, unless
+            `launcher.stages` names it.
         scope: one process for the site, or one for each tray, where `launcher.shards` says nothing of it. Only stages
             with a process for each tray may have a device.
         has_common_shards: a `launcher.shards` that is one number for all stages applies to it.

@@ -1,4 +1,4 @@
-"""Connections of the HTTP source that do not wait for ever for a request."""
+"""Connections of the HTTP source, with a limit on how long they wait for a request."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class ModbusFan(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
 
 
 class ModbusConfig(PolledConfig, frozen=True):
-    """Drives and fan trays by Modbus, TCP or RTU. The extra `devices` of the installation is needed."""
+    """Drives and fan trays by Modbus, TCP or RTU. It needs the extra `devices`."""
 
     kind: Literal["modbus"] = "modbus"
     host: str = Field(default="", description="name or address, for Modbus TCP")

@@ -176,7 +176,7 @@ class MqttSource:
             self._deliver(batch)
 
     def _is_own(self, topic: str) -> bool:
-        """Whether it is subscribed to. With a client_id the broker keeps the subscriptions of earlier settings."""
+        """Whether this tray subscribes to a topic. With a client_id, the broker keeps earlier subscriptions."""
         from paho.mqtt.client import topic_matches_sub  # noqa: PLC0415  an extra
 
         return topic in self._topics or any(topic_matches_sub(_unshared(each), topic) for each in self._topics)
@@ -186,7 +186,7 @@ class MqttSource:
     ) -> list[ReadingBatch]:
         """What a message has. is_retained: the broker had kept it. is_again: the broker may have sent it before."""
         if not self._is_own(topic):
-            detail = f"{topic} is not a topic of this tray: it is an earlier subscription of client_id, and is ended"
+            detail = f"{topic} is not a topic of this tray: the earlier subscription of client_id is ended"
             return [_refused(received_t_ns, payload, Rejected("foreign_topic", detail, harmless=True))]
         if self._config.has_values:
             items = self._items_of_value(topic, payload, is_retained)

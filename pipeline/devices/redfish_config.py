@@ -15,7 +15,7 @@ USER_VARIABLE, PASSWORD_VARIABLE = "FANTWIN_REDFISH_USER", "FANTWIN_REDFISH_PASS
 
 
 class RedfishConfig(PolledConfig, frozen=True):
-    """Fans of a server by its baseboard controller. The extra `devices` of the installation is needed."""
+    """Fans of a server by its baseboard controller. It needs the extra `devices`."""
 
     kind: Literal["redfish"] = "redfish"
     period_s: float = Field(default=1.0, gt=0, le=SLOWEST_S, description="time between two readings")

@@ -24,7 +24,7 @@ class GatewayConfig(StageConfig):
         default=8080,
         ge=1,
         le=65535,
-        description="port; if it is not set and 8080 is taken, `fantwin up` takes the next free one; shard K uses "
+        description="port; if it is not set and 8080 is taken, `fantwin up` chooses the next free one; shard K uses "
         "the K-th from here on",
     )
     certificate: Path | None = Field(default=None, description="PEM file: serve https with this certificate")

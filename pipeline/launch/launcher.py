@@ -103,8 +103,8 @@ class Launcher:
         trays: Collection[str] | None = None,
         when_started: Sequence[str] = (),
     ) -> None:
-        """`say` is called with one line for each event. trays: of this host, see `process_list`. when_started: lines to
-        say when all stages have started.
+        """`say` is called with one line for each event. trays: of this host, see `process_list`. when_started:
+        lines to print when all stages have started.
 
         Raises:
             UserError: no process has its first tray among them.

@@ -1,6 +1,6 @@
 """The configuration as `fantwin up` runs it on this host: without stages whose extra is missing, and with a free port.
 
-What is chosen is added to the overrides, so that each stage and the recording know it, too.
+Both choices are added to the overrides, so that every stage and the recording know them.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from pipeline.extras import missing_extra
 from pipeline.launch.processes import process_list
 
 _PORTS = 1000
-"""tried, from the configured one on"""
+"""number of ports that are tried, from the configured one on"""
 
 
 @dataclass(frozen=True)
 class ThisHost:
-    """What runs here.
+    """The configuration that runs here.
 
     Attributes:
-        overrides: those given, and what was chosen.
+        overrides: those given, and the choices of this module.
         left_out: a line for each stage that is left out.
     """
 
@@ -64,7 +64,7 @@ def _missing(stage: str) -> str:
 
 
 def with_free_port(host: ThisHost, trays: Collection[str] | None) -> ThisHost:
-    """The same with a port of the operators' page that is free, where the configuration sets none.
+    """The same, with a free port for the operators' page if the configuration sets none.
 
     trays: of this host, see `process_list`.
     """

@@ -1,8 +1,8 @@
-"""The room that recordings may take on the disk, and what is deleted for it.
+"""The limits on the disk space of recordings and clips, and the deletions that keep them.
 
-One principle: the oldest recordings go when they are older than `keep_days`, when all recordings and clips of the
-folder exceed `keep_share_of_disk`, or when the disk runs short. A clip goes as a part of its time, once its alarms are
-acknowledged.
+The oldest recordings are deleted when they are older than `keep_days`, when all recordings and clips of the folder
+exceed `keep_share_of_disk`, or when the disk is nearly full. A clip is deleted with the parts of its time, once its
+alarms are acknowledged.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class _Oldest(NamedTuple):
-    """What may be deleted next."""
+    """The part or clip that may be deleted next."""
 
     last_ns: int
     part: StoredPart | None
@@ -35,7 +35,7 @@ class _Oldest(NamedTuple):
 
 
 class DiskRoom:
-    """Keeps the limits, and says what is short."""
+    """Deletes what exceeds the limits, and says when the disk has too little free space."""
 
     def __init__(self, parts: PartsFolder, config: RecorderConfig, clips: AlarmClips | None) -> None:
         self._parts, self._config, self._clips = parts, config, clips
@@ -57,7 +57,7 @@ class DiskRoom:
         return min(self._config.part_s or math.inf, kept_s / PARTS_WITHIN_LIMITS)
 
     def keep_limits(self, now_ns: int) -> None:
-        """Delete what is too old, and the oldest that is too much; room for the part that is written is left.
+        """Delete recordings that are too old, then the oldest until the rest fits with the part that is being written.
 
         Raises:
             DiskError: the disk is gone.
@@ -76,9 +76,10 @@ class DiskRoom:
         self._warn_of_what_is_kept(since_ns, is_all=oldest is None)
 
     def shortage(self, more_bytes: int) -> str:
-        """Why the free space is not enough for `more_bytes`; empty if it is. Deletes what is oldest, one at a time: the
-        space may become free a little later. The last finished part stays: where others fill the disk, recordings
-        would be deleted second by second, and nothing would be left of them.
+        """Why the free space is not enough for `more_bytes`; empty if it is, or if a file was deleted for it.
+
+        One file is deleted for each call, because its space may become free a little later. The last finished part is
+        kept: if other programs fill the disk, no recording would be left otherwise.
 
         Raises:
             DiskError: the disk is gone.
@@ -97,7 +98,7 @@ class DiskRoom:
         )
 
     def notes(self) -> list[str]:
-        """What recordings take of what they may, for people; empty before the first look."""
+        """The space and days that recordings take of their limits, for people; empty before the first look."""
         if not self._limit_bytes:
             return []
         return [usage(self._stored, self._limit_bytes, self._config, self._now_ns), *filter(None, [self._beyond])]
@@ -110,7 +111,7 @@ class DiskRoom:
         return f"recordings and clips would exceed {in_bytes(self._limit_bytes)} (recorder.keep_share_of_disk)"
 
     def _oldest(self) -> _Oldest | None:
-        """The oldest part, or an older clip whose alarms are acknowledged. A part that a clip still needs goes last."""
+        """The oldest part, or an older clip whose alarms are acknowledged. A part that a clip needs is deleted last."""
         self._stored = self._parts.stored()
         part = next(iter(self._stored.parts), None)
         is_needed = part is not None and self._clips is not None and self._clips.needs(part.last_ns)
@@ -120,7 +121,7 @@ class DiskRoom:
         return _Oldest(part.last_ns, part, is_needed) if part else None
 
     def _delete(self, oldest: _Oldest, why: str) -> bool:
-        """False: it cannot be deleted."""
+        """Delete it; False if that is not possible."""
         if oldest.part is None:
             assert self._clips
             deleted = self._clips.delete_oldest_acknowledged()
@@ -135,7 +136,7 @@ class DiskRoom:
         return True
 
     def _warn_of_what_is_kept(self, since_ns: float, *, is_all: bool) -> None:
-        """Say once what the limits do not delete. is_all: nothing may be deleted."""
+        """Warn once of files beyond the limits that may not be deleted. is_all: no file may be deleted."""
         before, self._beyond = self._beyond, ""
         if self._clips and (kept := self._clips.unacknowledged_before(since_ns)):
             size = sum(clip.size_bytes for clip in kept)
@@ -144,13 +145,13 @@ class DiskRoom:
                 f"{in_bytes(size)}"
             )
         elif is_all and self._is_too_much():
-            self._beyond = f"{self._too_much()}, and nothing may be deleted: acknowledge alarms, or allow more"
+            self._beyond = f"{self._too_much()}, and nothing may be deleted: acknowledge alarms, or raise this limit"
         if self._beyond and not before:
             _LOG.warning("%s", self._beyond)
 
 
 def usage(stored: Stored, limit_bytes: int, config: RecorderConfig, now_ns: int) -> str:
-    """What recordings take of what they may, in words."""
+    """The space and days that recordings take of their limits, in words."""
     line = f"recordings: {in_bytes(stored.finished_bytes + stored.open_bytes)} of {in_bytes(limit_bytes)}"
     if not config.keep_days:
         return line
@@ -159,14 +160,18 @@ def usage(stored: Stored, limit_bytes: int, config: RecorderConfig, now_ns: int)
 
 
 def usage_of(folder: Path, config: RecorderConfig, now_ns: int) -> str:
-    """The same of a folder, which need not exist. OSError or DiskError if it cannot be read."""
+    """The usage of a folder, which need not exist.
+
+    Raises:
+        OSError, DiskError: it cannot be read.
+    """
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     stored = StoredRecordings(folder).look() if existing == folder else Stored()
     return usage(stored, round(Disk(existing).size_bytes() * config.keep_share_of_disk), config, now_ns)
 
 
 def in_bytes(size: float) -> str:
-    """A size for people, of three digits."""
+    """A size for people, with three digits."""
     for unit in ("bytes", "kB", "MB"):
         if size < 1000:
             return f"{size:.3g} {unit}"

@@ -147,14 +147,14 @@ class RecordingParts:
         return self._disk.size_bytes()
 
     def stored(self) -> Stored:
-        """What recordings and clips there are in the folder; nothing if it cannot be read."""
+        """The recordings and clips in the folder; none if it cannot be read."""
         try:
             return self._stored.look()
         except OSError:
             return Stored()
 
     def delete(self, part: StoredPart) -> bool:
-        """Delete a finished part; False: it cannot be deleted."""
+        """Delete a finished part; False if that is not possible."""
         try:
             part.path.unlink(missing_ok=True)
         except OSError:

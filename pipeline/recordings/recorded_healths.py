@@ -1,4 +1,4 @@
-"""Which healths are recorded: a stage sends one a second, and most say nothing new."""
+"""The health messages that are recorded: a stage sends one a second, and most report nothing new."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from schemas.health import Health
 from schemas.units import NS_PER_S
 
 HEALTH_S = 3600
-"""at least one in this time is recorded of each session"""
+"""at least one message of each session is recorded in this time"""
 _NUMBERS = re.compile(r"[\d.,]+")
 
 
@@ -19,18 +19,20 @@ class _Session:
     said: object
     recorded_t_ns: int
     waiting: Envelope | None = None
-    """the newest, if it is not recorded"""
+    """its newest message, if that is not recorded"""
 
 
 class RecordedHealths:
-    """Takes the first and the last health of a session, one each HEALTH_S, and each that reports something new: another
-    status or problem, more losses."""
+    """Selects the first and the last message of a session, one in HEALTH_S, and each that reports something new.
+
+    New are another status or problem, and more losses.
+    """
 
     def __init__(self) -> None:
         self._sessions: dict[str, _Session] = {}
 
     def is_due(self, envelope: Envelope, health: Health) -> bool:
-        """Whether it is to be recorded; if not, it waits until a newer one comes."""
+        """Whether to record this message; if not, it is kept until a newer one comes."""
         producer, said = health.header.producer, _said(health)
         session = self._sessions.get(producer)
         age_ns = abs(envelope.received_t_ns - session.recorded_t_ns) if session else 0
@@ -41,8 +43,10 @@ class RecordedHealths:
         return False
 
     def take_waiting(self) -> list[Envelope]:
-        """The newest of each session that is not recorded, for the end of a part: it says what was published. Sessions
-        that have ended are forgotten."""
+        """The newest message of each session that is not recorded yet, for the end of a part.
+
+        It says how many messages the stage has published. Sessions that have ended are forgotten.
+        """
         found: list[Envelope] = []
         for producer, session in list(self._sessions.items()):
             if session.waiting is None:
@@ -54,7 +58,7 @@ class RecordedHealths:
 
 
 def _said(health: Health) -> object:
-    """What matters when it changes. Numbers in the text of a problem may change each second."""
+    """The content whose change is worth recording. Numbers in the text of a problem may change each second."""
     lost = sum(line.missing + line.refused for line in health.inputs)
     awaited = tuple(line.key for line in health.waiting_for)
     return health.status, _NUMBERS.sub("", health.problem), health.lost, lost, awaited, health.is_last

@@ -12,15 +12,15 @@ from pipeline.runtime.stage import StageConfig
 from schemas.topics import BY_NAME, TOPICS
 
 FLUSH_S, FLUSH_BYTES = 1.0, 64 << 10
-"""what waits in memory is flushed after this time if it is more than this, or if something has happened"""
+"""messages in memory are flushed after this time if they are more than this, or if one of them is urgent"""
 PARTS_WITHIN_LIMITS = 8
-"""a new part begins after this share of each limit, because only whole parts are deleted"""
+"""parts within each limit at least, because only whole parts are deleted"""
 RECORDED = tuple(topic.name for topic in TOPICS if topic.recorded)
 SAMPLES = tuple(name for name in RECORDED if BY_NAME[name].has_samples)
 """the topics that may be left out"""
 RAW = "raw"
 CLIPS_SHARE = 0.5
-"""of what recordings and clips may take: more is not kept of clips whose alarms wait to be acknowledged"""
+"""share of the space for recordings and clips that clips with unacknowledged alarms may fill"""
 
 
 class RecorderConfig(StageConfig):
@@ -28,8 +28,8 @@ class RecorderConfig(StageConfig):
 
     topics: tuple[str, ...] = Field(
         default=(RAW,),
-        description=f"which topics of samples are recorded, of {', '.join(SAMPLES)}; all others always are. From {RAW} "
-        "`fantwin view`, `plot` and `replay --offline` make the rest again",
+        description=f"recorded topics of samples, of {', '.join(SAMPLES)}; all other topics are always recorded. From "
+        f"{RAW} `fantwin view`, `plot` and `replay --offline` make the rest again",
     )
     file: Path = Field(
         default=Path("recording.mcap"),
@@ -39,27 +39,36 @@ class RecorderConfig(StageConfig):
     flush_interval_s: float = Field(
         default=120.0,
         gt=0,
-        description="a crash of the machine loses at most this much; what fills "
-        f"{FLUSH_BYTES >> 10} KiB earlier, or is an alarm, a request or a problem, or is "
-        f"needed for a clip, is flushed after {FLUSH_S:g} s",
+        description="longest time between flushes to the disk; a crash of the machine loses at most this much. It is "
+        f"{FLUSH_S:g} s if {FLUSH_BYTES >> 10} KiB, an alarm, a request, a twin or a problem wait, and while a clip is "
+        "running",
     )
-    part_bytes: int = Field(default=100_000_000, ge=0, description="a new part begins at this size; 0: never")
-    part_s: float = Field(default=0.0, ge=0, description="a new part begins after this time; 0: never")
+    part_bytes: int = Field(
+        default=100_000_000,
+        ge=0,
+        description="a new part begins at this size, or at an eighth of the space of `keep_share_of_disk`; 0: only at "
+        "that eighth",
+    )
+    part_s: float = Field(
+        default=0.0,
+        ge=0,
+        description="a new part begins after this time, or after an eighth of `keep_days`; 0: only after that eighth",
+    )
     keep_days: float = Field(
-        default=14.0, ge=0, description="recordings are deleted when they are older; 0: they are kept for any time"
+        default=14.0, ge=0, description="older recordings are deleted; 0: none is deleted because of its age"
     )
     keep_share_of_disk: float = Field(
         default=0.10,
         gt=0,
         le=1,
-        description="most space for all recordings of the folder with their clips, as a share of the disk; beyond it "
-        "the oldest are deleted",
+        description="most space for all recordings and clips of the folder, as a share of the disk; the oldest are "
+        "deleted beyond it",
     )
     min_free_bytes: int = Field(
         default=100_000_000,
         ge=0,
-        description="free space to leave on the disk: below it the oldest recordings are deleted, and without any, "
-        "recording pauses",
+        description="free space to leave on the disk; below it the oldest recordings are deleted, and recording pauses "
+        "if that is not enough",
     )
 
     clips: bool = Field(default=True, description="keep a clip of each alarm, in the folder clips beside the recording")

@@ -283,12 +283,12 @@ def _second_record(file: BinaryIO) -> McapRecord | None:
 
 @cache
 def this_program() -> str:
-    """This program as the maker of a recording: its name and version."""
+    """Name and version of this program, as the maker of a recording."""
     return f"fantwin {version('fantwin')}"
 
 
 def _check_format(record: McapRecord | None, path: Path | str) -> None:
-    """Raises RecordingError for the metadata of a recording of an unknown format."""
+    """Refuse the metadata of a recording of an unknown format, by a RecordingError."""
     if isinstance(record, Metadata) and record.name == METADATA_NAME:
         stated = record.metadata.get(FORMAT_KEY)
         number = int(stated) if stated and stated.isdecimal() else stated

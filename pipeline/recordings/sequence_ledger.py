@@ -56,7 +56,7 @@ class SequenceLedger:
             stream: StreamState(sequence) for stream, sequence in (before or {}).items() if self._is_recorded(stream[0])
         }
         self._thinned = set(filter(_is_thinned, self._streams))
-        """streams of which not every message is recorded, so that a gap is no loss"""
+        """streams that are recorded only in part, so that a gap in them is no loss"""
         self._published: dict[StreamId, int] = {}
 
     @property
@@ -241,7 +241,7 @@ def sum_by_key(streams: Iterable[tuple[StreamId, StreamCounts]]) -> dict[str, St
 
 
 def _is_thinned(stream: StreamId) -> bool:
-    """Whether it is of healths, of which a recorder takes those that say something new."""
+    """Whether a stream has health messages: a recorder takes only those that report something new."""
     try:
         return topic_of(stream[0]).name == HEALTH
     except KeyError:

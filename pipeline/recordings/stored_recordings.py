@@ -1,7 +1,7 @@
-"""The recordings that recorders have finished in a folder: which may be deleted, and what all of them take.
+"""The finished recordings in a folder: which of them may be deleted, and the space that all of them take.
 
-Those of earlier runs, of other names and of other shards count too. A file that fantwin's recorder did not write under
-this name is never deleted: an import, a clip, a part that was renamed to keep it.
+Recordings of earlier runs, of other names and of other shards count too. Only files that a recorder wrote under their
+present name may be deleted: no import, no clip, and no part that was renamed to keep it.
 """
 
 from __future__ import annotations
@@ -32,25 +32,29 @@ class StoredPart(NamedTuple):
 
 @dataclass(frozen=True)
 class Stored:
-    """What is in the folder now."""
+    """The recordings and clips in the folder at one time."""
 
     parts: tuple[StoredPart, ...] = ()
     """the oldest first"""
     finished_bytes: int = 0
-    """of parts, and of all clips"""
+    """size of these parts and of all clips"""
     open_bytes: int = 0
-    """of parts that are being written"""
+    """size of the parts that are being written"""
 
 
 class StoredRecordings:
-    """The folder of a recording. A file is opened once: afterwards its size and time show that it is the same."""
+    """The folder of a recording. A file is opened only once; its size and time then show whether it has changed."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._known: dict[tuple[Path, int, int], StoredPart | None] = {}
 
     def look(self) -> Stored:
-        """What is there now. OSError if the folder cannot be read."""
+        """The recordings and clips that are there now.
+
+        Raises:
+            OSError: the folder cannot be read.
+        """
         known, self._known = self._known, {}
         parts: list[StoredPart] = []
         finished_bytes = open_bytes = 0
@@ -77,7 +81,7 @@ def _files(folder: Path) -> Iterator[tuple[Path, int, int]]:
 
 
 def _part(path: Path) -> StoredPart | None:
-    """None: it is no part that a recorder wrote under this name."""
+    """The part in a file; None if no recorder wrote it under this name."""
     try:
         metadata = read_metadata(path).metadata
     except RecordingError:

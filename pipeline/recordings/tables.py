@@ -81,7 +81,7 @@ class ParquetTable:
     """Parquet, with `time`, a timestamp in UTC, before all other columns."""
 
     def __init__(self, path: Path, message_type: type[Message], about: Mapping[str, str]) -> None:
-        import pyarrow as pa  # noqa: PLC0415  the extra `parquet` may not be installed
+        import pyarrow as pa  # noqa: PLC0415  the extra `logs` may not be installed
         from pyarrow.parquet import ParquetWriter  # noqa: PLC0415
 
         self.rows = 0

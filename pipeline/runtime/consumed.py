@@ -25,7 +25,7 @@ from schemas.units import NS_PER_S
 
 CONSUMED = "consumed"
 PERIOD_NS = 120 * NS_PER_S
-"""about as long as a recorder takes to flush a slow line"""
+"""equal to the default `flush_interval_s` of the recorder"""
 
 
 @dataclass

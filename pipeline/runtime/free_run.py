@@ -78,8 +78,8 @@ class FreeRun(ColumnState):
         self.stop(np.ones_like(self.running))
         self._period_s = period_ns / NS_PER_S
         self._steps = max(1, round(min(self._period_s * self._twin.card.rate_hz, MOST_STEPS)))
-        """of the twin in a sample, each about as long as those it was trained with: on a slower grid, for example at
-        1 Hz, a single step could be unstable"""
+        """steps of the twin in a sample, each about as long as in training: on a slower grid, for example at 1 Hz, a
+        single step could be unstable"""
         self._reading = ExpectedReading(self._twin.tachos, self._period_s)
 
     @property

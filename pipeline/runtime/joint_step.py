@@ -13,7 +13,7 @@ MOST_FANS = 512
 
 
 def step_together(joint: Joint, cores: Sequence[Core], items: Sequence[Any]) -> Iterator[list[Message]]:
-    """What `core.step(item)` returns for each of several trays: decisions are the same, numbers but for rounding.
+    """The messages of `core.step(item)` for each of several trays: the same decisions; numbers may differ by rounding.
 
     A core finishes its step only when its messages are taken, so what it saves is never ahead of what is published.
     """

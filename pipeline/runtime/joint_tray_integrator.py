@@ -1,4 +1,4 @@
-"""Predicts blocks of several trays with one twin in one pass; each gets what it would get alone, but for rounding."""
+"""Predicts blocks of several trays with one twin in one pass. Processed alone, each would differ only by rounding."""
 
 from __future__ import annotations
 

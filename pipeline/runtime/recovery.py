@@ -20,7 +20,7 @@ from schemas.topics import topic_of
 MOST_AT_A_TIME = 8
 MOST_QUEUED = 4096
 BACK_OFF_S = 10.0
-"""how long a producer that did not answer at all in time is not asked again"""
+"""pause before a producer that did not answer at all in time is asked again"""
 MOST_BACKED_OFF = 256
 IMPATIENT_S = 0.5
 """how long further catch-ups wait once one was not answered in time; a complete answer usually comes much sooner"""

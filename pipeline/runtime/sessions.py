@@ -53,8 +53,9 @@ class Session:
 
     @classmethod
     def of_key(cls, key: str) -> Session | None:
-        """The session that shows the token `key`; None if it is no such token, or names a producer of others: rights
-        are about stage and instance alone. A token without trays is of all of the site.
+        """The session that shows the token `key`; None if it is no such token, or names a producer of others.
+
+        Rights depend only on stage and instance. A token without trays stands for all trays of the site.
         """
         parts = key.split("/")
         if len(parts) not in (9, 10) or parts[2] != SESSION_CHUNK:

@@ -82,7 +82,7 @@ class SnapshotStore:
         The last one counts also if it is of another twin: what operators have set since must not be forgotten.
 
         Raises:
-            StageError: there is a file and it cannot be read, or the last snapshot is of an unknown format.
+            StageError: the file cannot be read, or the last snapshot has an unknown format.
         """
         own = self._read()
         if self._elsewhere is None:

@@ -120,8 +120,10 @@ class Joint(Protocol):
     """Processes admitted blocks, for one process of a stage."""
 
     def process(self, cores: Sequence[Any], blocks: Sequence[Any]) -> Sequence[Any]:
-        """What is made of the block of each core, for its `finish`: what would be made of it alone, but for
-        rounding. Blocks of several cores have equal keys."""
+        """The result of each core's block, for its `finish`; processed alone, it would differ only by rounding.
+
+        Blocks of several cores have equal keys.
+        """
         ...
 
 
@@ -148,7 +150,7 @@ class Kept(Protocol):
 
 
 def never() -> bool:
-    """False: see `Context.is_replayed`."""
+    """The `Context.is_replayed` of a site without a replay: always False."""
     return False
 
 
@@ -173,7 +175,7 @@ class Context:
     kept: Kept | None = field(default=None, repr=False)
     """what others keep of that state; None: nobody is asked"""
     is_replayed: Callable[[], bool] = field(default=never, repr=False)
-    """whether the samples that come now are of a recording"""
+    """whether a replay presents the site now, so that samples are those of a recording"""
     configuration_path: Path | None = None
     """the configuration file; None: there is none, as in a replay"""
     configuration_text: str = field(default="", repr=False)

@@ -140,7 +140,7 @@ class TrayScorer:
     def _limits_at(
         self, item: Prediction, samples: Samples, scored: ScoredBlock, row: int, statistic: int
     ) -> tuple[Array, Array]:
-        """(fans,) how far both residuals may be from their baselines, by the alarm's statistic, sigma."""
+        """Limits of both residuals from their baselines, by the alarm's statistic: (fans,) each, in sigma."""
         period_s = item.period_ns / NS_PER_S
         limits, limit_at = self.fan_scorer.limits, self.fan_scorer.limit_at
         speed = samples.operating_speed_rad_s(is_predicted=limits.over_predicted_speed)[row]

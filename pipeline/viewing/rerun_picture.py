@@ -151,7 +151,7 @@ def draw_picture(
 
 def _read(rrd: Path) -> _Rrd:
     if not rrd.is_file():
-        raise PictureError(f"{rrd}: no such file; the viewer stage writes view.rrd into run_folder")
+        raise PictureError(f"{rrd}: no such file; make one: fantwin view RECORDING -o {rrd}")
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*no footer")

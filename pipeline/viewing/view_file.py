@@ -30,7 +30,11 @@ class ViewFile:
     """
 
     def __init__(self, path: Path, limit_bytes: float = math.inf) -> None:
-        """Open an existing file for writing, which ends before it exceeds the limit. OSError if that is refused."""
+        """Open an existing file for writing; it ends before it exceeds the limit.
+
+        Raises:
+            OSError: the file cannot be opened.
+        """
         self.problem = ""
         """why nothing is written any more; empty if all is well"""
         self._path = path

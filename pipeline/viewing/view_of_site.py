@@ -32,7 +32,7 @@ class ViewOptions:
     alarm_plot_hold_s: float = 60.0
     memory_limit: str = "256MB"
     file_bytes: float = math.inf
-    """at which the file ends; the section has a limit"""
+    """size at which the file ends; `[viewer]` sets one"""
 
 
 def view_of_site(

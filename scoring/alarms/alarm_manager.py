@@ -306,7 +306,7 @@ def _state_fields(state: AlarmState) -> dict[str, Any]:
 
 
 def _to_json(alarm: Alarm) -> dict[str, Any]:
-    """Without feedback if there is none, as of most alarms."""
+    """The fields of an alarm. Most alarms have no feedback, so its fields are left out if they are empty."""
     return {
         name: value for name, value in asdict(alarm).items() if name != "header" and (value or name not in _OF_FEEDBACK)
     }

@@ -40,7 +40,7 @@ class ConditionSettings:
 
     on_delay_ns: int
     detectors: tuple[HoldingDetector, ...]
-    """those that exceeded their limit decide on the return, see scoring.alarms.return_rule"""
+    """all detectors; those that exceeded their limit decide on the return, see scoring.alarms.return_rule"""
     return_ratio: float = 0.75
     """an active alarm begins to return below this"""
     alarm_ratio: float = 1.5
@@ -50,11 +50,11 @@ class ConditionSettings:
     confirming: bool = False
     """an acknowledged alarm must also be confirmed"""
     data_lost_after_ns: int = DATA_LOST_AFTER_NS
-    """after a longer time without a valid sample an active alarm is stale"""
+    """an active alarm is stale after a longer time without a valid sample"""
     settling_ns: int = 0
     """time of valid samples after a gap, from which on low ratios count: statistics have started again"""
     earlier_alarms: int = EARLIER_ALARMS
-    """of each fan, whose onsets are kept for feedback"""
+    """number of earlier alarms of each fan whose onsets are kept for feedback"""
 
 
 @dataclass(frozen=True, slots=True)

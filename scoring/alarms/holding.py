@@ -11,7 +11,7 @@ from scoring.detectors.table import rows
 
 
 def holding_detectors(detectors: Mapping[str, Detector], off_delay_s: float) -> tuple[HoldingDetector, ...]:
-    """What decides on the return of alarms, in the order of the table. off_delay_s: the least for all."""
+    """The detectors that decide on the return of alarms, in the order of the table. off_delay_s: their least delay."""
     made = []
     for row in rows():
         detector = detectors.get(row.name)

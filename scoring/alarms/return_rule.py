@@ -45,7 +45,7 @@ class HoldingDetector:
     grows_with_speed: bool
     """whether the same fault is larger at a higher speed: of a residual, not of the tacho"""
     return_share: float = RETURN_SHARE
-    """share of the time for which it held the alarm, for which it must have returned"""
+    """a return must last for this share of the time for which the statistic held the alarm"""
     is_sum: bool = False
     """whether its statistic is a sum, which falls only as fast as it may"""
     standing_ns: int = 0
@@ -53,7 +53,7 @@ class HoldingDetector:
     least_off_delay_ns: int = 0
     """of all detectors"""
     elsewhere_ns: int = ELSEWHERE_NS
-    """how long it must have returned at other speeds than those at which it came"""
+    """a return at speeds other than those of the alarm must last for this time"""
 
 
 @dataclass(frozen=True)

@@ -232,8 +232,8 @@ class Baseline(ColumnState):
         within_limit, below_half_limit: (fans,) whether every statistic stayed there during the interval. moving:
         (fans,) whether the fan moved, so that only its first baseline may come from the interval
         (scoring.baseline.movement). few_readings: (fans,) whether an interval has too few readings to show that it is
-        steady. The first baseline of such a fan comes from an interval in which it does not move: one of a fan that
-        speeds up would hold an alarm that never returns.
+        steady. Such a fan gets its first baseline only from an interval in which it does not move: a baseline of a fan
+        that speeds up would raise an alarm that never clears.
         """
         counts, is_set, commissioning = np.maximum(self._counts, 1), self.is_set, self.is_commissioning
         product, information, square = self._sums / counts / FIXED_POINT_ONE

@@ -79,7 +79,7 @@ class SharedOffset(ColumnState):
         reach_sigmas: float,
     ) -> None:
         """limit: of the offset, for each rad/s. residual_std: of the healthy residual, sigma. interval_s: length of an
-        interval. adaptation_s, reach_sigmas: how slowly, and how far, the baseline of a fan may move.
+        interval. adaptation_s, reach_sigmas: time constant and limit of the movement of a fan's baseline.
 
         Offsets at low speed are drawn towards zero, or what was shared when all fans were commissioned again (ridge
         regression): errors of the twin there, as large as half of its residual, must not become large offsets at high
@@ -275,10 +275,10 @@ class SharedOffset(ColumnState):
         self._first[:] = 0
 
     def restart(self, fans: Array) -> None:
-        """Some fans, (fans,) of bool, are commissioned again.
+        """Commission some fans again, (fans,) of bool.
 
-        The value stays, also where these are all fans. What they share is a share of the speed; baselines that are
-        learned with it still in the residual would take it as an offset, which is wrong at all other speeds.
+        The value is kept, even if these are all fans of the tray. It is a share of the speed. If it were left in the
+        residuals, new baselines would learn it as an offset, which is wrong at all other speeds.
         """
         self.products[fans] = self.squares[fans] = self.counts[fans] = 0
         if not fans.all():

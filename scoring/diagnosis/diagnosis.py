@@ -93,8 +93,8 @@ def diagnose(
 ) -> Diagnosis:
     """Diagnose one fan from its last seconds, some before the onset of the fault and all since.
 
-    advice: on what would show the cause, where it is unclear. knows_supply: the command is that at the supply voltage
-    as it was measured, so that a weak supply is no cause of less drive.
+    advice: what to do to show the cause, if it is unclear. knows_supply: the command takes account of the measured
+    supply voltage, so a weak supply is no cause of less drive.
 
     About three seconds of health before the onset are enough; the samples after it decide. The diagnosis can be
     repeated as samples arrive. It takes milliseconds.
@@ -200,7 +200,7 @@ def _most_probable_onset(lacks: NDArray[np.bool_], first: int, onset: int) -> in
 
 
 def _of_dropout(missing: float, seconds: float) -> tuple[Evidence | None, str]:
-    """seconds: over which the share was counted."""
+    """The evidence of missing readings. seconds: time over which their share was counted."""
     if not missing:
         return None, "no reading is missing"
     found = Evidence("missing readings", missing, missing, missing, "share")

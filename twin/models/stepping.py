@@ -2,8 +2,8 @@
 
 With many fans, creating temporary arrays takes a large part of a step. What does not change from step to step, or
 depends on the command alone, is calculated once, and every result is written where it is needed next. The operations
-and their order are those of `integration.rk4_step` and of the acceleration of FanEquation: the speeds are the same but
-for rounding.
+and their order are those of `integration.rk4_step` and of the acceleration of FanEquation: the speeds differ only by
+rounding.
 """
 
 import numpy as np

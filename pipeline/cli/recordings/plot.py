@@ -30,7 +30,7 @@ def plot(
 ) -> None:
     """Plot measured speed, prediction, band, alarms and states of a recording.
 
-    What the recorder left out (recorder.topics) is made again first.
+    Topics that the recorder left out (recorder.topics) are made again first.
 
     Example: fantwin plot runs/demo/recording.mcap --truth runs/demo/truth.json -o bands.png
     """

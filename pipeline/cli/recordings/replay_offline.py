@@ -130,7 +130,7 @@ def print_result(result: dict[str, Any], output: Path | None) -> None:
     for damage in result["damage"]:
         console.print(f"[bold yellow]damaged:[/bold yellow] {escape(damage)}")
     for line in result["other_version"]:
-        console.print(f"{line}: decisions are the same for the same version only", markup=False)
+        console.print(f"{line}: only the same version makes the same decisions", markup=False)
     for one in result.get("recordings", [result]):
         for name in ("gained", "lost") if "what_if" in one else ():
             found = one["what_if"][name]

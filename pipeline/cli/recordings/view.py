@@ -30,7 +30,7 @@ def view(
 ) -> None:
     """Turn a recording into a view file that shows what the stage `viewer` shows live.
 
-    What the recorder left out (recorder.topics) is made again first.
+    Topics that the recorder left out (recorder.topics) are made again first.
 
     Exits with 3 if the recording could not be read in full; the view then shows what could be read.
 

@@ -1,4 +1,4 @@
-"""Recordings with their scores: where the recorder left these out, a replay makes them again for a command."""
+"""Recordings with scores: if the recorder left them out, a replay makes them again."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.recordings.run_recordings import recorded_files
 
 @contextmanager
 def with_scores(recordings: Sequence[Path]) -> Iterator[list[Path]]:
-    """The files of a recording; or in their place one with all topics, which is removed at the end.
+    """The files of a recording, or in their place a temporary file with all topics.
 
     Raises:
         UserError: a recording cannot be read, or scored again.

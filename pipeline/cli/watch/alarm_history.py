@@ -194,7 +194,7 @@ def _kept_by_gateway(config: Config) -> _Past:
     present = [file for file in files if file.exists()]
     if not present:
         raise UserError(
-            f"{files[0]}: no gateway has kept a history of alarms there (section [gateway]); take it from recordings: "
+            f"{files[0]}: no gateway has kept a history of alarms there; take it from recordings: "
             "fantwin alarms --history --recordings FILE..."
         )
     alarms: list[Alarm] = []

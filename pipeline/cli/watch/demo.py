@@ -57,7 +57,7 @@ OUTPUTS = (
     *("*.snapshot", "alarms.sqlite*", "clips/*"),
 )
 ERROR_PREFIX = "fantwin: "
-"""of the line in which a command says why it failed"""
+"""start of the line in which a command says why it failed"""
 _START_TIMEOUT_S = 60.0
 _STOP_TIMEOUT_S = 60.0
 
@@ -230,7 +230,7 @@ def _unfinished(what: str, log: Path) -> UserError:
 
 
 def _reason(log: Path) -> str:
-    """Why a command failed: its error, or else what it said last of a stage that failed, or else its last line."""
+    """Why a command failed: its error, else its last line about a failed stage, else its last line."""
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no output"]
     for mark in (ERROR_PREFIX, "ended with status", "cannot start", "not arrive", "never ready", "killed"):
         if found := [line for line in lines if mark in line]:

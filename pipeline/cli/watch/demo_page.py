@@ -25,7 +25,7 @@ class DemoPage:
     """Takes the picture in a thread of its own, while the demo goes on."""
 
     def __init__(self, config: Config, out: Path, fan: int) -> None:
-        """fan: the one that is shown, while it is in alarm. Without `[gateway]` there is no page."""
+        """fan: the one that is shown, while it is in alarm. Without the stage gateway there is no page."""
         section = config.sections.get("gateway")
         self.address = f"http://{LOOPBACK}:{section.port}/" if section else ""  # pyright: ignore[reportAttributeAccessIssue]
         self._url = f"{self.address}#/fan/{config.trays[0].name}/{fan}"

@@ -39,7 +39,7 @@ from pipeline.runtime.sessions import Session
 from pipeline.runtime.stage import Context, load_stage
 from schemas.topics import sessions_key
 
-_NOT_LISTED = {"all", "dev", "bench"}  # of others, or used by tests and benches only
+_NOT_LISTED = {"all", "dev", "bench"}  # a sum of others, or for tests and benches only
 _NOT_GRANTED = "the router does not grant the rights of its role: restart the router with this configuration"
 _MIN_FREE_BYTES = 1 << 30
 _LOOKS = 4
@@ -279,7 +279,7 @@ def _check_stages(
 
 
 def _check_recordings(context: Context, label: str) -> Iterator[tuple[bool, str]]:
-    """What recordings take of what they may."""
+    """The space and days that recordings take of their limits."""
     try:
         folder = context.own_file(context.config.file).parent
         yield True, f"{label}: {usage_of(folder, context.config, context.started_t_ns)}"

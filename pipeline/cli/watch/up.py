@@ -39,7 +39,7 @@ def up(
     """Start all stages, restart those that die, stop all in order on Ctrl-C.
 
     Events are written to standard error. The site keeps running when the terminal is closed; SIGTERM stops it, too.
-    The operators' page is served on this host; its address is printed.
+    It serves the operators' page on this host and prints its address.
     For a tray without `twin` in the configuration, a twin is learned in the background (docs/how-to/learned-twins.md).
 
     Exit codes: 0 stopped in order, nothing lost; 1 could not start, a stage failed or was killed at the end, or all

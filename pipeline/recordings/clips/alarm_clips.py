@@ -71,7 +71,7 @@ class AlarmClips:
         return clip.until_ns if clip else None
 
     def unacknowledged_before(self, t_ns: float) -> list[Clip]:
-        """The clips from before this time that wait until their alarms are acknowledged."""
+        """The clips from before this time that have unacknowledged alarms."""
         return [clip for clip in self._tracker.clips if clip.until_ns < t_ns and not clip.is_acknowledged]
 
     def delete_oldest_acknowledged(self) -> str | None:

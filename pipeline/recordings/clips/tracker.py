@@ -163,8 +163,8 @@ class ClipTracker:
         """Why clips cannot be cut or kept; empty if all is well."""
         if self._full and self._is_full():
             return (
-                f"{self._full}: clips whose alarms nobody has acknowledged fill half of "
-                "recorder.keep_share_of_disk; acknowledge alarms, or allow more"
+                f"{self._full}: clips with unacknowledged alarms fill half of "
+                "recorder.keep_share_of_disk: acknowledge alarms, or raise this limit"
             )
         is_waiting = any(clip.is_due for clip in self._clips.values())
         return self._waits if self._waits and is_waiting else self._not_kept

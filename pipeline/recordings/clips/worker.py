@@ -57,8 +57,8 @@ class ClipWorker(ClipMaker):
     """Cuts the clips of one recording."""
 
     def __init__(self, recording: Path, min_free_bytes: int, free_bytes: Callable[[], int]) -> None:
-        """recording: its first part. free_bytes: of its disk; raises DiskError. While a clip is written it may use half
-        of min_free_bytes: the oldest part is deleted meanwhile."""
+        """recording: its first part. free_bytes: of its disk; raises DiskError. min_free_bytes: half of it may be used
+        while a clip is written, until the oldest part is deleted."""
         self._recording, self._folder, self._list = recording, clip_folder(recording), list_path(recording)
         self._begin_bytes = min_free_bytes + ROOM_BYTES
         self._least_bytes = min_free_bytes // 2

@@ -1,8 +1,8 @@
 """The plan of a replay of an alarm clip that begins in the middle of a scorer's session, with the scorer's snapshot.
 
 Such a clip lacks what the stages before the scorer had in memory. A replay runs them over the clip's raw samples, which
-begin early enough for them to settle; the scorer continues from the snapshot. The same alarms come out, and may come a
-few samples earlier or later. To verify them, the scorer is given the predictions that were recorded.
+begin early enough for them to settle; the scorer continues from the snapshot. The same alarms are raised, perhaps a few
+samples earlier or later. To verify them, the scorer gets the recorded predictions.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from schemas.units import NS_PER_S
 from scoring.diagnosis.diagnoser import WINDOW_S
 
 NO_PREDICTIONS = (
-    "an alarm clip without predictions cannot be compared: leave out --verify, and its alarms come out again"
+    "an alarm clip without predictions cannot be compared: replay it without --verify to raise its alarms again"
 )
 AFTER_SNAPSHOT = "the clip begins after the snapshot from which it is scored"
 

@@ -88,7 +88,10 @@ class SnapshotVerifier:
 def first_difference(
     made: ScorerSnapshot, recorded: ScorerSnapshot, note: Callable[[Apart], None] = lambda _apart: None
 ) -> str:
-    """Where two snapshots differ by more than is allowed; empty: nowhere. note: see `tolerance.differences`."""
+    """The first place in which two snapshots differ by more than the tolerance; empty if none.
+
+    note: see `tolerance.differences`.
+    """
     if made.twin_sha256 != recorded.twin_sha256:
         return "twin_sha256"
     if made.state_json == recorded.state_json:

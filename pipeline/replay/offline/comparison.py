@@ -24,9 +24,9 @@ class Comparison:
     tray: str
     equal: int = 0
     different: int = 0
-    """replayed, and another decision or a number that differs by more than its tolerance"""
+    """replayed with another decision, or with a number that differs by more than its tolerance"""
     numbers_different: int = 0
-    """those with such a number"""
+    """the different samples with such a number"""
     not_made: int = 0
     """recorded, and not replayed"""
     not_recorded: int = 0
@@ -44,7 +44,7 @@ class Comparison:
     snapshots_different: int = 0
     snapshots_not_comparable: int = 0
     largest: Apart = Apart()
-    """the largest difference of numbers that is allowed, by its share of the tolerance"""
+    """the largest difference within the tolerance, by its share of the tolerance"""
     reasons: list[str] = field(default_factory=list)
     """why something is not comparable, a line each"""
     named: list[str] = field(default_factory=list)
@@ -63,7 +63,7 @@ class Comparison:
         return bool(self.alarms_equal or self.snapshots_equal or not self.is_equal)
 
     def note(self, apart: Apart) -> None:
-        """Keep the largest of the differences that are allowed."""
+        """Keep the largest of the differences within the tolerance."""
         self.largest = max(self.largest, apart)
 
     def add_not_comparable(self, samples: int, limit: Limit) -> None:

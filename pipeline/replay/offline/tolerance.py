@@ -1,4 +1,4 @@
-"""How far a replayed number may lie from the recorded one.
+"""The tolerance between a replayed number and the recorded one.
 
 Decisions are compared exactly. The last digits of numbers depend on the processor: matrix products and functions such
 as tanh are computed in another order, or with another rounding, by each kernel of BLAS, NumPy and ONNX Runtime. Scores
@@ -40,15 +40,15 @@ class Apart(NamedTuple):
     """A difference of two numbers."""
 
     share: float = 0.0
-    """of what is allowed; 0: equal"""
+    """share of the tolerance; 0: equal"""
     name: str = ""
     difference: float = 0.0
 
 
 def shares(name: str, one: Array, other: Array) -> Array:
-    """The differences of unequal numbers, in shares of what is allowed for their name, which ends in their unit.
+    """The differences of unequal numbers, as shares of the tolerance for their name, which ends in their unit.
 
-    Infinite where only one of both is finite.
+    A share is infinite if only one of both numbers is finite.
     """
     one, other = one.astype(np.float64), other.astype(np.float64)
     absolute = SPEED_RAD_S if name.endswith(("_rad_s", "variance")) else COMMAND if name.endswith("_command") else RATIO
@@ -58,10 +58,10 @@ def shares(name: str, one: Array, other: Array) -> Array:
 
 
 def differences(one: Any, other: Any, note: Callable[[Apart], None], path: tuple[str, ...] = ()) -> Iterator[str]:
-    """Where two nested values differ by more than is allowed: keys and places in lists, with dots between.
+    """The places in which two nested values differ by more than the tolerance: keys and list indices, joined by dots.
 
-    Sentences are compared without their numbers, which are rounded from numbers that are compared by themselves. note:
-    is given the differences that are allowed.
+    Sentences are compared without their numbers, because these are rounded from numbers that are compared anyway.
+    note: called with each difference within the tolerance.
     """
     if isinstance(one, dict) and isinstance(other, dict):
         for key in {**one, **other}:

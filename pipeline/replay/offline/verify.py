@@ -1,4 +1,4 @@
-"""Comparing replayed scores and alarms with the recorded ones; where scores are not recorded, snapshots.
+"""Comparison of replayed scores and alarms with the recorded ones; of snapshots if scores are not recorded.
 
 Decisions must be equal: states, statistics, validity and its reasons, times, and alarms with the order of their causes.
 Numbers may differ within a tolerance (pipeline.replay.offline.tolerance).
@@ -162,7 +162,7 @@ def _columns(score: Score, rows: Array) -> dict[str, Array]:
 def _compare_samples(
     t_ns: Array, made: Mapping[str, Array], recorded: Mapping[str, Array], within: Array, found: Comparison
 ) -> Array:
-    """(n,) whether a sample differs. within: (n,) which are not beyond the limit of their session: those are named."""
+    """(n,) whether a sample differs. within: (n,) samples within the limit of their session; only these are named."""
     differ = {name: _differ(name, values, recorded[name], found) for name, values in made.items()}
     is_number = {name: values.dtype.kind == "f" for name, values in made.items()}
     number_differs = np.any([differs for name, differs in differ.items() if is_number[name]], axis=0)
@@ -180,7 +180,7 @@ def _compare_samples(
 
 
 def _differ(name: str, one: Array, other: Array, found: Comparison) -> Array:
-    """(n, fans) which values differ: decisions at all, numbers by more than is allowed. All NaN are equal."""
+    """(n, fans) which values differ: decisions at all, numbers by more than the tolerance. All NaN are equal."""
     differs = one != other
     if one.dtype.kind == "f":
         differs &= ~(np.isnan(one) & np.isnan(other))
@@ -274,7 +274,7 @@ def _scores(envelopes: Iterable[Envelope], producer: str) -> Iterator[Score]:
 
 
 def first_difference(alarm: Alarm, other: Alarm, note: Callable[[Apart], None], left_out: Collection[str] = ()) -> str:
-    """Where two alarms differ by more than is allowed; empty: nowhere. left_out: fields that may differ."""
+    """The first field in which two alarms differ by more than the tolerance; empty if none. left_out: may differ."""
     one, beside = (
         {name: value for name, value in asdict(each).items() if name not in ("header", *left_out)}
         for each in (alarm, other)

@@ -15,8 +15,8 @@ from pipeline.errors import UserError
 from tests.pipeline.cli.test_many_recordings import RECORDINGS, folder, outcome_of, run_all
 from tests.support.fantwin_command import error_of
 
-dask = pytest.importorskip("dask", reason="the extra `cluster` is not installed")
-distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+dask = pytest.importorskip("dask", reason="the extra `remote` is not installed")
+distributed = pytest.importorskip("distributed", reason="the extra `remote` is not installed")
 
 __all__ = ["folder"]
 
