@@ -78,13 +78,11 @@ def test_trays_that_their_plant_moves_get_calibrated_twins(
         assert its["extrapolated"]
         assert its["false_alarms_per_day"] == 1.0
         assert its["fan_hours"] == pytest.approx(fans * 2 * 0.7 / 60, rel=0.25)
-        assert twin.card.training.data[0].name == "recording.mcap"
+        assert twin.card.training.data[0].name == "commissioned-1.mcap"
         assert twin.card.fans == fans
-    assert [Path(name).name for name in found["recordings"]] == [
-        "recording.mcap",
-        "recording-2.mcap",
-        "recording-3.mcap",
-    ]
+    recordings = [configuration.parent / f"runs/commissioned-{n}/commissioned-{n}.mcap" for n in (1, 2, 3)]
+    assert found["recordings"] == list(map(str, recordings))
+    assert all(path.exists() for path in recordings)
 
 
 def test_a_second_one_is_refused_and_ctrl_c_leaves_no_twin(configuration: Path, tray: RunningCommand) -> None:
@@ -97,8 +95,8 @@ def test_a_second_one_is_refused_and_ctrl_c_leaves_no_twin(configuration: Path, 
         line = run.line_with("interrupted: no twin was written; recorded until then:")
     finally:
         run.kill()
-    (recording,) = configuration.parent.glob("runs/recording*")
-    assert re.search(r"runs/recording\.mcap$", line)
+    (recording,) = configuration.parent.glob("runs/commissioned-1/*")
+    assert re.search(r"runs/commissioned-1/commissioned-1\.mcap$", line)
     assert any(True for _ in read_recording(recording, topics=("raw",)))
     assert configuration.read_text(encoding="utf-8") == before
     assert not list(configuration.parent.glob("*.onnx"))

@@ -9,6 +9,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Sequence
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import TracebackType
@@ -18,6 +19,7 @@ import typer
 
 from pipeline.bus.session import join_bus
 from pipeline.config.models import Config, TrayConfig
+from pipeline.config.registry import RECORDER
 from pipeline.errors import UserError
 from pipeline.selftest.scratch_site import FANTWIN
 from schemas.codec import CodecError, decode
@@ -27,8 +29,10 @@ from schemas.topics import tray_key
 RECORDING_ONLY = (
     *("--set", f"launcher.stages={json.dumps(['acquisition', 'resampler', 'recorder'])}"),
     *("--set", "launcher.shards={ recorder = 1 }"),
+    *("--set", "recorder.keep_days=0"),
+    *("--set", "recorder.keep_share_of_disk=1"),
 )
-"""the options of a site that only records, all trays in one recording"""
+"""the options of a site that only records: all trays in one recording, however much it takes of the disk"""
 SILENT_S = 60.0
 """without a sample, from the start of a recording on: the line is dead"""
 STANDARD_ERROR = 2
@@ -101,12 +105,13 @@ class RecordingSite:
     def __init__(
         self, commands: Commands, config: Config, configured: list[str], log: Path, trays: Sequence[TrayConfig]
     ) -> None:
-        """configured: the words that give a command this configuration. log: what `up` says is added to it. trays:
-        those whose samples are wanted; all of the configuration are recorded."""
+        """config: with the section of the recorder. configured: the words that give a command this configuration. log:
+        what `up` says is added to it. trays: those whose samples are wanted; all of the configuration are recorded."""
         self._commands = commands
         self._config = config
         self._fans = {tray.name: tray.fans for tray in trays}
-        self._words = ["up", *configured, "--json", "--until-stdin-closes", *RECORDING_ONLY]
+        file = f"recorder.file={json.dumps(str(next_recording_file(config)))}"
+        self._words = ["up", *configured, "--json", "--until-stdin-closes", *RECORDING_ONLY, "--set", file]
         self._log = log
         self._received: list[bytes] = []
         self._last_sample_s = dict.fromkeys(self._fans, time.monotonic())
@@ -205,6 +210,18 @@ class RecordingSite:
     def _take(self, _key: str, payload: bytes) -> None:
         with self._lock:
             self._received.append(payload)
+
+
+def next_recording_file(config: Config) -> Path:
+    """The name of a recording in a new folder of its own, relative to the run folder.
+
+    A recorder deletes only in the folder of its own recording: the limits of the recorder that runs afterwards do not
+    reach what a twin was trained on and is calibrated on.
+    """
+    file: Path = config.sections[RECORDER].file  # pyright: ignore[reportAttributeAccessIssue]
+    folders = (file.with_name(f"commissioned-{number}") for number in count(1))
+    free = next(folder for folder in folders if not (config.run_folder / folder).exists())
+    return free / f"{free.name}.mcap"
 
 
 def _started(words: list[str], **streams: Any) -> subprocess.Popen[str]:

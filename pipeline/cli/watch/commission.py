@@ -24,7 +24,7 @@ from pipeline.cli.watch.doctor import running_sessions
 from pipeline.cli.watch.sweep import range_within
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
-from pipeline.config.registry import STAGES
+from pipeline.config.registry import RECORDER, STAGES
 from pipeline.config.twin_entry import with_twin
 from pipeline.errors import UsageError, UserError
 from pipeline.runtime.signals import stop_on_signals
@@ -83,14 +83,15 @@ def commission(
     calibrate again after a few days.
 
     A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends `commission`
-    without further twins. Recordings stay. With --json, `fantwin up` is not started.
+    without further twins. Recordings stay, in folders `commissioned-N` of their own, which the limits of `[recorder]`
+    do not touch. With --json, `fantwin up` is not started.
 
     Exit codes: 0 success; 1 at least one tray failed, and one line says why; 3 success, but data were lost while
     recording; 130 Ctrl-C. Once `fantwin up` is started, the exit code is that of `up`.
 
     Example: fantwin commission -c fantwin.toml --sweep --low 0.2
     """
-    settings = load_config(config, overrides or (), stages=())
+    settings = load_config(config, overrides or (), stages=(RECORDER,))
     chosen = [settings.tray(name) for name in dict.fromkeys(tray or ())] or list(settings.trays)
     works = _works(settings, chosen, output)
     for work in works:

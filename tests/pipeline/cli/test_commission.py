@@ -8,9 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.child_commands import Commands
+from pipeline.cli.watch.child_commands import Commands, next_recording_file
+from pipeline.config.loading import load_config
 from pipeline.config.models import TrayConfig
 from pipeline.learning.ordinary_operation import OrdinaryOperation
+from pipeline.recordings.disk_room import DAY_NS, DiskRoom
+from pipeline.recordings.parts import RecordingParts
+from pipeline.recordings.recorder_config import RecorderConfig
+from pipeline.recordings.sequence_ledger import SequenceLedger
 from schemas.messages import Raw
 from schemas.units import NS_PER_S
 from tests.support.fantwin_command import error_of
@@ -129,3 +134,26 @@ def test_what_its_doctor_step_finds_in_order_is_on_standard_output(capfd: pytest
     printed = capfd.readouterr()
     assert "ok   Python " in printed.out
     assert printed.err == ""
+
+
+def test_no_limit_of_a_later_recorder_deletes_what_twins_are_made_of(tmp_path: Path) -> None:
+    configuration = tmp_path / "fantwin.toml"
+    text = '[[tray]]\nname = "tray1"\nfans = 1\nport = "line"\n[recorder]\nfile = "disk/recording.mcap"\n'
+    configuration.write_text(text, encoding="utf-8")
+    config = load_config(configuration, stages=("recorder",))
+
+    def recorded(file: Path) -> Path:
+        """One part, a day after the start of 1970."""
+        parts = RecordingParts(config.run_folder / file, {}, {}, session="one")
+        part = parts.begin(DAY_NS, SequenceLedger(), {})
+        part.finish()
+        return part.path
+
+    ordinary = recorded(Path("disk/recording.mcap"))
+    for_twins = [recorded(next_recording_file(config)) for _ in range(2)]
+    limits = RecorderConfig(keep_days=1)
+    for file in (Path("disk/recording.mcap"), next_recording_file(config)):
+        DiskRoom(RecordingParts(config.run_folder / file, {}, {}, session="two"), limits, None).keep_limits(10 * DAY_NS)
+    assert not ordinary.exists()
+    assert for_twins == [config.run_folder / f"disk/commissioned-{n}/commissioned-{n}.mcap" for n in (1, 2)]
+    assert all(path.exists() for path in for_twins)
