@@ -162,7 +162,7 @@ class Recorder(Core):
             self._keep_limits()
         if self._part and self._is_full(self._part):
             self._attempt(self._end_part)
-            self._keep_limits()
+            self._keep_limits(has_ended_part=True)
             if not self._problem:
                 self._attempt(lambda: self._begin({}))
         if self._clips:
@@ -209,9 +209,11 @@ class Recorder(Core):
         return self._part.pending if self._part else self._held.messages
 
     def problem(self) -> str:
-        """Why nothing is recorded now, or what another program did to the file; empty if all is well."""
+        """Why nothing is recorded now, what another program did to the file, and why limits are not kept; empty if all
+        is well."""
         of_clips = self._clips.problem() if self._clips else ""
-        return self._problem or "; ".join(filter(None, (self._interference.problem(self._now_ns), of_clips)))
+        others = self._interference.problem(self._now_ns), self._room.problem, of_clips
+        return self._problem or "; ".join(filter(None, others))
 
     def _index(self) -> PartIndex | None:
         return self._part.index() if self._part else None
@@ -258,10 +260,9 @@ class Recorder(Core):
         room = self._room
         return part.size >= room.part_bytes or self._now_ns - self._began_ns >= room.part_s * NS_PER_S
 
-    def _keep_limits(self) -> None:
+    def _keep_limits(self, *, has_ended_part: bool = False) -> None:
         self._limited_ns = self._now_ns
-        with suppress(DiskError):  # the disk is gone: the next look at the free space says so
-            self._room.keep_limits(self._now_ns)
+        self._room.keep_limits(self._now_ns, has_ended_part=has_ended_part)
 
     def _end_part(self, *, has_ended: bool = False) -> None:
         """Finish the open part. It is closed even if this raises RecordingError."""
@@ -329,6 +330,7 @@ class Recorder(Core):
             self._pause(shortage)
             return
         self._lost_in_pause = 0
+        self._limited_ns = self._now_ns - LIMITS_CHECK_NS  # due now: the disk may be another
         for envelope in self._held.take_all():
             self._record(envelope)
 
@@ -388,7 +390,9 @@ def build(context: Context) -> BuiltStage:
 
 
 def _clips_of(parts: RecordingParts, config: RecorderConfig) -> AlarmClips:
-    most_bytes = round(parts.disk_bytes() * config.keep_share_of_disk * CLIPS_SHARE)
+    most_bytes = 0
+    with suppress(DiskError):  # it does not say its size: the health reports that
+        most_bytes = round(parts.disk_bytes() * config.keep_share_of_disk * CLIPS_SHARE)
     tracker = tracker_of(parts.path, config.clip_before_s, config.clip_after_s, most_bytes, CLIP_SETTLED_S)
     worker = ClipWorker(parts.path, config.min_free_bytes, parts.free_bytes)
     clips = AlarmClips(tracker, worker)

@@ -187,8 +187,17 @@ class Disk:
         return found.f_bavail * found.f_frsize
 
     def size_bytes(self) -> int:
-        """Size of its file system. Raises DiskError as `free_bytes` does."""
+        """Size of its file system.
+
+        Raises:
+            DiskError: the disk is not there, or its file system does not say its size, such as some of FUSE.
+        """
         found = self._state()
+        if not found.f_blocks:
+            raise DiskError(
+                f"{self._mounted_at}: the file system does not say its size, which the limits of recordings need; "
+                "name a folder of another one"
+            )
         return found.f_blocks * found.f_frsize
 
     def _state(self) -> os.statvfs_result:

@@ -9,18 +9,23 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.recordings.clips.alarm_clips import AlarmClips
-from pipeline.recordings.disk import Disk
+from pipeline.recordings.disk import Disk, DiskError
 from pipeline.recordings.open_part import PartsFolder
-from pipeline.recordings.recorder_config import PARTS_WITHIN_LIMITS, RecorderConfig
+from pipeline.recordings.recorder_config import CLIPS_SHARE, PARTS_WITHIN_LIMITS, RecorderConfig
+from pipeline.recordings.records import RecordingError
 from pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
 from schemas.units import NS_PER_S
 
 DAY_NS = 86_400 * NS_PER_S
+AGED_S = 3600.0
+"""between two parts that are deleted by age alone, unless a part has ended: the clock may be wrong"""
 _LOG = logging.getLogger(__name__)
 
 
@@ -37,8 +42,21 @@ class _Oldest(NamedTuple):
 class DiskRoom:
     """Deletes what exceeds the limits, and says when the disk has too little free space."""
 
-    def __init__(self, parts: PartsFolder, config: RecorderConfig, clips: AlarmClips | None) -> None:
-        self._parts, self._config, self._clips = parts, config, clips
+    def __init__(
+        self,
+        parts: PartsFolder,
+        config: RecorderConfig,
+        clips: AlarmClips | None,
+        monotonic_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._parts, self._config, self._clips, self._monotonic_s = parts, config, clips, monotonic_s
+        self._aged_s = -math.inf
+        """when a part was last deleted by age alone, by `monotonic_s`"""
+        self._spared: Path | None = None
+        """the last finished part when the disk ran short: a pause ends one more, which must not cost this one"""
+        self._logged = ""
+        self.problem = ""
+        """why the limits are not kept; empty if they are"""
         self._stored = Stored()
         self._limit_bytes = 0
         self._now_ns = 0
@@ -56,24 +74,33 @@ class DiskRoom:
         kept_s = self._config.keep_days * 86_400 or math.inf
         return min(self._config.part_s or math.inf, kept_s / PARTS_WITHIN_LIMITS)
 
-    def keep_limits(self, now_ns: int) -> None:
-        """Delete recordings that are too old, then the oldest until the rest fits with the part that is being written.
-
-        Raises:
-            DiskError: the disk is gone.
+    def keep_limits(self, now_ns: int, *, has_ended_part: bool = False) -> None:
+        """Delete what is too old, and the oldest that is too much; room for the part that is written is left. The last
+        finished part stays. has_ended_part: a part has just ended, so that one may go by age.
         """
-        self._now_ns = now_ns
-        self._limit_bytes = round(self._parts.disk_bytes() * self._config.keep_share_of_disk)
+        self._now_ns, self.problem = now_ns, ""
+        try:
+            self._limit_bytes = round(self._parts.disk_bytes() * self._config.keep_share_of_disk)
+        except DiskError as error:
+            self._report(error)
+            return
+        if has_ended_part:
+            self._aged_s = -math.inf
         since_ns = now_ns - self._config.keep_days * DAY_NS if self._config.keep_days else -math.inf
         while True:
             oldest = self._oldest()
-            is_old = oldest is not None and oldest.last_ns < since_ns
-            if oldest is None or oldest.is_needed or not (is_old or self._is_too_much()):
+            if oldest is None or oldest.is_needed or self._is_last(oldest):
                 break
-            why = f"older than {self._config.keep_days:g} days (recorder.keep_days)" if is_old else self._too_much()
-            if not self._delete(oldest, why):
+            is_too_much = self._is_too_much()
+            if not is_too_much and not (oldest.last_ns < since_ns and self._may_go_by_age(oldest)):
                 break
-        self._warn_of_what_is_kept(since_ns, is_all=oldest is None)
+            old = f"older than {self._config.keep_days:g} days (recorder.keep_days)"
+            if not self._delete(oldest, self._too_much() if is_too_much else old):
+                break
+            if oldest.part and not is_too_much:
+                self._aged_s = self._monotonic_s()
+        if not self.problem:
+            self._warn_of_what_is_kept(since_ns, is_all=oldest is None or self._is_last(oldest))
 
     def shortage(self, more_bytes: int) -> str:
         """Why the free space is not enough for `more_bytes`; empty if it is, or if a file was deleted for it.
@@ -82,43 +109,67 @@ class DiskRoom:
         kept: if other programs fill the disk, no recording would be left otherwise.
 
         Raises:
-            DiskError: the disk is gone.
+            DiskError: the disk is gone, or its file system does not say its size.
         """
         wanted = self._config.min_free_bytes + more_bytes
         free = self._parts.free_bytes()
         if free >= wanted:
+            self._spared = None
             return ""
+        self._parts.disk_bytes()  # raises if the file system does not say its size: nothing is free there either
+        self.problem = ""
         oldest = self._oldest()
-        is_last = oldest is not None and oldest.part is not None and len(self._stored.parts) == 1
-        if oldest and not is_last and self._delete(oldest, "the disk runs short (recorder.min_free_bytes)"):
+        if oldest and oldest.part and self._is_last(oldest):
+            self._spared = oldest.part.path
+        is_spared = oldest is not None and oldest.part is not None and oldest.part.path == self._spared
+        if oldest and not is_spared and self._delete(oldest, "the disk runs short (recorder.min_free_bytes)"):
             return ""
         return (
             f"{free / 1e6:,.1f} MB are free on the disk, but {wanted / 1e6:,.1f} MB are required "
-            "(recorder.min_free_bytes), and there is no older recording to delete: make room"
+            f"(recorder.min_free_bytes), and {self.problem or 'there is no older recording to delete: make room'}"
         )
 
     def notes(self) -> list[str]:
-        """The space and days that recordings take of their limits, for people; empty before the first look."""
-        if not self._limit_bytes:
+        """What recordings take of what they may, for people; empty where `problem` says why that is not known."""
+        if self.problem or not self._limit_bytes:
             return []
         return [usage(self._stored, self._limit_bytes, self._config, self._now_ns), *filter(None, [self._beyond])]
 
     def _is_too_much(self) -> bool:
+        """Clips count up to their share: those of other recorders may take more, and would push out every part."""
         stored = self._stored
-        return stored.finished_bytes + max(stored.open_bytes, self.part_bytes) > self._limit_bytes
+        clips_bytes = min(stored.clips_bytes, self._limit_bytes * CLIPS_SHARE)
+        return stored.finished_bytes + clips_bytes + max(stored.open_bytes, self.part_bytes) > self._limit_bytes
 
     def _too_much(self) -> str:
         return f"recordings and clips would exceed {in_bytes(self._limit_bytes)} (recorder.keep_share_of_disk)"
 
     def _oldest(self) -> _Oldest | None:
-        """The oldest part, or an older clip whose alarms are acknowledged. A part that a clip needs is deleted last."""
-        self._stored = self._parts.stored()
+        """The oldest part, or an older clip whose alarms are acknowledged. A part that a clip still needs goes last."""
+        try:
+            self._stored = self._parts.stored()
+        except RecordingError as error:
+            self._report(error)
+            return None
         part = next(iter(self._stored.parts), None)
         is_needed = part is not None and self._clips is not None and self._clips.needs(part.last_ns)
         until_ns = self._clips.oldest_acknowledged_until_ns() if self._clips else None
         if until_ns is not None and (part is None or is_needed or until_ns <= part.last_ns):
             return _Oldest(until_ns, None)
         return _Oldest(part.last_ns, part, is_needed) if part else None
+
+    def _is_last(self, oldest: _Oldest) -> bool:
+        """Whether it is the only finished part."""
+        return oldest.part is not None and len(self._stored.parts) == 1
+
+    def _may_go_by_age(self, oldest: _Oldest) -> bool:
+        return oldest.part is None or self._monotonic_s() - self._aged_s >= AGED_S
+
+    def _report(self, error: RecordingError) -> None:
+        self.problem = str(error)
+        if self.problem != self._logged:
+            self._logged = self.problem
+            _LOG.warning("%s", self.problem)
 
     def _delete(self, oldest: _Oldest, why: str) -> bool:
         """Delete it; False if that is not possible."""
@@ -127,7 +178,10 @@ class DiskRoom:
             deleted = self._clips.delete_oldest_acknowledged()
             _LOG.warning("clip %s, the oldest whose alarms are acknowledged, was deleted: %s", deleted, why)
             return True
-        if not self._parts.delete(oldest.part):
+        try:
+            self._parts.delete(oldest.part)
+        except RecordingError as error:
+            self._report(error)
             return False
         self.counts["parts_deleted"] += 1
         if self._clips and oldest.is_needed:
@@ -145,14 +199,24 @@ class DiskRoom:
                 f"{in_bytes(size)}"
             )
         elif is_all and self._is_too_much():
-            self._beyond = f"{self._too_much()}, and nothing may be deleted: acknowledge alarms, or raise this limit"
+            self._beyond = (
+                f"{self._too_much()}, and nothing may be deleted, the last finished part included: "
+                "acknowledge alarms, or allow more"
+            )
+        elif self._stored.clips_bytes > self._limit_bytes * CLIPS_SHARE:
+            self._beyond = (
+                f"clips take {in_bytes(self._stored.clips_bytes)}, more than {CLIPS_SHARE:.0%} of "
+                f"{in_bytes(self._limit_bytes)} (recorder.keep_share_of_disk): acknowledge alarms, "
+                "delete clips that no list names, or allow more"
+            )
         if self._beyond and not before:
             _LOG.warning("%s", self._beyond)
 
 
 def usage(stored: Stored, limit_bytes: int, config: RecorderConfig, now_ns: int) -> str:
-    """The space and days that recordings take of their limits, in words."""
-    line = f"recordings: {in_bytes(stored.finished_bytes + stored.open_bytes)} of {in_bytes(limit_bytes)}"
+    """What recordings take of what they may, in words."""
+    size = stored.finished_bytes + stored.clips_bytes + stored.open_bytes
+    line = f"recordings: {in_bytes(size)} of {in_bytes(limit_bytes)}"
     if not config.keep_days:
         return line
     days = (now_ns - stored.parts[0].last_ns) / DAY_NS if stored.parts else 0.0

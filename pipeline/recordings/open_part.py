@@ -44,4 +44,4 @@ class PartsFolder(Protocol):
     def free_bytes(self) -> int: ...  # noqa: D102
     def disk_bytes(self) -> int: ...  # noqa: D102
     def stored(self) -> Stored: ...  # noqa: D102
-    def delete(self, part: StoredPart) -> bool: ...  # noqa: D102
+    def delete(self, part: StoredPart) -> None: ...  # noqa: D102

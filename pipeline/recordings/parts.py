@@ -147,19 +147,30 @@ class RecordingParts:
         return self._disk.size_bytes()
 
     def stored(self) -> Stored:
-        """The recordings and clips in the folder; none if it cannot be read."""
+        """What recordings and clips there are in the folder; nothing if the folder is gone.
+
+        Raises:
+            RecordingError: it cannot be read, or the folder of its clips cannot.
+        """
         try:
             return self._stored.look()
-        except OSError:
+        except FileNotFoundError:
             return Stored()
+        except OSError as error:
+            what = f"{error.filename or self.path.parent}: cannot be read"
+            raise refused(what, error, "no recording is deleted until it can be") from error
 
-    def delete(self, part: StoredPart) -> bool:
-        """Delete a finished part; False if that is not possible."""
+    def delete(self, part: StoredPart) -> None:
+        """Delete a finished part.
+
+        Raises:
+            RecordingError: it cannot be deleted.
+        """
         try:
             part.path.unlink(missing_ok=True)
-        except OSError:
-            return False
-        return True
+        except OSError as error:
+            advice = "older recordings stay until it can be: delete or move it"
+            raise refused(f"{part.path}: cannot be deleted", error, advice) from error
 
     def _is_ours(self, path: Path) -> bool:
         try:

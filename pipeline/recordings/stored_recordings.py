@@ -37,7 +37,9 @@ class Stored:
     parts: tuple[StoredPart, ...] = ()
     """the oldest first"""
     finished_bytes: int = 0
-    """size of these parts and of all clips"""
+    """of parts"""
+    clips_bytes: int = 0
+    """of all clips"""
     open_bytes: int = 0
     """size of the parts that are being written"""
 
@@ -57,7 +59,7 @@ class StoredRecordings:
         """
         known, self._known = self._known, {}
         parts: list[StoredPart] = []
-        finished_bytes = open_bytes = 0
+        finished_bytes = clips_bytes = open_bytes = 0
         for path, size, written_ns in _files(self._folder):
             if path.name.endswith(SUFFIX + ACTIVE_SUFFIX):
                 open_bytes += size
@@ -68,8 +70,8 @@ class StoredRecordings:
                     parts.append(part)
                     finished_bytes += size
         with suppress(FileNotFoundError):
-            finished_bytes += sum(size for path, size, _ in _files(self._folder / CLIPS) if path.suffix == SUFFIX)
-        return Stored(tuple(sorted(parts)), finished_bytes, open_bytes)
+            clips_bytes = sum(size for path, size, _ in _files(self._folder / CLIPS) if path.suffix == SUFFIX)
+        return Stored(tuple(sorted(parts)), finished_bytes, clips_bytes, open_bytes)
 
 
 def _files(folder: Path) -> Iterator[tuple[Path, int, int]]:

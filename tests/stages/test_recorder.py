@@ -25,7 +25,7 @@ from pipeline.config.models import ConfigError, TrayConfig
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.disk import DiskError
 from pipeline.recordings.index import PartIndex
-from pipeline.recordings.reading import read_metadata, read_recording
+from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from pipeline.recordings.scan import scan
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
 from pipeline.recordings.stored_recordings import Stored, StoredPart
@@ -140,8 +140,9 @@ class Disk:
         self.refuses = False
         self.disk = 1 << 44
         self.old: list[StoredPart] = []
-        self.freed_by_each = 0
-        self.gone = ""
+        self.deleted: list[Path] = []
+        self.freed_by_each = self.clips_bytes = 0
+        self.gone = self.unreadable = self.undeletable = self.sizeless = ""
 
     def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> Part:
         if self.refuses:
@@ -155,15 +156,24 @@ class Disk:
         return self.free
 
     def disk_bytes(self) -> int:
+        if self.sizeless:
+            raise DiskError(self.sizeless)
         return self.disk
 
     def stored(self) -> Stored:
-        return Stored(tuple(self.old), len(self.old) * self.freed_by_each)
+        if self.unreadable:
+            raise RecordingError(self.unreadable)
+        numbered = enumerate(self.parts, 1000)
+        ended = [StoredPart(part.t_ns, number, part.path) for number, part in numbered if part.closed]
+        stored = [part for part in (*self.old, *ended) if part.path not in self.deleted]
+        return Stored(tuple(stored), len(stored) * self.freed_by_each, self.clips_bytes)
 
-    def delete(self, part: StoredPart) -> bool:
+    def delete(self, part: StoredPart) -> None:
+        if self.undeletable:
+            raise RecordingError(self.undeletable)
         self.free += self.freed_by_each
-        self.old.remove(part)
-        return True
+        self.deleted.append(part.path)
+        self.old = [kept for kept in self.old if kept != part]
 
     @property
     def old_names(self) -> list[str]:
@@ -661,13 +671,13 @@ def test_parts_older_than_the_limit_of_days_are_deleted_and_it_is_said(caplog):
         disk.old = day_old(disk, days)
     with caplog.at_level(logging.WARNING):
         core = recorder(disk)
-    assert disk.old_names == ["3-days.mcap"]
+    assert disk.old_names == ["14.1-days.mcap", "3-days.mcap"], "one at a time, because the clock may be wrong"
     assert "20-days.mcap, the oldest part, was deleted: older than 14 days (recorder.keep_days)" in caplog.text
-    assert core.counters()["parts_deleted"] == 2
-    assert core.notes()[0] == "recordings: 0 bytes of 1.76 TB, 3.0 of 14 days"
-    for hour in range(1, 12 * 24):
+    assert core.counters()["parts_deleted"] == 1
+    assert core.notes()[0] == "recordings: 0 bytes of 1.76 TB, 14.1 of 14 days"
+    for hour in range(1, 13 * 24):
         core.tick(NOW_NS + hour * 3600 * SECOND_NS)
-    assert disk.old_names == []
+    assert disk.old_names == [] and core.counters()["parts_deleted"] == 3
     assert {round((b.t_ns - a.t_ns) / 86_400e9, 1) for a, b in pairwise(disk.parts)} == {1.8}, "an eighth of 14 days"
 
 

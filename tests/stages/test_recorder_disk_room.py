@@ -1,0 +1,144 @@
+"""What the limits of the disk must not cost: a disk that others fill, wrong clocks, odd file systems, locked files."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+
+import pytest
+
+from pipeline.recordings.disk_room import DAY_NS, DiskRoom
+from pipeline.recordings.parts import RecordingParts
+from pipeline.recordings.reading import RecordingError, read_recording
+from pipeline.recordings.recorder_config import RecorderConfig
+from pipeline.recordings.sequence_ledger import SequenceLedger
+from pipeline.recordings.stored_recordings import StoredPart
+from stages.recorder import STAGE
+from tests.stages.test_recorder import NOW_NS, SECOND_NS, Disk, context, envelope, old_parts, raw, recorder
+
+
+def ten_days_of_parts() -> list[StoredPart]:
+    return [StoredPart(NOW_NS + number * DAY_NS, number, Path(f"r-{number}.mcap")) for number in range(1, 11)]
+
+
+def test_a_disk_that_others_fill_costs_no_recording_second_by_second():
+    disk = Disk()
+    disk.old = old_parts("history-1.mcap", "history-2.mcap")
+    core = recorder(disk)
+    disk.free = 1  # others take all that a deletion makes free
+    for second in range(1, 11):
+        core.step(envelope(raw(second), "raw", NOW_NS))
+        core.tick(NOW_NS + second * SECOND_NS)
+    assert disk.parts[0].closed and len(disk.stored().parts) == 2, "the pause has ended a part"
+    assert disk.old_names == ["history-2.mcap"] and core.counters()["parts_deleted"] == 1
+    assert core.problem().startswith("NOTHING IS RECORDED")
+    disk.free = 1 << 40
+    core.tick(NOW_NS + 11 * SECOND_NS)
+    assert core.problem() == ""
+    disk.free = 1
+    core.tick(NOW_NS + 12 * SECOND_NS)
+    assert disk.old_names == [], "there was room meanwhile: the oldest goes again"
+
+
+def test_clips_count_as_half_of_the_share_at_most_and_the_last_part_stays():
+    disk = Disk()
+    disk.disk, disk.freed_by_each = 1_000_000_000, 10_000_000  # 100 MB may be taken
+    disk.clips_bytes = 400_000_000  # of other shards, and of lists that were lost
+    disk.old = old_parts("a.mcap", "b.mcap", "c.mcap", "d.mcap")
+    core = recorder(disk)
+    assert disk.old_names == ["b.mcap", "c.mcap", "d.mcap"], "30 MB, 50 MB of clips, 12.5 MB for the open part"
+    usage, beyond = core.notes()
+    assert usage.startswith("recordings: 430 MB of 100 MB")
+    assert beyond.startswith("clips take 400 MB, more than 50% of 100 MB (recorder.keep_share_of_disk)")
+    disk.freed_by_each = 95_000_000
+    core.tick(NOW_NS + 10 * SECOND_NS)
+    assert disk.old_names == ["d.mcap"]
+    assert "nothing may be deleted, the last finished part included" in core.notes()[1]
+
+
+def test_a_clock_that_is_years_ahead_costs_a_part_an_hour_and_never_the_last():
+    disk, hours = Disk(), [0.0]
+    disk.old = ten_days_of_parts()
+    room = DiskRoom(disk, RecorderConfig(), None, monotonic_s=lambda: hours[-1] * 3600)
+    for look in range(60):
+        room.keep_limits(NOW_NS + (3650 + look) * DAY_NS)
+    assert len(disk.old) == 9
+    hours.append(0.99)
+    room.keep_limits(NOW_NS + 3650 * DAY_NS)
+    assert len(disk.old) == 9
+    hours.append(1.0)
+    room.keep_limits(NOW_NS + 3650 * DAY_NS)
+    assert len(disk.old) == 8
+    room.keep_limits(NOW_NS + 3650 * DAY_NS, has_ended_part=True)
+    assert len(disk.old) == 7, "as fast as parts are made, so that a busy site keeps the limit"
+    for hour in range(2, 30):
+        hours.append(hour)
+        room.keep_limits(NOW_NS + 3650 * DAY_NS)
+    assert disk.old_names == ["r-10.mcap"]
+
+
+@pytest.fixture
+def sizeless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every file system reports zeros, as some of FUSE do."""
+    monkeypatch.setattr("pipeline.recordings.disk.os.statvfs", lambda _: os.statvfs_result((0,) * 10))
+
+
+@pytest.mark.usefixtures("sizeless")
+@pytest.mark.parametrize(("min_free_bytes", "is_recorded"), [(0, True), (100_000_000, False)])
+def test_a_file_system_that_does_not_say_its_size_loses_no_part_and_health_says_so(
+    tmp_path, min_free_bytes, is_recorded
+):
+    run = context(tmp_path, min_free_bytes=min_free_bytes, keep_days=1)
+    parts = RecordingParts(run.run_folder / "recording.mcap", {}, {}, "earlier")
+    for _ in range(3):
+        parts.begin(1, SequenceLedger(), {}).finish()
+    core = STAGE.build(run).core
+    for sequence in range(3):
+        core.step(envelope(raw(sequence), "raw", NOW_NS))
+    for second in range(1, 30):
+        core.tick(NOW_NS + second * SECOND_NS)
+    assert len(parts.stored().parts) == 3 and "parts_deleted" not in core.counters()
+    assert "the file system does not say its size" in core.problem()
+    assert core.problem().startswith("NOTHING IS RECORDED") is not is_recorded
+    core.close()
+    if is_recorded:
+        assert len(list(read_recording(tmp_path / "runs" / "recording-4.mcap"))) == 3
+
+
+def test_a_part_that_cannot_be_deleted_is_named_in_health_and_once_in_the_log(caplog):
+    disk = Disk()
+    disk.disk, disk.freed_by_each, disk.old = 1_000_000_000, 30_000_000, ten_days_of_parts()
+    disk.undeletable = "runs/r-1.mcap: cannot be deleted: Operation not permitted; move it"
+    with caplog.at_level(logging.WARNING):
+        core = recorder(disk)
+        for second in range(1, 60):
+            core.tick(NOW_NS + second * SECOND_NS)
+    assert core.problem() == disk.undeletable and caplog.text.count(disk.undeletable) == 1
+    disk.free = 1
+    core.tick(NOW_NS + 60 * SECOND_NS)
+    assert core.problem().startswith("NOTHING IS RECORDED") and disk.undeletable in core.problem()
+    disk.free, disk.undeletable = 1 << 40, ""
+    for second in range(61, 75):
+        core.tick(NOW_NS + second * SECOND_NS)
+    assert core.problem() == "" and len(disk.stored().parts) == 2
+
+
+def test_a_folder_that_cannot_be_read_is_said_and_is_not_taken_for_empty():
+    disk = Disk()
+    disk.old, disk.unreadable = ten_days_of_parts(), "runs/clips: cannot be read: Permission denied; correct it"
+    core = recorder(disk)
+    assert core.problem() == disk.unreadable and core.notes() == [] and disk.parts
+    disk.unreadable = ""
+    core.tick(NOW_NS + 10 * SECOND_NS)
+    assert core.problem() == "" and core.notes()
+
+
+def test_files_that_the_system_refuses_to_delete_or_to_list_are_named(tmp_path):
+    parts = RecordingParts(tmp_path / "r.mcap", {}, {}, "s1")
+    (tmp_path / "r-2.mcap").mkdir()
+    with pytest.raises(RecordingError, match=r"r-2\.mcap: cannot be deleted: "):
+        parts.delete(StoredPart(1, 2, tmp_path / "r-2.mcap"))
+    (tmp_path / "clips").touch()  # as a folder without rights, which root could read
+    with pytest.raises(RecordingError, match="clips: cannot be read: Not a directory"):
+        parts.stored()
