@@ -36,8 +36,7 @@ from pipeline.cli.twins.training_data import (
     show_hints,
     twin_errors,
 )
-from pipeline.errors import UserError
-from pipeline.extras import how_to_install, is_installed
+from pipeline.extras import require_torch
 
 if TYPE_CHECKING:
     from schemas.reference_conditions import ReferenceConditions
@@ -127,8 +126,8 @@ def train(
 
     Example: fantwin train healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap --model hybrid -o TWIN.onnx
     """
-    if trainer == "adam" and not is_installed("torch"):
-        raise UserError(f"--trainer adam needs PyTorch: {how_to_install('torch')}")
+    if trainer == "adam":
+        require_torch("--trainer adam")
     not_written = "no twin was written; --iterations N ends after N iterations of each network and writes one"
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible(not_written), twin_errors():
