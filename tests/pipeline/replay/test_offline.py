@@ -265,7 +265,7 @@ def test_a_recorded_snapshot_is_restored_and_its_replay_is_equal():
     scorer was killed and restored from its snapshot."""
     tray = verified(DATA / "golden-restart.mcap")
     assert [session.snapshot is not None for session in tray.plan.last] == [False, True] and tray.plan.restarts == 1
-    assert made_equal(tray) > 250
+    assert made_equal(tray, share=1.0) > 250
     assert tray.comparison and tray.comparison.alarms_equal == 8
     restored = [alarm for alarm in tray.alarms if alarm.transition == Transition.REPUBLISHED]
     operators = {
