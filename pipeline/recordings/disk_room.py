@@ -51,7 +51,7 @@ class DiskRoom:
     ) -> None:
         self._parts, self._config, self._clips, self._monotonic_s = parts, config, clips, monotonic_s
         self._aged_s = -math.inf
-        """when a part was last deleted by age alone, by `monotonic_s`"""
+        """time of the last deletion by age alone, by `monotonic_s`"""
         self._spared: Path | None = None
         """the last finished part when the disk ran short: a pause ends one more, which must not cost this one"""
         self._logged = ""

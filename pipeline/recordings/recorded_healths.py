@@ -10,7 +10,7 @@ from schemas.health import Health
 from schemas.units import NS_PER_S
 
 HEALTH_S = 3600
-"""at least one message of each session is recorded in this time"""
+"""longest time without a recorded message of a session"""
 _NUMBERS = re.compile(r"[\d.,]+")
 
 

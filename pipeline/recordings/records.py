@@ -34,7 +34,7 @@ from schemas.formats import RECORDING
 METADATA_NAME = "fantwin"
 """the metadata record that describes a recording; it follows the header"""
 FORMAT_KEY, MADE_BY_KEY = "format", "made_by"
-"""in these metadata: the format number of the recording, and the program that wrote it"""
+"""keys of these metadata: the format number of the recording, and the program that wrote it"""
 LARGEST_CHUNK_BYTES = 64 << 20
 """of a chunk without compression; a larger one is treated as damaged"""
 LARGEST_RECORD_BYTES = 256 << 20

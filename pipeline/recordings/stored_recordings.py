@@ -25,7 +25,7 @@ class StoredPart(NamedTuple):
     """A finished part of a recording."""
 
     last_ns: int
-    """when its last message was received; when it began if its index does not say it"""
+    """time at which its last message was received; that of its start if its index does not say it"""
     number: int
     path: Path
 

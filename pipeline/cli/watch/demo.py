@@ -18,6 +18,7 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 
 from pipeline.bus.session import Bus, join_bus
@@ -269,4 +270,4 @@ def _print_report(summary: Summary, out: Path, took_s: float, console: Console) 
         if line:
             console.print(line, markup=False, soft_wrap=True)  # to be copied
     for problem in summary.problems:
-        console.print(f"[bold red]PROBLEM:[/bold red] {problem}")
+        console.print(f"[bold red]PROBLEM:[/bold red] {escape(problem)}")

@@ -18,7 +18,7 @@ import numpy as np
 from schemas.messages import Array
 
 RELATIVE = 1e-6
-"""of the larger of both numbers: eight units in the last digit of a recorded score"""
+"""share of the larger of both numbers: eight units in the last digit of a recorded score"""
 SPEED_RAD_S = 1e-6
 """absolute, of speeds: a hundred-thousandth of a revolution a minute"""
 COMMAND = 1e-9
