@@ -1,5 +1,5 @@
 # make demo   install what the demo needs into .venv and run it
-# make test   install what the tests need, check, and run all tests; those in real time come last, two at a time
+# make test   install what the tests need, check, and run all tests
 # make check  format, lint, types, direction of imports, generated code
 # make selftest  the faults of practice on a simulated site, as a table of promised and seen
 # make compose-test  compose.yaml brought up, killed and cut off, in namespaces of this machine (root)
@@ -20,6 +20,8 @@ CONTAINERS := build/compose
 TORCH := torch==2.13.0
 BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_table measured_table onnx_speed training_race) \
 	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed stage_memory)
+# compiled modules are kept: hundreds of processes of the tests would each compile them again
+unexport PYTHONDONTWRITEBYTECODE
 SOURCES := fantwin_client schemas scoring pipeline simulation stages twin tests bench
 
 .PHONY: demo test check selftest compose-test bench schema configuration twin lock rerun-bump clean
@@ -29,8 +31,7 @@ demo: $(VENV)/.runtime
 	$(BIN)/fantwin demo
 
 test: $(VENV)/.development check
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not real_time" --numprocesses 3 --dist worksteal
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m real_time --numprocesses 2 --dist load --maxschedchunk 1
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 3 --dist worksteal
 
 check: $(VENV)/.development
 	$(BIN)/ruff format --check $(SOURCES)

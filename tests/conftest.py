@@ -18,6 +18,33 @@ settings.register_profile("house", derandomize=True, deadline=None, suppress_hea
 settings.load_profile("house")
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Spread the tests in real time over the share of each worker, between the modules of the others: they wait more
+    than they work, so the others use the cores meanwhile. The last part of a share is without them, and evens out when
+    the workers end."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0"))
+    if not workers:
+        return
+    in_real_time = [item for item in items if item.get_closest_marker("real_time")]
+    others = [item for item in items if not item.get_closest_marker("real_time")]
+    shares = [others[len(others) * k // workers : len(others) * (k + 1) // workers] for k in range(workers)]
+    items[:] = [item for k, share in enumerate(shares) for item in _mixed(in_real_time[k::workers], share)]
+
+
+def _mixed(in_real_time: list[pytest.Item], others: list[pytest.Item]) -> list[pytest.Item]:
+    """Both, the first kind spread over the first two thirds of the other, whose modules stay whole."""
+    mixed: list[pytest.Item] = []
+    waiting = list(in_real_time)
+    for number, item in enumerate(others):
+        is_first_of_module = not number or item.path != others[number - 1].path
+        due = len(in_real_time) - len(waiting)
+        if waiting and is_first_of_module and 3 * number * len(in_real_time) >= 2 * due * len(others):
+            mixed.append(waiting.pop(0))
+        mixed.append(item)
+    return mixed + waiting
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _without_power_cuts() -> Iterator[None]:
     """A process reads what it has written without a flush to the disk, which would take half of the time of the tests

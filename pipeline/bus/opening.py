@@ -30,6 +30,9 @@ from pipeline.config.models import BusConfig
 if TYPE_CHECKING:
     from pipeline.bus.certificates import Credentials
 
+ONE_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
+"""Of two peers that discover each other, the one of the greater id connects. By default both do at once, and may refuse
+each other's connection as the second one. Where stages were restarted 2,000 times, it took a fifth of the CPU time."""
 _ROUTER_TIMEOUT_MS = 1000
 ROUTER_RETRY_S = 0.2
 MEETING_LIMIT_S = 10.0
@@ -144,6 +147,7 @@ def zenoh_config(
         settings.set("listen/timeout_ms", 0)
         settings.set("listen/exit_on_failure", False)
         settings.set("scouting/gossip/enabled", True)
+        settings.set("scouting/gossip/autoconnect_strategy", ONE_CONNECTS)
         settings.set("transport/link/tx/queue/congestion_control/block/wait_before_close", PEER_WAIT_US)
         if credentials and site:
             settings.set("access_control", access_control(site))

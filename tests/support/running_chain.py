@@ -173,11 +173,17 @@ class Chain:
             view = view_of(watcher, label)
             return view is not None and view.alive and view.health.process_id != old
 
-        try:
-            eventually(is_back, f"{label} is back")
-        except AssertionError as error:
-            raise AssertionError("\n".join((str(error), *(self.up.lines[-30:] if self.up else ())))) from error
+        self.eventually(watcher, is_back, f"{label} is back")
         return time.monotonic() - began_s
+
+    def eventually(self, watcher: SiteWatcher, condition: Callable[[], Any], what: str) -> None:
+        """Wait for a condition; if it does not come true, the error shows what the site says of itself."""
+        try:
+            eventually(condition, what)
+        except AssertionError as error:
+            views = (f"{view.health}, alive {view.alive}, {view.age_s:.1f} s ago" for view in watcher.stages())
+            lines = self.up.lines[-30:] if self.up else ()
+            raise AssertionError("\n".join((str(error), *lines, *views))) from error
 
     def recordings(self) -> list[Path]:
         return sorted(self.folder.glob("recording*.mcap"))

@@ -79,9 +79,9 @@ def kill(chain: Chain, watcher: SiteWatcher, label: str) -> None:
     before = chain.process_ids()
     chain.kill(watcher, label)
     scored = published(view_of(watcher, "scorer"))
-    eventually(lambda: published(view_of(watcher, "scorer")) > scored + 50, "scores flow again")
+    chain.eventually(watcher, lambda: published(view_of(watcher, "scorer")) > scored + 50, "scores flow again")
     if label == "recorder":
-        eventually(lambda: received(view_of(watcher, "recorder")) > 50, "the new recorder records")
+        chain.eventually(watcher, lambda: received(view_of(watcher, "recorder")) > 50, "the new recorder records")
     after = chain.process_ids()
     assert {name for name in after if after[name] != before[name]} == {label}
     assert is_running(after[label])
