@@ -10,6 +10,6 @@ OPEN_TIMEOUT_MS = 3000
 """after this long without an answer a client that has lost its router tries the next one. With Zenoh's 10 s, clients of
 a router whose host had vanished found the other one after 14 s."""
 PEER_WAIT_US = 9_000_000
-"""a peer that takes nothing for so long is cut off. Where two peers found each other through a third one, and one cuts
-the other off so, they stay apart until another process joins; where the lease, of 10 s, does it, they meet again. With
-Zenoh's 5 s a stage that was suspended for 8 s stayed apart. The watchdog's limit is beyond it: who sends lives on."""
+"""a peer that takes nothing for so long is cut off; it is back when it and the others have met again
+(`Bus.meet_again`). With Zenoh's 5 s a stage that was suspended for 8 s was cut off. The watchdog's limit is beyond it:
+who sends lives on."""

@@ -10,6 +10,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
@@ -31,6 +32,8 @@ from schemas.topics import Topic, key_in_words, largest_bytes
 SAID_AFTER_S = 3.0
 """a client that waits so long for its router says so"""
 _MEETING_POLL_S = 0.01
+_MEETING_S, _BETWEEN_MEETINGS_S = 2.0, 3.0
+"""how long a session stays through which others meet again, and how long the next one waits at least"""
 _ALIVE_TIMEOUTS = 2
 """`Bus.alive` asks again for so many times `recovery_timeout_s`"""
 
@@ -72,6 +75,8 @@ class Bus:
         if self.credentials and site:
             role, is_client = self.credentials.role, config.mode == "client"
             self.rights = OwnRights(self._session, site, role, is_client=is_client)
+        self._site = site
+        self._meeting = threading.Thread()
         self._stop = stop or threading.Event()
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
@@ -152,6 +157,23 @@ class Bus:
         while self._has_answered and not (self._session.info.peers_zid() or self._session.info.routers_zid()):
             if time.monotonic() > until_s or stop.wait(_MEETING_POLL_S):
                 return
+
+    def meet_again(self) -> None:
+        """Let peers meet again that a cut link has left apart, in a thread of its own; to be called while they are.
+
+        Zenoh does not connect again two peers that had found each other through a third one. But whoever joins is told
+        of all peers, and tells them of one another. So another session joins for a moment.
+        """
+        if self._config.mode == "peer" and not self._meeting.is_alive():
+            self._meeting = threading.Thread(target=self._meet, name="meet again", daemon=True)
+            self._meeting.start()
+
+    def _meet(self) -> None:
+        with suppress(BusError, zenoh.ZError):  # the next time it may work
+            session = open_session(self._config, self.credentials, None, listens=False, site=self._site)
+            self._stop.wait(_MEETING_S)
+            session.close()
+        self._stop.wait(_BETWEEN_MEETINGS_S)
 
     def alive(self, key_expression: str) -> set[str]:
         """The keys of the tokens that exist now. Asks again if there is no complete answer. That there is none must be

@@ -17,7 +17,8 @@ from pipeline.launch.loss_accounting import Launched, label, losses
 from pipeline.launch.refused_input import refused, unusable_lines
 from pipeline.launch.watched_alarms import WatchedAlarms
 from pipeline.runtime.believed_outputs import BelievedOutputs
-from pipeline.runtime.sessions import Session
+from pipeline.runtime.lost_sessions import LostSessions
+from pipeline.runtime.sessions import Session, this_host
 from schemas.codec import CodecError, decode
 from schemas.health import Health
 from schemas.messages import Alarm
@@ -80,6 +81,7 @@ class SiteWatcher:
         self._site = site
         self._lock = threading.Lock()
         self._sessions = KnownSessions()
+        self._lost = LostSessions(this_host())
         self._healths: dict[str, _Heard] = {}
         """by producer, in the order heard: of the sessions that have shown their token"""
         self._unknown: dict[str, _Heard] = {}
@@ -102,8 +104,11 @@ class SiteWatcher:
             self._on_health(key, payload)
 
     def stages(self) -> list[StageView]:
-        """The latest session of every stage instance, by name; one whose token is there, if there is one."""
+        """The latest session of every stage instance, by name; one whose token is there, if there is one. A session
+        whose link was cut is looked for."""
         with self._lock:
+            if self._lost.are_apart():
+                self._bus.meet_again()
             latest: dict[tuple[str, str], StageView] = {}
             at_work = self._sessions.alive()
             heard = self._believed()  # as heard: a host's clock may be set back
@@ -185,6 +190,7 @@ class SiteWatcher:
 
     def _on_session(self, key: str, alive: bool) -> None:
         with self._lock:
+            self._lost.update(key, alive)
             session = self._sessions.update(key, alive)
             if session and (heard := self._unknown.pop(session.producer, None)):
                 self._keep(heard)

@@ -19,7 +19,7 @@ from pipeline.runtime.clock import REPLAY, StageClock
 from pipeline.runtime.due_messages import DueMessages
 from pipeline.runtime.health import HealthBuilder
 from pipeline.runtime.inbox import FromBus, Inbox, Liveness, Newest, Recovered
-from pipeline.runtime.killed_sessions import KilledSessions
+from pipeline.runtime.lost_sessions import LostSessions
 from pipeline.runtime.newest_messages import NewestMessages
 from pipeline.runtime.peers import Peers
 from pipeline.runtime.recovery import Recovery
@@ -88,7 +88,7 @@ class Receiver:
         self._silences = Silences(
             {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}, sessions
         )
-        self._killed = KilledSessions(this_host())
+        self._lost = LostSessions(this_host())
 
     def start(self, *, follows_clock: bool) -> None:
         """Subscribe to health, to who is there and, if it follows them, to the clocks of the trays."""
@@ -142,10 +142,12 @@ class Receiver:
         return self.peers.awaits_last_health() or self.tracker.is_waiting
 
     def ask_again(self) -> None:
-        """Repeat unanswered requests when they are due; find sessions that were killed."""
+        """Repeat unanswered requests when they are due; find sessions that were killed, and those that were cut off."""
         self._recovery.send_due()
-        for producer in self._killed.take():
+        for producer in self._lost.take_killed():
             self._silences.end(producer)
+        if self._lost.are_apart():
+            self._bus.meet_again()
 
     def is_complete(self, tray: str) -> bool:
         """Whether the producer of a tray's main input has shown, since this was last asked, that all that it has sent
@@ -165,7 +167,7 @@ class Receiver:
             case Liveness():
                 self.peers.update(item)
                 self._sessions.update(item.key, item.alive)
-                self._killed.update(item.key, item.alive)
+                self._lost.update(item.key, item.alive)
                 if item.key == alive_key(self._site, REPLAY, ALL_TRAYS):
                     self._clock.set_replay_alive(item.alive)
 

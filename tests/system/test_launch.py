@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import signal
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -118,6 +121,35 @@ def test_row_08_visitors_and_a_closed_terminal_change_nothing_and_ctrl_c_stops_i
         "unusable": [],
     }
     assert not any(map(is_running, chain.process_ids().values()))
+    check_whole(chain)
+
+
+def cut_link(one: int, other: int) -> None:
+    """Cut each TCP connection between two processes, as their hosts would."""
+    listed = subprocess.run(["ss", "-tnpH"], capture_output=True, text=True, check=True).stdout
+    found = [(line.split()[3:5], set(map(int, re.findall(r"pid=(\d+)", line)))) for line in listed.splitlines()]
+    process_of = {(local, remote): ids for (local, remote), ids in found}
+    for (local, remote), ids in process_of.items():
+        if one in ids and other in process_of.get((remote, local), set()):
+            subprocess.run(["ss", "-K", "src", local, "dst", remote], capture_output=True, check=True)
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("ss"), reason="cutting a connection needs root and ss")
+def test_row_16_stages_whose_link_was_cut_meet_again_without_any_other_process(chain):
+    up = start(chain)
+    labels = (f"acquisition/{TRAY}", "resampler", "twin_integrator")
+    acquisition, resampler, integrator = (chain.process_ids()[label] for label in labels)
+    with chain.watcher() as watcher:
+
+        def scored() -> int:
+            return published(view_of(watcher, "scorer"))
+
+        for one, other in ((acquisition, resampler), (resampler, integrator)):
+            cut_link(one, other)
+            enough = scored() + MANY
+            chain.eventually(watcher, lambda enough=enough: scored() > enough, "scores flow again")
+    assert up.end(signal.SIGINT) == 0, up.lines
+    assert chain.tray and chain.tray.end() == 0
     check_whole(chain)
 
 

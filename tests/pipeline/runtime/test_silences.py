@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.runtime.killed_sessions import KilledSessions
+from pipeline.runtime.lost_sessions import LostSessions
 from pipeline.runtime.sessions import Session, Sessions, this_host
 from pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, MOST_HEARD, RESTART_S, Silences
 from schemas.enums import StageStatus
@@ -267,23 +267,34 @@ def token(process_id: int, host: str = this_host()) -> str:
 
 
 def test_row_11_a_session_without_a_token_was_killed_if_its_process_runs_no_more():
-    sessions = KilledSessions(this_host())
+    now_s = 0.0
+    sessions = LostSessions(this_host(), lambda: now_s)
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     key = token(process.pid)
     try:
         sessions.update(key, alive=True)
         sessions.update(key, alive=False)
-        assert sessions.take() == [], "only its link was cut"
+        assert sessions.take_killed() == [], "only its link was cut"
+        cut_off: list[bool] = []
+        for now_s in (1.9, 2.0, 59.9, 60.0):  # noqa: B007  read by the sessions
+            cut_off.append(sessions.are_apart())
+        assert cut_off == [False, True, True, False]
+        now_s = 10.0
+        sessions.update(key, alive=True)
+        assert not sessions.are_apart(), "it is back"
+        sessions.update(key, alive=False)
     finally:
         process.kill()
         process.communicate()
-    assert sessions.take() == ["acquisition-a-01"]
-    assert sessions.take() == []
+    now_s = 15.0
+    assert not sessions.are_apart(), "it was killed"
+    assert sessions.take_killed() == ["acquisition-a-01"]
+    assert sessions.take_killed() == []
 
 
 def test_row_11_sessions_that_come_and_go_are_remembered_up_to_a_limit(monkeypatch):
-    monkeypatch.setattr("pipeline.runtime.killed_sessions.MOST_SESSIONS", 3)
-    sessions = KilledSessions(this_host())
+    monkeypatch.setattr("pipeline.runtime.lost_sessions.MOST_SESSIONS", 3)
+    sessions = LostSessions(this_host())
     processes = [subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) for _ in range(5)]
     for process in processes:
         sessions.update(token(process.pid), alive=True)
@@ -291,14 +302,14 @@ def test_row_11_sessions_that_come_and_go_are_remembered_up_to_a_limit(monkeypat
     for process in processes:
         process.kill()
         process.communicate()
-    assert len(sessions.take()) == 3
+    assert len(sessions.take_killed()) == 3
 
 
 def test_row_11_whether_a_process_elsewhere_runs_is_not_known():
-    sessions = KilledSessions(this_host())
+    sessions = LostSessions(this_host())
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     for key in (token(process.pid), token(1, "elsewhere")):  # the first never ran where it can be seen from here
         sessions.update(key, alive=True)
         sessions.update(key, alive=False)
-    assert sessions.take() == []
+    assert sessions.take_killed() == []
