@@ -94,17 +94,6 @@ def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -
         closed.disconnect()
 
 
-def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = ModbusConfig.model_validate({"port": "/dev/ttyUSB7", "baud": 9600, "parity": "O", "fan": (FAN,)})
-    made = ModbusDevice(settings, SourceContext(1, "rpm", Path()))
-    client = made._made_client()
-    line = client.comm_params
-    assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 1)
-    assert made.check()[0].startswith("/dev/ttyUSB7: no such port")
-    with pytest.raises(DeviceError, match=r"^no such port, is it unplugged\?; waiting for it$"):
-        made.connect()
-
-
 def over_serial(line: SerialLine, **settings: Any) -> tuple[ModbusConfig, SourceContext]:
     values = {"port": line.host, "parity": "N", "timeout_s": 5.0, "fan": (FAN,), **settings}
     return ModbusConfig.model_validate(values), SourceContext(1, "rpm", Path())

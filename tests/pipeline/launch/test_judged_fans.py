@@ -13,14 +13,14 @@ from pipeline.launch.judged_fans import JUDGED_WITHIN_S, JudgedChanges, JudgedFa
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import encode
-from schemas.enums import FanState, InvalidReason, Severity
+from schemas.enums import FanState, InvalidReason
 from schemas.header import Header
 from schemas.health import Output
-from schemas.messages import Alarm
 from schemas.topics import tray_key
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.words_now import RETURNING
 from tests.pipeline.launch.test_site_watcher import SCORER, STRANGER, StubBus, health
+from tests.support import made_messages
 from tests.support.score_data import one_sample
 
 FANS = 4
@@ -134,17 +134,7 @@ def test_changes_are_of_fans_and_reasons_and_not_of_figures():
 
 def test_active_alarms_of_fans_that_are_not_judged_are_not_confirmed_by_data():
     def alarm(tray: str, fan: int, *, active: bool = True) -> CurrentAlarm:
-        newest = Alarm(
-            header=Header("", 0, tray),
-            fan=fan,
-            active=active,
-            severity=Severity.ALARM,
-            t_ns=1,
-            onset_t_ns=1,
-            residual_rad_s=0.0,
-            limit_rad_s=0.0,
-            message="too slow",
-        )
+        newest = made_messages.alarm(fan, 1, tray, active=active, message="too slow")
         return CurrentAlarm(newest, newest.message, (), "")
 
     alarms = [alarm("a", 0), alarm("a", 1), alarm("b", 2), alarm("b", 3, active=False), alarm("c", 0)]

@@ -9,7 +9,6 @@ import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, cast
@@ -21,26 +20,14 @@ from pipeline.config.shards import Shard
 from pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
 from pipeline.errors import UserError
 from pipeline.launch.launcher import Launcher, Outcome, _Slot
-from pipeline.launch.notices import Notices
 from pipeline.launch.processes import Child, StageProcess, process_list
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health
 from schemas.topics import alive_key
 from tests.pipeline.launch.test_site_watcher import StubBus
+from tests.support.made_messages import health
 from tests.support.running_chain import DEMO, SITE, Chain
 from tests.support.site_certificates import SiteCertificates
-
-HEALTH = Health(
-    header=Header("recorder-all-1", 0, ""),
-    stage="recorder",
-    instance="all",
-    status=StageStatus.OK,
-    t_ns=1,
-    uptime_s=1.0,
-    process_id=7,
-)
 
 
 @pytest.fixture
@@ -258,34 +245,6 @@ def test_a_stage_for_which_there_is_no_process_is_started_later_unless_the_site_
     assert slot.sessions == [("recorder", 7)]
 
 
-@pytest.mark.parametrize("fails", ["Popen", "Thread"])
-def test_of_a_process_that_could_not_be_started_nothing_is_left(monkeypatch, fails):
-    closed, killed = [], []
-
-    class Pipe:
-        def kill(self) -> None:
-            killed.append(True)
-
-        def wait(self) -> None:
-            """It has ended."""
-
-    def start(*_arguments: object, **_more: object) -> Any:
-        if fails == "Popen":
-            raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
-        return Pipe()
-
-    def start_thread(_thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
-    config = load_config(DEMO / "demo.toml")
-    monkeypatch.setattr(subprocess, "Popen", start)
-    monkeypatch.setattr(threading.Thread, "start", start_thread)
-    monkeypatch.setattr(Notices, "close", lambda _notices: closed.append(True))
-    with pytest.raises(OSError, match="Cannot allocate memory|Resource temporarily unavailable"):
-        Child(process_list(config)[0], config.path, (), lambda _row, _line: None, 0)
-    assert (closed, killed) == ([True], [True] if fails == "Thread" else [])
-
-
 class EndedChild:
     """The process of a stage that ends in order."""
 
@@ -340,7 +299,7 @@ class Heard:
     def last_health(self, _session: object) -> Any:
         if len(self.statuses) > 1:
             del self.statuses[0]
-        return replace(HEALTH, status=self.statuses[0]) if self.statuses else None
+        return health("recorder", status=self.statuses[0], process_id=7) if self.statuses else None
 
 
 def stopped(watcher: Any, monkeypatch: pytest.MonkeyPatch, *, was_ready: bool = True) -> tuple[Outcome, list[str]]:

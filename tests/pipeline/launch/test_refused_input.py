@@ -7,6 +7,7 @@ import pytest
 from pipeline.launch.refused_input import refused, refused_lines, unusable_lines
 from schemas.enums import StageStatus
 from schemas.health import Counter, Health
+from tests.support import made_messages
 
 LAUNCHED = {("acquisition/bench", 7)}
 
@@ -15,9 +16,7 @@ def health(name: str = "acquisition/bench", process_id: int = 7, /, **counters: 
     stage, instance = name.split("/")
     counts = tuple(Counter(name=name, value=value) for name, value in counters.items())
     status = StageStatus.STOPPED
-    return Health(
-        stage=stage, instance=instance, status=status, t_ns=1, uptime_s=1.0, process_id=process_id, counters=counts
-    )
+    return made_messages.health(stage, instance, status=status, process_id=process_id, counters=counts)
 
 
 def test_row_07_what_sessions_have_refused_is_added_up():

@@ -13,11 +13,12 @@ from pipeline.launch.site_watcher import MOST_UNKNOWN_SESSIONS, MOST_WATCHED_SES
 from pipeline.launch.watched_alarms import MOST_WATCHED_FANS, WATCHED_BYTES
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode
-from schemas.enums import Severity, StageStatus, Transition
+from schemas.enums import StageStatus
 from schemas.header import Header
 from schemas.health import Health, Output
-from schemas.messages import Alarm, Diagnosis
+from schemas.messages import Alarm
 from schemas.topics import alive_key, health_key, sessions_key, tray_key
+from tests.support import made_messages
 from tests.support.bus_peer import alarm
 
 KEY = tray_key("s", "tray", "alarm")
@@ -59,8 +60,7 @@ def session(stage: str, number: int) -> Session:
 
 
 def health(of: Session, t_ns: int = 1, **more: Any) -> Health:
-    fields: dict[str, Any] = {"status": StageStatus.OK, "t_ns": t_ns, "uptime_s": 0.0, "process_id": of.process_id}
-    return Health(header=Header(of.producer, 0, ""), stage=of.stage, instance=of.instance, **fields | more)
+    return made_messages.health(of.stage, of.instance, of.producer, t_ns=t_ns, process_id=of.process_id, **more)
 
 
 def of(producer: str, sequence: int = 0, **more: Any) -> Alarm:
@@ -142,21 +142,6 @@ def test_row_11_the_alarms_that_are_kept_are_bounded_and_those_of_strangers_are_
     for number in range(40):
         bus.raise_alarm(of(STRANGER, number, fan=number, message="x" * (1 << 19)))
     assert 20 < len(fans(watcher)) <= WATCHED_BYTES >> 19
-
-
-def test_row_11_of_a_long_alarm_only_the_messages_that_are_shown_are_kept(bus, watcher):
-    causes = (Diagnosis(cause="drag_up", probability=0.8),)
-    bus.raise_alarm(of(SCORER.producer, 0, causes=causes))
-    acknowledged: dict[str, Any] = {"acknowledged": True, "operator_name": "Ann", "message": ""}
-    bus.raise_alarm(of(SCORER.producer, 1, transition=Transition.ACKNOWLEDGED, **acknowledged))
-    for number in range(2, 200):
-        severity = (Severity.WARNING, Severity.ALARM)[number % 2]
-        changed = of(SCORER.producer, number, transition=Transition.SEVERITY, severity=severity, message=f"{number}")
-        bus.raise_alarm(replace(changed, acknowledged=True))
-        bus.raise_alarm(replace(changed, acknowledged=True))  # the same again: recovered
-    (current,) = watcher.current_alarms()
-    assert (current.message, current.causes, current.acknowledged_by) == ("199", causes, "Ann")
-    assert [len(each.messages) for each in watcher._alarms._fans.values()] == [3]
 
 
 def test_row_11_healths_of_strangers_hide_no_stage_and_few_are_kept(bus, watcher):

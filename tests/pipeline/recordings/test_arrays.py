@@ -17,11 +17,13 @@ from pipeline.recordings.arrays import Arrays, Block, block_columns, read_topics
 from pipeline.recordings.order import Seen
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import InvalidReason, Severity, StageStatus, Statistic, Transition
+from schemas.enums import InvalidReason, Statistic, Transition
 from schemas.header import Header
 from schemas.health import Counter, Health
 from schemas.messages import Alarm, Array, Command, Grid, Message, ModelCard, Raw
 from schemas.topics import health_key, tray_key
+from tests.support import made_messages
+from tests.support.made_messages import health
 from tests.support.score_data import made_up_tray
 
 
@@ -58,19 +60,9 @@ def raw(
 
 
 def alarm(sequence: int) -> Alarm:
-    return Alarm(
-        header=Header("s", sequence, "tray1"),
-        fan=sequence,
-        active=sequence % 2 == 0,
-        severity=Severity.ALARM,
-        t_ns=70 + sequence,
-        onset_t_ns=50,
-        residual_rad_s=3.5,
-        limit_rad_s=2.0,
-        message=f"alarm {sequence}",
-        transition=Transition.RAISED,
-        statistic=Statistic.SPEED_DRIFT,
-    )
+    fields = {"onset_t_ns": 50, "residual_rad_s": 3.5, "message": f"alarm {sequence}", "active": sequence % 2 == 0}
+    fields |= {"transition": Transition.RAISED, "statistic": Statistic.SPEED_DRIFT}
+    return made_messages.alarm(sequence, 70 + sequence, sequence=sequence, **fields)
 
 
 def together(blocks: Iterable[Block], name: str) -> Array:
@@ -167,15 +159,7 @@ def test_an_event_is_a_row(tmp_path):
 
 def test_health_belongs_to_no_tray_and_keeps_its_order(tmp_path):
     healths = [
-        Health(
-            header=Header(stage, number, ""),
-            stage=stage,
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=number,
-            uptime_s=1.0,
-            counters=(Counter(name="lost_frames", value=3),),
-        )
+        health(stage, sequence=number, t_ns=number, counters=(Counter(name="lost_frames", value=3),))
         for number in range(2)
         for stage in ("scorer", "resampler")
     ]

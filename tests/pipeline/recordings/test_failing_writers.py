@@ -17,18 +17,8 @@ from pipeline.recordings.disk import AtomicAppendFile, DiskError
 from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.writing import CHUNK_BYTES, RecordingWriter
-from tests.support.failing_writers import disk_of, kill_a_recorder
+from tests.support.failing_writers import disk_of
 from tests.support.written_recordings import RAW_KEY, raw, sequences
-
-
-def test_all_that_was_flushed_survives_kill_9(tmp_path):
-    path = tmp_path / "r.mcap"
-    kill_a_recorder(path, flushed=25)
-    active = path.with_name(path.name + ACTIVE_SUFFIX)
-    reading = read_recording(active)
-    assert [e.message.header.sequence for e in reading] == list(range(25))
-    assert reading.truncated
-    assert "it is truncated" in reading.damage
 
 
 def test_an_exception_while_writing_leaves_no_file(tmp_path):
@@ -145,25 +135,6 @@ def test_without_room_for_an_index_the_file_is_still_readable(tmp_path):
     assert reading.damage == ""
     with path.open("rb") as file:
         assert make_reader(file).get_summary() is None
-
-
-def test_a_ledger_that_is_refused_at_first_is_in_the_index_once(tmp_path, monkeypatch):
-    writer = RecordingWriter(tmp_path / "r.mcap", {})
-    writer.add_message(RAW_KEY, raw(0), 0)
-    writer.flush()
-    write_whole, refusals = AtomicAppendFile.write, iter([OSError(errno.ENOSPC, "No space left on device")])
-
-    def refuse_once(file: AtomicAppendFile, data: bytes) -> None:
-        for error in refusals:
-            raise error
-        write_whole(file, data)
-
-    monkeypatch.setattr(AtomicAppendFile, "write", refuse_once)
-    with pytest.raises(DiskError):
-        writer.finish()
-    with (tmp_path / "r.mcap").open("rb") as file:
-        names = [record.name for record in make_reader(file).iter_metadata()]
-    assert names == ["fantwin", "fantwin.ledger"]
 
 
 def test_a_file_that_cannot_be_begun_is_reported_in_one_line_and_leaves_nothing(tmp_path, monkeypatch):

@@ -8,14 +8,12 @@ import pytest
 from mcap.opcode import Opcode
 
 from pipeline.recordings.contents import contents_of
-from pipeline.recordings.disk import Disk, DiskError
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from pipeline.recordings.records import RecordReader
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import RecordingWriter
 from tests.support.failing_writers import disk_of, kill_a_recorder
-from tests.support.small_disk import unmount
 from tests.support.written_recordings import RAW_KEY, raw, sequences, write
 
 STREAM = (RAW_KEY, "acquisition-1")
@@ -203,23 +201,6 @@ def test_an_active_file_that_is_not_a_recording_is_renamed(tmp_path, content):
     assert place.unreadable[0].read_bytes() == content
     part(place).finish()
     assert names(tmp_path) == ["r-2.mcap", "r.mcap.original"]
-
-
-def test_free_bytes_is_the_free_space_of_the_disk(small_disk):
-    disk = Disk(small_disk)
-    before = disk.free_bytes()
-    (small_disk / "file").write_bytes(bytes(1 << 20))
-    assert before - disk.free_bytes() == 1 << 20
-
-
-def test_the_mount_point_of_an_unmounted_disk_is_not_mistaken_for_the_disk(small_disk):
-    place = parts_in(small_disk)
-    part(place, [0]).finish()
-    unmount(small_disk)
-    for use in (place.free_bytes, lambda: part(place)):
-        with pytest.raises(DiskError, match="disk: the disk is no longer mounted; mount it again"):
-            use()
-    assert names(small_disk) == []
 
 
 def test_a_folder_that_disappears_is_made_again(tmp_path):

@@ -80,14 +80,6 @@ def test_a_recording_of_an_unknown_format_is_refused_however_it_is_read(of_tomor
         read(of_tomorrow)
 
 
-def test_a_copy_names_the_program_that_made_the_first_one(tmp_path):
-    about = read_metadata(write(tmp_path / "r.mcap", 0)).metadata
-    with RecordingWriter(tmp_path / "copy.mcap", {**about, "made_by": "fantwin 0.0.9", "format": "0"}):
-        pass
-    head = read_metadata(tmp_path / "copy.mcap")
-    assert (head.metadata["made_by"], head.metadata["format"]) == ("fantwin 0.0.9", "1")
-
-
 def test_a_recording_without_a_format_number_is_refused_and_a_file_of_another_program_has_no_messages(tmp_path):
     with (tmp_path / "foreign.mcap").open("wb") as file:
         writer = Writer(file)
@@ -102,16 +94,6 @@ def test_a_recording_without_a_format_number_is_refused_and_a_file_of_another_pr
         writer.finish()
     with pytest.raises(RecordingError, match=r"without a format number; .* \(made by fantwin 0\.0\.1\)"):
         read_metadata(tmp_path / "r.mcap")
-
-
-def test_a_recording_is_called_active_until_it_is_finished(tmp_path):
-    path = tmp_path / "r.mcap"
-    writer = RecordingWriter(path, {})
-    assert [p.name for p in tmp_path.iterdir()] == ["r.mcap.active"]
-    writer.finish()
-    writer.finish()  # twice is once
-    assert [p.name for p in tmp_path.iterdir()] == ["r.mcap"]
-    assert list(read_recording(path)) == []
 
 
 def test_a_finished_recording_is_never_overwritten_unasked(tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -22,16 +21,15 @@ from mcap_protobuf.decoder import DecoderFactory
 from pipeline.recordings.contents import contents_of, damage_of
 from pipeline.recordings.disk import AtomicAppendFile
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.records import RECORD, Record, RecordReader, record_bytes
+from pipeline.recordings.records import RECORD, RecordReader, record_bytes
 from pipeline.recordings.repair import recover, repair_in_place
 from pipeline.recordings.scan import scan
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
 from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Output
+from schemas.health import Output
 from schemas.topics import health_key
 from tests.support.failing_writers import disk_of
+from tests.support.made_messages import health
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
 
 STREAM = (RAW_KEY, "acquisition-1")
@@ -411,37 +409,14 @@ def test_a_truncated_file_from_another_writer_is_repaired_too(tmp_path, chunked,
         assert [m.log_time for _, _, m in reader.iter_messages()] == all_of_it[: found.messages]
 
 
-def test_a_recording_that_is_renamed_while_it_is_read_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As by the recorder that finishes it."""
-    path, read = small(tmp_path / "one.mcap"), RecordReader.__iter__
-
-    def then_renamed(reader: RecordReader) -> Iterator[Record]:
-        yield from read(reader)
-        path.rename(tmp_path / "other.mcap")
-
-    monkeypatch.setattr(RecordReader, "__iter__", then_renamed)
-    with pytest.raises(RecordingError, match="one.mcap: cannot read the recording: No such file"):
-        scan(path)
-
-
 def test_what_a_killed_recorder_left_out_on_purpose_is_not_missing_in_the_repaired_file(tmp_path):
     metadata = {"site": "plant", "left_out": "grid,score"}
     writer = RecordingWriter(tmp_path / "r.mcap", metadata, ledger=SequenceLedger(left_out=("grid", "score")))
     keys = (RAW_KEY, RAW_KEY.replace("/raw", "/grid"))
     for number in range(2):
         outputs = tuple(Output(key=key, published=5 * number) for key in keys)
-        health = Health(
-            header=Header("acquisition-1", number, ""),
-            stage="acquisition",
-            instance="tray1",
-            status=StageStatus.OK,
-            t_ns=1,
-            uptime_s=1.0,
-            outputs=outputs,
-        )
-        writer.add_message(health_key("plant", "acquisition", "tray1"), health, number)
+        message = health("acquisition", "tray1", "acquisition-1", number, outputs=outputs)
+        writer.add_message(health_key("plant", "acquisition", "tray1"), message, number)
     writer.flush()
     killed = tmp_path / "killed.mcap"
     killed.write_bytes((tmp_path / "r.mcap.active").read_bytes())

@@ -11,28 +11,19 @@ import pytest
 from pipeline.cli.recordings import info
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.run_recordings import recorded_files, run_metadata
+from pipeline.recordings.run_recordings import recorded_files
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from pipeline.replay.offline.replay_input import open_replay_input
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Counter, Health
+from schemas.health import Counter
 from schemas.topics import health_key, tray_key
 from tests.support.fantwin_command import fantwin
 from tests.support.killed_site import CONFIGURATION, SITE, TRAY, Site
+from tests.support.made_messages import health
 
 TRAYS = (TRAY, "tray2")
 _TRAY_TABLE = CONFIGURATION[CONFIGURATION.index("[[tray]]") : CONFIGURATION.index("[twin_integrator]")]
 OF_BOTH = CONFIGURATION.replace(_TRAY_TABLE, _TRAY_TABLE + _TRAY_TABLE.replace(TRAY, TRAYS[1]))
-HEALTH = Health(
-    header=Header("resampler-all-1", 0, ""),
-    stage="resampler",
-    instance="all",
-    status=StageStatus.OK,
-    t_ns=1,
-    uptime_s=1,
-)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +31,7 @@ def sites(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """The recordings of two sites of one tray, whose scorer was killed."""
     found: list[Path] = []
     for seed in (1, 2):
-        site = Site(tmp_path_factory.mktemp("site"), seed)
+        site = Site(tmp_path_factory.mktemp("site"), seed, raw_samples=4)
         site.run(320)
         site.kill("scorer")
         site.run(80)
@@ -62,13 +53,9 @@ def shard(sites: list[Path], folder: Path, number: int, overrides: str = "[]") -
             message = replace(entry.message, header=header)
             writer.add_message(tray_key(SITE, tray, entry.topic), message, entry.received_t_ns)
         for sequence in range(number):  # the second one has heard the stage of both for longer
-            health = replace(
-                HEALTH,
-                header=Header("resampler-all-1", sequence, ""),
-                counters=(Counter(name="lost_late", value=sequence),),
-                lost=sequence,
-            )
-            writer.add_message(health_key(SITE, "resampler", "all"), health, entries[-1].received_t_ns)
+            late = (Counter(name="lost_late", value=sequence),)
+            report = health("resampler", sequence=sequence, counters=late, lost=sequence)
+            writer.add_message(health_key(SITE, "resampler", "all"), report, entries[-1].received_t_ns)
     return writer.path
 
 
@@ -88,13 +75,6 @@ def test_a_folder_stands_for_what_recorders_have_recorded_there(folder, tmp_path
     assert recorded_files([folder, both[0]]) == both
     with pytest.raises(RecordingError, match="no recording that a recorder has finished in this folder"):
         recorded_files([tmp_path])
-
-
-def test_the_shards_together_know_what_each_knows_about_its_trays(folder):
-    found = run_metadata(recorded_files([folder]))
-    assert found.trays == TRAYS
-    assert {f"{tray}.onnx" for tray in TRAYS} < set(found.attachments)
-    assert [found.speed_unit(tray) for tray in TRAYS] == ["rad/s", "rad/s"]
 
 
 def test_a_replay_of_the_folder_decides_for_all_trays_as_it_was_decided(folder):

@@ -15,9 +15,8 @@ from pipeline.recordings.sequence_ledger import (
     next_sequences,
     sum_by_key,
 )
-from schemas.enums import StageStatus
-from schemas.header import Header
 from schemas.health import Health, Output
+from tests.support import made_messages
 
 KEY, TWIN_KEY = "fantwin/plant/tray1/raw", "fantwin/plant/tray1/twin"
 
@@ -30,16 +29,7 @@ def counted(sequences, before=None, key=KEY, producer="a") -> SequenceLedger:
 
 
 def health(producer: str, published: int, key: str = KEY) -> Health:
-    output = Output(key=key, published=published)
-    return Health(
-        header=Header(producer, 0, ""),
-        stage="acquisition",
-        instance="tray1",
-        status=StageStatus.OK,
-        t_ns=1,
-        uptime_s=1.0,
-        outputs=(output,),
-    )
+    return made_messages.health("acquisition", "tray1", producer, outputs=(Output(key=key, published=published),))
 
 
 def test_messages_in_gaps_are_missing_and_times_are_the_first_and_the_last_also_of_a_clock_that_was_set_back():
