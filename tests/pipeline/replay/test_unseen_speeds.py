@@ -110,7 +110,7 @@ def test_a_speed_that_training_has_not_seen_widens_the_band_and_raises_no_alarm(
 def test_evaluate_counts_the_band_of_a_running_site(folder: Path) -> None:
     twin = folder / "twin.onnx"
     covered = [
-        json.loads(fantwin("evaluate", each, folder / "beyond.mcap", "--json").output)["coverage_2_sigma"]
+        json.loads(fantwin("evaluate", each, folder / "beyond.mcap", "--json").stdout)["coverage_2_sigma"]
         for each in (twin, knows_nothing(twin))
     ]
     assert 1.0 - covered[0] < 0.8 * (1.0 - covered[1]), "a third of the commands are beyond training"
