@@ -65,8 +65,9 @@ def test_after_any_kills_and_requests_a_replay_decides_the_same_and_makes_again_
         return
     assert found.is_equal, found
     assert has_loss or not found.reasons
-    # a scorer that answers a request before its first sample has nothing that a replay could make again
-    snapshots = [each for each in recorded(path, "snapshot") if not each.restored and each.header.input_position]
+    # a scorer that answered a request and was killed before its first score made nothing that can be made again
+    judged = {score.header.producer for score in recorded(whole, "score")}
+    snapshots = [one for one in recorded(path, "snapshot") if not one.restored and one.header.producer in judged]
     assert found.snapshots_equal + found.snapshots_not_comparable == len(snapshots)
     assert has_loss or found.alarms_equal == len(alarms_of(path))
     again = remade(path, whole)

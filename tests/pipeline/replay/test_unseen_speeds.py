@@ -52,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("unseen")
     training = recording(path, "training", rough_run(5, 60.0, high=KNEE))
     healthy = recording(path, "healthy", rough_run(6, 150.0, low=20.0, high=KNEE))
-    result = fantwin("train", training, "-o", path / "twin.onnx")
+    result = fantwin("train", training, "--iterations", 12, "-o", path / "twin.onnx")
     assert result.exit_code == 0, result.output
     result = fantwin("calibrate", path / "twin.onnx", healthy, "--false-alarms-per-day", 24, "--extrapolate")
     assert result.exit_code == 0, result.output
