@@ -51,7 +51,6 @@ def container(stateful_set: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("version", [OLDEST, NEWEST])
 @pytest.mark.parametrize(
     "values",
     [
@@ -62,11 +61,12 @@ def container(stateful_set: dict[str, Any]) -> dict[str, Any]:
     ],
     ids=str,
 )
-def test_what_is_rendered_fits_the_schemas_of_kubernetes(values, version):
+def test_what_is_rendered_fits_the_schemas_of_kubernetes(values):
     documents = rendered(**values)
     assert {"ConfigMap", "Service", "StatefulSet"} <= {each["kind"] for each in documents}
     for document in documents:
-        schemas.validate(document, version, strict=True)
+        for version in (OLDEST, NEWEST):
+            schemas.validate(document, version, strict=True)
 
 
 def test_helm_finds_nothing_to_complain_about():
@@ -93,13 +93,10 @@ def test_wrong_values_are_refused(values):
         rendered(**values)
 
 
-def test_a_stage_without_shards_has_no_pods():
+def test_another_number_of_shards_is_another_set_with_pods_and_a_service_of_its_own_and_without_shards_there_is_none():
     assert set(of_kind("StatefulSet", rendered(stages={"scorer": {"shards": 0}}))) == {
         f"plant-{stage}-of-1" for stage in ("resampler", "twin-integrator", "recorder")
     }
-
-
-def test_another_number_of_shards_is_another_set_with_pods_and_a_service_of_its_own():
     for shards in (2, 3):
         (of_scorer,) = (
             each
@@ -115,32 +112,33 @@ def test_another_number_of_shards_is_another_set_with_pods_and_a_service_of_its_
     assert max(map(len, names)) <= 52, "the hash of the revision is appended to it in a label of 63 characters"
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_the_pods_of_a_stage_share_the_trays_by_their_ordinals(stages, stage):
-    spec = stages[stage]["spec"]
-    assert (spec["replicas"], spec["ordinals"]) == (3, {"start": 1})
-    (ordinal,) = (each for each in container(stages[stage])["env"] if each["name"] == "SHARD")
-    assert ordinal["valueFrom"]["fieldRef"]["fieldPath"] == "metadata.labels['apps.kubernetes.io/pod-index']"
-    for number in (1, 2, 3):
-        words = [word.replace("$(SHARD)", str(number)) for word in container(stages[stage])["args"]]
-        found = parsed(words)
-        assert (found["stage"], found["shard"]) == (stage, f"{number}/3")
-        assert {"bus.mode=client", "bus.endpoint=tls/plant-router:7447"} <= set(found["overrides"])
+def test_the_pods_of_a_stage_share_the_trays_and_keep_what_must_survive_them(stages):
+    for stage, stateful_set in stages.items():
+        spec, pod = stateful_set["spec"], container(stateful_set)
+        assert (spec["replicas"], spec["ordinals"]) == (3, {"start": 1})
+        (ordinal,) = (each for each in pod["env"] if each["name"] == "SHARD")
+        assert ordinal["valueFrom"]["fieldRef"]["fieldPath"] == "metadata.labels['apps.kubernetes.io/pod-index']"
+        for number in (1, 3):
+            found = parsed([word.replace("$(SHARD)", str(number)) for word in pod["args"]])
+            assert (found["stage"], found["shard"]) == (stage, f"{number}/3")
+            assert {"bus.mode=client", "bus.endpoint=tls/plant-router:7447"} <= set(found["overrides"])
+        assert ("--set=scorer.asks_for_snapshots=true" in pod["args"]) == (stage == "scorer")
+        claims = [each["metadata"]["name"] for each in spec.get("volumeClaimTemplates", ())]
+        volumes = [each["name"] for each in spec["template"]["spec"]["volumes"]]
+        is_kept = bool(MANY[stage]["storage"])
+        assert (claims, "run" in volumes) == ((["run"], False) if is_kept else ([], True)), stage
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_a_pod_is_ready_when_its_own_process_is_at_work(stages, stage, tmp_path):
+def test_a_pod_is_ready_when_its_own_process_is_at_work_and_alive_while_its_main_loop_renews_its_file(stages, tmp_path):
     program = tmp_path / "fantwin"
     program.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
     program.chmod(0o755)
-    command = container(stages[stage])["readinessProbe"]["exec"]["command"]
     environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "SHARD": "2"}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    found = parsed(done.stdout.splitlines())
-    assert (found["stage"], found["shard"]) == (stage, "2/3")
-
-
-def test_a_pod_is_alive_while_its_main_loop_renews_its_file(stages, tmp_path):
+    for stage in ("scorer", "twin_integrator"):
+        command = container(stages[stage])["readinessProbe"]["exec"]["command"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+        found = parsed(done.stdout.splitlines())
+        assert (found["stage"], found["shard"]) == (stage, "2/3")
     file = tmp_path / "alive"
     env = {each["name"]: each.get("value") for each in container(stages["scorer"])["env"]}
     assert env["FANTWIN_ALIVE_FILE"] == "/tmp/alive"
@@ -156,22 +154,12 @@ def test_a_pod_is_alive_while_its_main_loop_renews_its_file(stages, tmp_path):
     assert not is_alive()
 
 
-def test_only_what_must_survive_a_pod_has_a_claim(stages):
-    for stage, stateful_set in stages.items():
-        claims = [each["metadata"]["name"] for each in stateful_set["spec"].get("volumeClaimTemplates", ())]
-        volumes = [each["name"] for each in stateful_set["spec"]["template"]["spec"]["volumes"]]
-        is_kept = bool(MANY[stage]["storage"])
-        assert (claims, "run" in volumes) == ((["run"], False) if is_kept else ([], True)), stage
-
-
-def test_only_pods_of_the_site_reach_its_router():
-    (policy,) = of_kind("NetworkPolicy", rendered()).values()
+def test_a_pod_has_the_certificate_of_its_own_role_only_and_only_pods_of_the_site_reach_their_router(stages):
+    documents = rendered()
+    (policy,) = of_kind("NetworkPolicy", documents).values()
     (peer,) = policy["spec"]["ingress"][0]["from"]
     assert peer["podSelector"]["matchLabels"]["app.kubernetes.io/instance"] == "plant"
-
-
-def test_a_pod_has_the_certificate_of_its_own_role_only_and_its_commands_find_it(stages):
-    (router,) = of_kind("Deployment", rendered()).values()
+    (router,) = of_kind("Deployment", documents).values()
     for role, pods in {**stages, "router": router}.items():
         (volume,) = (each for each in pods["spec"]["template"]["spec"]["volumes"] if each["name"] == "certificates")
         files = {each["path"] for each in volume["secret"]["items"]}
@@ -190,9 +178,3 @@ def test_without_certificates_every_command_says_that_it_is_insecure():
         words = container(pods)["args"]
         assert "--insecure" in words
         assert not any("certs" in word or "tls" in word for word in words)
-
-
-def test_the_pods_of_the_scorer_ask_for_the_snapshots_of_those_before_them(stages):
-    for stage, stateful_set in stages.items():
-        words = container(stateful_set)["args"]
-        assert ("--set=scorer.asks_for_snapshots=true" in words) == (stage == "scorer")

@@ -15,11 +15,10 @@ from pipeline.config.models import BusConfig
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.tracked_streams import Request
 from schemas.codec import decode, encode, type_name
-from schemas.enums import Severity
 from schemas.envelope import Envelope
-from schemas.header import Header
 from schemas.messages import Alarm
 from schemas.topics import BY_NAME, tray_key
+from tests.support import made_messages
 
 KEY = tray_key("site", "tray", "alarm")
 TOPIC = BY_NAME["alarm"]
@@ -35,17 +34,7 @@ def publish(bus: Bus, count: int) -> None:
 
 
 def alarm(sequence: int) -> Alarm:
-    return Alarm(
-        header=Header("peer", sequence, "tray"),
-        fan=0,
-        active=True,
-        severity=Severity.ALARM,
-        t_ns=sequence,
-        onset_t_ns=0,
-        residual_rad_s=0,
-        limit_rad_s=0,
-        message="x" * 200,
-    )
+    return made_messages.alarm(0, sequence, "tray", "peer", sequence, onset_t_ns=0, message="x" * 200)
 
 
 def collect(bus: Bus, count: int) -> None:

@@ -22,6 +22,7 @@ from schemas.header import Header
 from schemas.health import Health, Output
 from schemas.messages import Raw
 from schemas.topics import BY_NAME, health_key, tray_key
+from tests.support.made_messages import health
 from tests.support.running_chain import eventually
 from tests.support.secured_site import SITE, SecuredSite
 
@@ -96,16 +97,9 @@ class Sender:
 
     def send_health(self) -> None:
         """That it is there, and what it publishes."""
-        health = Health(
-            header=Header(self.producer, self._health.published, ""),
-            stage="acquisition",
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=HOST_CLOCK.now_ns(),
-            uptime_s=1,
-            outputs=(Output(key=self._raw.key, published=self._raw.published),),
-        )
-        self._health.put(encode(health))
+        outputs = (Output(key=self._raw.key, published=self._raw.published),)
+        about = {"sequence": self._health.published, "t_ns": HOST_CLOCK.now_ns(), "outputs": outputs}
+        self._health.put(encode(health("acquisition", producer=self.producer, **about)))
 
 
 def samples(began_ns: int, number: int) -> Raw:

@@ -9,10 +9,10 @@ import numpy as np
 
 from pipeline.recordings.reading import read_recording
 from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import Severity
 from schemas.header import Header
 from schemas.messages import Alarm, Array, Raw
 from schemas.topics import tray_key
+from tests.support import made_messages
 from twin.runs import Run
 
 RAW_KEY = tray_key("plant", "tray1", "raw")
@@ -35,17 +35,7 @@ def raw(sequence: int, samples: int = 10, fans: int = 2) -> Raw:
 
 
 def alarm(sequence: int) -> Alarm:
-    return Alarm(
-        header=Header("scorer-1", sequence, "tray1"),
-        fan=1,
-        active=True,
-        severity=Severity.ALARM,
-        t_ns=7,
-        onset_t_ns=5,
-        residual_rad_s=3.0,
-        limit_rad_s=2.0,
-        message="fan 1 is slower than its twin",
-    )
+    return made_messages.alarm(1, 7, sequence=sequence, onset_t_ns=5, message="fan 1 is slower than its twin")
 
 
 def write(path: Path, messages: int, **options: Any) -> Path:

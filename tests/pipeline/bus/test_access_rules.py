@@ -92,11 +92,11 @@ def test_who_may_publish_what(site):
                 put(session, tray_key(SITE, tray, topic), role.encode())
                 if may_write(role, topic, tray):
                     allowed.add((tray_key(SITE, tray, topic), role))
+            session.delete(tray_key(SITE, "a", topic))
         for stage, instance in PROCESSES:
             put(session, health_key(SITE, stage, instance), role.encode())
             if is_process_of(role, stage, instance):
                 allowed.add((health_key(SITE, stage, instance), role))
-        session.delete(tray_key(SITE, "a", "raw"))
         put(session, rights_key(SITE, role), role.encode())
         put(session, "another/key", role.encode())
         site.flush(role)
@@ -165,7 +165,7 @@ def test_who_may_answer_for_what_was_missed_and_who_may_ask(site):
             }
             assert answers(site, "router", recovery_key(key, "*")) == writers, key
             assert answers(site, "router", kept_key(key, "*")) == keepers, key
-            for role in roles(site):
+            for role in (each for each in roles(site) if tray == "a" or "." in each):  # the others are for both trays
                 expected = writers if may_read(role, topic, tray) else set()
                 assert answers(site, role, recovery_key(key, "*")) - {role} == expected - {role}, (role, key)
     kept = kept_key(tray_key(SITE, "a", "snapshot"), "*")

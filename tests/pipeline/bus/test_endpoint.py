@@ -49,8 +49,7 @@ def test_row_15_other_endpoints_are_left_to_zenoh(endpoint):
     assert endpoint_problem(endpoint) == ""
 
 
-@pytest.mark.parametrize("mode", ["peer", "client"])
-@pytest.mark.parametrize("stop", [None, threading.Event()])
+@pytest.mark.parametrize(("mode", "stop"), [("peer", None), ("client", threading.Event())])
 def test_row_15_a_foreign_program_at_the_endpoint_is_one_line(foreign, monkeypatch, mode, stop):
     monkeypatch.setattr("pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
     with pytest.raises(BusError) as refused:
@@ -62,15 +61,12 @@ def test_row_15_a_foreign_program_at_the_endpoint_is_one_line(foreign, monkeypat
 
 
 @pytest.mark.parametrize("mode", ["peer", "client"])
-def test_row_15_without_certificates_at_a_port_with_tls_is_one_line_that_says_so(tmp_path, monkeypatch, mode):
+def test_row_15_tls_on_one_side_only_is_one_line_that_says_so(tmp_path, monkeypatch, foreign, mode):
     monkeypatch.setattr("pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
     with SecuredSite(tmp_path, free_endpoint()).running() as site, pytest.raises(BusError) as refused:
         Bus(BusConfig(mode=mode, endpoint=site.endpoint.replace("tls/", "tcp/")))
     assert "the program that listens there takes TLS only: give this configuration" in str(refused.value)
-
-
-def test_row_15_certificates_at_a_port_without_tls_are_one_line_that_says_so(tmp_path, foreign):
-    site = SecuredSite(tmp_path, foreign)
+    site = SecuredSite(tmp_path, foreign, is_new=False)
     with pytest.raises(BusError, match="the program that listens there takes no TLS: it has no"):
         join_bus(site.config, roles=("viewer",))
 
@@ -89,14 +85,9 @@ def test_row_15_a_command_tries_again_where_a_router_is_just_starting(endpoint, 
             assert bus.alive("fantwin/**") == set()
 
 
-def test_row_15_where_nobody_listens_nobody_is_waited_for(endpoint):
+def test_row_15_where_nobody_listens_nobody_is_waited_for_and_a_process_that_answers_is_no_foreign_program(endpoint):
     assert not somebody_listens(endpoint)
     assert not accepts_connections(endpoint)
-    with Bus(BusConfig(endpoint=endpoint)) as bus:
-        bus.wait_for_others(threading.Event())
-
-
-def test_row_15_a_process_that_answers_is_no_foreign_program(endpoint):
     with Bus(BusConfig(endpoint=endpoint)), Bus(BusConfig(endpoint=endpoint)) as second:
         assert somebody_listens(endpoint)
         assert accepts_connections(endpoint)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from queue import SimpleQueue
 
-import pytest
-
 from pipeline.bus import publisher as publisher_module
 from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
 from pipeline.bus.recovery import Answer
@@ -30,11 +28,10 @@ def test_row_16_what_is_sent_while_a_link_is_lost_for_30_s_is_kept(endpoint):
         assert len(asker.recover(key)) == CATCH_UP_MESSAGES
 
 
-@pytest.mark.parametrize("name", ["recover", "kept"])
-def test_a_site_or_tray_may_have_a_name_of_which_other_keys_are_made(endpoint, name):
+def test_a_site_or_tray_may_have_a_name_of_which_other_keys_are_made(endpoint):
     config, topic = BusConfig(endpoint=endpoint), BY_NAME["snapshot"]
     with Bus(config) as bus, Bus(config) as asker:
-        for key in (tray_key("s", name, "snapshot"), tray_key(name, "a", "snapshot"), tray_key(name, name, "snapshot")):
+        for key in (tray_key("s", "recover", "snapshot"), tray_key("kept", "recover", "snapshot")):
             bus.publisher(key, topic, "", "p").put(b"one")
             asked: list[str] = []
             with answer_for_kept(bus._session, key, "recorder", lambda query, asked=asked: answer(query, asked)):
@@ -48,12 +45,10 @@ def answer(query: KeptQuery, asked: list[str]) -> None:
     query.answer(b"one")
 
 
-@pytest.mark.parametrize(
-    ("first", "last", "newest"), [(0, 99, 3), (0, 99, None), (5, 7, 2), (97, 200, 1), (100, 200, 1)]
-)
-def test_a_request_for_a_range_is_answered_with_what_is_kept_of_it_or_its_newest(
-    endpoint, monkeypatch, first: int, last: int, newest: int | None
-):
+RANGES: list[tuple[int, int, int | None]] = [(0, 99, 3), (0, 99, None), (5, 7, 2), (97, 200, 1), (100, 200, 1)]
+
+
+def test_a_request_for_a_range_is_answered_with_what_is_kept_of_it_or_its_newest(endpoint, monkeypatch):
     monkeypatch.setattr(publisher_module, "KEPT_BYTES", 60)
     key, answers = tray_key("s", "a", "raw"), SimpleQueue[Answer]()
     config = BusConfig(endpoint=endpoint)
@@ -62,11 +57,12 @@ def test_a_request_for_a_range_is_answered_with_what_is_kept_of_it_or_its_newest
         for number in range(100):
             publisher.put(bytes([number]))
         eventually(lambda: asker.recover(key, "p"), "they have met")
-        asker.request_missed(key, "p", first, last, 20.0, answers.put, newest)
-        answer = answers.get(timeout=20)
-    kept = [number for number in range(40, 100) if first <= number <= last]
-    assert [payload[0] for _, payload in answer.messages] == (kept[-newest:] if newest else kept)
-    assert answer.published == (None if newest else 100)
+        for first, last, newest in RANGES:
+            asker.request_missed(key, "p", first, last, 20.0, answers.put, newest)
+            answer = answers.get(timeout=20)
+            kept = [number for number in range(40, 100) if first <= number <= last]
+            assert [payload[0] for _, payload in answer.messages] == (kept[-newest:] if newest else kept)
+            assert answer.published == (None if newest else 100)
 
 
 def test_row_16_publishers_of_a_process_keep_a_bounded_number_of_bytes_together(endpoint, monkeypatch):

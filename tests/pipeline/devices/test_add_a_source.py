@@ -77,6 +77,9 @@ def test_a_new_source_shares_range_checks_units_blocks_and_loss_counting() -> No
     assert (counts["samples"], counts["absurd_speed"], counts["lost_on_line"]) == (3, 2, 2)
     parts.core.tick(10_000_000_000)
     assert parts.core.problem().startswith("toy: nothing received for 2 s")
+    others, _ = built(CONFIGURATION.replace("fans = 2", "fans = 3"))
+    assert [message for event in events_of(others) for message in parts.core.step(event)] == []
+    assert parts.core.counters()["wrong_fan_count"] == 3
 
 
 def test_what_a_source_states_to_measure_is_in_its_messages_unless_the_tray_says_otherwise() -> None:
@@ -109,13 +112,6 @@ def test_commands_reach_a_new_source_in_the_unit_of_its_tray() -> None:
     assert parts.core.counters()["refused_commands"] == 1
 
 
-def test_a_reading_with_another_number_of_fans_is_refused_and_counted() -> None:
-    parts, _ = built()
-    others, _ = built(CONFIGURATION.replace("fans = 2", "fans = 3"))
-    assert [message for event in events_of(others) for message in parts.core.step(event)] == []
-    assert parts.core.counters()["wrong_fan_count"] == 3
-
-
 @pytest.mark.parametrize(
     ("source", "words"),
     [
@@ -139,21 +135,16 @@ TRAY = '[[tray]]\nname = "a"\nfans = 1\n'
 
 
 def test_port_baud_and_protocol_in_the_tray_are_the_short_form_of_a_serial_source() -> None:
-    short = parse_config(TRAY + 'port = "/dev/ttyUSB0"\nbaud = 9600\nprotocol = "text"\n', Path("fantwin.toml"))
+    def source_of(text: str, *overrides: str) -> object:
+        (tray,) = parse_config(TRAY + text, Path("fantwin.toml"), overrides).trays
+        return tray.source
+
+    usb = 'port = "/dev/ttyUSB0"\n'
     keys = 'kind = "serial", port = "/dev/ttyUSB0", baud = 9600, protocol = "text"'
-    long = parse_config(TRAY + f"source = {{ {keys} }}\n", Path("fantwin.toml"))
-    assert short.trays == long.trays
-    assert short.trays[0].source == SerialConfig(port="/dev/ttyUSB0", baud=9600, protocol="text")
-
-
-@pytest.mark.parametrize("override", ["tray.0.port=/dev/ttyACM1", "tray.0.source.port=/dev/ttyACM1"])
-def test_the_port_can_be_set_on_the_command_line_in_the_form_of_the_file(override: str) -> None:
-    form = 'port = "/dev/ttyUSB0"' if override.startswith("tray.0.port") else 'source = { kind = "serial" }'
-    config = parse_config(TRAY + form, Path("fantwin.toml"), [override])
-    assert config.trays[0].source == SerialConfig(port="/dev/ttyACM1")
-
-
-def test_short_form_and_source_together_are_refused() -> None:
-    text = TRAY + 'port = "/dev/ttyUSB0"\nsource = { kind = "toy", speeds = [] }\n'
+    expected = SerialConfig(port="/dev/ttyUSB0", baud=9600, protocol="text")
+    assert source_of(usb + 'baud = 9600\nprotocol = "text"\n') == source_of(f"source = {{ {keys} }}\n") == expected
+    assert source_of(usb, "tray.0.port=/dev/ttyACM1") == SerialConfig(port="/dev/ttyACM1")
+    long = 'source = { kind = "serial" }'
+    assert source_of(long, "tray.0.source.port=/dev/ttyACM1") == SerialConfig(port="/dev/ttyACM1")
     with pytest.raises(ConfigError, match="port and source are both given; put port into source"):
-        parse_config(text, Path("fantwin.toml"))
+        source_of(usb + 'source = { kind = "toy", speeds = [] }\n')

@@ -20,6 +20,8 @@ EPOCH_NS = 1_700_000_000_000_000_000
 MS, US = 1_000_000, 1_000
 STEP_NS = 10 * MS
 SMALLEST_DELAY_NS = 300 * US
+AWAY_US = UINT32 + 30_000_000
+"""a silence after which the clock looks as if half a minute had passed"""
 
 
 @dataclass(frozen=True)
@@ -93,30 +95,34 @@ def test_times_approach_a_new_line_and_never_jump_to_it() -> None:
     assert np.abs(error_ns[-1_000:]).max() < 20 * MS
 
 
-def test_a_wrap_of_the_clock_makes_no_difference() -> None:
+@pytest.mark.parametrize(
+    ("before", "after", "segments"),
+    [
+        pytest.param(sampled(30, jitter_ms=0.1, clock_starts_us=UINT32 - 15_000_000), None, 1, id="the clock wraps"),
+        *(
+            pytest.param(
+                sampled(20, jitter_ms=0.1, clock_starts_us=uptime_us),
+                sampled(20, jitter_ms=0.1, starts_ns=EPOCH_NS + 25 * NS_PER_S),
+                2,
+                id=f"the device restarts after {uptime_us // 1_000_000} s",
+            )
+            for uptime_us in (5_000_000, 3_000_000_000)
+        ),
+        pytest.param(
+            sampled(20, jitter_ms=0.1),
+            sampled(20, jitter_ms=0.1, starts_ns=EPOCH_NS + AWAY_US * US, clock_starts_us=AWAY_US),
+            2,
+            id="a silence in which it may have wrapped",
+        ),
+    ],
+)
+def test_times_are_right_when_the_clock_wraps_and_a_new_segment_begins_when_it_may_not_continue(
+    before: ClockReadings, after: ClockReadings | None, segments: int
+) -> None:
     clock = DeviceClock()
-    error_ns = sampled(30, jitter_ms=0.1, clock_starts_us=UINT32 - 15_000_000).error_ns(clock)
-    assert clock.segments == 1
+    error_ns = (joined(before, after) if after else before).error_ns(clock)
+    assert clock.segments == segments
     assert np.abs(error_ns).max() < 1 * MS
-
-
-@pytest.mark.parametrize("uptime_us", [5_000_000, 3_000_000_000])
-def test_a_device_that_restarts_begins_a_new_segment(uptime_us: int) -> None:
-    before = sampled(20, jitter_ms=0.1, clock_starts_us=uptime_us)
-    after = sampled(20, jitter_ms=0.1, starts_ns=EPOCH_NS + 25 * NS_PER_S)
-    clock = DeviceClock()
-    error_ns = joined(before, after).error_ns(clock)
-    assert clock.segments == 2
-    assert np.abs(error_ns).max() < 1 * MS
-
-
-def test_a_silence_in_which_the_clock_may_have_wrapped_begins_a_new_segment() -> None:
-    before = sampled(20, jitter_ms=0.1)
-    away_us = UINT32 + 30_000_000  # the clock looks as if half a minute had passed
-    after = sampled(20, jitter_ms=0.1, starts_ns=EPOCH_NS + away_us * US, clock_starts_us=away_us)
-    clock = DeviceClock()
-    assert np.abs(joined(before, after).error_ns(clock)).max() < 1 * MS
-    assert clock.segments == 2
 
 
 def test_a_correction_does_not_grow_while_no_samples_arrive() -> None:
@@ -128,7 +134,7 @@ def test_a_correction_does_not_grow_while_no_samples_arrive() -> None:
     assert error_ns[501] > error_ns[500] - 11 * MS  # the drift of one bucket, not of 300 s
 
 
-@pytest.mark.parametrize("set_by_s", [30, 3600, -3600])
+@pytest.mark.parametrize("set_by_s", [30, -3600])
 def test_a_host_clock_that_is_set_begins_a_new_segment(set_by_s: int) -> None:
     line = sampled(60, jitter_ms=0.1)
     shift_ns = np.where(np.arange(6000) >= 3000, set_by_s * NS_PER_S, 0)
@@ -137,15 +143,6 @@ def test_a_host_clock_that_is_set_begins_a_new_segment(set_by_s: int) -> None:
     error_ns = moved.error_ns(clock)
     assert clock.segments == 2
     assert np.abs(error_ns[-2_000:]).max() < 1 * MS
-
-
-def test_a_host_that_stalls_for_three_seconds_does_not_disturb_the_times() -> None:
-    line = sampled(60, jitter_ms=0.1)
-    stalled = (line.receive_t_ns > EPOCH_NS + 30 * NS_PER_S) & (line.receive_t_ns < EPOCH_NS + 33 * NS_PER_S)
-    receive_t_ns = np.where(stalled, EPOCH_NS + 33 * NS_PER_S, line.receive_t_ns)
-    clock = DeviceClock()
-    assert np.abs(ClockReadings(line.true_t_ns, line.clock_us, receive_t_ns).error_ns(clock)).max() < 1 * MS
-    assert clock.segments == 1
 
 
 def test_old_samples_that_come_again_change_nothing() -> None:
@@ -160,7 +157,7 @@ def test_old_samples_that_come_again_change_nothing() -> None:
     )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     drift=st.floats(-1e-3, 1e-3),
     jitter_ms=st.floats(0.0, 5.0),

@@ -129,7 +129,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(JSON)
 def test_no_json_raises_anything_else(value: object) -> None:
     try:

@@ -73,7 +73,8 @@ def test_registers_of_all_types_are_read_by_one_request_and_a_command_moves_the_
         made.disconnect()
 
 
-def test_what_is_refused_is_nan_but_the_command_must_be_there() -> None:
+def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -> None:
+    without = {key: value for key, value in FAN.items() if key != "write"}
     with modbus_server({3: drive()}) as port:
         made = device(port, FAN | {"speed": {"address": REFUSED}})
         assert math.isnan(made.read().speed[0])
@@ -82,11 +83,6 @@ def test_what_is_refused_is_nan_but_the_command_must_be_there() -> None:
         with pytest.raises(DeviceError, match=r"command of fan 0 cannot be read: unit 3 refuses input register 200"):
             made.read()
         made.disconnect()
-
-
-def test_a_command_that_the_drive_refuses_or_that_no_register_takes_is_an_error() -> None:
-    without = {key: value for key, value in FAN.items() if key != "write"}
-    with modbus_server({3: drive()}) as port:
         made = device(port)
         with pytest.raises(DeviceError, match=r"unit 3 refuses 1.5 for register 100 \(exception 3\)"):
             made.write((1.5,), ())
@@ -96,34 +92,6 @@ def test_a_command_that_the_drive_refuses_or_that_no_register_takes_is_an_error(
         closed = device(port, without)
         assert not closed.is_writable
         closed.disconnect()
-
-
-def test_a_unit_that_does_not_answer_is_a_failed_poll_and_a_server_that_ends_is_lost() -> None:
-    slow = drive()
-    with modbus_server({3: slow}) as port:
-        made = device(port)
-        made.read()  # the first one waits for the simulation
-        made.disconnect()
-        made = device(port, timeout_s=0.1)
-        slow.delay_s = 0.5
-        with pytest.raises(DeviceError, match=r"^unit 3 does not answer within 0.1 s; check unit and wiring$"):
-            made.read()
-        slow.delay_s = 0.0
-        made.disconnect()
-    with pytest.raises(DeviceError, match=r"^cannot be opened or reached; waiting for it$") as caught:
-        device(port)
-    assert caught.value.is_lost
-
-
-def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = ModbusConfig.model_validate({"port": "/dev/ttyUSB7", "baud": 9600, "parity": "O", "fan": (FAN,)})
-    made = ModbusDevice(settings, SourceContext(1, "rpm", Path()))
-    client = made._made_client()
-    line = client.comm_params
-    assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 1)
-    assert made.check()[0].startswith("/dev/ttyUSB7: no such port")
-    with pytest.raises(DeviceError, match=r"^no such port, is it unplugged\?; waiting for it$"):
-        made.connect()
 
 
 def over_serial(line: SerialLine, **settings: Any) -> tuple[ModbusConfig, SourceContext]:
@@ -176,13 +144,13 @@ def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_
         made.connect()
         made.read()  # the first one waits for the simulation
         made.disconnect()
-        made = ModbusDevice(*over_serial(line, timeout_s=0.2))
+        made = ModbusDevice(*over_serial(line, timeout_s=1.0))
         made.connect()
-        slow.delay_s = 0.4
-        with pytest.raises(DeviceError, match=r"unit 3 does not answer within 0.2 s; check unit and wiring") as caught:
+        slow.delay_s = 1.5
+        with pytest.raises(DeviceError, match=r"unit 3 does not answer within 1 s; check unit and wiring") as caught:
             made.read()
         assert not caught.value.is_lost
         slow.delay_s = 0.0
-        time.sleep(0.4)
+        time.sleep(1.5)
         assert made.read().supply_voltage_v == pytest.approx((540.25,))
         made.disconnect()

@@ -110,8 +110,3 @@ def test_what_still_waits_when_the_source_stops_is_delivered_and_none_stays() ->
     blocks.stop()
     assert [times_ms(event) for event in events] == [[980], [990, 999]]
     assert blocks.take_rest() is None
-
-
-def test_a_stage_that_ends_before_its_source_takes_the_rest(blocks: SampleBlocks) -> None:
-    blocks.add(batch(1010))
-    assert times_ms(blocks.take_rest()) == [1010]

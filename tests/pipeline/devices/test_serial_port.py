@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import queue
 import threading
-import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,13 +13,8 @@ from typing import TypeVar, cast
 import pytest
 import serial
 
-from pipeline.config.models import TrayConfig
 from pipeline.devices.sample_source import LinkDown, LinkUp
-from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.serial_port import ReceivedBytes, SerialPort
-from schemas.wire import CommandFrame, Decoder, Sample, encode
-from stages.acquisition import AcquisitionConfig
-from tests.support.serial_core import SerialCore
 
 TIMEOUT_S = 20.0  # of a wait that normally ends at once
 T = TypeVar("T")
@@ -110,20 +104,9 @@ def test_every_byte_value_passes_unchanged_in_both_directions(device: Device, li
     assert device.receive(512) == everything
 
 
-def test_a_file_that_is_not_a_serial_port_is_reported_and_waited_for(device: Device, line: SerialPort) -> None:
-    device.path.write_text("a file")
-    items = Items()
-    line.start(items.queue.put)
-    reason = items.next(LinkDown).reason
-    assert reason.startswith("cannot be opened (")
-    assert reason.endswith("check [[tray]] port and baud")
-    device.path.unlink()
-    assert items.next(LinkDown).reason.startswith("no such port"), "another reason is reported too"
-    device.plug_in()
-    items.next(LinkUp)
-
-
-def test_a_port_in_use_is_reported_and_opened_when_it_is_free(device: Device, line: SerialPort) -> None:
+def test_a_port_in_use_is_opened_when_it_is_free_and_a_file_that_is_no_port_is_reported(
+    device: Device, line: SerialPort, tmp_path: Path
+) -> None:
     device.plug_in()
     first, items = Items(), Items()
     other = SerialPort(str(device.path), 115200)
@@ -133,6 +116,13 @@ def test_a_port_in_use_is_reported_and_opened_when_it_is_free(device: Device, li
     assert items.next(LinkDown).reason == "in use by another program; stop that one"
     other.stop()
     items.next(LinkUp)
+    line.stop()
+    (file := tmp_path / "file").touch()
+    no_port = SerialPort(str(file), 115200)
+    no_port.start(items.queue.put)
+    reason = items.skip_until(LinkDown).reason
+    assert reason.startswith("cannot be opened (") and reason.endswith("check [[tray]] port and baud")
+    no_port.stop()
 
 
 def test_stop_delivers_the_bytes_that_had_arrived_and_no_more(device: Device) -> None:
@@ -182,45 +172,6 @@ def test_write_reports_a_device_that_accepts_no_bytes_instead_of_blocking(device
     line.start(items.queue.put)
     items.next(LinkUp)
     assert not all(line.write(bytes(4096)) for _ in range(100)), "a terminal holds less than that"
-
-
-def test_samples_continue_after_the_device_was_away_and_health_reports_it_meanwhile(
-    device: Device, line: SerialPort
-) -> None:
-    tray = TrayConfig(name="bench", fans=1, source=SerialConfig(port=str(device.path)))
-    core = SerialCore(tray, AcquisitionConfig(block_s=0.0), line, started_t_ns=time.time_ns())
-    items = Items()
-    sequences: list[int] = []
-
-    def sequence(number: int) -> bytes:
-        return encode("binary", Sample(number * 10_000, number, (0.5,), (100.0,)))
-
-    def step_until(wanted: int) -> None:
-        while wanted not in sequences:
-            for raw in core.step(items.queue.get(timeout=TIMEOUT_S)):
-                sequences.extend(raw.device_sequence.tolist())
-
-    device.plug_in()
-    line.start(items.queue.put)
-    core.step(items.next(LinkUp))
-    device.send(sequence(0) + sequence(1) + sequence(2)[:9])
-    step_until(1)
-    device.unplug()
-    while not core.problem():
-        core.step(items.queue.get(timeout=TIMEOUT_S))
-    assert core.problem().startswith(f"{device.path}: ")
-    device.plug_in()
-    while core.problem():
-        core.step(items.queue.get(timeout=TIMEOUT_S))
-    device.send(sequence(4)[9:] + sequence(5) + sequence(6))
-    step_until(6)
-    assert sequences == [0, 1, 5, 6]
-    counters = core.counters()
-    assert (counters["lost_on_line"], counters["line_up"], counters["resync"]) == (3, 2, 1)
-    assert "truncated" not in counters
-    assert line.write(encode("binary", CommandFrame((0.25,))))
-    command = encode("binary", CommandFrame((0.25,)))
-    assert Decoder("binary", 1, "device").feed(device.receive(len(command))) == [CommandFrame((0.25,))]
 
 
 def test_a_byte_that_came_just_before_the_device_was_disconnected_is_delivered():

@@ -30,7 +30,7 @@ def readings(tacho: Tacho, rate_hz: float, duration_s: float = 300.0, seed: int 
     return t_s, printed
 
 
-@pytest.mark.parametrize(("window_s", "rate_hz"), [(0.5, 100.0), (0.75, 10.0), (1.0, 1.0), (1.0, 2.0)])
+@pytest.mark.parametrize(("window_s", "rate_hz"), [(0.5, 100.0), (0.75, 10.0), (1.0, 1.0)])
 def test_a_count_is_found_at_any_rate_of_reports(window_s: float, rate_hz: float) -> None:
     found = find_tacho(*readings(Tacho(kind="count", window_s=window_s), rate_hz))
     assert found is not None

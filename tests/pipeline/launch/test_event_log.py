@@ -98,10 +98,5 @@ def test_a_line_that_comes_every_second_is_written_less_and_less_often():
         3 * FOLD_S: ["the disk is full ... repeated 20 times"],
         7 * FOLD_S: ["the disk is full ... repeated 40 times"],
     }
-
-
-def test_a_line_that_comes_again_later_is_written_again():
     lines = RepeatedLines()
-    assert lines.add("a", 0) == ["a"]
-    assert lines.due(FOLD_S) == []
-    assert lines.add("a", FOLD_S) == ["a"]
+    assert (lines.add("a", 0), lines.due(FOLD_S), lines.add("a", FOLD_S)) == (["a"], [], ["a"]), "later it is again"

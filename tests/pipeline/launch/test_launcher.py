@@ -9,7 +9,6 @@ import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, cast
@@ -21,26 +20,14 @@ from pipeline.config.shards import Shard
 from pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
 from pipeline.errors import UserError
 from pipeline.launch.launcher import Launcher, Outcome, _Slot
-from pipeline.launch.notices import Notices
 from pipeline.launch.processes import Child, StageProcess, process_list
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health
 from schemas.topics import alive_key
 from tests.pipeline.launch.test_site_watcher import StubBus
+from tests.support.made_messages import health
 from tests.support.running_chain import DEMO, SITE, Chain
 from tests.support.site_certificates import SiteCertificates
-
-HEALTH = Health(
-    header=Header("recorder-all-1", 0, ""),
-    stage="recorder",
-    instance="all",
-    status=StageStatus.OK,
-    t_ns=1,
-    uptime_s=1.0,
-    process_id=7,
-)
 
 
 @pytest.fixture
@@ -182,15 +169,19 @@ def search_time_s(bus: Any, monkeypatch: pytest.MonkeyPatch, *settings: str) -> 
     return bus.now_s - 100.0
 
 
-def test_a_second_launcher_searches_for_stages_of_its_site_for_two_seconds(monkeypatch):
+def test_a_second_launcher_searches_for_stages_of_its_site_for_two_seconds_and_the_first_does_not(monkeypatch):
     with pytest.raises(UserError, match=r"site 'demo' already runs at \S+ \(scorer\): stop that"):
         search_time_s(LateBus(SITE, after_s=1.5), monkeypatch)
     assert search_time_s(LateBus(SITE, after_s=99.0), monkeypatch) == pytest.approx(2.0, abs=0.1)
     assert search_time_s(LateBus("other", after_s=0.0), monkeypatch, "bus.mode='client'") == pytest.approx(2.0, abs=0.1)
-
-
-def test_the_first_launcher_does_not_search(monkeypatch):
     assert search_time_s(LateBus(SITE, after_s=1.0, came_second=False), monkeypatch) == 0.0
+    stopped, stop = LateBus("other", after_s=5.0), threading.Event()
+    stop.set()
+    monkeypatch.setattr("pipeline.launch.launcher.time", stopped)
+    Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)._refuse_second_launcher(
+        cast("Any", stopped), stop
+    )
+    assert stopped.now_s == 100.0
 
 
 def test_row_07_a_launcher_is_refused_where_a_replay_presents_its_site_unless_it_starts_no_device(monkeypatch):
@@ -233,64 +224,25 @@ def recorder_only(lines: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[La
     return launcher, bus, slot
 
 
-def test_a_stage_for_which_there_is_no_process_is_started_later(monkeypatch, no_room):
+def test_a_stage_for_which_there_is_no_process_is_started_later_unless_the_site_begins_or_ends(monkeypatch, no_room):
     lines: list[str] = []
     launcher, clock, slot = recorder_only(lines, monkeypatch)
+    why = "recorder: no process could be started: Resource temporarily unavailable"
+    with pytest.raises(UserError, match=f"^{why}; free "):
+        launcher._start_all(threading.Event())
     slot.start_at_s = clock.now_s
     for _ in range(5):
         launcher._check_processes()
         clock.now_s += 1.0
+    launcher._restart_those_down()
+    assert launcher.outcome.failed == ["recorder"]
     no_room.has_room = True
     clock.now_s += 3.0
     launcher._check_processes()
-    failed = "recorder: no process could be started: Resource temporarily unavailable; trying again in"
-    assert lines == [f"{failed} 1.0 s", f"{failed} 2.0 s", f"{failed} 3.0 s", "recorder: started, process 7"]
+    again = [f"{why}; trying again in {delay_s} s" for delay_s in (1.0, 2.0, 3.0)]
+    lost = f"{why}; what it missed while it was down is lost"
+    assert lines == [*again, lost, "recorder: started, process 7"]
     assert slot.sessions == [("recorder", 7)]
-
-
-def test_a_stage_for_which_there_is_no_process_at_the_end_has_failed(monkeypatch, no_room):
-    lines: list[str] = []
-    launcher, clock, slot = recorder_only(lines, monkeypatch)
-    slot.start_at_s = clock.now_s
-    launcher._restart_those_down()
-    launcher._stop_all()
-    why = "no process could be started: Resource temporarily unavailable"
-    assert lines == [f"recorder: {why}; what it missed while it was down is lost"]
-    assert launcher.outcome.failed == ["recorder"]
-
-
-def test_a_site_for_which_there_is_no_process_is_refused_in_one_line(monkeypatch, no_room):
-    launcher, _, _ = recorder_only([], monkeypatch)
-    with pytest.raises(UserError, match="^recorder: no process could be started: Resource .* unavailable; free "):
-        launcher._start_all(threading.Event())
-
-
-@pytest.mark.parametrize("fails", ["Popen", "Thread"])
-def test_of_a_process_that_could_not_be_started_nothing_is_left(monkeypatch, fails):
-    closed, killed = [], []
-
-    class Pipe:
-        def kill(self) -> None:
-            killed.append(True)
-
-        def wait(self) -> None:
-            """It has ended."""
-
-    def start(*_arguments: object, **_more: object) -> Any:
-        if fails == "Popen":
-            raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
-        return Pipe()
-
-    def start_thread(_thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
-    config = load_config(DEMO / "demo.toml")
-    monkeypatch.setattr(subprocess, "Popen", start)
-    monkeypatch.setattr(threading.Thread, "start", start_thread)
-    monkeypatch.setattr(Notices, "close", lambda _notices: closed.append(True))
-    with pytest.raises(OSError, match="Cannot allocate memory|Resource temporarily unavailable"):
-        Child(process_list(config)[0], config.path, (), lambda _row, _line: None, 0)
-    assert (closed, killed) == ([True], [True] if fails == "Thread" else [])
 
 
 class EndedChild:
@@ -347,7 +299,7 @@ class Heard:
     def last_health(self, _session: object) -> Any:
         if len(self.statuses) > 1:
             del self.statuses[0]
-        return replace(HEALTH, status=self.statuses[0]) if self.statuses else None
+        return health("recorder", status=self.statuses[0], process_id=7) if self.statuses else None
 
 
 def stopped(watcher: Any, monkeypatch: pytest.MonkeyPatch, *, was_ready: bool = True) -> tuple[Outcome, list[str]]:
@@ -364,23 +316,23 @@ def stopped(watcher: Any, monkeypatch: pytest.MonkeyPatch, *, was_ready: bool = 
     return launcher.outcome, lines
 
 
-@pytest.mark.parametrize("heard", [(StageStatus.OK,), ()], ids=["not its last", "not the one started at the end"])
-def test_row_18_a_stage_whose_last_health_is_not_heard_has_not_ended_in_order(heard, monkeypatch):
-    outcome, lines = stopped(Heard(*heard), monkeypatch)
-    assert outcome.exit_code == 1
-    assert lines == ["recorder: its last health message did not arrive: what it lost is unknown"]
+UNKNOWN = ["recorder: its last health message did not arrive: what it lost is unknown"]
 
 
-def test_the_last_health_of_a_stage_may_arrive_after_its_end(monkeypatch):
-    watcher = Heard(StageStatus.OK, StageStatus.OK, StageStatus.OK, StageStatus.STOPPED)
-    outcome, lines = stopped(watcher, monkeypatch)
-    assert (outcome.exit_code, lines) == (0, [])
-
-
-def test_a_stage_that_was_never_ready_has_failed(monkeypatch):
-    outcome, lines = stopped(Heard(), monkeypatch, was_ready=False)
-    assert outcome.exit_code == 1
-    assert lines == ["recorder: was never ready: it has received nothing"]
+@pytest.mark.parametrize(
+    ("heard", "was_ready", "said"),
+    [
+        pytest.param([StageStatus.OK], True, UNKNOWN, id="not its last"),
+        pytest.param([], True, UNKNOWN, id="not the one started at the end"),
+        pytest.param([*[StageStatus.OK] * 3, StageStatus.STOPPED], True, [], id="its last, after its end"),
+        pytest.param([], False, ["recorder: was never ready: it has received nothing"], id="none, never ready"),
+    ],
+)
+def test_row_18_a_stage_has_ended_in_order_if_it_was_ready_and_its_last_health_is_heard(
+    heard, was_ready, said, monkeypatch
+):
+    outcome, lines = stopped(Heard(*heard), monkeypatch, was_ready=was_ready)
+    assert (outcome.exit_code, lines) == (1 if said else 0, said)
 
 
 class NoSessions:
@@ -403,7 +355,6 @@ class NoSessions:
     ("files", "recorded"),
     [
         ((), "nothing"),
-        (("recording-3.mcap",), "recording-3.mcap"),
         (("recording-3.mcap", "recording-4.mcap.active"), "recording-3.mcap to {}recording-4.mcap, 2 parts"),
     ],
 )
@@ -435,19 +386,12 @@ def test_it_says_which_files_a_run_recorded_also_one_that_failed(tmp_path, monke
         (Outcome(restarts={"scorer": 1}, lost={"scorer": 0}), 0),
         (Outcome(lost={"scorer": 0, "resampler": 4}), 3),
         (Outcome(killed=["viewer"], lost={"resampler": 4}), 1),
+        (Outcome(lost={"acquisition/bench": 4}, unusable=["acquisition/bench: ..."]), 1),
+        (Outcome(refused={"acquisition/bench": {"refused_input": 30}}), 0),
     ],
 )
-def test_the_exit_code_says_whether_anything_was_lost(outcome, code):
+def test_the_exit_code_says_whether_anything_was_lost_or_a_device_is_unusable(outcome, code):
     assert outcome.exit_code == code
-
-
-def test_the_search_ends_when_the_launcher_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus: Any = LateBus("elsewhere", 5.0)
-    monkeypatch.setattr("pipeline.launch.launcher.time", bus)
-    stop = threading.Event()
-    stop.set()
-    Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)._refuse_second_launcher(bus, stop)
-    assert bus.now_s == 100.0
 
 
 def test_row_13_a_stage_goes_on_with_the_time_of_its_launcher_when_it_is_started_again(tmp_path, monkeypatch):

@@ -12,8 +12,8 @@ import pytest
 
 from pipeline.launch.loss_accounting import losses
 from schemas.enums import StageStatus
-from schemas.header import Header
 from schemas.health import Counter, Health, Input, Output
+from tests.support import made_messages
 
 KEY, COMMAND = "fantwin/s/t/raw", "fantwin/s/t/command"
 OK, STOPPED = StageStatus.OK, StageStatus.STOPPED
@@ -29,19 +29,10 @@ def health(
     lost: int = 0,
     counters: tuple[Counter, ...] = (),
 ) -> Health:
-    return Health(
-        header=Header(producer, 0, ""),
-        stage=stage,
-        instance="t" if stage == "acquisition" else "all",
-        status=status,
-        t_ns=at,
-        uptime_s=0,
-        inputs=inputs,
-        outputs=(Output(key=KEY, published=published),) if published else (),
-        lost=lost,
-        counters=counters,
-        process_id=int(producer[1:] or 0),
-    )
+    instance, outputs = "t" if stage == "acquisition" else "all", (Output(key=KEY, published=published),)
+    about = {"status": status, "t_ns": at, "inputs": inputs, "outputs": outputs if published else ()}
+    about |= {"lost": lost, "counters": counters, "process_id": int(producer[1:] or 0)}
+    return made_messages.health(stage, instance, producer, **about)
 
 
 def line(producer: str, first: int, until: int, missing: int = 0, key: str = KEY, **counts: int) -> Input:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.launch.launcher import Outcome
 from pipeline.launch.refused_input import refused, refused_lines, unusable_lines
 from schemas.enums import StageStatus
 from schemas.health import Counter, Health
+from tests.support import made_messages
 
 LAUNCHED = {("acquisition/bench", 7)}
 
@@ -16,9 +16,7 @@ def health(name: str = "acquisition/bench", process_id: int = 7, /, **counters: 
     stage, instance = name.split("/")
     counts = tuple(Counter(name=name, value=value) for name, value in counters.items())
     status = StageStatus.STOPPED
-    return Health(
-        stage=stage, instance=instance, status=status, t_ns=1, uptime_s=1.0, process_id=process_id, counters=counts
-    )
+    return made_messages.health(stage, instance, status=status, process_id=process_id, counters=counts)
 
 
 def test_row_07_what_sessions_have_refused_is_added_up():
@@ -49,6 +47,7 @@ def test_a_device_of_which_all_was_refused_is_named_with_the_count_and_the_setti
         "acquisition/bench: no sample could be used, 412 were refused (absurd_command 410, garbage 2): "
         "check command_min and command_max of the [[tray]]"
     ]
+    assert unusable_lines([health("acquisition/bench", 8, garbage=30, refused_input=30)], LAUNCHED) == [], "of others"
 
 
 @pytest.mark.parametrize(
@@ -63,12 +62,3 @@ def test_a_device_of_which_all_was_refused_is_named_with_the_count_and_the_setti
 )
 def test_some_noise_and_a_device_that_sends_nothing_are_not_named(counters: dict[str, int]):
     assert unusable_lines([health(**counters)], LAUNCHED) == []
-
-
-def test_sessions_that_others_have_started_do_not_count():
-    assert unusable_lines([health("acquisition/bench", 8, garbage=30, refused_input=30)], LAUNCHED) == []
-
-
-def test_a_device_of_which_all_was_refused_is_a_failure_of_the_site():
-    assert Outcome(lost={"acquisition/bench": 4}, unusable=["acquisition/bench: ..."]).exit_code == 1
-    assert Outcome(refused={"acquisition/bench": {"refused_input": 30}}).exit_code == 0

@@ -11,26 +11,15 @@ from pipeline.launch.processes import StageProcess
 from pipeline.launch.site_state import StageState, Word, stage_states
 from pipeline.launch.site_watcher import StageView
 from schemas.enums import StageStatus
-from schemas.header import Header
 from schemas.health import AwaitedInput, Health, Input, Output
 from schemas.units import NS_PER_S
+from tests.support.made_messages import health
 
 GRID = "fantwin/s/tray1/grid"
 NOW_NS = 1_800_000_000 * NS_PER_S
-PRODUCER = Health(
-    header=Header("resampler-all-1", 0, ""),
-    stage="resampler",
-    instance="all",
-    status=StageStatus.OK,
-    t_ns=NOW_NS,
-    uptime_s=100.0,
-    outputs=(Output(key=GRID, published=900),),
-)
-CONSUMER = Health(
-    header=Header("twin_integrator-all-1", 0, ""),
-    stage="twin_integrator",
-    instance="all",
-    status=StageStatus.OK,
+PRODUCER = health("resampler", t_ns=NOW_NS, uptime_s=100.0, outputs=(Output(key=GRID, published=900),))
+CONSUMER = health(
+    "twin_integrator",
     t_ns=NOW_NS,
     uptime_s=100.0,
     inputs=(Input(key=GRID, producer="resampler-all-1", received=800, missing=0, duplicated=0, next_sequence=800),),

@@ -13,11 +13,12 @@ from pipeline.launch.site_watcher import MOST_UNKNOWN_SESSIONS, MOST_WATCHED_SES
 from pipeline.launch.watched_alarms import MOST_WATCHED_FANS, WATCHED_BYTES
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode
-from schemas.enums import Severity, StageStatus, Transition
+from schemas.enums import StageStatus
 from schemas.header import Header
 from schemas.health import Health, Output
-from schemas.messages import Alarm, Diagnosis
+from schemas.messages import Alarm
 from schemas.topics import alive_key, health_key, sessions_key, tray_key
+from tests.support import made_messages
 from tests.support.bus_peer import alarm
 
 KEY = tray_key("s", "tray", "alarm")
@@ -59,8 +60,7 @@ def session(stage: str, number: int) -> Session:
 
 
 def health(of: Session, t_ns: int = 1, **more: Any) -> Health:
-    fields: dict[str, Any] = {"status": StageStatus.OK, "t_ns": t_ns, "uptime_s": 0.0, "process_id": of.process_id}
-    return Health(header=Header(of.producer, 0, ""), stage=of.stage, instance=of.instance, **fields | more)
+    return made_messages.health(of.stage, of.instance, of.producer, t_ns=t_ns, process_id=of.process_id, **more)
 
 
 def of(producer: str, sequence: int = 0, **more: Any) -> Alarm:
@@ -88,13 +88,6 @@ def fans(watcher: SiteWatcher) -> list[int]:
     return [current.newest.fan for current in watcher.current_alarms()]
 
 
-def test_row_11_an_alarm_of_a_stranger_is_not_shown_while_the_scorer_is_alive(bus, watcher):
-    bus.raise_alarm(of(STRANGER))
-    assert fans(watcher) == []
-    bus.raise_alarm(of(SCORER.producer, fan=3))
-    assert fans(watcher) == [3]
-
-
 @pytest.mark.parametrize(
     ("stage", "claimed"),
     [("viewer", KEY), ("acquisition", KEY), ("resampler", tray_key("s", "other", "grid"))],
@@ -116,13 +109,17 @@ def test_row_17_a_health_is_not_believed_about_what_its_stage_may_not_write(bus,
     assert fans(watcher) == [0], "no session publishes there"
 
 
-def test_row_11_an_alarm_of_a_stranger_that_came_before_the_scorer_was_heard_is_not_shown_after_it(bus):
+def test_row_11_an_alarm_of_a_stranger_is_not_shown_once_the_scorer_is_heard(bus):
     watcher = SiteWatcher(bus, "s")
     bus.raise_alarm(of(STRANGER))
     assert fans(watcher) == [0], "a replay, say: nobody else publishes there"
     bus.show(SCORER)
     bus.say(health(SCORER, outputs=(Output(key=KEY, published=0),)))
     assert fans(watcher) == []
+    bus.raise_alarm(of(STRANGER))
+    assert fans(watcher) == []
+    bus.raise_alarm(of(SCORER.producer, fan=3))
+    assert fans(watcher) == [3]
 
 
 def test_the_alarm_of_a_scorer_that_was_killed_is_shown_beside_its_successor(bus, watcher):
@@ -134,42 +131,28 @@ def test_the_alarm_of_a_scorer_that_was_killed_is_shown_beside_its_successor(bus
     assert fans(watcher) == [0]
 
 
-def test_row_11_the_fans_whose_alarm_is_kept_are_bounded_and_those_of_strangers_are_forgotten_first(bus):
+def test_row_11_the_alarms_that_are_kept_are_bounded_and_those_of_strangers_are_forgotten_first(bus):
     watcher = SiteWatcher(bus, "s")
     bus.show(SCORER)
     bus.raise_alarm(of(SCORER.producer, fan=1))
     for number in range(MOST_WATCHED_FANS + 10):
         bus.raise_alarm(of(STRANGER, number, fan=10 + number))
     assert (len(fans(watcher)), fans(watcher)[0]) == (MOST_WATCHED_FANS, 1)
-
-
-def test_row_11_the_bytes_of_the_alarms_kept_are_bounded(bus):
     watcher = SiteWatcher(bus, "s")
     for number in range(40):
         bus.raise_alarm(of(STRANGER, number, fan=number, message="x" * (1 << 19)))
     assert 20 < len(fans(watcher)) <= WATCHED_BYTES >> 19
 
 
-def test_row_11_of_a_long_alarm_only_the_messages_that_are_shown_are_kept(bus, watcher):
-    causes = (Diagnosis(cause="drag_up", probability=0.8),)
-    bus.raise_alarm(of(SCORER.producer, 0, causes=causes))
-    acknowledged: dict[str, Any] = {"acknowledged": True, "operator_name": "Ann", "message": ""}
-    bus.raise_alarm(of(SCORER.producer, 1, transition=Transition.ACKNOWLEDGED, **acknowledged))
-    for number in range(2, 200):
-        severity = (Severity.WARNING, Severity.ALARM)[number % 2]
-        changed = of(SCORER.producer, number, transition=Transition.SEVERITY, severity=severity, message=f"{number}")
-        bus.raise_alarm(replace(changed, acknowledged=True))
-        bus.raise_alarm(replace(changed, acknowledged=True))  # the same again: recovered
-    (current,) = watcher.current_alarms()
-    assert (current.message, current.causes, current.acknowledged_by) == ("199", causes, "Ann")
-    assert [len(each.messages) for each in watcher._alarms._fans.values()] == [3]
-
-
-def test_row_11_a_late_health_of_a_stranger_hides_no_stage(bus, watcher):
+def test_row_11_healths_of_strangers_hide_no_stage_and_few_are_kept(bus, watcher):
     assert watcher.is_ready(SCORER.process_id)
     bus.say(replace(health(SCORER, 4 * 10**18), header=Header(STRANGER, 0, ""), process_id=77))
     assert watcher.is_ready(SCORER.process_id)
     assert [view.health.header.producer for view in watcher.stages()] == [SCORER.producer]
+    for number in range(100, 100 + 2 * MOST_UNKNOWN_SESSIONS):
+        bus.say(health(session("scorer", number)))
+    assert len(watcher._unknown) == MOST_UNKNOWN_SESSIONS
+    assert watcher.is_ready(SCORER.process_id)
 
 
 @pytest.mark.parametrize("stage", ["scorer", "viewer"])
@@ -208,29 +191,16 @@ def test_what_shows_no_token_of_a_session_such_as_a_replay_is_seen_where_no_sess
     assert [view.health.stage for view in watcher.stages()] == ["replay", "scorer"]
 
 
-def test_row_11_the_healths_of_strangers_that_are_kept_are_few(bus, watcher):
-    for number in range(100, 100 + 2 * MOST_UNKNOWN_SESSIONS):
-        bus.say(health(session("scorer", number)))
-    assert len(watcher._unknown) == MOST_UNKNOWN_SESSIONS
-    assert watcher.is_ready(SCORER.process_id)
-
-
-@pytest.mark.parametrize("name", ["", "other", "tray/../x", "*"])
-def test_row_18_bytes_of_a_stranger_are_no_alarm(name):
-    bus: Any = StubBus()
+def test_row_18_bytes_of_a_stranger_are_no_alarm_and_one_that_is_recovered_is_known(bus):
     watcher = SiteWatcher(bus, "s")
     receive = bus.subscribers[tray_key("s", "*", "alarm")]
-    receive("fantwin/s/tray/alarm", b"")  # all fields at their defaults: it decodes
-    receive("fantwin/s/tray/alarm", encode(replace(alarm(0), header=Header("peer", 0, name))))
-    bus.kept = [("fantwin/s/tray/alarm", b"")]
+    receive(KEY, b"")  # all fields at their defaults: it decodes
+    for name in ("", "other", "tray/../x", "*"):
+        receive(KEY, encode(replace(alarm(0), header=Header("peer", 0, name))))
+    bus.kept = [(KEY, b"")]
     watcher.ask_for_past_alarms()
     assert watcher.alarms() == []
-
-
-def test_an_alarm_that_is_recovered_is_known():
-    bus: Any = StubBus()
-    watcher = SiteWatcher(bus, "s")
-    bus.kept = [("fantwin/s/tray/alarm", encode(alarm(3)))]
+    bus.kept = [(KEY, encode(alarm(3)))]
     watcher.ask_for_past_alarms()
     assert [type(each) for each in watcher.alarms()] == [Alarm]
 

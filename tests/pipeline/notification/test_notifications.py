@@ -47,8 +47,9 @@ class Desk:
         """The texts that are sent in this time."""
         texts: list[Text] = []
         end_ns = self.now_ns + round(seconds * NS_PER_S)
+        step_ns = max(NS_PER_S, round(seconds / 1000.0 * NS_PER_S))  # of a day not each second
         while self.now_ns < end_ns:
-            self.now_ns = min(end_ns, self.now_ns + NS_PER_S)
+            self.now_ns = min(end_ns, self.now_ns + step_ns)
             self.notifications.tick(self.now_ns)
             changes, self.notifications.changes = self.notifications.changes, Changes()
             self.sent |= changes.events

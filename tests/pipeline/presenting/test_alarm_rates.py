@@ -11,20 +11,13 @@ from pipeline.presenting import alarm_rates
 from pipeline.presenting.alarm_rates import AlarmRates
 from pipeline.presenting.alarm_store import AlarmStore
 from pipeline.presenting.judged_time import JudgedStretch, JudgedTime
-from schemas.enums import Severity, Transition
-from schemas.header import Header
-from schemas.messages import Alarm
+from schemas.enums import Transition
 from schemas.units import NS_PER_S
 from tests.stages.test_gateway import score
+from tests.support.made_messages import alarm
 
 HOUR_NS = 3600 * NS_PER_S
 FIRST = JudgedStretch("tray1", "twin", NS_PER_S, NS_PER_S + HOUR_NS, 8 * HOUR_NS, 0.1)
-
-
-def raised(t_ns: int, number: int) -> Alarm:
-    about = {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "", "transition": Transition.RAISED}
-    header = Header("scorer-1", number, "tray1")
-    return Alarm(header=header, fan=0, active=True, severity=Severity.ALARM, t_ns=t_ns, onset_t_ns=t_ns, **about)
 
 
 def test_a_stretch_that_grows_for_long_does_not_push_out_the_ones_before_it(
@@ -33,7 +26,7 @@ def test_a_stretch_that_grows_for_long_does_not_push_out_the_ones_before_it(
     monkeypatch.setattr(alarm_rates, "MOST_KEPT", 10)
     store = AlarmStore(tmp_path / "alarms.sqlite")
     rates = AlarmRates(tmp_path / "alarms.sqlite")
-    store.add(raised(FIRST.last_t_ns, 1))
+    store.add(alarm(0, FIRST.last_t_ns, sequence=1, transition=Transition.RAISED))
     rates.catch_up(store, [FIRST])
     growing = replace(FIRST, first_t_ns=FIRST.last_t_ns + HOUR_NS)
     for saves in range(20):
@@ -53,7 +46,7 @@ def test_alarms_count_from_the_first_to_the_last_score_of_the_twin_in_force(tmp_
     within = [FIRST.first_t_ns, FIRST.last_t_ns, last.first_t_ns, last.last_t_ns]
     outside = [FIRST.first_t_ns - 1, FIRST.last_t_ns + 1, other.first_t_ns, last.first_t_ns - 1, last.last_t_ns + 1]
     for number, t_ns in enumerate([*within, *outside]):
-        store.add(raised(t_ns, number))
+        store.add(alarm(0, t_ns, sequence=number, transition=Transition.RAISED))
     rates.catch_up(store, [FIRST, other, last])
     assert rates.observed()["tray1"].unmarked == len(within)
     rates.close()

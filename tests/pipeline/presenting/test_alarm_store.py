@@ -48,6 +48,11 @@ def test_what_a_full_disk_has_no_room_for_is_kept_in_its_order_once_there_is_roo
     assert kept(store) == expected, "the oldest of those that waited are lost"
     queue.notice_new()
     assert [found.header.sequence for _, found in queue.take(1000)] == expected
+    fill(store, is_full=True)
+    assert all(map(store.add, added[251:290]))
+    fill(store, is_full=False)
+    assert store.add(added[290])
+    assert kept(store) == [*expected, *range(251, 291)], "those that waited come before the one that found room"
 
 
 def test_a_damaged_file_is_named_in_one_line_and_holds_up_no_alarm(store, tmp_path):

@@ -17,14 +17,14 @@ from pipeline.recordings.arrays import Arrays, Block, block_columns, read_topics
 from pipeline.recordings.order import Seen
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import InvalidReason, Severity, StageStatus, Statistic, Transition
+from schemas.enums import InvalidReason, Statistic, Transition
 from schemas.header import Header
 from schemas.health import Counter, Health
-from schemas.messages import MESSAGE_TYPES, Alarm, Array, Command, Grid, Message, ModelCard, Raw
+from schemas.messages import Alarm, Array, Command, Grid, Message, ModelCard, Raw
 from schemas.topics import health_key, tray_key
+from tests.support import made_messages
+from tests.support.made_messages import health
 from tests.support.score_data import made_up_tray
-
-GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
 
 
 def key_of(message: Message, site: str = "plant") -> str:
@@ -60,19 +60,9 @@ def raw(
 
 
 def alarm(sequence: int) -> Alarm:
-    return Alarm(
-        header=Header("s", sequence, "tray1"),
-        fan=sequence,
-        active=sequence % 2 == 0,
-        severity=Severity.ALARM,
-        t_ns=70 + sequence,
-        onset_t_ns=50,
-        residual_rad_s=3.5,
-        limit_rad_s=2.0,
-        message=f"alarm {sequence}",
-        transition=Transition.RAISED,
-        statistic=Statistic.SPEED_DRIFT,
-    )
+    fields = {"onset_t_ns": 50, "residual_rad_s": 3.5, "message": f"alarm {sequence}", "active": sequence % 2 == 0}
+    fields |= {"transition": Transition.RAISED, "statistic": Statistic.SPEED_DRIFT}
+    return made_messages.alarm(sequence, 70 + sequence, sequence=sequence, **fields)
 
 
 def together(blocks: Iterable[Block], name: str) -> Array:
@@ -104,7 +94,7 @@ def test_the_columns_are_those_of_the_messages(tmp_path):
     assert np.isnan(block["measured_speed_rad_s"][120, 1])
 
 
-@pytest.mark.parametrize(("rows", "lengths"), [(1, [10] * 7), (20, [20, 20, 20, 10]), (25, [30, 30, 10]), (1000, [70])])
+@pytest.mark.parametrize(("rows", "lengths"), [(20, [20, 20, 20, 10]), (25, [30, 30, 10])])
 def test_blocks_have_the_rows_asked_for_or_a_little_more(tmp_path, rows, lengths):
     path = write(tmp_path / "r.mcap", (raw(n) for n in range(7)))
     blocks = list(read_arrays(path, "raw", rows=rows))
@@ -169,15 +159,7 @@ def test_an_event_is_a_row(tmp_path):
 
 def test_health_belongs_to_no_tray_and_keeps_its_order(tmp_path):
     healths = [
-        Health(
-            header=Header(stage, number, ""),
-            stage=stage,
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=number,
-            uptime_s=1.0,
-            counters=(Counter(name="lost_frames", value=3),),
-        )
+        health(stage, sequence=number, t_ns=number, counters=(Counter(name="lost_frames", value=3),))
         for number in range(2)
         for stage in ("scorer", "resampler")
     ]
@@ -186,32 +168,22 @@ def test_health_belongs_to_no_tray_and_keeps_its_order(tmp_path):
     assert "counters" not in block.columns
 
 
-def test_the_first_column_of_every_topic_is_its_time():
-    for kind in MESSAGE_TYPES:
-        time, *others = block_columns(kind)
-        assert time == ("host_receive_t_ns" if kind is Raw else "t_ns")
-        assert others[-1] == "producer"
-
-
 def test_several_topics_are_read_in_one_pass(tmp_path):
     path = write(tmp_path / "r.mcap", [raw(0), alarm(0), raw(1)])
     assert [(block.topic, len(block)) for block in read_topics([path], ("raw", "alarm"))] == [("raw", 20), ("alarm", 1)]
 
 
-def test_parts_in_any_order_are_one_recording_and_duplicates_count_once(tmp_path):
+def test_parts_in_any_order_are_one_recording_each_time_it_is_read_and_duplicates_count_once(tmp_path):
     first = write(tmp_path / "z.mcap", (raw(n) for n in range(6)))
     second = write(tmp_path / "a.mcap", (raw(n) for n in range(4, 9)), start=100)
     third = write(tmp_path / "b.mcap", (raw(n, producer="b") for n in range(9, 11)), start=200)
     arrays = read_arrays([third, second, first], "raw")
-    assert times(arrays) == [*range(90), *range(90, 110)]
+    assert times(arrays) == times(arrays) == list(range(110))
     assert arrays.duplicated == 2
     assert times(read_arrays([first, first], "raw")) == list(range(60))
-
-
-def test_sequence_numbers_are_counted_per_producer_and_key(tmp_path):
-    messages = [raw(0, producer="a"), raw(0, producer="b"), raw(0, tray="other")]
-    arrays = read_arrays(write(tmp_path / "r.mcap", messages), "raw")
-    assert (sum(len(block) for block in arrays), arrays.duplicated) == (30, 0)
+    same_numbers = [raw(0, producer="a"), raw(0, producer="b"), raw(0, tray="other")]
+    arrays = read_arrays(write(tmp_path / "r.mcap", same_numbers), "raw")
+    assert (sum(len(block) for block in arrays), arrays.duplicated) == (30, 0), "numbers are of a producer and a key"
 
 
 @given(st.lists(st.integers(0, 30)))
@@ -220,7 +192,6 @@ def test_a_sequence_number_is_new_once_in_any_order(sequences):
     for sequence in sequences:
         assert seen.is_new(sequence) == (sequence not in known)
         known.add(sequence)
-    assert len(seen._first) == sum(1 for sequence in known if sequence - 1 not in known)
 
 
 def test_an_imported_recording_is_not_a_part_of_another(tmp_path):
@@ -228,12 +199,6 @@ def test_an_imported_recording_is_not_a_part_of_another(tmp_path):
     with pytest.raises(RecordingError, match=r"1\.mcap: made by .* so it is not a part"):
         read_arrays(made, "raw")
     assert times(read_arrays(made[0], "raw")) == list(range(10))
-
-
-def test_arrays_can_be_iterated_again(tmp_path):
-    arrays = read_arrays(write(tmp_path / "r.mcap", [raw(0), raw(0), raw(1)]), "raw")
-    assert times(arrays) == times(arrays)
-    assert arrays.duplicated == 1
 
 
 def test_a_truncated_part_is_read_up_to_its_end_and_reported(tmp_path):

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.recordings.clips import clip as clip_module
 from pipeline.recordings.clips.clip import Clip, clip_lines, clips_as_text, clips_in, kept_clips
 from pipeline.recordings.clips.tracker import JUDGED_NS, LONGEST_NS, ClipTracker, CutResult
 from schemas.enums import Severity, Transition
@@ -175,38 +173,4 @@ def test_only_clips_with_a_file_are_listed_and_damaged_lists_have_none(tmp_path:
         (tmp_path / clip.name).touch()
     assert [clip.alarms[0].fan for clip in kept_clips(tmp_path)] == [1, 0]
     assert kept_clips(tmp_path / "none") == []
-
-
-def test_metadata_that_are_damaged_are_one_line():
-    assert clip_lines({}) == []
     assert clip_lines({"clip": '{"tray": "tray1", "alarms": 3}'}) == ["alarm clip, whose metadata are damaged"]
-
-
-def test_acknowledging_a_storm_touches_each_of_its_alarms_once(monkeypatch):
-    touched: list[object] = []
-
-    def count(of: Any, **changes: Any) -> Any:
-        touched.append(of)
-        return replace(of, **changes)
-
-    of = tracker()
-    follow(of, *(alarm(fan, 10.0) for fan in range(200)), *(alarm(fan, 10.0, "tray2") for fan in range(200)))
-    cut(of, 80.0)
-    monkeypatch.setattr(clip_module, "replace", count)
-    follow(of, *(alarm(fan, 90.0, transition=Transition.ACKNOWLEDGED, acknowledged=True) for fan in range(200)))
-    assert [(clip.tray, clip.is_acknowledged) for clip in of.clips] == [("tray1", True), ("tray2", False)]
-    assert len(touched) <= 2 * 200
-
-
-def test_that_a_clip_waits_for_the_disk_is_said_no_longer_once_none_waits():
-    of = tracker(most_bytes=1000)
-    follow(of, alarm(0, 10.0), alarm(0, 10.0, "tray2"))
-    first, second = (clip.name for clip in of.due(T0 + 80 * S))
-    of.cut(CutResult(first, 2000))
-    of.cut(CutResult(second, problem="the disk is full", may_pass=True))
-    assert "cannot be cut yet: the disk is full" in of.problem()
-    follow(of, alarm(0, 85.0, transition=Transition.ACKNOWLEDGED, acknowledged=True))
-    assert "cannot be cut yet" in of.problem()
-    assert of.due(T0 + 100 * S) == []  # it is over the limit now, and is dropped
-    assert [clip.name for clip in of.to_delete()] == [first]
-    assert of.problem() == ""

@@ -75,18 +75,34 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return found
 
 
-def test_an_excerpt_decodes_what_is_around_it_and_not_the_recording(tmp_path: Path, decoded: list[int]) -> None:
-    path = written(tmp_path / "r.mcap", has_clock=True)
-    reader = ExcerptReader(path)
+@pytest.fixture(scope="module")
+def with_clock(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("clock") / "r.mcap", has_clock=True)
+
+
+@pytest.fixture(scope="module")
+def without_clock(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("none") / "r.mcap", has_clock=False)
+
+
+def test_an_excerpt_and_commands_are_found_without_decoding_the_recording(with_clock: Path, decoded: list[int]) -> None:
+    reader = ExcerptReader(with_clock)
     decoded.clear()
     (run,) = reader.read(600.0, 610.0).runs
     assert len(run.t_s) == 10 * RATE_HZ
     assert len(decoded) < 0.2 * SAMPLES / BLOCK, "100 s of 1200"
+    decoded.clear()
+    t_s, command = reader.commands(10.0)
+    assert len(decoded) < 0.06 * SAMPLES / BLOCK
+    assert np.all(np.diff(t_s) < 11.0) and len(t_s) == pytest.approx(SECONDS / 10.0, rel=0.05)
+    assert command[:, 0] == pytest.approx(RATE_HZ * t_s, abs=1.0)
+    assert len(reader.commands(1.0)[0]) == pytest.approx(SECONDS, rel=0.1)
+    with pytest.raises(RecordingError, match="fewer than two raw samples from 5000 s to 5060 s"):
+        reader.read(5000.0, 5060.0)
 
 
-def test_without_a_device_clock_an_excerpt_is_that_of_the_whole_recording(tmp_path: Path) -> None:
-    path = written(tmp_path / "r.mcap", has_clock=False)
-    reader = ExcerptReader(path)
+def test_without_a_device_clock_an_excerpt_is_that_of_the_whole_recording(without_clock: Path) -> None:
+    reader, path = ExcerptReader(without_clock), without_clock
     for from_s, to_s in ((0.0, 5.0), (33.3, 93.3), (1190.0, 2000.0)):
         (run,), (expected,) = reader.read(from_s, to_s).runs, read_runs(path, from_s=from_s, to_s=to_s).runs
         np.testing.assert_array_equal(run.t_s, expected.t_s)
@@ -94,10 +110,9 @@ def test_without_a_device_clock_an_excerpt_is_that_of_the_whole_recording(tmp_pa
         np.testing.assert_array_equal(run.command, expected.command)
 
 
-def test_with_a_device_clock_times_are_within_a_tenth_of_a_millisecond_and_steps_are_the_same(tmp_path: Path) -> None:
-    path = written(tmp_path / "r.mcap", has_clock=True)
-    reader = ExcerptReader(path)
-    (whole,) = read_runs(path).runs
+def test_with_a_device_clock_times_are_within_a_tenth_of_a_millisecond_and_steps_are_the_same(with_clock: Path) -> None:
+    reader = ExcerptReader(with_clock)
+    (whole,) = read_runs(with_clock).runs
     for from_s in (0.0, 40.0, 550.0, 620.0, 1100.0):
         (run,) = reader.read(from_s, from_s + 60.0).runs
         expected_s = whole.t_s[np.isin(whole.speed_rad_s[:, 0], run.speed_rad_s[:, 0])]
@@ -105,9 +120,8 @@ def test_with_a_device_clock_times_are_within_a_tenth_of_a_millisecond_and_steps
         assert np.diff(run.t_s) == pytest.approx(np.diff(expected_s), rel=1e-5)
 
 
-def test_a_truncated_recording_is_read_whole_and_says_so(tmp_path: Path) -> None:
-    path = written(tmp_path / "r.mcap", has_clock=False)
-    content = path.read_bytes()
+def test_a_truncated_recording_is_read_whole_and_says_so(tmp_path: Path, without_clock: Path) -> None:
+    path, content = tmp_path / "r.mcap", without_clock.read_bytes()
     path.write_bytes(content[: len(content) * 3 // 4])
     found = ExcerptReader(path).read(300.0, 360.0)
     assert len(found.runs[0].t_s) == pytest.approx(60 * RATE_HZ, abs=1)
@@ -116,9 +130,8 @@ def test_a_truncated_recording_is_read_whole_and_says_so(tmp_path: Path) -> None
     assert len(t_s) == len(command) < SECONDS
 
 
-def test_a_damaged_chunk_is_left_out_and_said(tmp_path: Path) -> None:
-    path = written(tmp_path / "r.mcap", has_clock=False)
-    content = bytearray(path.read_bytes())
+def test_a_damaged_chunk_is_left_out_and_said(tmp_path: Path, without_clock: Path) -> None:
+    path, content = tmp_path / "r.mcap", bytearray(without_clock.read_bytes())
     content[len(content) // 2] ^= 0xFF
     path.write_bytes(content)
     reader = ExcerptReader(path)
@@ -136,27 +149,6 @@ def test_recordings_that_an_index_does_not_suit_are_read_whole(tmp_path: Path) -
     several = written(tmp_path / "several.mcap", has_clock=False, trays=("a", "b"))
     with pytest.raises(RecordingError, match="several trays, a, b"):
         ExcerptReader(several).read(0.0, 10.0)
-
-
-def test_an_excerpt_without_samples_is_an_error(tmp_path: Path) -> None:
-    reader = ExcerptReader(written(tmp_path / "r.mcap", has_clock=True))
-    with pytest.raises(RecordingError, match="fewer than two raw samples from 5000 s to 5060 s"):
-        reader.read(5000.0, 5060.0)
-    with pytest.raises(RecordingError, match="cannot read the recording"):
-        ExcerptReader(tmp_path / "missing.mcap")
-
-
-def test_the_commands_of_a_recording_are_found_from_few_of_its_messages(tmp_path: Path, decoded: list[int]) -> None:
-    path = written(tmp_path / "r.mcap", has_clock=True)
-    reader = ExcerptReader(path)
-    decoded.clear()
-    t_s, command = reader.commands(10.0)
-    assert np.all(np.diff(t_s) < 11.0)
-    assert len(t_s) == pytest.approx(SECONDS / 10.0, rel=0.05)
-    assert command[:, 0] == pytest.approx(RATE_HZ * t_s, abs=1.0)
-    assert len(decoded) < 0.06 * SAMPLES / BLOCK
-    every_s, _ = reader.commands(1.0)
-    assert len(every_s) == pytest.approx(SECONDS, rel=0.1)
 
 
 def test_an_excerpt_may_lie_within_one_long_message_whose_time_is_that_of_its_last_sample(tmp_path: Path) -> None:

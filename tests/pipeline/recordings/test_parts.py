@@ -8,14 +8,12 @@ import pytest
 from mcap.opcode import Opcode
 
 from pipeline.recordings.contents import contents_of
-from pipeline.recordings.disk import Disk, DiskError
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from pipeline.recordings.records import RecordReader
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import RecordingWriter
 from tests.support.failing_writers import disk_of, kill_a_recorder
-from tests.support.small_disk import unmount
 from tests.support.written_recordings import RAW_KEY, raw, sequences, write
 
 STREAM = (RAW_KEY, "acquisition-1")
@@ -41,14 +39,21 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_parts_are_numbered_and_name_the_part_before(tmp_path):
+def test_parts_are_numbered_say_what_the_recorder_says_and_name_the_part_before(tmp_path):
     place = parts_in(tmp_path)
     ledger = SequenceLedger()
     for first in (0, 10, 20):
         part(place, range(first, first + 10), ledger).finish()
         ledger = ledger.for_next_part()
-    assert names(tmp_path) == ["r-2.mcap", "r-3.mcap", "r.mcap"]
-    metadata = [read_metadata(tmp_path / name).metadata for name in ("r.mcap", "r-2.mcap", "r-3.mcap")]
+    writer = part(place)
+    assert names(tmp_path) == ["r-2.mcap", "r-3.mcap", "r-4.mcap.active", "r.mcap"]
+    assert place.stored().open_bytes == writer.size
+    assert "r-4.mcap.active" not in [each.path.name for each in place.stored().parts], "it is not deleted"
+    writer.finish()
+    heads = [read_metadata(tmp_path / name) for name in ("r.mcap", "r-2.mcap", "r-3.mcap")]
+    assert all(head.attachments == {"configuration.toml": b"site = 'plant'"} for head in heads)
+    metadata = [head.metadata for head in heads]
+    assert all(each["site"] == "plant" for each in metadata)
     assert [(m["part"], m["session"], m.get("continues")) for m in metadata] == [
         ("1", "s1", None),
         ("2", "s1", "r.mcap"),
@@ -56,24 +61,6 @@ def test_parts_are_numbered_and_name_the_part_before(tmp_path):
     ]
     assert metadata[2]["started_t_ns"] == "5000000000"
     assert contents_of(tmp_path / "r-3.mcap").before == {STREAM: 20}
-
-
-def test_each_part_has_metadata_and_attachments(tmp_path):
-    place = parts_in(tmp_path)
-    for _ in range(2):
-        part(place, [0]).finish()
-    for name in ("r.mcap", "r-2.mcap"):
-        head = read_metadata(tmp_path / name)
-        assert head.metadata["site"] == "plant"
-        assert head.attachments == {"configuration.toml": b"site = 'plant'"}
-
-
-def test_an_open_part_is_called_active(tmp_path):
-    place = parts_in(tmp_path)
-    part(place).finish()
-    writer = part(place)
-    assert names(tmp_path) == ["r-2.mcap.active", "r.mcap"]
-    writer.finish()
 
 
 def oldest_deleted(place: RecordingParts) -> str | None:
@@ -111,13 +98,6 @@ def test_what_other_recorders_wrote_counts_and_what_recorders_did_not_write_is_n
     assert names(tmp_path) == ["clips", "import.mcap", "kept-by-me.mcap", "r-2.mcap"]
 
 
-def test_the_part_that_is_open_is_not_deleted(tmp_path):
-    place = parts_in(tmp_path)
-    writer = part(place)
-    assert place.stored().parts == () and place.stored().open_bytes == writer.size
-    writer.finish()
-
-
 def test_a_new_recorder_takes_a_number_above_all_existing_ones(tmp_path):
     for name in ("r.mcap", "r-7.mcap", "r-9.mcap.original"):
         (tmp_path / name).touch()
@@ -135,29 +115,23 @@ def test_the_file_of_a_killed_recorder_is_repaired_and_continued(tmp_path):
     assert names(tmp_path) == ["r.mcap"]
 
 
-def test_the_first_part_after_a_killed_recorder_continues_its_last(tmp_path):
-    killed_writer = part(parts_in(tmp_path), range(40))
-    killed_writer.flush()
-    killed(killed_writer)
+def kill_with_a_part_open(writer: RecordingWriter) -> None:
+    writer.flush()
+    killed(writer)
+
+
+@pytest.mark.parametrize(
+    "end",
+    [kill_with_a_part_open, RecordingWriter.finish, lambda writer: writer.finish(has_ended=True)],
+    ids=["killed", "killed in a pause", "stopped in order"],
+)
+def test_the_next_recorder_continues_the_last_part_however_the_one_before_has_ended(tmp_path, end):
+    end(part(parts_in(tmp_path), range(40)))
     place = parts_in(tmp_path, "s2")
     assert place.before == {STREAM: 40}
     part(place, [45]).finish()
     head = read_metadata(tmp_path / "r-2.mcap").metadata
     assert (head["session"], head["part"], head["continues"]) == ("s2", "1", "r.mcap")
-    assert contents_of(tmp_path / "r-2.mcap").streams[STREAM].missing == 5
-
-
-def test_a_recorder_killed_while_it_had_no_open_part_is_continued_too(tmp_path):
-    part(parts_in(tmp_path), range(40)).finish()  # it paused, and was killed
-    assert parts_in(tmp_path, "s2").before == {STREAM: 40}
-
-
-def test_a_recorder_that_was_stopped_in_order_is_continued_too(tmp_path):
-    part(parts_in(tmp_path), range(40)).finish(has_ended=True)
-    place = parts_in(tmp_path, "s2")
-    assert place.before == {STREAM: 40}
-    part(place, [45]).finish()
-    assert read_metadata(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
     assert contents_of(tmp_path / "r-2.mcap").streams[STREAM].missing == 5
 
 
@@ -199,15 +173,11 @@ def test_a_damaged_active_file_that_a_full_disk_keeps_from_being_repaired_is_con
     assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
 
 
-def test_an_active_file_without_messages_is_removed(tmp_path):
-    kill_a_recorder(tmp_path / "r.mcap", flushed=0)
-    assert parts_in(tmp_path).repaired == []
-    assert names(tmp_path) == []
-
-
 def test_recorders_killed_before_they_recorded_anything_do_not_hide_the_last_message(tmp_path):
     kill_a_recorder(tmp_path / "r.mcap", flushed=0)
-    first = part(parts_in(tmp_path), range(40))
+    place = parts_in(tmp_path)
+    assert (place.repaired, names(tmp_path)) == ([], [])
+    first = part(place, range(40))
     first.flush()
     killed(first)
     for _ in range(3):
@@ -231,23 +201,6 @@ def test_an_active_file_that_is_not_a_recording_is_renamed(tmp_path, content):
     assert place.unreadable[0].read_bytes() == content
     part(place).finish()
     assert names(tmp_path) == ["r-2.mcap", "r.mcap.original"]
-
-
-def test_free_bytes_is_the_free_space_of_the_disk(small_disk):
-    disk = Disk(small_disk)
-    before = disk.free_bytes()
-    (small_disk / "file").write_bytes(bytes(1 << 20))
-    assert before - disk.free_bytes() == 1 << 20
-
-
-def test_the_mount_point_of_an_unmounted_disk_is_not_mistaken_for_the_disk(small_disk):
-    place = parts_in(small_disk)
-    part(place, [0]).finish()
-    unmount(small_disk)
-    for use in (place.free_bytes, lambda: part(place)):
-        with pytest.raises(DiskError, match="disk: the disk is no longer mounted; mount it again"):
-            use()
-    assert names(small_disk) == []
 
 
 def test_a_folder_that_disappears_is_made_again(tmp_path):

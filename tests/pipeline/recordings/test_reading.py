@@ -23,20 +23,8 @@ def test_the_messages_read_as_bytes_are_those_read_decoded():
     for one, other in zip(as_bytes, decoded, strict=True):
         assert encode(decode(type(other.message), one.payload)) == encode(other.message)
         assert one.newest_t_ns == newest_t_ns(other.message)
-
-
-def test_one_tray_can_be_chosen():
     assert list(read_recording(GOLDEN, ("raw",), tray="tray1").undecoded())
     assert not list(read_recording(GOLDEN, ("raw",), tray="tray2").undecoded())
-
-
-def test_a_truncated_file_is_read_up_to_its_end_and_reported(tmp_path):
-    truncated = tmp_path / "truncated.mcap"
-    truncated.write_bytes(GOLDEN.read_bytes()[: GOLDEN.stat().st_size // 2])
-    reading = read_recording(truncated, ("score",))
-    found = list(reading.undecoded())
-    assert 0 < len(found) < len(list(read_recording(GOLDEN, ("score",)).undecoded()))
-    assert "it is truncated" in reading.damage
 
 
 def test_a_file_that_is_still_being_written_is_no_crash(tmp_path):

@@ -39,15 +39,12 @@ def raw(host_ns, clock_us=(), command=None, speed=None, tray="tray1", fans=1) ->
     )
 
 
-def test_the_device_clock_gives_the_time_also_when_it_wraps(tmp_path):
+def test_the_device_clock_gives_the_time_also_when_it_wraps_and_without_one_the_time_of_receipt_does(tmp_path):
     rng = np.random.default_rng(1)
     clock_us = (2**32 - 500_000 + np.arange(100) * 10_000) % 2**32
     received_ns = START_NS + np.arange(100) * 10_000_000 + rng.integers(0, 5_000_000, 100)
     (run,) = read_runs(record(tmp_path / "r.mcap", raw(received_ns, clock_us))).runs
     np.testing.assert_allclose(run.t_s, np.arange(100) * 0.01, rtol=0, atol=2e-4)
-
-
-def test_without_a_device_clock_the_time_is_that_of_receipt(tmp_path):
     (run,) = read_runs(record(tmp_path / "r.mcap", raw([START_NS, START_NS + 7, START_NS + 10**9]))).runs
     np.testing.assert_allclose(run.t_s, [0, 7e-9, 1], rtol=0, atol=1e-12)
 
@@ -95,9 +92,6 @@ def test_parts_and_fans_that_do_not_exist_are_an_error(tmp_path):
         read_runs(path, fans=[1])
     with pytest.raises(RecordingError, match="no raw samples in this recording"):
         read_runs(record(tmp_path / "empty.mcap"))
-
-
-def test_a_tray_that_changes_its_number_of_fans_is_an_error(tmp_path):
     times = START_NS + np.arange(3) * 10**7
     with pytest.raises(RecordingError, match="the number of fans changes from 1 to 2"):
         read_runs(record(tmp_path / "r.mcap", raw(times), raw(times + 10**9, fans=2)))

@@ -4,12 +4,9 @@ from importlib.metadata import version
 
 import numpy as np
 import pytest
-from google.protobuf.descriptor_pool import DescriptorPool
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
 from mcap.writer import Writer
-from mcap_protobuf.decoder import DecoderFactory
 
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.rare_messages import last_message_ns, last_messages, rare_messages
@@ -18,14 +15,19 @@ from pipeline.recordings.scan import scan
 from pipeline.recordings.writing import RecordingWriter
 from schemas.envelope import Envelope
 from schemas.header import Header
-from schemas.messages import Command, Message, Raw
-from schemas.topics import tray_key
+from schemas.messages import Message, Raw
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, raw, sequences, write
 
 
-def test_messages_are_read_back_as_written_in_their_order(tmp_path):
+def test_messages_metadata_and_attachments_are_read_back_as_written_each_time_they_are_read(tmp_path):
     path = write(tmp_path / "r.mcap", 3)
-    entries = list(read_recording(path))
+    reading = read_recording(path)
+    entries = list(reading)
+    assert len(list(reading)) == len(entries) and reading.damage == ""
+    assert [e.topic for e in read_recording(path, topics=("alarm",))] == ["alarm"]
+    head = read_metadata(path)
+    assert head.metadata == {"site": "plant", "format": "1", "made_by": f"fantwin {version('fantwin')}"}
+    assert head.attachments == {"configuration.toml": b"site = 'plant'"}
     assert [(e.key, e.topic, e.received_t_ns) for e in entries] == [
         (RAW_KEY, "raw", 1000),
         (RAW_KEY, "raw", 1001),
@@ -39,23 +41,6 @@ def test_messages_are_read_back_as_written_in_their_order(tmp_path):
     assert entries[3].message.header.producer == "scorer-1"
 
 
-def test_topics_can_be_chosen(tmp_path):
-    path = write(tmp_path / "r.mcap", 3)
-    assert [e.topic for e in read_recording(path, topics=("alarm",))] == ["alarm"]
-
-
-def test_a_reading_can_be_iterated_again(tmp_path):
-    reading = read_recording(write(tmp_path / "r.mcap", 3))
-    assert len(list(reading)) == len(list(reading)) == 4
-    assert reading.damage == ""
-
-
-def test_metadata_and_attachments_are_read_back(tmp_path):
-    head = read_metadata(write(tmp_path / "r.mcap", 0))
-    assert head.metadata == {"site": "plant", "format": "1", "made_by": f"fantwin {version('fantwin')}"}
-    assert head.attachments == {"configuration.toml": b"site = 'plant'"}
-
-
 def test_the_unit_of_speed_is_that_of_the_tray_or_of_the_recording_or_radians(tmp_path):
     path = tmp_path / "r.mcap"
     for metadata, unit in (
@@ -65,38 +50,6 @@ def test_the_unit_of_speed_is_that_of_the_tray_or_of_the_recording_or_radians(tm
     ):
         RecordingWriter(path, metadata, overwrite=True).finish()
         assert read_metadata(path).speed_unit("tray1") == unit
-
-
-def test_other_readers_need_no_code_of_fantwin(tmp_path):
-    path = write(tmp_path / "r.mcap", 5)
-    with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        summary = reader.get_summary()
-        assert summary is not None and summary.statistics is not None
-        assert summary.statistics.message_count == 6
-        assert {schema.name for schema in summary.schemas.values()} == {"fantwin.Raw", "fantwin.Alarm"}
-        assert {channel.topic for channel in summary.channels.values()} == {RAW_KEY, ALARM_KEY}
-        assert [a.name for a in reader.iter_attachments()] == ["configuration.toml"]
-        assert {m.name: m.metadata for m in reader.iter_metadata()}["fantwin"]["site"] == "plant"
-        decoded = list(reader.iter_decoded_messages())
-    _, channel, message, proto = decoded[2]
-    assert (channel.message_encoding, message.log_time, message.sequence) == ("protobuf", 1002, 2)
-    assert message.publish_time == proto.host_receive_t_ns[-1] == 29
-    np.testing.assert_array_equal(proto.speed_rad_s, raw(2).speed_rad_s.ravel())
-
-
-def test_the_embedded_schema_needs_no_other_file(tmp_path):
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet  # noqa: PLC0415
-
-    path = write(tmp_path / "r.mcap", 1)
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    files = FileDescriptorSet.FromString(next(iter(summary.schemas.values())).data)
-    pool = DescriptorPool()
-    for file_descriptor in files.file:
-        pool.Add(file_descriptor)  # type: ignore[attr-defined]
-    assert pool.FindMessageTypeByName("fantwin.Score").fields_by_name["band_variance"].number == 8
 
 
 @pytest.fixture
@@ -127,15 +80,13 @@ def test_a_recording_of_an_unknown_format_is_refused_however_it_is_read(of_tomor
         read(of_tomorrow)
 
 
-def test_a_copy_names_the_program_that_made_the_first_one(tmp_path):
-    about = read_metadata(write(tmp_path / "r.mcap", 0)).metadata
-    with RecordingWriter(tmp_path / "copy.mcap", {**about, "made_by": "fantwin 0.0.9", "format": "0"}):
-        pass
-    head = read_metadata(tmp_path / "copy.mcap")
-    assert (head.metadata["made_by"], head.metadata["format"]) == ("fantwin 0.0.9", "1")
-
-
-def test_a_recording_without_a_format_number_is_refused(tmp_path):
+def test_a_recording_without_a_format_number_is_refused_and_a_file_of_another_program_has_no_messages(tmp_path):
+    with (tmp_path / "foreign.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_message(writer.register_channel("/camera", "json", 0), 1, b"{}", 1)
+        writer.finish()
+    assert list(read_recording(tmp_path / "foreign.mcap")) == []
     with (tmp_path / "r.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -143,21 +94,6 @@ def test_a_recording_without_a_format_number_is_refused(tmp_path):
         writer.finish()
     with pytest.raises(RecordingError, match=r"without a format number; .* \(made by fantwin 0\.0\.1\)"):
         read_metadata(tmp_path / "r.mcap")
-
-
-def test_a_recording_is_called_active_until_it_is_finished(tmp_path):
-    path = tmp_path / "r.mcap"
-    writer = RecordingWriter(path, {})
-    assert [p.name for p in tmp_path.iterdir()] == ["r.mcap.active"]
-    writer.finish()
-    assert [p.name for p in tmp_path.iterdir()] == ["r.mcap"]
-
-
-def test_closing_twice_is_closing_once(tmp_path):
-    writer = RecordingWriter(tmp_path / "r.mcap", {})
-    writer.finish()
-    writer.finish()
-    assert list(read_recording(writer.path)) == []
 
 
 def test_a_finished_recording_is_never_overwritten_unasked(tmp_path):
@@ -182,21 +118,7 @@ def test_a_truncated_file_is_read_up_to_its_end(tmp_path):
     assert found[-1] >= 400
 
 
-def test_a_damaged_chunk_is_left_out_and_the_rest_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("pipeline.recordings.writing.CHUNK_BYTES", 64 * 1024)
-    path = write(tmp_path / "r.mcap", 600)
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    path.write_bytes(content)
-    reading = read_recording(path)
-    read = [e.message.header.sequence for e in reading if e.topic == "raw"]
-    assert 0 < len(read) < 600
-    assert (read[0], read[-1]) == (0, 599)
-    assert reading.damaged_chunks == 1
-    assert "damaged chunks left out: 1" in reading.damage
-
-
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_changed_bytes_anywhere_never_make_a_reader_crash(tmp_path, data):
     path = tmp_path / "r.mcap"
@@ -211,17 +133,6 @@ def test_changed_bytes_anywhere_never_make_a_reader_crash(tmp_path, data):
     read_metadata(broken)
 
 
-def test_channels_of_other_programs_are_skipped(tmp_path):
-    path = tmp_path / "foreign.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/camera", "json", 0)
-        writer.add_message(channel, 1, b"{}", 1)
-        writer.finish()
-    assert list(read_recording(path)) == []
-
-
 def test_a_payload_that_cannot_be_decoded_is_skipped_and_counted(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
         writer.add(Envelope(RAW_KEY, "raw", b"\xff\xff\xff", 0, raw(0)))
@@ -232,30 +143,15 @@ def test_a_payload_that_cannot_be_decoded_is_skipped_and_counted(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"t,u,y\n0,1,2\n", bytes(100)])
-def test_a_file_that_is_no_recording_is_reported_in_one_line(tmp_path, content):
+def test_a_file_that_is_no_recording_or_is_not_there_is_reported_in_one_line(tmp_path, content):
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
-    for read in (read_recording, read_metadata):
+    for read in (read_recording, read_metadata, lambda path: rare_messages(path, "alarm")):
         with pytest.raises(RecordingError, match=r"x\.mcap: not a recording"):
             read(path)
-
-
-def test_a_missing_file_is_reported_in_one_line(tmp_path):
+    assert last_messages(path, "alarm") == {}
     with pytest.raises(RecordingError, match=r"r\.mcap: cannot read the recording: No such file"):
         read_recording(tmp_path / "r.mcap")
-
-
-def test_every_key_gets_its_own_channel(tmp_path):
-    keys = [tray_key("plant", "a", "command"), tray_key("plant", "b", "command")]
-    with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
-        for key in keys:
-            message: Message = Command(fans=1, t_ns=1, command=np.ones(1), set_point_rad_s=np.ones(1))
-            writer.add_message(key, message, 1)
-    assert [e.key for e in read_recording(writer.path)] == keys
-    with writer.path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    assert (len(summary.channels), len(summary.schemas)) == (2, 1)
 
 
 def test_a_message_on_which_the_writer_crashes_is_not_counted_as_recorded(tmp_path, monkeypatch):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -22,16 +21,15 @@ from mcap_protobuf.decoder import DecoderFactory
 from pipeline.recordings.contents import contents_of, damage_of
 from pipeline.recordings.disk import AtomicAppendFile
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.records import RECORD, Record, RecordReader, record_bytes
+from pipeline.recordings.records import RECORD, RecordReader, record_bytes
 from pipeline.recordings.repair import recover, repair_in_place
 from pipeline.recordings.scan import scan
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
 from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Output
+from schemas.health import Output
 from schemas.topics import health_key
 from tests.support.failing_writers import disk_of
+from tests.support.made_messages import health
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
 
 STREAM = (RAW_KEY, "acquisition-1")
@@ -87,46 +85,35 @@ SIZE = 15_000
 """More than the file has: what is drawn beyond it is the whole file."""
 
 
-@settings(max_examples=150, suppress_health_check=NO_CHECK)
+@settings(max_examples=60, suppress_health_check=NO_CHECK)
 @given(size=st.integers(0, SIZE))
-def test_a_file_truncated_at_any_byte_is_recovered_up_to_its_last_intact_chunk(tmp_path, whole, size):
+def test_a_file_truncated_at_any_byte_is_recovered_up_to_its_last_intact_chunk_as_a_copy_and_in_place(
+    tmp_path, whole, size
+):
     content = whole.read_bytes()
-    truncated, output = tmp_path / "truncated.mcap", tmp_path / "out.mcap"
+    truncated, output, active = (tmp_path / name for name in ("truncated.mcap", "out.mcap", "a.mcap.active"))
+    for path in tmp_path.iterdir():
+        path.unlink()
     truncated.write_bytes(content[:size])
-    output.unlink(missing_ok=True)
+    active.write_bytes(content[:size])
+    repaired = repair_in_place(active)
+    assert not active.exists()
     expected = max((messages for end, messages in chunk_ends(whole) if end <= size), default=0)
     if not expected:
         with pytest.raises(RecordingError, match="nothing can be recovered|not a recording"):
             recover(truncated, output)
-        assert not output.exists()
+        assert repaired is None and not output.exists()
         return
     recover(truncated, output)
     assert read_by_others(output) == read_by_others(whole)[:expected]
     assert read_metadata(output) == read_metadata(whole)
     assert scan(output).is_intact
     assert truncated.read_bytes() == content[:size]
-
-
-@settings(max_examples=100, suppress_health_check=NO_CHECK)
-@given(size=st.integers(0, SIZE))
-def test_repair_in_place_gives_the_same_messages_and_ledger_as_a_copy(tmp_path, whole, size):
-    content = whole.read_bytes()
-    active, output = tmp_path / "a.mcap.active", tmp_path / "out.mcap"
-    for path in tmp_path.iterdir():
-        path.unlink()
-    active.write_bytes(content[:size])
-    repaired = repair_in_place(active)
-    assert not active.exists()
-    (tmp_path / "truncated.mcap").write_bytes(content[:size])
-    if repaired is None:
-        assert not any(end <= size for end, _ in chunk_ends(whole))
-        return
-    recover(tmp_path / "truncated.mcap", output)
+    assert repaired is not None and repaired.path.name == "a.mcap"
     assert read_by_others(repaired.path) == read_by_others(output)
+    assert read_metadata(repaired.path) == read_metadata(output)
     in_place, copy = contents_of(repaired.path), contents_of(output)
     assert (in_place.streams, in_place.recovered) == (copy.streams, copy.recovered)
-    assert read_metadata(repaired.path) == read_metadata(output)
-    assert repaired.path.name == "a.mcap"
 
 
 def test_a_kill_at_any_byte_of_a_repair_loses_nothing(tmp_path, whole):
@@ -203,7 +190,7 @@ def test_an_intact_file_is_left_unchanged_or_copied(tmp_path, whole):
     assert (tmp_path / "copy.mcap").read_bytes() == whole.read_bytes()
 
 
-def test_the_ledger_of_a_file_that_lacks_only_its_index_is_kept(tmp_path):
+def test_the_ledger_of_a_file_that_lacks_only_its_index_is_kept_and_else_gaps_are_counted(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
         writer.add_message(RAW_KEY, raw(0), 1)
         writer.ledger.add_duplicated(*STREAM, 7)
@@ -212,19 +199,16 @@ def test_the_ledger_of_a_file_that_lacks_only_its_index_is_kept(tmp_path):
     found = recover(path).found
     assert found.is_ended
     assert contents_of(path).streams[STREAM].duplicated == 7
-
-
-def test_gaps_are_counted_in_the_new_ledger(tmp_path):
-    writer = RecordingWriter(tmp_path / "r.mcap", {})
+    writer = RecordingWriter(tmp_path / "killed.mcap", {})
     for sequence in (0, 1, 5):
         writer.add_message(RAW_KEY, raw(sequence), 1000 + sequence)
     writer.flush()
     writer._file.close()
-    recovery = recover(tmp_path / "r.mcap.active")
+    recovery = recover(tmp_path / "killed.mcap.active")
     assert contents_of(recovery.path).streams[STREAM] == StreamCounts(3, 3, 0, 0, 5, 1000, 1005)
 
 
-@settings(max_examples=100, suppress_health_check=NO_CHECK)
+@settings(max_examples=40, suppress_health_check=NO_CHECK)
 @example(at=0.0, value=0)
 @given(at=st.floats(0, 1), value=st.integers(0, 255))
 def test_a_changed_byte_costs_at_most_its_record(tmp_path, whole, at, value):
@@ -243,7 +227,7 @@ def test_a_changed_byte_costs_at_most_its_record(tmp_path, whole, at, value):
 
 
 @pytest.mark.parametrize("opcode", [Opcode.CHUNK, Opcode.MESSAGE_INDEX])
-@pytest.mark.parametrize("more", [1, 256, -256, 1024, 4096, 1 << 16])
+@pytest.mark.parametrize("more", [1, -256, 1 << 16])
 def test_a_damaged_length_costs_one_chunk_though_it_fits_into_the_file(tmp_path, opcode, more):
     path = write(tmp_path / "r.mcap", 3000)
     records = [record for record in RecordReader(path) if record.opcode == opcode]
@@ -362,7 +346,7 @@ def test_two_repairs_do_not_write_the_same_file(tmp_path, whole):
     assert len(read_by_others(recover(path).path)) == 41
 
 
-@pytest.mark.parametrize("room", [0, 100, 10_000])
+@pytest.mark.parametrize("room", [0, 10_000])
 def test_a_disk_that_fills_during_recovery_leaves_everything_as_it_was(tmp_path, whole, room):
     path = tmp_path / "r.mcap"
     truncated = whole.read_bytes()[:-300]
@@ -425,37 +409,14 @@ def test_a_truncated_file_from_another_writer_is_repaired_too(tmp_path, chunked,
         assert [m.log_time for _, _, m in reader.iter_messages()] == all_of_it[: found.messages]
 
 
-def test_a_recording_that_is_renamed_while_it_is_read_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As by the recorder that finishes it."""
-    path, read = small(tmp_path / "one.mcap"), RecordReader.__iter__
-
-    def then_renamed(reader: RecordReader) -> Iterator[Record]:
-        yield from read(reader)
-        path.rename(tmp_path / "other.mcap")
-
-    monkeypatch.setattr(RecordReader, "__iter__", then_renamed)
-    with pytest.raises(RecordingError, match="one.mcap: cannot read the recording: No such file"):
-        scan(path)
-
-
 def test_what_a_killed_recorder_left_out_on_purpose_is_not_missing_in_the_repaired_file(tmp_path):
     metadata = {"site": "plant", "left_out": "grid,score"}
     writer = RecordingWriter(tmp_path / "r.mcap", metadata, ledger=SequenceLedger(left_out=("grid", "score")))
     keys = (RAW_KEY, RAW_KEY.replace("/raw", "/grid"))
     for number in range(2):
         outputs = tuple(Output(key=key, published=5 * number) for key in keys)
-        health = Health(
-            header=Header("acquisition-1", number, ""),
-            stage="acquisition",
-            instance="tray1",
-            status=StageStatus.OK,
-            t_ns=1,
-            uptime_s=1.0,
-            outputs=outputs,
-        )
-        writer.add_message(health_key("plant", "acquisition", "tray1"), health, number)
+        message = health("acquisition", "tray1", "acquisition-1", number, outputs=outputs)
+        writer.add_message(health_key("plant", "acquisition", "tray1"), message, number)
     writer.flush()
     killed = tmp_path / "killed.mcap"
     killed.write_bytes((tmp_path / "r.mcap.active").read_bytes())

@@ -11,44 +11,41 @@ import pytest
 from pipeline.cli.recordings import info
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.run_recordings import recorded_files, run_metadata
+from pipeline.recordings.run_recordings import recorded_files
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from pipeline.replay.offline.replay_input import open_replay_input
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Counter, Health
+from schemas.health import Counter
 from schemas.topics import health_key, tray_key
 from tests.support.fantwin_command import fantwin
 from tests.support.killed_site import CONFIGURATION, SITE, TRAY, Site
+from tests.support.made_messages import health
 
 TRAYS = (TRAY, "tray2")
 _TRAY_TABLE = CONFIGURATION[CONFIGURATION.index("[[tray]]") : CONFIGURATION.index("[twin_integrator]")]
 OF_BOTH = CONFIGURATION.replace(_TRAY_TABLE, _TRAY_TABLE + _TRAY_TABLE.replace(TRAY, TRAYS[1]))
-HEALTH = Health(
-    header=Header("resampler-all-1", 0, ""),
-    stage="resampler",
-    instance="all",
-    status=StageStatus.OK,
-    t_ns=1,
-    uptime_s=1,
-)
 
 
-def shard(folder: Path, number: int, configuration: str = OF_BOTH, overrides: str = "[]") -> Path:
+@pytest.fixture(scope="module")
+def sites(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The recordings of two sites of one tray, whose scorer was killed."""
+    found: list[Path] = []
+    for seed in (1, 2):
+        site = Site(tmp_path_factory.mktemp("site"), seed, raw_samples=4)
+        site.run(320)
+        site.kill("scorer")
+        site.run(80)
+        found.append(site.finished())
+    return found
+
+
+def shard(sites: list[Path], folder: Path, number: int, overrides: str = "[]") -> Path:
     """The recording of one of two shards: a whole site of one tray, under the name of its tray."""
-    tray = TRAYS[number - 1]
-    made = folder / f"site-{number}"
-    made.mkdir()
-    site = Site(made, seed=number)
-    site.run(500)
-    site.kill("scorer")
-    site.run(100)
-    path = site.finished()
+    tray, path = TRAYS[number - 1], sites[number - 1]
     head = read_metadata(path)
     metadata = {name.replace(TRAY, tray): value.replace(TRAY, tray) for name, value in head.metadata.items()}
     metadata |= {"recording": f"{number}-of-2.recording.mcap", "overrides": overrides}
-    attachments = {"configuration.toml": configuration.encode(), f"{tray}.onnx": head.attachments[f"{TRAY}.onnx"]}
+    attachments = {"configuration.toml": OF_BOTH.encode(), f"{tray}.onnx": head.attachments[f"{TRAY}.onnx"]}
     with RecordingWriter(folder / f"{number}-of-2.recording.mcap", metadata, attachments) as writer:
         entries = list(read_recording(path))
         for entry in entries:
@@ -56,22 +53,18 @@ def shard(folder: Path, number: int, configuration: str = OF_BOTH, overrides: st
             message = replace(entry.message, header=header)
             writer.add_message(tray_key(SITE, tray, entry.topic), message, entry.received_t_ns)
         for sequence in range(number):  # the second one has heard the stage of both for longer
-            health = replace(
-                HEALTH,
-                header=Header("resampler-all-1", sequence, ""),
-                counters=(Counter(name="lost_late", value=sequence),),
-                lost=sequence,
-            )
-            writer.add_message(health_key(SITE, "resampler", "all"), health, entries[-1].received_t_ns)
+            late = (Counter(name="lost_late", value=sequence),)
+            report = health("resampler", sequence=sequence, counters=late, lost=sequence)
+            writer.add_message(health_key(SITE, "resampler", "all"), report, entries[-1].received_t_ns)
     return writer.path
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(sites: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder with the recordings of two shards, and a table that somebody has imported there."""
     found = tmp_path_factory.mktemp("runs")
     for number in (1, 2):
-        shard(found, number)
+        shard(sites, found, number)
     with RecordingWriter(found / "imported.mcap", {"trays": "other", "source": "table.csv"}):
         pass
     return found
@@ -84,33 +77,28 @@ def test_a_folder_stands_for_what_recorders_have_recorded_there(folder, tmp_path
         recorded_files([tmp_path])
 
 
-def test_the_shards_together_know_what_each_knows_about_its_trays(folder):
-    found = run_metadata(recorded_files([folder]))
-    assert found.trays == TRAYS
-    assert {f"{tray}.onnx" for tray in TRAYS} < set(found.attachments)
-    assert [found.speed_unit(tray) for tray in TRAYS] == ["rad/s", "rad/s"]
-
-
 def test_a_replay_of_the_folder_decides_for_all_trays_as_it_was_decided(folder):
     done = fantwin("replay", "--offline", "--verify", "--json", folder)
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     assert found["verified"]["equal"]
-    assert found["verified"]["samples_equal"] > 900
+    assert found["verified"]["samples_equal"] > 600
     assert found["restarts"] == 2
     assert [set(one["counts"]) for one in found["recordings"]] == [{tray} for tray in TRAYS]
     alone = json.loads(fantwin("replay", "--offline", "--json", folder / "2-of-2.recording.mcap").stdout)
     assert alone["counts"] == found["recordings"][1]["counts"]
 
 
-def test_shards_of_hosts_that_run_at_different_places_are_one_run_and_those_that_decide_otherwise_are_not(tmp_path):
-    here = shard(tmp_path, 1, overrides='["run_folder=\\"/a\\"", "bus.endpoint=\\"x\\""]')
-    there = shard(tmp_path, 2, overrides='["run_folder=\\"/b\\""]')
+def test_shards_of_hosts_that_run_at_different_places_are_one_run_and_those_that_decide_otherwise_are_not(
+    sites, tmp_path
+):
+    here = shard(sites, tmp_path, 1, overrides='["run_folder=\\"/a\\"", "bus.endpoint=\\"x\\""]')
+    there = shard(sites, tmp_path, 2, overrides='["run_folder=\\"/b\\""]')
     with open_replay_input([here, there], None, (), None) as both:
         assert [tray.name for tray in both.trays] == list(TRAYS)
     other = tmp_path / "other"
     other.mkdir()
-    strict = shard(other, 2, overrides='["scorer.alarm_sigmas=9.0"]')
+    strict = shard(sites, other, 2, overrides='["scorer.alarm_sigmas=9.0"]')
     with (
         pytest.raises(RecordingError, match="they differ in keys set on the command line"),
         open_replay_input([here, strict], None, (), None),

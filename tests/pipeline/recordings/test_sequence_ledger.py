@@ -15,9 +15,8 @@ from pipeline.recordings.sequence_ledger import (
     next_sequences,
     sum_by_key,
 )
-from schemas.enums import StageStatus
-from schemas.header import Header
 from schemas.health import Health, Output
+from tests.support import made_messages
 
 KEY, TWIN_KEY = "fantwin/plant/tray1/raw", "fantwin/plant/tray1/twin"
 
@@ -30,36 +29,14 @@ def counted(sequences, before=None, key=KEY, producer="a") -> SequenceLedger:
 
 
 def health(producer: str, published: int, key: str = KEY) -> Health:
-    output = Output(key=key, published=published)
-    return Health(
-        header=Header(producer, 0, ""),
-        stage="acquisition",
-        instance="tray1",
-        status=StageStatus.OK,
-        t_ns=1,
-        uptime_s=1.0,
-        outputs=(output,),
-    )
+    return made_messages.health("acquisition", "tray1", producer, outputs=(Output(key=key, published=published),))
 
 
-def test_messages_in_gaps_are_missing():
-    assert counted([3, 4, 8, 9]).counts[KEY, "a"] == StreamCounts(4, 3, 0, 3, 9, 1003, 1009)
-
-
-def test_messages_before_the_first_one_seen_are_not_missing():
-    assert counted([500]).counts[KEY, "a"].missing == 0
-
-
-def test_messages_between_two_parts_are_missing_in_the_second():
-    first = counted(range(10))
-    second = first.for_next_part()
-    second.add(KEY, "a", 14, 1014)
-    assert (first.counts[KEY, "a"].missing, second.counts[KEY, "a"].missing) == (0, 4)
-
-
-def test_repeated_messages_are_counted_and_make_no_gap():
-    account = counted([0, 1, 2, 1, 3]).counts[KEY, "a"]
-    assert (account.messages, account.missing, account.duplicated, account.last_sequence) == (5, 0, 1, 3)
+def test_messages_in_gaps_are_missing_and_times_are_the_first_and_the_last_also_of_a_clock_that_was_set_back():
+    ledger = counted([3, 4, 8, 9])
+    assert ledger.counts[KEY, "a"] == StreamCounts(4, 3, 0, 3, 9, 1003, 1009)
+    ledger.add(KEY, "a", 10, 5)
+    assert ledger.counts[KEY, "a"] == StreamCounts(5, 3, 0, 3, 10, 5, 1009)
 
 
 def test_a_card_that_is_written_again_at_the_start_of_a_part_counts_once():
@@ -86,16 +63,11 @@ def test_messages_that_will_not_be_recorded_are_missing_at_the_end_if_no_later_o
     ledger = counted([0, 1])
     ledger.add_lost(KEY, "a", 3)
     ledger.add_lost(KEY, "b", 7)
+    assert before_from_metadata(ledger.before_as_metadata()) == {(KEY, "a"): 2, (KEY, "b"): 7}
     last = ledger.for_next_part().for_next_part()
     last.finish()
     assert ledger.counts[KEY, "a"].missing == 0
     assert {line: account.missing for line, account in last.counts.items()} == {(KEY, "a"): 2, (KEY, "b"): 1}
-
-
-def test_a_part_is_expected_to_begin_where_the_one_before_ended_despite_losses():
-    ledger = counted([0, 1]).for_next_part()
-    ledger.add_lost(KEY, "a", 5)
-    assert before_from_metadata(ledger.before_as_metadata()) == {(KEY, "a"): 2}
 
 
 def test_messages_that_health_reports_as_published_and_that_never_came_are_unrecorded():
@@ -109,14 +81,11 @@ def test_messages_that_health_reports_as_published_and_that_never_came_are_unrec
     assert ledger.unrecorded() == {}
 
 
-def test_nothing_is_missing_of_a_producer_without_recorded_messages():
+def test_all_messages_count_of_a_producer_that_was_known_before_its_first_one_and_only_of_it():
     ledger = SequenceLedger()
     ledger.add_health(health("a", 500))
     ledger.finish()
     assert ledger.counts == {}
-
-
-def test_all_messages_count_of_a_producer_that_was_known_before_its_first_one():
     ledger = SequenceLedger()
     ledger.add_health(health("a", 0))
     ledger.add(KEY, "a", 3, 1)
@@ -128,16 +97,13 @@ def test_all_messages_count_of_a_producer_that_was_known_before_its_first_one():
     assert ledger.counts[KEY, "a"] == StreamCounts(missing=5)
 
 
-def test_topics_that_are_not_recorded_are_never_missing():
+def test_topics_that_are_never_recorded_or_were_left_out_on_purpose_are_never_missing():
     ledger = SequenceLedger()
     for published in (0, 5):
         ledger.add_health(health("a", published, "fantwin/plant/tray1/clock"))
         ledger.add_health(health("a", published, "fantwin/something/else"))
     ledger.finish()
     assert ledger.counts == {}
-
-
-def test_topics_that_were_left_out_on_purpose_are_never_missing():
     grid = "fantwin/plant/tray1/grid"
     ledger = SequenceLedger({(grid, "a"): 3, (KEY, "a"): 3}, left_out=("grid",))
     for published in (0, 5):
@@ -150,14 +116,6 @@ def test_topics_that_were_left_out_on_purpose_are_never_missing():
         successor.add_health(health("c", 5, grid))
         successor.finish()
         assert not [key for key, _ in successor.counts if key == grid]
-
-
-def test_first_and_last_times_allow_for_a_clock_that_was_set_back():
-    ledger = SequenceLedger()
-    for sequence, t_ns in enumerate((50, 90, 10, 20)):
-        ledger.add(KEY, "a", sequence, t_ns)
-    account = ledger.counts[KEY, "a"]
-    assert (account.first_ns, account.last_ns) == (10, 90)
 
 
 def test_messages_recorded_in_a_damaged_file_and_not_found_are_missing():
@@ -191,15 +149,11 @@ def test_the_counts_of_parts_add_up_to_those_of_the_whole(first, second):
     assert sum(part.missing for part in parts) == total.missing
 
 
-def test_a_ledger_is_read_back_as_it_was_written():
+def test_a_ledger_is_read_back_as_it_was_written_and_the_next_part_is_due_after_its_last_message():
     ledger = counted([0, 5])
     ledger.add(KEY, "b", 7, 1)
     assert counts_from_metadata(ledger_metadata(ledger.counts)) == ledger.counts
     assert before_from_metadata(ledger.before_as_metadata()) == ledger.next == {(KEY, "a"): 6, (KEY, "b"): 8}
-
-
-def test_the_next_part_is_due_after_the_last_recorded_message():
-    ledger = counted([0, 5], before={(KEY, "c"): 9})
     ledger.add_lost(KEY, "a", 6)
     ledger.finish()
-    assert next_sequences({(KEY, "c"): 9}, ledger.counts) == {(KEY, "a"): 6, (KEY, "c"): 9}
+    assert next_sequences({(KEY, "c"): 9}, ledger.counts) == {(KEY, "a"): 6, (KEY, "b"): 8, (KEY, "c"): 9}

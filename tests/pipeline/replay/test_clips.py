@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from pipeline.recordings.clips.clip import Clip, clip_lines
-from pipeline.recordings.clips.cutting import _Parts, cut_clips
+from pipeline.recordings.clips.cutting import cut_clips
 from pipeline.recordings.contents import contents_of
-from pipeline.recordings.disk import DiskError
-from pipeline.recordings.parts import part_path
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.records import active_path
 from pipeline.recordings.writing import RecordingWriter
@@ -49,9 +46,14 @@ def again(path: Path) -> RescoredTray:
     return tray
 
 
-def test_a_clip_has_every_message_of_its_time_with_its_bytes(undisturbed, tmp_path):
+@pytest.fixture(scope="module")
+def clip(undisturbed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of the first alarm of the undisturbed recording."""
+    return cut(undisturbed, tmp_path_factory.mktemp("clip"))
+
+
+def test_a_clip_has_every_message_of_its_time_with_its_bytes(undisturbed, clip):
     alarm = first_raised(undisturbed)
-    clip = cut(undisturbed, tmp_path)
     window = range(alarm.t_ns - S // 2, alarm.t_ns + 2 * S + 1)
     wanted = [(e.key, e.payload, e.received_t_ns) for e in read_recording(undisturbed) if e.received_t_ns in window]
     found = [(e.key, e.payload, e.received_t_ns) for e in read_recording(clip) if e.received_t_ns in window]
@@ -67,17 +69,13 @@ def test_a_clip_has_every_message_of_its_time_with_its_bytes(undisturbed, tmp_pa
     assert "raised 2027-01-15" in clip_lines(contents.metadata)[0]
 
 
-def test_the_same_alarm_comes_out_of_a_clip_again(undisturbed, tmp_path):
+def test_the_same_alarm_comes_out_of_a_clip_again_from_its_snapshot_on(undisturbed, clip):
     alarm = first_raised(undisturbed)
-    tray = again(cut(undisturbed, tmp_path))
+    tray = again(clip)
     (raised,) = [each for each in tray.alarms if each.transition == Transition.RAISED]
     assert (raised.fan, raised.severity, raised.statistic) == (alarm.fan, alarm.severity, alarm.statistic)
     assert abs(raised.t_ns - alarm.t_ns) < 0.1 * S
     assert tray.lost == 0
-
-
-def test_the_scorer_of_a_replay_continues_from_the_snapshot_of_the_clip(undisturbed, tmp_path):
-    clip = cut(undisturbed, tmp_path)
     with open_replay_input([clip], None, (), None) as replay_input:
         plan, _, _ = replay_input.read_plan("tray1")
         first, second, *_ = (each.message for each in replay_input.pipeline("tray1", plan).run())
@@ -95,8 +93,7 @@ def test_the_same_alarm_comes_out_of_a_clip_with_raw_samples_only(undisturbed, t
         verified(clip)
 
 
-def test_a_clip_is_verified_from_its_snapshot_and_predictions(undisturbed, tmp_path):
-    clip = cut(undisturbed, tmp_path)
+def test_a_clip_is_verified_from_its_snapshot_and_predictions(clip):
     found = verified(clip).comparison
     assert found and found.is_equal and found.alarms_equal >= 1
     assert found.equal == sum(len(score.t_ns) for score in recorded(clip, "score")) > 200
@@ -147,39 +144,3 @@ def test_a_clip_of_parts_that_are_gone_is_not_written_and_one_of_some_has_the_re
     assert (result.size_bytes, result.may_pass) == (0, False)
     assert "nothing of that time is recorded" in result.problem
     assert not active_path(tmp_path / "clips" / past.name).exists()
-
-
-def test_where_room_runs_out_while_clips_are_written_the_last_one_is_given_up(undisturbed, tmp_path):
-    clip = clip_of(first_raised(undisturbed), before_s=0.5, after_s=2.0)
-    record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
-    folder = tmp_path / "clips"
-    files: list[int] = []
-
-    def rest() -> None:
-        files.append(len(list(folder.iterdir())))
-        if len(files) == 2:
-            raise DiskError("0.1 MB are free")
-
-    clips = [clip, replace(clip, name="last.mcap")]
-    first, last = cut_clips(clips, tmp_path / "recording.mcap", folder, rest=rest)
-    assert first.size_bytes and not first.problem
-    assert (last.size_bytes, last.may_pass, last.problem) == (0, True, "0.1 MB are free")
-    assert files[:3] == [2, 2, 1]  # there is room again before the first one goes on
-    assert [path.name for path in folder.iterdir()] == [clip.name]
-
-
-def test_of_parts_from_before_the_clock_was_set_back_only_the_last_is_read(undisturbed, tmp_path):
-    recording = tmp_path / "recording.mcap"
-    head = read_metadata(undisturbed)
-    raws = list(read_recording(undisturbed, ("raw",)))
-    for number in range(1, 9):  # a day apart; the last two are of a clock that was set back
-        moved_ns = (number - (100 if number > 6 else 0)) * 86400 * S
-        about = {**head.metadata, "recording": "recording.mcap"}
-        with RecordingWriter(part_path(recording, number), about, t_ns=raws[0].received_t_ns) as writer:
-            for each in raws:
-                writer.add(each.received_at(each.received_t_ns + moved_ns))
-    parts = _Parts(recording, None)
-    first_ns = raws[0].received_t_ns
-    found = parts.go_back_to(first_ns - 98 * 86400 * S)
-    assert len(parts.read) <= 3
-    assert [part.first_ns for part in found][:1] == [first_ns - 92 * 86400 * S]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pty
 import sys
-import termios
 
 import pytest
 
@@ -40,26 +39,6 @@ def test_without_a_terminal_there_are_no_keys(monkeypatch, tmp_path):
         assert not keys.is_available
         with keys:
             assert keys.pressed() == []
-
-
-def test_keys_are_read_without_return_and_the_terminal_is_restored_even_after_an_error(monkeypatch):
-    ours, theirs = pty.openpty()
-    monkeypatch.setattr(os, "tcgetpgrp", lambda _descriptor: os.getpgrp())  # as if this test were in its foreground
-    with os.fdopen(theirs, "r") as terminal:
-        monkeypatch.setattr(sys, "stdin", terminal)
-        before = termios.tcgetattr(theirs)
-        keys = Keys()
-        assert keys.is_available
-        with pytest.raises(KeyboardInterrupt), keys:
-            os.write(ours, b" q")
-            assert not termios.tcgetattr(theirs)[3] & termios.ICANON
-            found: list[Key] = []
-            while len(found) < 2:
-                found += keys.pressed()
-            assert found == [Key.PAUSE, Key.QUIT]
-            raise KeyboardInterrupt
-        assert termios.tcgetattr(theirs) == before
-    os.close(ours)
 
 
 def test_in_the_background_of_a_terminal_there_are_no_keys(monkeypatch):

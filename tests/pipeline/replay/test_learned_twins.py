@@ -101,7 +101,7 @@ def test_a_replay_of_a_part_begins_with_the_twin_that_was_in_force(learned: Path
 
 
 def test_a_twin_that_cannot_be_used_is_refused_and_the_former_one_stays(tmp_path: Path) -> None:
-    site = Site(tmp_path, 8, learns=True)
+    site = Site(tmp_path, 8, raw_samples=4, learns=True)
     site.put_in_force("tray1-1", twin_of(tmp_path, "tray1-1", 1))
     site.run(300)
     site.put_in_force("tray1-2", b"not a twin")
@@ -113,7 +113,7 @@ def test_a_twin_that_cannot_be_used_is_refused_and_the_former_one_stays(tmp_path
 
 
 def test_with_new_limits_alone_baselines_and_alarms_go_on(tmp_path: Path) -> None:
-    site = Site(tmp_path, 9, learns=True)
+    site = Site(tmp_path, 9, raw_samples=4, learns=True)
     model = small_hybrid(1)
     first = write_twin(tmp_path / "1.onnx", model, fans=FANS, name="tray1-1", calibration=CALIBRATION).read_bytes()
     detectors = {
@@ -146,7 +146,7 @@ def test_with_new_limits_alone_baselines_and_alarms_go_on(tmp_path: Path) -> Non
 def test_wear_goes_on_in_a_replay_as_it_did_when_a_twin_took_over(tmp_path: Path) -> None:
     """The second twin takes one more of the command for healthy."""
     settings = "limit_factor = 3.0\nwear_every_s = 10.0\n"
-    site = Site(tmp_path, 7, raw_samples=4, learns=True, scorer_settings=settings)
+    site = Site(tmp_path, 7, raw_samples=20, learns=True, scorer_settings=settings)
     model = small_hybrid(1)
     site.put_in_force("tray1-1", write_twin(tmp_path / "1.onnx", model, fans=FANS, name="tray1-1").read_bytes())
     site.run(2400)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
 
 import pytest
 
@@ -12,10 +11,9 @@ from pipeline.config.models import BusConfig
 from pipeline.replay.live.listeners import Listeners, Present, conflict, made_by_stages
 from pipeline.runtime.stage import load_stage
 from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.header import Header
 from schemas.health import Health, Input, Output
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from tests.support.made_messages import health
 from tests.support.running_chain import eventually
 
 ALL = ("raw", "grid", "prediction", "score", "alarm", "command", "twin")
@@ -79,18 +77,17 @@ class FakeStage:
 
     def say(self, *inputs: Input, published: int = 0, lost: int = 0) -> None:
         out = load_stage(self.stage).writes[:1]
-        health = Health(
-            header=Header(self.producer, self.publisher.published, ""),
-            stage=self.stage,
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=self.publisher.published,
-            uptime_s=0.0,
+        number, outputs = self.publisher.published, [tray_key("s", "a", name) for name in out]
+        said = health(
+            self.stage,
+            producer=self.producer,
+            sequence=number,
+            t_ns=number,
             inputs=inputs,
-            outputs=tuple(Output(key=tray_key("s", "a", name), published=published) for name in out),
+            outputs=tuple(Output(key=key, published=published) for key in outputs),
             lost=lost,
         )
-        self.publisher.put(encode(health))
+        self.publisher.put(encode(said))
 
 
 def seen_stages(bus: Bus, listeners: Listeners, *names: str) -> list[FakeStage]:
@@ -182,12 +179,3 @@ def test_messages_before_the_first_received_one_count_as_lost_for_listeners_pres
     recorder.say(line(GRID, "replay-1", 50, first=50))
     eventually(lambda: len(listeners._views()) == 2, "both are known")
     eventually(lambda: listeners.lost("replay-1", {GRID: 100}) == {"twin_integrator": 10}, "7 early, 3 missing")
-
-
-def test_another_replay_is_seen(sites):
-    bus, listeners = sites
-    assert not listeners.is_replaying()
-    bus.declare_alive(alive_key("s", "replay", "all"))
-    eventually(listeners.is_replaying, "it is seen")
-    assert listeners.present() == []
-    assert replace(there("viewer")[0], instance="x").label == "viewer/x"

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import pytest
 
 from pipeline.replay.live.keyboard import Key
-from pipeline.replay.live.pace import Pace
+from pipeline.replay.live.pace import FASTEST, SLOWEST, Pace, faster, slower
 from pipeline.replay.live.player import BEAT_S, Player, Progress, Stopped
-from schemas.enums import Severity, StageStatus
+from schemas.enums import StageStatus
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, NewTwin
+from schemas.messages import NewTwin
+from tests.support import made_messages
 from tests.support.replay_data import START_NS, STEP_NS, raw_of
 
 
@@ -44,13 +44,16 @@ class Sent:
     messages: list[tuple[float, str, int]] = field(default_factory=list)
     clocks: list[tuple[float, int, float]] = field(default_factory=list)
     healths: list[float] = field(default_factory=list)
+    order: list[str] = field(default_factory=list)
     cost_s: float = 0.0
 
     def send(self, entry: Envelope) -> None:
+        self.order.append("message")
         self.messages.append((round(self.time.s - 50.0, 6), entry.topic, entry.message.header.sequence))
         self.time.s += self.cost_s
 
     def publish_clock(self, t_ns: int, rate: float) -> None:
+        self.order.append("clock")
         self.clocks.append((self.time.s - 50.0, t_ns - START_NS, rate))
 
     def publish_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
@@ -83,9 +86,7 @@ def raws(count: int, period_ns: int = STEP_NS, samples: int = 1) -> list[tuple[i
 
 
 def alarm(log_ns: int, sequence: int) -> Envelope:
-    fields: dict[str, Any] = {"residual_rad_s": 0, "limit_rad_s": 0, "message": ""}
-    message = Alarm(fan=0, active=True, severity=Severity.ALARM, t_ns=log_ns, onset_t_ns=log_ns, **fields)
-    return Envelope.of("fantwin/demo/tray1/alarm", message, log_ns)
+    return Envelope.of("fantwin/demo/tray1/alarm", made_messages.alarm(0, log_ns, sequence=sequence), log_ns)
 
 
 def play(
@@ -130,18 +131,7 @@ def test_the_clock_is_published_twenty_times_a_second_and_health_once_a_second()
 def test_the_time_is_published_before_the_first_message():
     sent, _ = play(raws(3))
     assert sent.clocks[0] == (0.0, 0, 1.0)
-    order: list[str] = []
-
-    class Ordered(Sent):
-        def send(self, entry: Envelope) -> None:
-            order.append("message")
-
-        def publish_clock(self, t_ns: int, rate: float) -> None:
-            order.append("clock")
-
-    time = FakeTime()
-    Player(Ordered(time), Pace(math.inf), time).play(raws(3))
-    assert order[0] == "clock"
+    assert sent.order[0] == "clock"
 
 
 def test_the_clock_waits_before_samples_that_are_still_to_come_however_late_their_message_was():
@@ -200,15 +190,11 @@ def test_a_twin_that_is_published_before_a_sample_is_no_step_of_its_own():
     assert by_second == [["new_twin", "raw"], ["raw"]]
 
 
-def test_after_a_step_the_replay_continues_from_there():
-    sent, _ = play(raws(100), paused=True, keys=[(10.0, Key.STEP), (20.0, Key.PAUSE)])
-    assert [at_s for at_s, _, _ in sent.messages[:3]] == pytest.approx([10.0, 20.01, 20.02], abs=0.051)
-
-
-def test_up_and_down_double_and_halve_the_rate():
+def test_up_and_down_double_and_halve_the_rate_between_its_ends():
     sent, _ = play(raws(400), keys=[(1.0, Key.FASTER), (2.0, Key.SLOWER)])
     assert sent.messages[-1][0] == pytest.approx(2.99, abs=0.06)
     assert {rate for _, _, rate in sent.clocks} == {1.0, 2.0}
+    assert (slower(SLOWEST), faster(FASTEST), slower(math.inf)) == (SLOWEST, math.inf, FASTEST)
 
 
 @pytest.mark.parametrize("paused", [False, True])

@@ -130,7 +130,7 @@ def changes(predictions: Iterable[Prediction]) -> list[tuple[str, int]]:
 
 
 @pytest.mark.parametrize("start", TOPICS)
-def test_stages_predict_in_a_replay_what_they_predicted_when_it_was_recorded(learned, start):
+def test_stages_get_their_twins_and_predict_in_a_replay_as_when_it_was_recorded(learned, start):
     stages = played(learned, start)
     before: list[Prediction] = recorded(learned.path, "prediction")
     assert changes(before) == learned.firsts == changes(stages.predictions)
@@ -138,22 +138,16 @@ def test_stages_predict_in_a_replay_what_they_predicted_when_it_was_recorded(lea
     for name in columns:
         then, now = (np.concatenate([getattr(each, name) for each in found]) for found in (before, stages.predictions))
         np.testing.assert_array_equal(then, now, name)
-
-
-@pytest.mark.parametrize("start", TOPICS)
-def test_each_twin_is_published_with_its_first_sample_as_soon_as_the_one_before_takes_over(learned, start):
-    stages = played(learned, start)
     assert [(twin.twin, twin.first_sample_t_ns) for twin in stages.new_twins] == learned.firsts
     assert [twin.content for twin in stages.new_twins] == [card.content for card in learned.cards]
     first, second = (place for place, entry in enumerate(stages.entries) if entry.topic == "new_twin")
-    assert first == 0
+    assert first == 0, "each is published as soon as the one before takes over"
     message: Any = stages.entries[second + 1].message
     newest_t_ns = int((message.t_ns if isinstance(message, Grid) else message.host_receive_t_ns)[-1])
     assert newest_t_ns - 4 * STEP_NS < learned.firsts[0][1] <= newest_t_ns, "the block with the first one's sample"
 
 
-@pytest.mark.parametrize("start", TOPICS)
-@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize(("start", "number"), [("grid", 0), ("raw", 1)])
 def test_a_stretch_begins_with_the_twin_then_in_force(learned, start, number):
     at_s = learned.seconds_until(learned.firsts[number][1]) + 0.5
     stages = played(learned, start, at_s)
@@ -168,10 +162,9 @@ def test_a_twin_that_takes_over_after_the_stretch_is_not_published(learned):
     assert [twin.twin for twin in stages.new_twins] == ["tray1-1"]
 
 
-@pytest.mark.parametrize("start", TOPICS)
-def test_each_round_of_a_loop_changes_the_twins_at_the_same_samples(learned, start):
+def test_each_round_of_a_loop_changes_the_twins_at_the_same_samples(learned):
     at_s = learned.seconds_until(learned.firsts[0][1]) + 0.5
-    stages = played(learned, start, at_s, rounds=3)
+    stages = played(learned, "raw", at_s, rounds=3)
     assert [twin.twin for twin in stages.new_twins] == ["tray1-1", "tray1-2"] * 3
     found = changes(stages.predictions)
     assert [twin for twin, _ in found] == ["tray1-1", "tray1-2"] * 3
@@ -182,9 +175,7 @@ def test_each_round_of_a_loop_changes_the_twins_at_the_same_samples(learned, sta
     named = [twin.first_sample_t_ns for twin in stages.new_twins if twin.twin == "tray1-1"]
     assert named[1:] == begins[1:], "not a sample of the round before, which stages may still have to predict"
     late_ns = [t_ns - begin for (_, t_ns), begin in zip(found[2::2], begins[1:], strict=True)]
-    assert late_ns == pytest.approx([0, 0], abs=0 if start == "grid" else 4 * STEP_NS), (
-        "with the first message of its round"
-    )
+    assert late_ns == pytest.approx([0, 0], abs=4 * STEP_NS), "with the first message of its round"
 
 
 def test_the_clock_does_not_pass_the_samples_that_follow_a_twin(learned):

@@ -15,13 +15,14 @@ from mcap.records import ChunkIndex
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.live.recording_playback import RecordingPlayback, TimeExtent, shifted
-from schemas.enums import InvalidReason, Severity
+from schemas.enums import InvalidReason
 from schemas.envelope import Envelope
 from schemas.fields import columns
 from schemas.header import Header
 from schemas.messages import MESSAGE_TYPES, Alarm, Grid, ModelCard
 from schemas.topics import tray_key
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from tests.support import made_messages
 from tests.support.replay_data import START_NS, STEP_NS, raw_of, write_raw
 
 RAW = tray_key("demo", "tray1", "raw")
@@ -116,9 +117,7 @@ def test_a_round_is_a_whole_number_of_grid_steps_and_longer_than_all_that_is_in_
 
 
 def test_all_times_of_a_message_are_shifted_and_nothing_else():
-    alarm = Alarm(
-        fan=1, active=True, severity=Severity.ALARM, t_ns=50, onset_t_ns=40, residual_rad_s=3, limit_rad_s=2, message=""
-    )
+    alarm = made_messages.alarm(1, 50, onset_t_ns=40)
     later = shifted(Envelope.of(ALARM_KEY, alarm, 60), 1000)
     assert later.received_t_ns == 1060
     assert vars(later.message) == vars(replace(alarm, t_ns=1050, onset_t_ns=1040))

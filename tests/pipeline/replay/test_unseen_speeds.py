@@ -52,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("unseen")
     training = recording(path, "training", rough_run(5, 60.0, high=KNEE))
     healthy = recording(path, "healthy", rough_run(6, 150.0, low=20.0, high=KNEE))
-    result = fantwin("train", training, "-o", path / "twin.onnx")
+    result = fantwin("train", training, "--iterations", 12, "-o", path / "twin.onnx")
     assert result.exit_code == 0, result.output
     result = fantwin("calibrate", path / "twin.onnx", healthy, "--false-alarms-per-day", 24, "--extrapolate")
     assert result.exit_code == 0, result.output
@@ -110,7 +110,7 @@ def test_a_speed_that_training_has_not_seen_widens_the_band_and_raises_no_alarm(
 def test_evaluate_counts_the_band_of_a_running_site(folder: Path) -> None:
     twin = folder / "twin.onnx"
     covered = [
-        json.loads(fantwin("evaluate", each, folder / "beyond.mcap", "--json").output)["coverage_2_sigma"]
+        json.loads(fantwin("evaluate", each, folder / "beyond.mcap", "--json").stdout)["coverage_2_sigma"]
         for each in (twin, knows_nothing(twin))
     ]
     assert 1.0 - covered[0] < 0.8 * (1.0 - covered[1]), "a third of the commands are beyond training"

@@ -13,14 +13,12 @@ from schemas.enums import FanState, Severity, Transition
 from schemas.envelope import Envelope
 from schemas.header import Header
 from schemas.messages import Alarm, Diagnosis, Score
+from tests.support import made_messages
 from tests.support.score_data import made_up_tray
 
 
 def alarm(transition: Transition, message: str) -> Alarm:
-    return Alarm(
-        fan=0, active=False, severity=Severity.ALARM, t_ns=7, onset_t_ns=5, residual_rad_s=3.0, limit_rad_s=2.0,
-        message=message, transition=transition,
-    )  # fmt: skip
+    return made_messages.alarm(active=False, onset_t_ns=5, residual_rad_s=3.0, message=message, transition=transition)
 
 
 @pytest.mark.parametrize("transition", [Transition.RAISED, Transition.REPUBLISHED])

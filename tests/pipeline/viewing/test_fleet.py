@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from pipeline.config.models import TrayConfig
 from pipeline.viewing.fleet import NORMAL_LEVELS, Fleet, class_names
-from schemas.enums import FanState, InvalidReason, Severity, Transition
+from schemas.enums import FanState, InvalidReason, Transition
 from schemas.header import Header
 from schemas.messages import Alarm, Score
+from tests.support import made_messages
 from tests.support.score_data import START_NS
 
 SECOND_NS = 1_000_000_000
@@ -33,19 +33,7 @@ def newest(tray: str, t_ns: int, *fans: tuple[Any, ...]) -> Score:
 
 
 def alarm(tray: str, fan: int, onset_t_ns: int, **changes: Any) -> Alarm:
-    made = Alarm(
-        header=Header("p", 0, tray),
-        fan=fan,
-        active=True,
-        severity=Severity.ALARM,
-        t_ns=onset_t_ns,
-        onset_t_ns=onset_t_ns,
-        residual_rad_s=0.0,
-        limit_rad_s=1.0,
-        message="",
-        transition=Transition.RAISED,
-    )
-    return replace(made, **changes)
+    return made_messages.alarm(fan, onset_t_ns, tray, **{"transition": Transition.RAISED, **changes})
 
 
 def fleet_of(**trays: int) -> Fleet:

@@ -21,7 +21,7 @@ def test_every_fan_has_a_cell_of_its_own_within_the_block_of_its_tray(fans: list
     assert (gaps(shown.blocks, shown.blocks) + np.eye(len(fans)) * 1e6).min() >= 1.0, "no two blocks touch"
 
 
-@pytest.mark.parametrize("fans", [[8] * 10, [64] * 5, [64] * 16, [64] * 157, [1024] * 10, [8] * 1250])
+@pytest.mark.parametrize("fans", [[8] * 10, [64] * 157, [1024] * 10])
 def test_the_map_fills_a_window_and_its_names_do_not_touch(fans: list[int]) -> None:
     names = [f"hall1-{number}" for number in range(len(fans))]
     shown = fleet_map(names, fans)

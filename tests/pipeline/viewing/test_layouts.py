@@ -33,7 +33,6 @@ WEAR = {
 @pytest.mark.parametrize(
     ("made", "layout", "names"),
     [
-        (live_view, "all", ALL),
         (recorded_view, "alarms", ALARMS),
         (live_view, "wear", WEAR),
     ],
@@ -51,13 +50,14 @@ def test_a_layout_of_a_live_view_and_of_a_recording_opens_without_a_report(
 
 @pytest.mark.slow
 @needs_a_driver
-def test_all_time_axes_are_linked_and_show_the_window_before_the_cursor(tmp_path: Path) -> None:
+def test_without_a_report_all_time_axes_are_linked_and_show_the_window_before_the_cursor(tmp_path: Path) -> None:
     with rerun_picture._headless_viewer([live_view(tmp_path, window_s=1.0)]) as viewer:
         eventually(lambda: shown(viewer).keys() - {"stages"} == ALL, "the views")
         axes = [part["TimeAxis"] for part in viewer.get_blueprint().blueprint.values() if "TimeAxis" in part]
         assert [axis["link"] for axis in axes if "link" in axis] == ["LinkToGlobal"] * (len(ALL) - 2), "but for texts"
         assert len([axis for axis in axes if "view_range" in axis]) == 1
         in_the_hole, after_it = (score_line(viewer, seconds) for seconds in (5.5, 9.0))
+        assert {name: reports for name, reports in shown(viewer).items() if reports} == {}
         assert in_the_hole == 0.0 and after_it > 0.005, "the window is a second long, and no samples are from 4 to 6 s"
 
 
