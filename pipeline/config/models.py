@@ -260,7 +260,7 @@ class TrayConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _expand_short_form(cls, values: Any) -> Any:
-        """Turn `port = ...` into a serial source: short to write, and all that older configurations have."""
+        """Turn `port = ...`, the short form, into a serial source."""
         if not isinstance(values, dict):
             return values
         short = {key: value for key, value in values.items() if key in cls.short_form_keys}

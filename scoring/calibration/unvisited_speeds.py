@@ -1,8 +1,8 @@
 """Limits at speeds that calibration has hardly seen, of fans whose tachos count and of which there are few data.
 
-At other speeds than those of calibration a twin errs by more than calibration shows. How much more was found on
-simulated racks at 2 Hz, calibrated on ten minutes (docs/reference/benchmarks.md): the fans of one rack had held speeds
-from 40 to 75 % of full speed, and had 45 false alarms a day at other speeds; with these limits, one.
+At other speeds than those of calibration a twin errs by more than calibration shows. How much more was found on a
+simulated rack at 2 Hz, calibrated on ten minutes in which its fans held 40 to 75 % of full speed: without these limits
+it had 45 false alarms a day at other speeds, with them one.
 """
 
 from __future__ import annotations
