@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from schemas.enums import Statistic
 from schemas.tacho import Tacho
+from schemas.units import NS_PER_S
 from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.settings import BaselineSettings
 from scoring.baseline.speed_scaling import speed_scaling
@@ -127,7 +128,8 @@ def test_cuts_change_no_bit_of_scores_and_snapshots(seed: int, cuts: list[int], 
     samples = troubled(400, seed)
     whole = FanScorer(FANS, limits)
     scored = scored_of(whole, samples)
-    for each in (cuts, range(seed % 7, 400, 3)):
+    after_gap = (np.flatnonzero(np.diff(samples.t_ns) > NS_PER_S) + 1).tolist()
+    for each in ((*cuts, *after_gap, *(row + 1 for row in after_gap)), range(seed % 7, 400, 3)):
         scorer = FanScorer(FANS, limits)
         assert_same(scored_of(scorer, samples, each), scored)
         assert json.dumps(scorer.snapshot()) == json.dumps(whole.snapshot())
