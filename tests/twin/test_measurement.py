@@ -56,18 +56,6 @@ def test_a_constant_is_left_as_it_is_and_a_ramp_is_late_by_the_mean_delay() -> N
         assert times[known, column][0] >= times[0, column] + tacho.reach_s
 
 
-def test_derivatives_and_parts_of_the_batch_give_the_same_numbers_and_padding_does_not_count() -> None:
-    times = uneven_times(60, len(TACHOS))
-    times[50:, 1] = times[50, 1]
-    signals = np.random.default_rng(5).standard_normal((60, len(TACHOS), 3))
-    measurement = Measurement(times, TACHOS)
-    whole = measurement.of_speed(signals)
-    np.testing.assert_allclose(measurement.of_speed(signals[..., 1]), whole[..., 1], rtol=1e-12)
-    np.testing.assert_allclose(measurement.of_speed(signals[:, 1:3], slice(1, 3)), whole[:, 1:3], rtol=1e-12)
-    signals[51:, 1] = 1e3
-    np.testing.assert_allclose(measurement.of_speed(signals)[:51, 1], whole[:51, 1], atol=1e-6)
-
-
 @pytest.mark.parametrize("tacho", TACHOS[:2], ids=str)
 def test_the_runtime_averages_commands_as_the_maker_does(tacho: Tacho) -> None:
     period_s = 0.1

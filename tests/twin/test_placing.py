@@ -14,7 +14,6 @@ from tests.support.trained_once import TrainedOnce
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.export.onnx_twin import OnnxTwin
-from twin.export.stored_model import stored_hybrid
 from twin.finishing import TrainedTwin
 from twin.placing import place_twin
 from twin.runs import Array, Run
@@ -79,16 +78,6 @@ def test_a_fan_of_another_type_is_named(type_twin: Path, others: tuple[Run, Run]
     assert warning.startswith("fan 0: its ")
     assert "standard deviations from that of its type: it is another type of fan, or faulty" in warning
     assert not place_twin(type_twin, [own], [], name="placed").identification.warnings
-
-
-def test_the_model_in_a_file_is_the_one_that_was_written(type_twin: Path, others: tuple[Run, Run]) -> None:
-    own, _ = others
-    twin = OnnxTwin(type_twin)
-    state = twin.state_layout.initial_state(np.full(4, 100.0), own.command[0])
-    arguments = state, own.command, own.step_s, twin.parameters[:4]
-    stored = stored_hybrid(type_twin, twin.card)
-    for ours, theirs in zip(stored.advance(*arguments), twin.advance(*arguments), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-7)
 
 
 def test_what_cannot_be_placed_is_refused_in_one_line(type_twin: Path, others: tuple[Run, Run], tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from simulation.surroundings import Surroundings
 from simulation.tacho import NoisyTacho, TachoSettings
 from simulation.tray import TraySettings
 from twin.build import evaluate, train_twin
-from twin.errors import TwinError
 from twin.evaluation.resampling import resampled
 from twin.fitting.drive_fit import FoundDrive
 from twin.fitting.identification import identify
@@ -110,9 +109,3 @@ def test_speeds_are_missing_where_the_conditions_are_not_known(runs: tuple[Run, 
     known = np.isfinite(converted.speed_rad_s[:, 0])
     assert known[: 100 + 240].all()
     assert not known[100 + 260 :].any()
-
-
-def test_a_run_without_a_column_that_the_twin_needs_is_refused(runs: tuple[Run, Run]) -> None:
-    needs = ReferenceConditions(supply_voltage_v=12.0)
-    with pytest.raises(TwinError, match="has no supply_voltage_v, which the twin needs"):
-        at_reference([replace(runs[0], auxiliary={})], needs)

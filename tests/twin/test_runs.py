@@ -1,14 +1,13 @@
 """Valid and invalid runs, and how a run is cut."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from schemas.tacho import Tacho
 from twin.errors import TwinError
-from twin.runs import Run, common_tacho, run_from_samples, starting_speed_rad_s
+from twin.runs import Run, common_tacho, run_from_samples
 
 
 def ramp(times: list[float]) -> Run:
@@ -57,16 +56,3 @@ def test_a_bad_run_is_refused_in_one_line(t_s: list, command: list, speed: list,
     with pytest.raises(TwinError, match=words) as refusal:
         Run("bad", np.array(t_s), np.array(command), np.array(speed))
     assert "\n" not in str(refusal.value)
-
-
-def test_the_starting_speed_skips_missing_samples() -> None:
-    speed = np.array([[np.nan, np.nan], [2.0, np.nan], [4.0, np.nan]])
-    np.testing.assert_array_equal(starting_speed_rad_s(speed), [3.0, np.nan])
-
-
-def test_equal_parts_follow_one_another_and_none_is_longer_than_allowed() -> None:
-    run = ramp(np.arange(1003.0).tolist())
-    parts = run.equal_parts(100)
-    assert (parts[0][0], parts[-1][1], len(parts)) == (0, 1003, 11)
-    assert all(before[1] == after[0] for before, after in pairwise(parts))
-    assert {last - first for first, last in parts} <= {91, 92}

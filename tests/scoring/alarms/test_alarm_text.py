@@ -85,35 +85,3 @@ def test_every_cause_that_can_be_found_has_words() -> None:
 def test_every_transition_is_one_line_that_names_the_fan(transition: Transition) -> None:
     reported = line(transition, refusal="it is active", causes=(BLOCKED,))
     assert reported.startswith("fan 2: ") and len(reported) > len("fan 2: ") and "\n" not in reported
-
-
-@pytest.mark.parametrize(
-    ("more", "expected"),
-    [
-        ({}, "the alarm continues from before the restart"),
-        ({"active": False}, "back to normal, not acknowledged"),
-        ({"active": False, "latched": True, "shelved_until_t_ns": 1},
-         "back to normal, not acknowledged, latched, shelved"),
-        ({"active": False, "acknowledged": True, "suppressed": True}, "back to normal, suppressed"),
-        ({"active": False, "acknowledged": True}, "back to normal"),
-        ({"active": False, "acknowledged": True, "severity": Severity.NONE, "out_of_service": True},
-         "no alarm, out of service"),
-    ],
-)  # fmt: skip
-def test_a_republished_alarm_says_whether_it_is_active_and_else_what_keeps_it(
-    more: dict[str, Any], expected: str
-) -> None:
-    assert line(Transition.REPUBLISHED, **{"acknowledged": False, "confirmed": True, **more}) == f"fan 2: {expected}"
-
-
-def test_a_refusal_says_why() -> None:
-    assert line(Transition.REFUSED, refusal="it is not latched") == "fan 2: refused: it is not latched"
-
-
-def test_a_twin_that_does_not_know_its_unit_says_so() -> None:
-    alarm = Alarm(
-        fan=0, active=True, severity=Severity.ALARM, t_ns=0, onset_t_ns=0, residual_rad_s=0.0, limit_rad_s=0.0,
-        message="", transition=Transition.RAISED, statistic=Statistic.BALANCE_SMOOTHED, torque_balance_command=2.0,
-        torque_balance_limit_command=1.0,
-    )  # fmt: skip
-    assert AlarmText("rpm", "").of(alarm) == "fan 0: takes 2 of command more than a healthy one (limit 1)"

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import itertools
 import json
-import time
 from typing import Any
-
-import pytest
 
 from schemas.enums import Severity, Transition
 from schemas.header import Header
 from schemas.messages import Alarm, Diagnosis
 from scoring.alarms.alarm_flags import is_retained
-from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms
+from scoring.alarms.current_alarms import CurrentAlarm, current_alarms
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
 _numbers = itertools.count()
@@ -37,24 +34,6 @@ def test_the_newest_message_of_each_fan_decides_its_state_in_any_order():
     for messages in itertools.permutations(reported):
         found = [(each.newest.header.tray, each.newest.fan, each.newest.active) for each in current_alarms(messages)]
         assert found == [("a", 0, False), ("a", 1, True), ("b", 0, True)]
-
-
-@pytest.mark.parametrize(
-    ("transition", "more", "line"),
-    [
-        (Transition.RAISED, {}, "WARNING  a  RAISED at 1"),
-        (Transition.SEVERITY, {"severity": Severity.ALARM}, "ALARM  a  SEVERITY at 1"),
-        (Transition.RAISED, {"out_of_service": True}, "WARNING (silenced)  a  RAISED at 1"),
-        (Transition.CLEARED, {"active": False}, "cleared  a  CLEARED at 1"),
-        (
-            Transition.OUT_OF_SERVICE,
-            {"active": False, "out_of_service": True},
-            "out of service  a  OUT_OF_SERVICE at 1",
-        ),
-    ],
-)
-def test_a_log_says_what_happened_and_how_bad_it_is(transition, more, line):
-    assert one(alarm(transition, **more)).line() == line
 
 
 def test_the_later_sent_of_two_messages_at_the_same_sample_counts():
@@ -107,19 +86,6 @@ def test_states_in_words():
     assert silenced.states()[2:] == ["shelved until it clears", "suppressed", "out of service"]
     never = one(alarm(active=False, severity=Severity.NONE, acknowledged=True, suppressed=True))
     assert never.states() == ["never raised", "suppressed"]
-
-
-def test_a_time_of_another_day_has_its_date():
-    now_ns = time.time_ns()
-    assert len(clock(now_ns)) == len("12:00:00")
-    assert len(clock(now_ns - 2 * 86_400_000_000_000)) == len("2020-01-01 12:00:00")
-
-
-def test_a_message_has_its_time_unless_it_only_says_that_the_alarm_continues():
-    at = one(alarm(t_ns=7, message="fan 0: too slow"), alarm(Transition.ACKNOWLEDGED, 9))
-    assert at.about() == f"at {clock(7)}: too slow"
-    continues = "the alarm continues from before the restart"
-    assert one(alarm(Transition.REPUBLISHED, 7, message=f"fan 0: {continues}")).about() == continues
 
 
 def test_a_machine_gets_it_all_as_json():

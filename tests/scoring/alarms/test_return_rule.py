@@ -138,36 +138,10 @@ def one_long_sample(ratios: Sample, period_ns: int) -> tuple[Any, ...]:
     )
 
 
-def test_a_late_statistic_does_not_make_the_speed_that_followed_one_at_which_the_alarm_came() -> None:
-    fan = Fan()
-    fan.play([(LOW, 2.9, LOW)] * 20)
-    fan.play([(LOW, 2.9, LOW)] * 2, SLOW)
-    assert fan.play([CALM] * 90, SLOW) == []
-    assert len(fan.play([CALM] * 11, FULL)) == 1
-
-
 def test_an_alarm_that_came_at_no_known_speed_may_return_at_any() -> None:
     fan = Fan()
     fan.play([(UP, LOW, LOW)], 0.0)
     assert fan.play([CALM] * 3, SLOW) == [(3, Transition.CLEARED)]
-
-
-def test_a_long_off_delay_is_kept_at_any_speed() -> None:
-    slow = replace(SETTINGS, detectors=(HoldingDetector("speed_smoothed", 3000, grows_with_speed=True),))
-    elsewhere = replace(slow, detectors=(replace(slow.detectors[0], elsewhere_ns=1000),))
-    for conditions in (slow, elsewhere):
-        fan = Fan(conditions)
-        fan.play([(4.0,)])
-        assert fan.play([(LOW,)] * 400) == [(301, Transition.CLEARED)], "after 3,000 ns"
-        fan.play([(2.9,)])
-        assert fan.play([(LOW,)] * 299, SLOW) == []
-
-
-def test_where_its_residual_is_not_scored_a_detector_neither_returns_nor_exceeds() -> None:
-    fan = Fan()
-    fan.play([(UP, LOW, LOW)])
-    assert fan.play([(NONE, NONE, LOW)] * 500) == []
-    assert fan.play([CALM] * 3) == [(503, Transition.CLEARED)]
 
 
 def test_after_commissioning_every_speed_counts_again() -> None:
@@ -180,7 +154,7 @@ def test_after_commissioning_every_speed_counts_again() -> None:
 ratio = st.sampled_from([LOW, LOW, LOW, MID, UP, 3.0, NONE])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     history=st.lists(st.tuples(st.tuples(ratio, ratio, ratio), st.sampled_from([0.0, SLOW, FULL, NONE])), max_size=120),
     cut=st.integers(0, 120),

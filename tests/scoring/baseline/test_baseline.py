@@ -69,32 +69,6 @@ def test_while_commissioning_it_is_the_median_of_the_intervals() -> None:
     assert not baseline.is_commissioning.any()
 
 
-def test_in_the_long_run_it_follows_with_its_time_constant() -> None:
-    baseline = baseline_of(adaptation_limit_sigmas=10.0)
-    feed(baseline, 0.0, 200)
-    feed(baseline, 1.0, 60)
-    np.testing.assert_allclose(baseline.value, 1.0 - (1.0 - 1.0 / 60) ** 60, atol=1e-6)
-
-
-@pytest.mark.parametrize("valid_share", [0.0, 0.4])
-def test_an_interval_with_too_few_samples_is_ignored(valid_share: float) -> None:
-    baseline = baseline_of()
-    valid = np.zeros((SAMPLES, 2), np.bool_)
-    valid[: round(valid_share * SAMPLES)] = True
-    add(baseline, np.full((SAMPLES, 2), 1.0), valid)
-    baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
-    assert not baseline.is_set.any()
-
-
-def test_nothing_is_learned_from_an_anomaly() -> None:
-    baseline = baseline_of()
-    feed(baseline, 0.2, 20)
-    before = baseline.value.copy()
-    feed(baseline, 0.4, 100, good=np.array([False, True]))
-    assert baseline.value[0] == before[0]
-    assert baseline.value[1] > before[1]
-
-
 @pytest.mark.parametrize("level", [9.0, -9.0])
 def test_while_commissioning_it_stays_within_the_commissioning_limit(level: float) -> None:
     baseline = baseline_of()
@@ -103,46 +77,22 @@ def test_while_commissioning_it_stays_within_the_commissioning_limit(level: floa
         feed(baseline, level, 1)
         assert np.abs(baseline.commissioned).max() <= SETTINGS.commissioning_limit_sigmas
     np.testing.assert_allclose(np.abs(baseline.commissioned), SETTINGS.commissioning_limit_sigmas)
-    feed(baseline, level, 1000)
+    feed(baseline, level, 300)
     np.testing.assert_allclose(
         np.abs(baseline.value), SETTINGS.commissioning_limit_sigmas + SETTINGS.adaptation_limit_sigmas
     )
 
 
-@pytest.mark.parametrize("commissioned", [0.0, 0.1, 1.0 / 3.0, 2.0])
+@pytest.mark.parametrize("commissioned", [0.0, 1.0 / 3.0])
 def test_it_stops_at_the_adaptation_limit_and_reports_it(commissioned: float) -> None:
     baseline = baseline_of()
     feed(baseline, commissioned, COMMISSIONING_INTERVALS)
     assert not baseline.is_at_limit.any()
-    feed(baseline, commissioned + 5.0, 1000)
+    feed(baseline, commissioned + 5.0, 300)
     np.testing.assert_allclose(baseline.value, commissioned + 0.5, atol=1e-6)
     assert baseline.is_at_limit.all()
     feed(baseline, commissioned, 20)
     assert not baseline.is_at_limit.any()
-
-
-def test_some_fans_are_commissioned_again() -> None:
-    baseline = baseline_of()
-    feed(baseline, 0.2, 20)
-    baseline.restart(np.array([True, False]))
-    np.testing.assert_array_equal(baseline.is_set, [False, True])
-    feed(baseline, 2.0, 1)
-    assert baseline.value[0] == pytest.approx(2.0)
-
-
-def test_a_sum_does_not_depend_on_how_it_was_cut() -> None:
-    x = np.random.default_rng(2).normal(size=(SAMPLES, 2))
-    valid = np.ones(x.shape, np.bool_)
-    whole, cut = baseline_of(), baseline_of()
-    add(whole, x, valid)
-    for row in range(SAMPLES):
-        add(cut, x[row : row + 1], valid[row : row + 1])
-    for baseline in (whole, cut):
-        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
-    np.testing.assert_array_equal(whole.value, cut.value)
-
-
-BAD = np.array([False, False])
 
 
 def test_unsteady_intervals_are_skipped_but_not_for_ever() -> None:
@@ -153,22 +103,6 @@ def test_unsteady_intervals_are_skipped_but_not_for_ever() -> None:
         add(baseline, swing, np.ones((SAMPLES, 2), np.bool_))
         baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
     assert baseline.is_set.all()
-
-
-def test_while_commissioning_nothing_is_learned_beyond_a_limit() -> None:
-    baseline = baseline_of()
-    feed(baseline, 2.0, 1)
-    feed(baseline, 0.0, 5, good=BAD)
-    np.testing.assert_allclose(baseline.value, 2.0, atol=1e-6)
-
-
-def test_a_long_anomaly_never_becomes_the_baseline() -> None:
-    baseline = baseline_of()
-    feed(baseline, 0.0, 1)
-    feed(baseline, 2.0, COMMISSIONING_INTERVALS - 1, good=BAD)
-    before = baseline.value.copy()
-    feed(baseline, 2.0, 100, good=BAD)
-    np.testing.assert_array_equal(baseline.value, before)
 
 
 def test_once_commissioned_it_learns_only_below_half_of_the_limits() -> None:
@@ -200,62 +134,5 @@ def test_an_offset_that_changes_with_the_speed_is_found_while_the_speed_changes(
     np.testing.assert_allclose(baseline.value, 2.0, atol=0.05)
 
 
-def test_a_fan_too_slow_to_show_its_offset_gets_a_baseline_near_zero() -> None:
-    baseline = baseline_of(SCALED)
-    for seed in range(5 * COMMISSIONING_INTERVALS):
-        add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, 0.02), seed, 1.0)))
-        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
-        assert baseline.is_set.all()
-        assert np.abs(baseline.value).max() < 0.5
-
-
-def test_an_offset_is_certain_at_the_scaling_where_it_was_learned() -> None:
-    baseline = baseline_of(SCALED)
-    for level, unknown in ((0.2, 3.0 * 0.5 * 0.8), (1.0, 0.0)):
-        for seed in range(COMMISSIONING_INTERVALS):
-            add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, level), seed, 0.2)))
-            baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
-        np.testing.assert_allclose(
-            baseline.offset_uncertainty(np.ones((1, 2)), baseline.learned_scale), unknown, atol=1e-6
-        )
-        assert (baseline.offset_uncertainty(np.full((1, 2), 0.1), baseline.learned_scale) == 0.0).all()
-
-
-def test_intervals_with_more_information_replace_those_with_little() -> None:
-    baseline = baseline_of(SCALED)
-    for seed in range(COMMISSIONING_INTERVALS):
-        add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, 0.02), seed, 1.0)))
-        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
-    for seed in range(2):
-        add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, 1.0), seed, 0.2)))
-        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
-    assert not baseline.is_commissioning.any()
-    np.testing.assert_allclose(baseline.value, 2.0 * 1.0 / 1.25, rtol=0.05)
-
-
 def _with(valid: np.ndarray, made: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return made[0], valid, made[1]
-
-
-def test_a_moment_at_a_higher_speed_does_not_undo_the_adaptation() -> None:
-    """The baseline follows to that level; the commissioned one moves by at most the uncertainty."""
-    baseline = baseline_of(SCALED, adaptation_limit_sigmas=4.5, ridge=0.01, rms_sigmas=0.1)
-    for level in np.linspace(0.0, 4.0, 600):
-        add(baseline, np.full((SAMPLES, 2), level), EVERY, np.ones((SAMPLES, 2)))
-        baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
-    followed, commissioned = baseline.value.copy(), baseline.commissioned.copy()
-    assert followed.min() > 3.0
-    add(baseline, np.full((SAMPLES, 2), 1.5 * 4.0), EVERY, np.full((SAMPLES, 2), 1.5))
-    baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
-    assert (baseline.value > followed).all()
-    assert (np.abs(baseline.commissioned - commissioned) <= 3.0 * 0.1 * 0.5).all()
-
-
-def test_a_worn_fan_is_held_at_its_limit_at_a_higher_speed_too() -> None:
-    baseline = baseline_of(SCALED, adaptation_limit_sigmas=1.0, ridge=0.01, rms_sigmas=0.1)
-    for level, scaling in ((0.0, 1.0), (3.0, 1.0), (3.0 * 1.25, 1.25)):
-        for _ in range(300):
-            add(baseline, np.full((SAMPLES, 2), level), EVERY, np.full((SAMPLES, 2), scaling))
-            baseline.end_interval(SAMPLES, GOOD, GOOD, STILL, MANY_READINGS)
-    assert baseline.is_at_limit.all()
-    assert (baseline.value <= 1.0 + 3.0 * 0.1 * 0.25 + 1e-6).all()

@@ -47,21 +47,6 @@ def test_variation_from_day_to_day_is_not_attributed_to_the_fans() -> None:
     assert np.sqrt(np.mean((found - alike) ** 2)) < 0.1, "means of twelve days are off by 0.26"
 
 
-def test_a_fan_never_seen_at_a_speed_gets_the_mean_offset_of_the_others_there() -> None:
-    offsets = np.random.default_rng(3).normal(0.0, 0.3, (10, BINS)) + np.linspace(0.0, 3.0, BINS)
-    runs = [
-        Cells(run.known_as, np.where(np.arange(10)[:, np.newaxis] == 4, 0.0, run.count), run.total)
-        for run in runs_of(offsets, 12, noise=0.01)
-    ]
-    of_others = without_its_mean(np.delete(offsets, 4, axis=0)).mean(axis=0)
-    np.testing.assert_allclose(found_of(runs)[4], of_others, atol=0.02)
-
-
-@pytest.mark.parametrize(("fans", "days"), [(2, 20), (10, 11)])
-def test_too_few_fans_or_days_give_no_offsets(fans: int, days: int) -> None:
-    assert fan_offsets(runs_of(np.zeros((fans, BINS)), days, noise=1.0), CENTRES, STEP_S) is None
-
-
 def test_three_nights_are_enough_and_two_are_not() -> None:
     offsets = without_its_mean(np.random.default_rng(4).normal(0.0, 1.0, (4, BINS)))
     nights = [
@@ -69,11 +54,6 @@ def test_three_nights_are_enough_and_two_are_not() -> None:
     ]
     assert np.sqrt(np.mean((found_of(nights) - offsets) ** 2)) < 0.15
     assert fan_offsets(nights[:2], CENTRES, STEP_S) is None
-
-
-def test_runs_too_short_at_every_speed_give_no_offsets() -> None:
-    short = [Cells(run.known_as, run.count / 20.0, run.total) for run in runs_of(np.zeros((5, BINS)), 12, noise=1.0)]
-    assert fan_offsets(short, CENTRES, STEP_S) is None
 
 
 def test_a_table_with_a_hole_is_refused() -> None:

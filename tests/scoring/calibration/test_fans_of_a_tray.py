@@ -14,7 +14,6 @@ from schemas.tacho import INSTANTANEOUS, Tacho
 from scoring.calibration.calibration import SHARED_SHARE
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.detectors.detector import Signal
-from scoring.detectors.deviation import summed_deviation
 from scoring.detectors.drift import DriftSettings
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.fan_scorer import FanScorer
@@ -49,7 +48,7 @@ def healthy(runs: int, seconds: float, tachos: tuple[Tacho, ...] = INSTANTANEOUS
 
 @pytest.fixture(scope="module")
 def limits() -> Limits:
-    return calibrate(healthy(3, 600.0), 200.0, default_timing(FANS), 40.0)
+    return calibrate(healthy(2, 600.0), 200.0, default_timing(FANS), 60.0)
 
 
 def shifted(limits: Limits, size_sigmas: float, fans: list[int]) -> list[Raised]:
@@ -66,11 +65,6 @@ def test_what_all_fans_share_raises_no_alarm_and_the_same_of_one_fan_does(limits
 
 def test_more_than_weather_raises_an_alarm_of_every_fan(limits: Limits) -> None:
     assert {alarm.fan for alarm in shifted(limits, 3.0 * SHARED_LIMIT_SIGMAS, [0, 1, 2, 3])} == {0, 1, 2, 3}
-
-
-def test_baselines_of_a_fan_beside_others_follow_slowly() -> None:
-    assert default_timing(1) == Timing()
-    assert default_timing(2).adaptation_s > 3.0 * Timing().adaptation_s
 
 
 def test_a_fan_alone_shares_nothing() -> None:
@@ -120,18 +114,6 @@ def test_weather_that_fans_share_does_not_look_like_offsets_that_go_with_the_spe
     assert found.speed.mean_residual_std < 1.1
 
 
-def test_a_counting_tacho_with_gaps_is_calibrated_all_the_same() -> None:
-    def each() -> Iterator[HealthyRun]:
-        for name, fans, blocks, *_ in healthy(2, 120.0)():
-            gaps = [
-                replace(b, speed_valid=b.speed_valid & ((b.t_ns // PERIOD_NS) % 90 != 0)[:, np.newaxis]) for b in blocks
-            ]
-            yield HealthyRun(name, fans, gaps, tachos=(Tacho(kind="count", pulses=2, window_s=1.0),))
-
-    found = calibrate(each, 200.0, default_timing(FANS), 1.0, extrapolate=True, has_drive=True)
-    assert "speed_drift" in found.detectors
-
-
 @pytest.mark.parametrize(("expected_alarms", "has_margins"), [(5.0, True), (20.0, False)])
 def test_of_a_tacho_that_counts_a_few_expected_alarms_declare_a_rate_and_keep_the_margins(
     expected_alarms: float, has_margins: bool
@@ -149,30 +131,6 @@ def test_of_a_tacho_that_counts_a_few_expected_alarms_declare_a_rate_and_keep_th
 
     assert (drift((counts,)).large_limit is not None) == has_margins
     assert drift(INSTANTANEOUS).large_limit is None
-
-
-def test_with_few_data_a_shift_lasts_until_it_is_reported_if_a_tacho_counts() -> None:
-    counts = Tacho(kind="count", pulses=2, window_s=0.1)
-
-    def drift(tachos: tuple[Tacho, ...]) -> tuple[float, float, float | None]:
-        found = calibrate(healthy(2, 120.0, tachos), 200.0, default_timing(FANS), 1.0, extrapolate=True, has_drive=True)
-        settings = found.settings_of("speed", DriftSettings)
-        assert settings
-        sum_std = summed_deviation(found.speed.autocorrelation_time_s, settings.period_s)
-        return (
-            settings.reference_sigmas * found.speed.mean_residual_std,
-            settings.limit * sum_std / settings.reference_sigmas,
-            settings.large_limit and settings.large_limit * sum_std / settings.reference_sigmas,
-        )
-
-    least = counts.resolution_rad_s / np.sqrt(6.0) / SIGMA_RAD_S
-    of_pulses = drift(INSTANTANEOUS)
-    assert of_pulses[0] < 0.5 * least
-    assert of_pulses[2] is None
-    reference, after_s, large_after_s = drift((counts,))
-    assert reference == pytest.approx(0.7 * least, rel=0.01)
-    assert after_s == pytest.approx(25.0), "a shift of twice the reference value is reported after so long"
-    assert large_after_s == pytest.approx(4.5), "one of three times the reference value after 3 s"
 
 
 def test_with_the_margins_of_few_data_the_recordings_have_no_more_alarms_than_declared() -> None:
@@ -259,7 +217,7 @@ def test_a_fan_with_little_noise_gets_no_narrower_limits_on_what_lasts_from_few_
     shares: dict[Signal, Array] = {"speed": np.array([0.01, 0.02, 0.02, 0.03]), "balance": np.full(FANS, 0.02)}
 
     def found(per_day: float, *, extrapolate: bool) -> Limits:
-        each = healthy(2, 300.0)
+        each = healthy(2, 120.0)
         return calibrate(each, 200.0, Timing(), per_day, extrapolate=extrapolate, sigma_shares=shares)
 
     enough, few = found(600.0, extrapolate=False), found(1.0, extrapolate=True)
@@ -274,8 +232,3 @@ def test_a_fan_with_little_noise_gets_no_narrower_limits_on_what_lasts_from_few_
     shares["balance"] = np.array([0.01, 0.01, 0.02, 0.2])
     beside_a_noisy_one = found(1.0, extrapolate=True).balance.low_frequency_std_of_fans
     assert beside_a_noisy_one == pytest.approx([math.sqrt(2.0), math.sqrt(2.0), 1.0, 1.0], abs=1e-4)
-
-    plain = few.model_copy(update={"speed": few.speed.model_copy(update={"low_frequency_std_of_fans": ()})})
-    size = next(size for size in np.arange(1.0, 20.0, 0.2) if {alarm.fan for alarm in shifted(plain, size, [0, 3])})
-    assert {alarm.fan for alarm in shifted(few, 1.3 * size, [0, 3])} == {3}
-    assert {alarm.fan for alarm in shifted(few, 1.3 * wider[0] * size, [0, 3])} == {0, 3}

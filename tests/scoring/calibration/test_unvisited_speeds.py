@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from schemas.tacho import INSTANTANEOUS, Tacho
-from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.calibration.healthy_statistics import HealthyRun
-from scoring.calibration.unvisited_speeds import wider_at_unvisited_speeds
 from scoring.limits import Limits, default_timing
 from tests.support.calibrated_runs import calibrate
 from tests.support.healthy_residuals import in_blocks, samples_of
@@ -48,17 +46,3 @@ def test_they_are_wider_with_few_data_of_tachos_that_count(tachos, per_day: floa
         assert std_at(limits, other_rad_s) == pytest.approx(
             (2.5 if is_wider else 1.0) * min(limits.speed.persistent_std)
         )
-
-
-def test_no_speed_is_below_zero_and_other_speeds_stay_as_they_are() -> None:
-    residual = HealthyResidual(
-        speeds_rad_s=(10.0, 50.0),
-        expected_residual_sigmas=(1.0, 2.0),
-        residual_std=(3.0, 4.0),
-        persistent_std=(1.5,),
-    )
-    wider = HealthyResidual.model_validate(wider_at_unvisited_speeds(residual, TOP_RAD_S).model_dump())
-    assert wider.speeds_rad_s == (10.0, 50.0, 70.0)
-    assert wider.expected_residual_sigmas == (1.0, 2.0, 2.0)
-    assert wider.residual_std == (3.0, 4.0, 4.0)
-    assert wider.persistent_std == (1.5, 1.5, 3.75)

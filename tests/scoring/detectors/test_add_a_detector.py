@@ -19,7 +19,6 @@ from scoring.detectors.detector import (
     DetectorContext,
     DetectorInput,
     DetectorRow,
-    LimitRule,
     Signal,
     SingleLimit,
 )
@@ -126,16 +125,6 @@ def test_its_state_is_in_the_snapshot_and_continues_to_the_bit() -> None:
     assert len(state["balance_peak"]["peak"]) == 1
 
 
-def test_its_alarm_survives_a_restart() -> None:
-    core = commissioned(core_of(calibration=PEAK_ONLY))
-    feed(core, [prediction_of(np.zeros(100), balance=np.where(np.arange(100) < 50, 0.0, 3.0))])
-    successor = core_of(calibration=PEAK_ONLY)
-    _, republished = successor.restore(snapshot_of(core))
-    assert isinstance(republished, Alarm)
-    assert (republished.active, republished.statistic) == (True, Statistic(100))
-    assert "snapshots_not_understood" not in successor.counters()
-
-
 def healthy() -> Iterator[HealthyRun]:
     for run in range(2):
         speed, balance = (autoregressive(6000, 5, 0.0, 10 * run + seed) for seed in (1, 2))
@@ -148,19 +137,3 @@ def test_its_limit_is_calibrated_by_rarity_with_the_others() -> None:
     assert isinstance(peak, PeakSettings)
     assert 2.0 < peak.limit < 6.0, "of white residuals of standard deviation one"
     assert limits.detectors.keys() == {row.name for row in table.calibrated_rows()}
-
-
-def test_a_row_may_have_a_fixed_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    class FixedSettings(PeakSettings):
-        rule: ClassVar[LimitRule] = LimitRule.FIXED
-
-        @classmethod
-        def fixed(cls, observed: object) -> FixedSettings:
-            return cls(limit=50.0)
-
-    class Fixed(Peak):
-        settings = FixedSettings
-
-    monkeypatch.setattr(table, "DETECTORS", (*table.DETECTORS[:-1], DetectorRow("balance_peak", 100, "balance", Fixed)))
-    limits = calibrate(healthy, 200.0, Timing(), 1500.0)
-    assert limits.detectors["balance_peak"] == FixedSettings(limit=50.0)

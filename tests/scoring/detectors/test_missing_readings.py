@@ -55,7 +55,7 @@ def calibrated(share: float, seed: int, seconds: int = 600) -> MissingReadingsSe
 def test_a_loose_wire_is_found_in_seconds_and_stays_found(
     healthy: float, share: float, median_s: float, most_s: float
 ) -> None:
-    found = ratios(detector_of(calibrated(healthy, 1), 300), by_chance(share, 600 * HZ, 300, 2)) > 1.0
+    found = ratios(detector_of(calibrated(healthy, 1), 100), by_chance(share, 300 * HZ, 100, 2)) > 1.0
     assert found.any(axis=0).all()
     after_s = (found.argmax(axis=0) + 1) / HZ
     assert np.median(after_s) < median_s
@@ -70,10 +70,9 @@ def longest_run(flags: Array) -> int:
     return int((np.diff(edges) * flags[edges[:-1]]).max(initial=0))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.002, 0.02])
+@pytest.mark.parametrize("share", [0.0, 0.02])
 def test_a_line_that_misses_as_many_as_at_calibration_has_no_alarm(share: float) -> None:
-    healthy = detector_of(calibrated(share, 3), 200)
-    assert max(ratios(healthy, by_chance(share, HOUR, 200, seed)).max() for seed in (4, 5)) < 1.0
+    assert ratios(detector_of(calibrated(share, 3), 200), by_chance(share, HOUR, 200, 4)).max() < 1.0
 
 
 def test_a_twin_without_calibration_bears_a_line_that_misses_two_percent() -> None:
@@ -99,14 +98,7 @@ def test_a_silent_line_and_a_fan_at_rest_miss_nothing() -> None:
 
 def test_after_any_time_the_sum_comes_down_in_bounded_time() -> None:
     detector = detector_of(calibrated(0.002, 1), 50)
-    assert ratios(detector, by_chance(0.9, HOUR, 50, 8)).max() == pytest.approx(2.0, rel=1e-3)
+    assert ratios(detector, by_chance(0.9, HOUR // 4, 50, 8)).max() == pytest.approx(2.0, rel=1e-3)
     below = ratios(detector, np.zeros((HOUR // 60, 50), np.bool_)) < 0.75
     assert (below.argmax(axis=0) < 20 * HZ).all()
     assert below[-1].all()
-
-
-def test_a_limit_twice_as_far_is_found_later() -> None:
-    settings = MissingReadingsSettings(healthy_share=0.005)
-    missing = by_chance(0.35, 100 * HZ, 20, 9)
-    near, far = (ratios(detector_of(each, 20), missing) for each in (settings, settings.scaled(2.0)))
-    assert ((far > 1.0).argmax(axis=0) > (near > 1.0).argmax(axis=0)).all()

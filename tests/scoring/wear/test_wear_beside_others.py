@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.units import NS_PER_S
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
     CALIBRATION,
@@ -56,15 +55,3 @@ def test_a_change_of_all_fans_is_no_wear_of_one_and_the_same_change_of_one_fan_i
     in_common, of_one = wear_sigmas(scorer_after([0, 1, 2])), wear_sigmas(scorer_after([1]))
     assert in_common == pytest.approx([0.0] * FANS, abs=0.1 * CHANGE_SIGMAS)
     assert of_one == pytest.approx([0.0, CHANGE_SIGMAS, 0.0], abs=0.2 * CHANGE_SIGMAS)
-
-
-def series_in(core: ScorerCore) -> dict[str, list[Any]]:
-    """The points of the balance of a fan."""
-    return json.loads(snapshot_of(core).state_json)["wear"]["fans"][1]["parameters"]["balance"]["series"]
-
-
-def test_points_are_kept_to_the_second_and_with_few_digits() -> None:
-    series = series_in(scorer_after([1]))
-    assert len(series["value"]) > 5
-    assert all(t_ns % NS_PER_S == 0 for t_ns in series["t_ns"])
-    assert max(len(f"{value:.12g}") for value in series["std_error"]) < 10

@@ -52,8 +52,3 @@ def test_a_fan_that_stands_or_starts_does_not_count() -> None:
     command[300:350] = 0.0
     stopped = replace(run, command=command)
     assert sigma(stopped, STANDSTILL) < 0.2 * sigma(stopped, None)
-
-
-def test_without_samples_to_judge_it_is_that_of_the_whole_residual() -> None:
-    run = counted()
-    assert sigma(replace(run, command=np.zeros_like(run.command)), STANDSTILL) == WHOLE_SIGMA[0]

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from schemas.tacho import Tacho
 from tests.support import fan_data
 from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluate_model
-from twin.evaluation.resampling import Grid, irregular, on_grid, resampled, thinned
+from twin.evaluation.resampling import Grid, on_grid, resampled, thinned
 from twin.models.hybrid import UNITS, Hybrid
 from twin.models.model import TwinModel
 from twin.models.network import Scaling, TanhNetwork
@@ -44,16 +43,6 @@ def test_speeds_are_the_measured_ones_wherever_the_grids_meet() -> None:
     same = resampled(run, 100.0)
     np.testing.assert_array_equal(same.speed_rad_s, run.speed_rad_s)
     np.testing.assert_allclose(same.command, run.command, rtol=1e-9)
-
-
-def test_irregular_steps_are_one_to_three_steps_of_the_run_and_depend_on_the_seed_only() -> None:
-    run = fan_data.published_run(4, 10.0)
-    thin = irregular(run, seed=1)
-    steps = np.rint(np.diff(thin.t_s) * fan_data.RATE_HZ)
-    assert [np.mean(steps == k) for k in (1, 2, 3)] == pytest.approx([1 / 3] * 3, abs=0.07)
-    np.testing.assert_array_equal(thin.speed_rad_s[:, 0], run.speed_rad_s[np.isin(run.t_s, thin.t_s), 0])
-    np.testing.assert_array_equal(irregular(run, seed=1).t_s, thin.t_s)
-    assert irregular(run, seed=2).samples != thin.samples or np.any(irregular(run, seed=2).t_s != thin.t_s)
 
 
 def test_on_grids_with_few_common_times_speeds_are_interpolated_and_gaps_stay_gaps() -> None:
@@ -124,25 +113,19 @@ def errors_in_noise(model: TwinModel, parameters: Array, run: Run) -> dict[str, 
     return {name: evaluate_model(model, parameters, sigma, on).pooled.rmse_rad_s / NOISE for name, on in runs.items()}
 
 
-@pytest.mark.parametrize("lag_s", [0.0, 0.05])
-def test_a_physical_twin_is_as_good_on_every_grid(lag_s: float) -> None:
+def random_hybrid() -> Hybrid:
+    untrained = TanhNetwork.zero(UNITS, ("speed", "command"), Scaling(50.0, 50.0, 50.0, 50.0, 100.0))
+    return Hybrid(untrained.with_theta(np.random.default_rng(1).normal(0.0, 0.7, untrained.parameter_count)))
+
+
+@pytest.mark.parametrize(
+    ("model", "lag_s"), [(PhysicalModel(), 0.05), (random_hybrid(), 0.0)], ids=["physical", "hybrid"]
+)
+def test_a_twin_is_as_good_on_every_grid(model: TwinModel, lag_s: float) -> None:
     parameters = parameters_of(**PUBLISHED, lag_s=lag_s)
     # 800 samples at 20 Hz: their root mean square scatters by 2.5 %.
-    for error in errors_in_noise(PhysicalModel(), parameters, simulated(PhysicalModel(), parameters)).values():
+    for error in errors_in_noise(model, parameters, simulated(model, parameters)).values():
         assert error == pytest.approx(1.0, abs=0.06)
-
-
-@pytest.mark.parametrize("inputs", [("speed", "command"), ("speed",)])
-def test_a_hybrid_is_as_good_on_every_grid(inputs: tuple[str, ...]) -> None:
-    parameters = parameters_of(**PUBLISHED)
-    untrained = TanhNetwork.zero(UNITS, inputs, Scaling(50.0, 50.0, 50.0, 50.0, 100.0))
-    weights = np.random.default_rng(1).normal(0.0, 0.7, untrained.parameter_count)
-    hybrid = Hybrid(untrained.with_theta(weights))
-    run = simulated(hybrid, parameters)
-    for error in errors_in_noise(hybrid, parameters, run).values():
-        assert error == pytest.approx(1.0, abs=0.06)
-    # The network matters: physics alone are far off.
-    assert errors_in_noise(PhysicalModel(), parameters, run)["own"] > 2.0
 
 
 def test_a_thinned_run_keeps_its_readings_and_loses_no_impulse() -> None:
@@ -153,20 +136,3 @@ def test_a_thinned_run_keeps_its_readings_and_loses_no_impulse() -> None:
         assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
     assert thinned(run, 1) is run
     assert thinned(run.rows(0, 4), 7).samples == 4, "a single sample is no run"
-
-
-def test_no_impulse_is_lost_on_irregular_steps_of_an_irregular_run() -> None:
-    rng = np.random.default_rng(2)
-    run = Run("jittered", np.cumsum(rng.uniform(0.005, 0.02, 500)), rng.uniform(0, 100, 500), rng.normal(size=500))
-    thin = irregular(run, seed=3)
-    for stop_s in thin.t_s[[1, 50, -1]]:
-        assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
-
-
-def test_the_readings_of_a_tacho_that_counts_are_predicted_as_well_when_thinned() -> None:
-    run = fan_data.counted_run(6, Tacho(kind="count", window_s=1.0, update_s=0.25), rate_hz=100.0)
-    model, parameters = PhysicalModel(), np.array([[*fan_data.PUBLISHED_PARAMETERS, 0.0]])
-    whole, thin = (
-        evaluate_model(model, parameters, np.ones(1), [each]).pooled.rmse_rad_s for each in (run, thinned(run, 10))
-    )
-    assert thin == pytest.approx(whole, rel=0.05)

@@ -7,7 +7,6 @@ import pytest
 from scipy import signal
 
 from tests.support import fan_data
-from twin.errors import TwinError
 from twin.evaluation.accuracy import free_run_residuals
 from twin.evaluation.residual_analysis import ResidualAnalysis, analyse_residual, healthy_residual
 from twin.models.physical import PhysicalModel
@@ -68,12 +67,12 @@ def test_white_noise_leaves_the_95_percent_bound_at_5_percent_of_the_lags() -> N
 def test_the_whiteness_test_rejects_as_much_white_noise_as_it_says() -> None:
     rng = np.random.default_rng(2)
     p = []
-    for _ in range(400):
+    for _ in range(200):
         residual = np.where(rng.random(SAMPLES) < 0.4, np.nan, white(rng))
         p.append(analysed(residual, np.zeros(SAMPLES)).ljung_box_p)
-    # three standard deviations of a share of 400
-    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.033)
-    assert np.mean(np.array(p) < 0.5) == pytest.approx(0.5, abs=0.075)
+    # three standard deviations of a share of 200
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.046)
+    assert np.mean(np.array(p) < 0.5) == pytest.approx(0.5, abs=0.106)
 
 
 @pytest.mark.parametrize(("residual", "command"), [(slow, stairs), (oscillating, binary)])
@@ -99,14 +98,6 @@ def test_a_residual_that_follows_the_command_peaks_at_its_lag_with_its_sign() ->
     assert abs(analysis.cross_over_bound) > 5.0
     peak = analysis.cross_correlation[np.argmin(np.abs(analysis.cross_lags_s - 0.25))]
     assert peak == pytest.approx(gain / np.hypot(1.0, gain), abs=0.05)
-
-
-def test_a_command_that_answers_the_residual_shows_at_a_negative_lag() -> None:
-    rng = np.random.default_rng(6)
-    residual = white(rng)
-    analysis = analysed(residual, 0.5 * np.roll(residual, 10) + rng.normal(size=SAMPLES))
-    assert analysis.cross_lags_s[np.argmax(analysis.cross_correlation)] == pytest.approx(-0.10)
-    assert abs(analysis.cross_over_bound) < 2.0
 
 
 def test_a_model_too_weak_or_too_slow_is_seen_in_its_residual() -> None:
@@ -159,30 +150,11 @@ def test_runs_are_not_joined_across_their_ends() -> None:
     assert analysis.cross_correlation[len(analysis.lags_s) + lag] == pytest.approx(crossed, rel=1e-9)
 
 
-def test_a_gap_within_a_run_is_time_in_which_nothing_was_measured() -> None:
-    rng = np.random.default_rng(9)
-    residual = slow(rng)
-    kept = rng.random(SAMPLES) < 0.7
-    run = Run("lossy", times(SAMPLES)[kept], np.zeros(kept.sum()), residual[kept])
-    lossy = analyse_residual(residual[kept, np.newaxis], [run], settling_s=0.0)[0]
-    marked = analysed(np.where(kept, residual, np.nan), np.zeros(SAMPLES))
-    common = slice(0, 400)
-    np.testing.assert_allclose(lossy.autocorrelation[common], marked.autocorrelation[common], atol=1e-3)
-    assert lossy.ljung_box_p == pytest.approx(marked.ljung_box_p)
-
-
-def test_independent_samples_say_how_far_the_mean_scatters() -> None:
-    rng = np.random.default_rng(10)
-    drawn = [np.where(rng.random(SAMPLES) < 0.5, np.nan, slow(rng)) for _ in range(200)]
-    claimed = [np.nanstd(one) / np.sqrt(analysed(one, np.zeros(SAMPLES)).independent_samples) for one in drawn]
-    assert np.mean(claimed) == pytest.approx(np.std([np.nanmean(one) for one in drawn]), rel=0.2)
-
-
 def test_the_autocorrelation_time_is_that_of_an_exponential_with_and_without_lost_samples() -> None:
     rng = np.random.default_rng(11)
     for missing in (np.zeros(SAMPLES, dtype=bool), rng.random(SAMPLES) < 0.5, np.arange(SAMPLES) % 2 == 1):
         times = [
-            analysed(np.where(missing, np.nan, slow(rng)), np.zeros(SAMPLES)).autocorrelation_time_s for _ in range(60)
+            analysed(np.where(missing, np.nan, slow(rng)), np.zeros(SAMPLES)).autocorrelation_time_s for _ in range(30)
         ]
         assert np.mean(times) == pytest.approx(0.5, rel=0.15)
 
@@ -214,8 +186,3 @@ def test_undefined_figures_are_nan() -> None:
     assert np.isnan(still.cross_peak_lag_s)
     assert still.white
     assert np.isnan(healthy_residual(never_measured[:, np.newaxis], pieces_of(np.zeros(SAMPLES))).max_sigma[0])
-
-
-def test_a_residual_of_other_runs_is_refused() -> None:
-    with pytest.raises(TwinError, match="residual of 10 samples, runs of 4000"):
-        analyse_residual(np.zeros((10, 1)), pieces_of(np.zeros(SAMPLES)))

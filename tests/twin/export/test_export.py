@@ -11,7 +11,7 @@ import onnx
 import pytest
 from onnx import helper
 
-from schemas.twin_card import CARD_PROPERTY, GRAPH_INPUTS, GRAPH_OUTPUTS, CardError, DataCard, TwinCard
+from schemas.twin_card import CARD_PROPERTY, DataCard, TwinCard
 from tests.support import fan_data
 from tests.support.trained_once import TrainedOnce
 from tests.twin.models.test_models import ALL_MODELS, random_network
@@ -23,7 +23,7 @@ from twin.models.hybrid import Hybrid
 from twin.models.model import Model
 from twin.models.physical import PhysicalModel
 
-MINUTE = 6000
+SAMPLES = 2000
 CREATED = datetime(2026, 1, 1, tzinfo=UTC)
 
 
@@ -56,12 +56,12 @@ def fleet(lag_s: float) -> np.ndarray:
     )
 
 
-def minute_of_commands() -> tuple[np.ndarray, np.ndarray]:
-    """A minute for four fans at uneven steps, some of them tiny or zero."""
+def uneven_commands() -> tuple[np.ndarray, np.ndarray]:
+    """Twenty seconds for four fans at uneven steps, some of them tiny or zero."""
     rng = np.random.default_rng(9)
-    step_s = rng.uniform(0.008, 0.012, MINUTE)
-    step_s[100:110], step_s[2000] = 1e-7, 0.0
-    return fan_data.stairs(rng, MINUTE, FANS), step_s
+    step_s = rng.uniform(0.008, 0.012, SAMPLES)
+    step_s[100:110], step_s[1500] = 1e-7, 0.0
+    return fan_data.stairs(rng, SAMPLES, FANS), step_s
 
 
 def state_of(model: Model, command: np.ndarray) -> np.ndarray:
@@ -70,10 +70,10 @@ def state_of(model: Model, command: np.ndarray) -> np.ndarray:
 
 
 @every_model
-def test_the_file_runs_a_minute_in_two_blocks_as_numpy_does_in_one(
+def test_the_file_runs_uneven_steps_in_two_blocks_as_numpy_does_in_one(
     model: Model, trained: TrainedTwin, tmp_path: Path
 ) -> None:
-    command, step_s = minute_of_commands()
+    command, step_s = uneven_commands()
     twin = saved(model, trained.card, tmp_path)
     state, parameters = state_of(model, command), fleet(0.05)
     expected, expected_state = model.advance(state, command, step_s, parameters)
@@ -88,7 +88,7 @@ def test_the_file_runs_a_minute_in_two_blocks_as_numpy_does_in_one(
 def test_without_a_lag_the_command_itself_acts_to_the_last_bit(
     model: Model, trained: TrainedTwin, tmp_path: Path
 ) -> None:
-    command, step_s = (values[:300] for values in minute_of_commands())
+    command, step_s = (values[:300] for values in uneven_commands())
     command[::3] = 0.0
     twin, parameters = saved(model, trained.card, tmp_path), fleet(0.0)
     speed = np.full(FANS, 50.0)
@@ -98,24 +98,6 @@ def test_without_a_lag_the_command_itself_acts_to_the_last_bit(
     ]
     np.testing.assert_array_equal(runs[0][0], runs[1][0])
     np.testing.assert_array_equal(runs[0][1][:, 1], command[-1])
-
-
-def test_the_graph_keeps_the_contract(trained: TrainedTwin, tmp_path: Path) -> None:
-    graph = onnx.load(trained.save(tmp_path / "twin.onnx")).graph
-
-    def shapes(values) -> dict[str, list[str | int]]:
-        return {
-            value.name: [axis.dim_param or axis.dim_value for axis in value.type.tensor_type.shape.dim]
-            for value in values
-        }
-
-    assert shapes(graph.input) == {
-        "state": ["fans", 2],
-        "command": ["n", "fans"],
-        "step_s": ["n"],
-        "parameters": ["fans", 4],
-    }
-    assert shapes(graph.output) == {"speed_rad_s": ["n", "fans"], "state_out": ["fans", 2]}
 
 
 def test_the_card_travels_in_the_file(trained: TrainedTwin, tmp_path: Path) -> None:
@@ -175,31 +157,8 @@ def test_a_card_that_does_not_fit_the_graph_is_refused_in_one_line(
     assert words in refusal(path)
 
 
-def test_a_graph_of_single_precision_is_refused(trained: TrainedTwin, tmp_path: Path) -> None:
-    path = tmp_path / "single.onnx"
-    names = [*GRAPH_INPUTS, *GRAPH_OUTPUTS]
-    values = {name: helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["a", "b"]) for name in names}
-    nodes = [
-        helper.make_node("Identity", [start], [end]) for start, end in zip(GRAPH_INPUTS, GRAPH_OUTPUTS, strict=False)
-    ]
-    graph = helper.make_graph(nodes, "g", [values[n] for n in GRAPH_INPUTS], [values[n] for n in GRAPH_OUTPUTS])
-    file = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    helper.set_model_props(file, {CARD_PROPERTY: trained.card.to_json()})
-    onnx.save(file, path)
-    assert "must be float64" in refusal(path)
-
-
 def test_a_truncated_file_is_refused_wherever_it_was_cut(trained: TrainedTwin, tmp_path: Path) -> None:
     whole, path = trained.save(tmp_path / "twin.onnx").read_bytes(), tmp_path / "cut.onnx"
-    for length in np.linspace(0, len(whole) - 1, 12).astype(int):
+    for length in np.linspace(0, len(whole) - 1, 5).astype(int):
         path.write_bytes(whole[:length])
         refusal(path)
-
-
-def test_a_card_with_a_field_missing_or_wrong_names_it(trained: TrainedTwin) -> None:
-    fields = json.loads(trained.card.to_json())
-    with pytest.raises(CardError, match="rate_hz: "):
-        TwinCard.from_json(json.dumps(fields | {"rate_hz": "fast"}))
-    del fields["fans"]
-    with pytest.raises(CardError, match="fans: Field required"):
-        TwinCard.from_json(json.dumps(fields))

@@ -6,8 +6,7 @@ import pytest
 from bench.training.published_fan import published_fan
 from tests.support import fan_data
 from twin.errors import TwinError
-from twin.fitting.filtering import filter_between_samples
-from twin.fitting.identification import Identification, filtering_operator, identify
+from twin.fitting.identification import Identification, identify
 from twin.runs import Run
 
 
@@ -30,19 +29,12 @@ def test_the_published_fan_is_recovered_within_its_confidence_intervals(publishe
 
 @pytest.mark.slow
 def test_95_percent_intervals_hold_the_truth_in_95_percent_of_recordings() -> None:
-    runs = [fan_data.published_run(seed, duration_s=5.0, fans=20) for seed in range(100, 108)]
+    runs = [fan_data.published_run(seed, duration_s=5.0, fans=20) for seed in range(100, 104)]
     found = [identify([run]) for run in runs]
     low, high = (np.concatenate([one.interval_95[:, :3, side] for one in found]) for side in (0, 1))
     inside = (low <= fan_data.PUBLISHED_PARAMETERS) & (high >= fan_data.PUBLISHED_PARAMETERS)
-    # 160 recordings determine a share of 95 % to 1.7 %; the bound is 2.7 times that.
-    assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.047), inside.mean(axis=0)
-
-
-def test_short_pieces_beside_a_long_run_do_not_widen_the_intervals() -> None:
-    whole = fan_data.published_run(4, 60.0)
-    pieces = [fan_data.published_run(seed, 1.5) for seed in range(50, 80)]
-    alone, with_pieces = identify([whole]), identify([whole, *pieces])
-    assert np.all(with_pieces.standard_errors[0, :3] < 1.3 * alone.standard_errors[0, :3])
+    # 80 recordings determine a share of 95 % to 2.4 %; the bound is 2.7 times that.
+    assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.066), inside.mean(axis=0)
 
 
 def test_a_fan_that_physics_alone_do_not_describe_is_reported(published) -> None:
@@ -62,20 +54,6 @@ def test_a_lag_is_found_where_there_is_one_and_none_where_there_is_none(publishe
     published_model = identify([lagging], with_lag=False)
     assert np.all(published_model.parameters[:, 3] == 0.0)
     assert np.all(published_model.rmse_rad_s > found.rmse_rad_s)
-
-
-def test_the_filtering_operator_is_exact_without_noise() -> None:
-    command = fan_data.stairs(np.random.default_rng(3), 2000, 1)
-    simulated = published_fan(command, 0, "noisy")
-    run = Run("without noise", simulated.run.t_s, command, simulated.true_speed_rad_s)
-    np.testing.assert_allclose(filtering_operator([run], 0, 2.0)[:3], fan_data.PUBLISHED_PARAMETERS, rtol=5e-3)
-
-
-def test_the_filter_of_a_ramp_is_its_closed_form_over_irregular_steps() -> None:
-    t_s = np.cumsum(np.random.default_rng(2).uniform(1e-4, 0.3, 40))
-    t_s -= t_s[0]
-    filtered = filter_between_samples(t_s[:-1, None], t_s[1:, None], np.diff(t_s), 1.7)
-    np.testing.assert_allclose(filtered[:, 0], t_s / 1.7 - (1.0 - np.exp(-1.7 * t_s)) / 1.7**2, atol=1e-12)
 
 
 def test_units_of_command_and_speed_do_not_matter(published) -> None:
@@ -105,7 +83,7 @@ def test_missing_and_jittered_samples_do_not_bias(published) -> None:
 
 def test_a_first_reading_long_after_the_beginning_shows_nothing_of_the_start(published) -> None:
     """Of the start nothing is left then: its share underflows to zero."""
-    run = published[0].between(0.0, 20.0)
+    run = published[0].between(0.0, 20.0).fan(0)
     before_s = np.arange(40_000) / 100.0
     later = Run(
         "later",

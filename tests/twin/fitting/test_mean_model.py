@@ -43,10 +43,3 @@ def test_what_is_the_same_for_all_stays_so_to_the_bit() -> None:
     model, parameters = mean_model([(one, own)])
     np.testing.assert_array_equal(model.theta, one.theta)
     np.testing.assert_array_equal(parameters, own)
-
-
-def test_of_networks_that_stayed_the_physics_one_is_enough() -> None:
-    silent = [(one.with_theta(np.zeros_like(one.theta)), own) for one, own in map(trained, range(2))]
-    model, _ = mean_model(silent)
-    assert model.network.units == 10
-    assert not np.any(model.theta)

@@ -62,7 +62,7 @@ def test_a_network_comes_from_windows_and_the_physics_of_each_fan_from_all_its_r
     def trained() -> tuple[TrainedTwin, list[int], set[str]]:
         parts: set[str] = set()
         fits_of_networks.clear()
-        twin = train_twin([run], [], "hybrid", name="x", max_iterations=20, progress=lambda part, *_: parts.add(part))
+        twin = train_twin([run], [], "hybrid", name="x", max_iterations=10, progress=lambda part, *_: parts.add(part))
         return twin, [int(data.compared.sum()) for data in fits_of_networks], parts
 
     def error_and_uncertainty(twin: TrainedTwin) -> tuple[float, float]:
@@ -82,8 +82,6 @@ def test_a_network_comes_from_windows_and_the_physics_of_each_fan_from_all_its_r
     (error, std), (of_thinned, std_of_thinned) = error_and_uncertainty(whole), error_and_uncertainty(thinned)
     assert of_thinned < 1.005 * error, "4 % more by windows alone, 1 % if the priors do not limit the steps"
     assert 0.8 < std_of_thinned / std < 1.25
-    monkeypatch.setattr(training, "MUCH_WORSE", 0.0)
-    assert error_and_uncertainty(trained()[0])[0] > 1.02 * error, "a last fit that is too bad is not kept"
 
 
 def test_coarser_samples_lie_on_the_course_of_the_speed_and_lose_no_command() -> None:

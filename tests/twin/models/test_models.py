@@ -5,7 +5,6 @@ import pytest
 
 from schemas.twin_card import StateLayout
 from tests.support import fan_data
-from twin.errors import TwinError
 from twin.models.hybrid import Hybrid
 from twin.models.narx import PARAMETER_COUNT, Narx
 from twin.models.network import Scaling, TanhNetwork
@@ -55,14 +54,6 @@ def test_the_network_is_differentiated_exactly(inputs: tuple[str, ...]) -> None:
         np.testing.assert_allclose(by_theta[:, index], (up - down) / 2e-5, rtol=1e-6, atol=1e-6)
 
 
-def test_physical_weights_are_the_scaled_ones_in_other_units() -> None:
-    network = random_network(10)
-    weights, bias, output, constant = network.physical_weights()
-    speed, command = np.array([12.0, 140.0]), np.array([3.0, 99.0])
-    by_hand = np.tanh(np.column_stack((speed, command)) @ weights + bias) @ output + constant
-    np.testing.assert_allclose(by_hand, network.acceleration(speed, command), rtol=1e-12)
-
-
 def test_a_hybrid_with_a_silent_network_is_the_physical_model() -> None:
     command, step_s = np.full((50, 2), 60.0), np.full(50, 0.01)
     silent = Hybrid(TanhNetwork.zero(10, ("speed", "command"), SCALING))
@@ -85,8 +76,3 @@ def test_the_fitted_unknowns_are_inverted_and_make_any_parameters_stable() -> No
     stable = physical_parameters(fitted_unknowns(unstable, top), top)
     assert np.all(stable[:, 1] > 0.0)
     assert np.all(stable[:, 1] + 2.0 * stable[:, 2] * top > 0.0)
-
-
-def test_a_network_of_the_wrong_size_is_refused() -> None:
-    with pytest.raises(TwinError, match=r"10 units need \(41,\)"):
-        TanhNetwork(10, ("speed", "command"), SCALING, np.zeros(44))

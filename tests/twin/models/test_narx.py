@@ -11,8 +11,8 @@ from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pool
 from twin.fitting.narx_fit import free_run_sensitivities
 from twin.fitting.narx_stability import forgets_its_start
 from twin.fitting.narx_start import starting_weights
-from twin.fitting.narx_training import BLOCKS, draw_stretches, leave_out, leave_out_blocks, train_narx
-from twin.models.narx import ORDER, PARAMETER_COUNT, Narx, regressor_rows
+from twin.fitting.narx_training import train_narx
+from twin.models.narx import ORDER, PARAMETER_COUNT, Narx
 from twin.models.network import Scaling
 from twin.models.physics import PARAMETER_NAMES
 from twin.runs import Array, Run
@@ -49,12 +49,6 @@ def filter_start(time_constant: float, rng: np.random.Generator) -> tuple[Array,
     return starting_weights([command], [noisy], rng)
 
 
-@pytest.fixture(scope="module")
-def published() -> tuple[Run, Narx]:
-    run = fan_data.published_run(1, 25.0)
-    return run, trained(run)
-
-
 def test_the_next_speed_is_the_layer_of_past_speeds_and_commands_newest_first() -> None:
     model, rng = random_narx(), np.random.default_rng(2)
     state, command = rng.uniform(0.0, 100.0, (2, 2 * ORDER)), rng.uniform(0.0, 100.0, (1, 2))
@@ -82,12 +76,6 @@ def test_the_free_run_is_differentiated_exactly_by_every_weight() -> None:
         np.testing.assert_allclose(by_theta[index], slope, rtol=1e-5, atol=1e-5)
 
 
-def test_regressors_before_the_first_sample_repeat_it() -> None:
-    rows = regressor_rows(np.arange(1.0, 31.0), np.arange(101.0, 131.0))
-    np.testing.assert_array_equal(rows[0], [1.0] * ORDER + [101.0] * (ORDER + 1))
-    np.testing.assert_array_equal(rows[20], [*range(21, 11, -1), *range(121, 110, -1)])
-
-
 def test_the_start_finds_gain_offset_and_time_constant_through_noise_and_gaps() -> None:
     theta, time_constant = filter_start(30.0, np.random.default_rng(3))
     # The grid of time constants is spaced by a quarter.
@@ -110,52 +98,11 @@ def test_a_recursion_with_two_steady_states_is_not_trusted() -> None:
     assert not forgets_its_start(one_unit(1.0), 10.0)
 
 
-def test_a_recursion_that_leaves_the_range_of_speeds_is_not_trusted() -> None:
-    constant = np.zeros(PARAMETER_COUNT)
-    constant[-1] = 3.0
-    assert not forgets_its_start(Narx(constant, SCALING), 10.0)
-
-
-def test_left_out_blocks_are_a_fourth_and_the_two_parts_share_only_the_start() -> None:
-    run = fan_data.published_run(3, 10.0, fans=2)
-    (kept,), (judged,) = leave_out_blocks([run])
-    out = np.isnan(kept.speed_rad_s)
-    assert np.mean(out) == pytest.approx(0.25, abs=1.0 / BLOCKS)
-    shared = np.isfinite(kept.speed_rad_s) & np.isfinite(judged.speed_rad_s)
-    np.testing.assert_array_equal(np.flatnonzero(shared.all(axis=1)), range(5))
-    assert np.all(np.isfinite(judged.speed_rad_s[out]))
-
-
-def test_long_recordings_are_sampled_up_to_a_limit() -> None:
-    runs = [fan_data.published_run(1, 20.0, fans=2)] * 6
-    drawn = draw_stretches(runs, np.random.default_rng(0))
-    assert 15_000 <= sum(run.samples for run in drawn) <= 16_000
-    assert all(run.fans == 1 for run in drawn)
-
-
 @pytest.mark.slow
-def test_its_free_run_comes_near_the_noise_on_commands_it_never_saw(published: tuple[Run, Narx]) -> None:
-    test = fan_data.published_run(11, 40.0)
-    assert free_run_rmse_rad_s(published[1], test) < 1.05 * fan_data.NOISE_RAD_S
-
-
-@pytest.mark.slow
-def test_it_forgets_its_start_after_training(published: tuple[Run, Narx]) -> None:
-    assert forgets_its_start(published[1], 25.0)
-
-
-def test_weights_that_are_not_trusted_give_way_to_those_of_a_firmer_prior(monkeypatch: pytest.MonkeyPatch) -> None:
-    probed: list[Array] = []
-
-    def trusts_the_second(model: Narx, _time_constant_samples: float) -> bool:
-        probed.append(model.theta)
-        return len(probed) == 2
-
-    monkeypatch.setattr("twin.fitting.narx_training.forgets_its_start", trusts_the_second)
-    model = trained(fan_data.published_run(9, 8.0), max_iterations=30)
-    assert len(probed) == 2
-    np.testing.assert_array_equal(model.theta, probed[1])
-    assert not np.array_equal(probed[0], probed[1])
+def test_trained_it_forgets_its_start_and_comes_near_the_noise_on_commands_it_never_saw() -> None:
+    model = trained(fan_data.published_run(1, 25.0))
+    assert forgets_its_start(model, 25.0)
+    assert free_run_rmse_rad_s(model, fan_data.published_run(11, 40.0)) < 1.05 * fan_data.NOISE_RAD_S
 
 
 def test_runs_without_speeds_are_refused_in_one_line() -> None:
@@ -163,10 +110,3 @@ def test_runs_without_speeds_are_refused_in_one_line() -> None:
     empty = replace(run, speed_rad_s=np.full_like(run.speed_rad_s, np.nan))
     with pytest.raises(TwinError, match="two measured speeds"):
         trained(empty)
-
-
-def test_each_of_several_runs_is_left_out_once() -> None:
-    runs = [replace(fan_data.published_run(seed, 2.0), name=str(seed)) for seed in range(5)]
-    folds = leave_out(runs)
-    assert sorted(run.name for _, judged in folds for run in judged) == ["0", "1", "2", "3", "4"]
-    assert all({run.name for run in kept}.isdisjoint(run.name for run in judged) for kept, judged in folds)

@@ -38,9 +38,3 @@ def test_derivatives_agree_with_finite_differences() -> None:
             speed, command, PARAMETERS - move
         )
         np.testing.assert_allclose(exact[:, index], change / (2 * move[:, index]), rtol=1e-5)
-
-
-def test_the_time_constant_falls_with_speed() -> None:
-    slow, fast = (physics.time_constant_s(np.full(2, speed), PARAMETERS) for speed in (0.0, 300.0))
-    np.testing.assert_allclose(slow, PARAMETERS[:, 0] / PARAMETERS[:, 1])
-    assert np.all(fast < slow)

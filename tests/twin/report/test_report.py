@@ -5,8 +5,7 @@ import re
 from dataclasses import astuple, replace
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,9 +24,8 @@ from twin.models.physics import PARAMETER_NAMES
 from twin.report import figures
 from twin.report.assessment import assess
 from twin.report.content import Content, SpeedUnit, report_content, summary_of
-from twin.report.page import MOST_FANS_DRAWN, drawn_fans, report_page
+from twin.report.page import report_page
 from twin.report.recording_sums import common_extent, extent_of, recording_sums
-from twin.report.speed_bins import speed_sums
 from twin.report.steady_states import static_curve
 from twin.report.timeline import broken_at, kept_samples, timeline
 from twin.runs import Run
@@ -164,15 +162,6 @@ def test_the_page_holds_every_section_and_every_figure(page):
         assert expected in parsed.text
 
 
-def test_the_parameters_and_their_intervals_are_those_of_identify(folder, page, twin):
-    (identified,) = json.loads(fantwin("identify", folder / "healthy.mcap", "--json").stdout)["fans"]
-    content = content_of(twin, published_run(2, 10.0))
-    for parameter in content.fans[0].parameters[:3]:
-        assert parameter.value == pytest.approx(identified[parameter.name])
-        assert (parameter.low, parameter.high) == pytest.approx(identified[f"{parameter.name}_95"])
-        assert f"{parameter.low:.4g} to {parameter.high:.4g}" in Page(page).text
-
-
 def test_the_page_needs_nothing_but_itself(page):
     parsed = Page(page)
     assert not parsed.tags & {"script", "link", "iframe", "img", "object", "embed"}
@@ -216,20 +205,6 @@ def test_a_fan_that_runs_slow_is_not_followed_and_the_page_says_by_how_much(twin
     assert "train it on them" in Page(report_page(content)).text
 
 
-def test_the_worst_fan_decides_and_is_named(twin):
-    healthy = published_run(6, 20.0, fans=3)
-    slow = healthy.speed_rad_s * np.array([1.0, 0.85, 1.0])
-    judged = assess(content_of(twin, with_speed(healthy, slow)))
-    assert "does not follow fan 1: rmse" in judged.headline
-    assert "A twin of one fan is used for 3: fans differ, and so may their errors." in judged.warnings
-
-
-def test_speeds_of_another_unit_are_recognised(twin):
-    run = published_run(5, 10.0)
-    (first, *_) = assess(content_of(twin, with_speed(run, run.speed_rad_s * 60.0 / (2.0 * np.pi)))).warnings
-    assert re.fullmatch(r"Speeds up to \d,\d{3} rad/s, the twin knows \d{3}: is the recording's unit right\?", first)
-
-
 def test_limitations_of_the_figures_are_reported_as_warnings(twin):
     run = published_run(7, 20.0)
     trained_on = DataCard("healthy.mcap", twin.card.training.data[0].sha256, 1, run.samples)
@@ -239,32 +214,6 @@ def test_limitations_of_the_figures_are_reported_as_warnings(twin):
     speed = run.speed_rad_s.copy()
     speed[::4] = np.nan
     assert any("speeds are missing" in line for line in assess(content_of(twin, with_speed(run, speed))).warnings)
-
-
-def test_a_free_run_that_diverges_is_reported_and_still_drawn(twin):
-    content = content_of(twin, published_run(8, 5.0))
-    (fan,) = content.fans
-    nowhere = np.full_like(fan.error_rad_s, np.nan)
-    figures = replace(fan.figures, rmse_rad_s=np.inf, max_error_rad_s=np.inf, r2=-np.inf)
-    gone = replace(
-        fan, figures=figures, predicted_rad_s=nowhere, error_rad_s=np.full_like(nowhere, np.inf), by_speed=()
-    )
-    lost = replace(content, fans=(gone,), evaluation=replace(content.evaluation, per_fan=(figures,), pooled=figures))
-    assert assess(lost).headline == "The twin does not follow this fan: rmse without limit."
-    assert "This fan: the free run diverges." in assess(lost).warnings
-    assert Page(report_page(lost)).numbers["row-0"][0] == np.inf
-
-
-def test_the_worst_of_many_fans_are_drawn(twin):
-    many = published_run(9, 4.0, fans=MOST_FANS_DRAWN + 3)
-    speed = many.speed_rad_s.copy()
-    speed[:, -1] *= 0.7
-    content = content_of(twin, with_speed(many, speed))
-    drawn = drawn_fans(content.fans)
-    assert len(drawn) == MOST_FANS_DRAWN
-    assert drawn[-1].number == many.fans - 1
-    left_out = [fan.rmse_in_sigma for fan in content.fans if fan not in drawn]
-    assert max(left_out) <= min(fan.rmse_in_sigma for fan in drawn)
 
 
 @given(spike=st.integers(0, 19_999), columns=st.integers(10, 500), missing=st.integers(0, 10_000))
@@ -294,16 +243,6 @@ def test_gaps_stay_open_and_long_ones_are_shortened():
     assert np.flatnonzero(np.isnan(drawn)).tolist() == [line.starts[1], line.starts[2] + 1]
 
 
-def test_recordings_follow_one_another_and_one_alone_keeps_its_clock():
-    first, second = published_run(1, 10.0), published_run(2, 10.0)
-    both = timeline([first.rows(500, 1000), second])
-    assert [name for _, name in both.recordings] == ["published 1", "published 2"]
-    assert both.t_s[0] == 0.0
-    alone = timeline([first.rows(500, 1000)])
-    assert alone.keeps_the_clock
-    assert alone.t_s[0] == 5.0
-
-
 def test_the_static_curve_is_where_torque_and_load_meet():
     hold = np.repeat([20.0, 80.0, 50.0], 1500)
     run = published_run(1, 45.0)
@@ -325,22 +264,6 @@ def test_the_static_curve_is_where_torque_and_load_meet():
     assert len(static_curve(model, parameters, [shaken], 0, 100.0, 180.0).measured) == 0
 
 
-def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_reported(twin):
-    run = published_run(5, 30.0)
-    assert assess(content_of(twin, run)).warnings == ()
-    content = content_of(twin, run)
-    wide = replace(content, fans=(replace(content.fans[0], sigma_rad_s=2.0 * content.fans[0].sigma_rad_s),))
-    (line,) = assess(wide).warnings
-    assert line.startswith("This fan: the card's sigma is over 1.5 times the standard deviation of the errors")
-    assert assess(wide).level == "as declared"
-    (line,) = assess(content_of(twin, run.between(0.0, 0.9))).warnings
-    assert re.search(r"\d+ independent errors determine the rmse to 1\d% only", line)
-    healthy = replace(twin.card.healthy, independent_samples=(8.0,))
-    of_few = SimpleNamespace(card=replace(twin.card, healthy=healthy), path=twin.path)
-    (line,) = assess(replace(content, twin=cast("OnnxTwin", of_few))).warnings
-    assert "equivalent of 8 independent errors: its sigma may be off by 25%" in line
-
-
 def test_recordings_summed_one_by_one_give_the_figures_of_all_their_samples(twin):
     runs = [published_run(2, 10.0), published_run(3, 14.0)]
     extent = common_extent([extent_of([run]) for run in runs])
@@ -358,22 +281,6 @@ def test_recordings_summed_one_by_one_give_the_figures_of_all_their_samples(twin
     np.testing.assert_allclose(fan.residual.cross_correlation, of_samples.residual.cross_correlation, atol=1e-9)
     assert [part.middle_rad_s for part in fan.by_speed] == [part.middle_rad_s for part in of_samples.by_speed]
     assert assess(summary) == assess(content)
-
-
-def test_errors_are_gathered_by_speed_and_few_samples_make_no_point():
-    rng = np.random.default_rng(1)
-    speed = rng.uniform(0.0, 100.0, 20_000)
-    error = rng.normal(np.where(speed < 50.0, 4.0, 0.0), 1.0)
-    speed[0], speed[1] = 300.0, np.nan
-    range_rad_s = np.array([[0.0], [300.0]])
-    bins = speed_sums(speed[:, np.newaxis], error[:, np.newaxis], range_rad_s).bins(0, range_rad_s[:, 0])
-    assert len(bins) == 7  # of 20 up to 300 rad/s: those that reach below 100
-    for part in bins:
-        if not 45.0 < part.middle_rad_s < 55.0:
-            assert part.mean_rad_s == pytest.approx(4.0 if part.middle_rad_s < 50.0 else 0.0, abs=0.15)
-            assert part.std_rad_s == pytest.approx(1.0, abs=0.1)
-    nothing = speed_sums(np.full((5, 1), np.nan), np.zeros((5, 1)), range_rad_s)
-    assert nothing.bins(0, range_rad_s[:, 0]) == nothing.bins(0, np.full(2, np.nan)) == ()
 
 
 def test_invalid_input_is_a_one_line_error(folder, tmp_path):
@@ -427,15 +334,3 @@ def test_what_the_twin_knows_is_drawn_where_its_card_says_it(twin, hybrid, monke
         **CORNERS,
     )
     assert figures.OUTSIDE not in figures.what_is_known(content, content.fans[0], everywhere), "no line where none is"
-
-
-def test_what_is_measured_beside_command_and_speed_has_its_curve_and_what_is_not_has_none(twin):
-    run = published_run(4, duration_s=20.0)
-    volts = np.full_like(run.command, 12.0)
-    volts[1000:] = np.nan
-    nothing = np.full_like(volts, np.nan)
-    measured = replace(run, auxiliary={"supply_voltage_v": volts, "current_a": nothing})
-    for one, units in ((run, ()), (measured, ("(V)",))):
-        content = report_content(twin, [one], [DataCard("r", "", 1, run.samples)], RAD_S)
-        drawn = figures.over_time(content, content.fans[0], narrow=False)
-        assert tuple(unit for unit in ("(V)", "(A)", "(°C)") if unit in drawn) == units
