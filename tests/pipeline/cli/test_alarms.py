@@ -370,27 +370,6 @@ def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, m
     assert f"alarms unknown: no scorer of site '{SITE}' answers at {endpoint}" in error
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("ack", "name a tray: fantwin alarms ack TRAY [FAN] (trays: tray1)"),
-        ("ack nobody", "no tray called 'nobody'"),
-        ("ack tray1 8", "fan 8: tray tray1 has fans 0 to 7"),
-        ("shelve tray1 3 --for 3", "--for 3: give a time such as 90s, 30m, 8h or 2d"),
-        ("shelve tray1 3 --for 0m", "--for 0m: give a time such as 90s, 30m, 8h or 2d"),
-        ("ack tray1 3 --for 3m", "--for can be used with shelve only, not with ack"),
-        ("ack tray1 3 --watch", "--all and --watch apply to the list only: leave them out with ack"),
-        ("ack tray1 3 --onset 14:03:10", "--onset can be used with true-alarm and false-alarm only, not with ack"),
-        ("true-alarm tray1 3 --onset noon", "--onset noon: give a time such as 14:03:10 or '2026-01-31 14:03:10'"),
-        ("--history --watch", "--history only lists: of the other options it takes --recordings and --json"),
-        ("--recordings a.mcap", "--recordings needs --history"),
-        ("--operator Ann", "--for, --comment, --operator and --onset need an action"),
-    ],
-)
-def test_wrong_arguments_are_a_one_line_error(words, expected):
-    assert expected in error_of("alarms", *words.split(), "-c", DEMO / "demo.toml")
-
-
 def test_every_action_can_be_typed():
     assert [asked.action for asked in OperatorAction] == [action for action in Action if action != Action.NONE]
 
@@ -415,8 +394,3 @@ def test_an_operator_says_whether_an_alarm_was_true_while_it_stands_and_after_it
     ]
     assert (answer["transition"], answer["marked_onset_t_ns"]) == ("marked_true", first["onset_t_ns"])
     assert "no alarm began then" in site.refused("true-alarm", TRAY, 3, "--onset", "2020-01-01 10:00:00")
-
-
-def test_without_a_gateway_the_history_says_where_else_it_could_come_from(tmp_path):
-    error = error_of("alarms", "--history", "-c", DEMO / "demo.toml", "--set", f"run_folder='{tmp_path}'")
-    assert f"{tmp_path}/alarms.sqlite: no gateway has kept a history of alarms there" in error

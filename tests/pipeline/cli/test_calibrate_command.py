@@ -6,16 +6,14 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import onnx
 import pytest
 
 from pipeline.cli.main import expand_variadic
 from pipeline.cli.twins.calibration_check import Check
-from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.runtime.tray_twin import load_tray_twin
-from scoring.calibration.healthy_statistics import RunWork
 from scoring.limits import Limits, default_timing
 from tests.support.fantwin_command import error_of, fantwin
 
@@ -148,34 +146,6 @@ def test_without_an_output_the_twin_itself_is_calibrated(folder: Path) -> None:
     assert load_tray_twin(twin).card.calibration is not None
 
 
-def test_too_little_data_is_refused_with_the_amount_needed_and_the_twin_is_unchanged(folder: Path) -> None:
-    before = (folder / "twin.onnx").read_bytes()
-    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1)
-    assert "fan-hours of healthy running cannot support 1 false alarm per fan and day: that takes 72" in error
-    assert "--extrapolate" in error
-    assert (folder / "twin.onnx").read_bytes() == before
-
-
-def test_too_little_data_for_any_limit_is_refused_also_with_extrapolate(folder: Path) -> None:
-    before = (folder / "twin.onnx").read_bytes()
-    few = "--to", 40, "--false-alarms-per-day", 1, "--extrapolate"
-    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap", *few)
-    assert re.match(r"\d\d s of healthy running could be scored, all fans together: too little for any limit; ", error)
-    assert error.endswith("that takes 60 s of each fan: record two minutes or more, better ten")
-    assert (folder / "twin.onnx").read_bytes() == before
-
-
-def test_recordings_too_short_for_the_rate_are_refused_before_any_of_them_is_scored(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def scored(self: HealthyRuns, work: RunWork) -> NoReturn:
-        raise AssertionError("scored")
-
-    monkeypatch.setattr(HealthyRuns, "__call__", scored)
-    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1)
-    assert error.startswith("0.068 fan-hours of healthy running cannot support 1 false alarm per fan and day")
-
-
 def test_extrapolated_limits_declare_a_target_only(folder: Path) -> None:
     output = folder / "extrapolated.onnx"
     result = fantwin(
@@ -234,38 +204,12 @@ def test_the_printed_interval_decides(alarms: int) -> None:
     assert f"(95 %: {low:.2g} to " in check.text
 
 
-def test_a_twin_that_was_never_calibrated_has_nothing_to_verify(folder: Path) -> None:
-    error = error_of("calibrate", folder / "twin.onnx", "--verify", folder / "other.mcap")
-    assert "never calibrated" in error
-
-
-def test_missing_arguments_are_named(folder: Path) -> None:
-    assert "nothing to calibrate on" in error_of("calibrate", folder / "twin.onnx")
-    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap")
-    assert "--false-alarms-per-day" in error
-
-
-def test_a_missing_twin_is_reported_by_the_given_name(folder: Path) -> None:
-    error = error_of("calibrate", folder / "no.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY)
-    assert error == f"{folder / 'no.onnx'}: there is no such twin: name the file that `fantwin train` wrote"
-
-
 def test_all_that_follows_verify_is_verified(folder: Path, calibrated: Path) -> None:
     more, other = folder / "more.mcap", folder / "other.mcap"
     simulated(more, 4, 30)
     words = expand_variadic(list(map(str, ("calibrate", calibrated, "--verify", other, more, "--json"))))
     result = fantwin(*words)
     assert json.loads(result.stdout)["verify"]["fan_hours"] == pytest.approx(FANS * 90 / 3600, rel=0.1)
-
-
-def test_arguments_consumed_by_verify_are_reported(folder: Path, calibrated: Path) -> None:
-    other, healthy, twin = folder / "other.mcap", folder / "healthy.mcap", folder / "twin.onnx"
-    for option in (("--false-alarms-per-day", PER_DAY), ("--extrapolate",), ("-o", folder / "never.onnx")):
-        words = expand_variadic(list(map(str, ("calibrate", twin, *option, "--verify", other, healthy))))
-        error = error_of(*words)
-        assert "those after --verify only test; name HEALTHY.mcap... before it" in error
-    words = expand_variadic(list(map(str, ("calibrate", calibrated, "--verify", other, twin))))
-    assert f"{twin}: --verify takes recordings" in error_of(*words)
 
 
 def test_a_recording_in_which_something_was_wrong_is_named(folder: Path) -> None:
@@ -278,44 +222,6 @@ def test_a_recording_in_which_something_was_wrong_is_named(folder: Path) -> None
     assert warning in result.stderr.splitlines()
     result = calibrate(folder, folder / "other.mcap", "-o", folder / "sure.onnx", "--json")
     assert json.loads(result.stdout)["warnings"] == []
-
-
-@pytest.mark.parametrize("wrong", ["twin", "recording", "missing"])
-def test_files_of_another_kind_are_named_in_one_line(folder: Path, wrong: str, tmp_path: Path) -> None:
-    twin, recording = folder / "twin.onnx", folder / "healthy.mcap"
-    if wrong == "twin":
-        twin = tmp_path / "not-a-twin.onnx"
-        twin.write_bytes(b"nothing of the kind")
-    elif wrong == "recording":
-        recording = tmp_path / "not-a-recording.mcap"
-        recording.write_bytes(b"nothing of the kind")
-    else:
-        recording = tmp_path / "missing.mcap"
-    error = error_of("calibrate", twin, recording, "--false-alarms-per-day", PER_DAY)
-    assert str(twin if wrong == "twin" else recording) in error
-
-
-def test_an_output_that_cannot_be_written_is_a_one_line_error(folder: Path) -> None:
-    error = error_of(
-        "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY,
-        "-o", folder / "no-folder" / "twin.onnx",
-    )  # fmt: skip
-    assert "cannot write the twin" in error
-
-
-def test_a_folder_as_output_is_refused_before_anything_is_judged(folder: Path) -> None:
-    error = error_of(
-        "calibrate", folder / "twin.onnx", folder / "missing.mcap", "--false-alarms-per-day", PER_DAY, "-o", folder
-    )
-    assert "cannot write the twin" in error
-    assert not folder.with_name(folder.name + ".new").exists()
-
-
-def test_a_recording_counts_once(folder: Path) -> None:
-    healthy, verify = folder / "healthy.mcap", ("--verify", folder / "healthy.mcap")
-    twin, rate = folder / "twin.onnx", ("--false-alarms-per-day", PER_DAY)
-    assert "named twice" in error_of("calibrate", twin, healthy, healthy, *rate)
-    assert "named twice" in error_of("calibrate", twin, healthy, *rate, *verify)
 
 
 def test_recordings_that_a_twin_was_made_from_cannot_verify_it_under_any_name(folder: Path, calibrated: Path) -> None:

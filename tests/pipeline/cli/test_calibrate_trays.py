@@ -89,16 +89,6 @@ def test_the_declared_rate_is_tested_on_the_chosen_tray_only(folder: Path) -> No
     assert json.loads(found.stdout)["verify"]["fan_hours"] == pytest.approx(60 / 3600, rel=0.1)
 
 
-@pytest.mark.parametrize("command", ["train", "calibrate"])
-def test_a_tray_that_a_recording_lacks_is_named(folder: Path, command: str) -> None:
-    recording = folder / "healthy.mcap"
-    words = {
-        "train": (recording, "--tray", "c", "-o", folder / "c.onnx"),
-        "calibrate": (folder / "twin.onnx", recording, *RATE, "--tray", "c"),
-    }
-    assert f"{recording}: no raw samples of tray 'c'" in error_of(command, *words[command])
-
-
 def test_where_the_twin_fits_only_some_of_the_trays_one_must_be_chosen(folder: Path) -> None:
     two, one = simulated(folder / "two.mcap", 7, 60, fans=2), simulated(folder / "one.mcap", 8, 60)
     both, twin = together(folder / "both.mcap", a=two, b=one), folder / "of-two.onnx"

@@ -127,26 +127,6 @@ def test_each_role_may_have_a_folder_of_its_own(path):
     assert all(role in certs(path, "show").stdout for role in roles)
 
 
-@pytest.mark.parametrize(
-    ("words", "what"),
-    [
-        (["issue", "skorer"], "did you mean 'scorer'"),
-        (["issue", "scorer.tray9"], "no role called 'scorer.tray9'"),
-        (["issue", "scorer", "--tray", "tray9"], "no tray called 'tray9'"),
-        (["issue", "--tray", "tray1"], "--tray needs a role"),
-        (["init", "scorer"], "init takes no role"),
-        (["issue", "scorer"], "no authority here"),
-        (["show"], "no certificates"),
-        (["renew"], "no certificates"),
-    ],
-)
-def test_mistakes_are_one_line(path, words, what):
-    result = certs(path, *words)
-    assert isinstance(result.exception, UserError)
-    assert what in str(result.exception)
-    assert "\n" not in str(result.exception)
-
-
 def test_an_expired_certificate_is_shown_and_ends_the_command_with_1(path):
     SiteCertificates(path.parent / "certs").issue("viewer", lifetime=-timedelta(minutes=1))
     result = certs(path, "show")

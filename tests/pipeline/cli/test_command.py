@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -27,8 +26,7 @@ from schemas.enums import StageStatus
 from schemas.header import Header
 from schemas.health import Counter, Health, Note
 from schemas.topics import BY_NAME, alive_key, health_key
-from tests.support.fantwin_command import error_of
-from tests.support.running_chain import DEMO, Chain, RunningCommand, eventually, fantwin
+from tests.support.running_chain import Chain, RunningCommand, eventually, fantwin
 
 
 @pytest.fixture
@@ -155,36 +153,3 @@ def test_a_note_names_the_range_and_the_command_that_was_probably_meant(chain, a
     done = eventually(sent, "the acquisition that starts takes a command")
     assert json.loads(done.stdout)["value"] == 0.6
     assert done.stderr == "note: commands of tray tray1 go from 0 to 255, and 0.6 was sent; 60 % of this range is 153\n"
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("--fan 8 0.5", "tray tray1 has fans 0 to 7"),
-        ("--fan -1 0.5", "tray tray1 has fans 0 to 7"),
-        ("--fan 2 1.5", "the command must be within 0 to 1"),
-        ("--fan 2 -0.1", "the command must be within 0 to 1"),
-        ("--fan 2 nan", "the command must be within 0 to 1"),
-        ("--fan 2 20001 --set-point", "the set-point, rpm, must be within -20000 to 20000"),
-        ("--tray nobody --fan 2 0.5", "no tray called 'nobody'"),
-    ],
-)
-def test_a_command_that_the_tray_cannot_carry_out_is_refused_in_one_line(words, expected):
-    assert expected in error_of("command", "-c", DEMO / "demo.toml", *words.split())
-
-
-def test_a_command_imports_nothing_that_only_watching_and_judging_need():
-    """It is to be answered at once, and most of its time is imports."""
-    code = "import sys, pipeline.cli.watch.command; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    unneeded = (
-        "scoring",
-        "stages",
-        "twin",
-        "pipeline.launch",
-        "pipeline.runtime.stage",
-        "rich",
-        "scipy",
-        "onnxruntime",
-    )
-    assert [name for name in done.stdout.split() if name.startswith(unneeded)] == []

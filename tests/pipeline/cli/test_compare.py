@@ -3,16 +3,14 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.pipeline.cli.test_train_commands import record
 from tests.support.fan_data import rough_run
-from tests.support.fantwin_command import error_of, fantwin
+from tests.support.fantwin_command import fantwin
 from twin.build import train_twin
 from twin.comparison import Contender, all_candidates, best
 from twin.errors import TwinError
-from twin.runs import Run
 
 FIGURES = ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma")
 
@@ -109,15 +107,3 @@ def test_a_model_that_cannot_be_trained_is_a_row_and_not_the_end(folder, monkeyp
 def test_if_no_model_could_be_trained_the_error_has_the_reason():
     with pytest.raises(TwinError, match="nothing moved"):
         best([Contender(candidate, invalid_reason="nothing moved") for candidate in all_candidates()])
-
-
-def test_invalid_input_is_a_one_line_error(folder, tmp_path):
-    healthy = folder / "healthy.mcap"
-    assert "--model hybird: no such model; known: physical" in error_of("compare", healthy, "--model", "hybird")
-    assert "cannot read the recording" in error_of("compare", healthy, "--test", tmp_path / "nowhere.mcap")
-    (tmp_path / "file").touch()
-    unwritable = ("-o", tmp_path / "file" / "twins", "--model", "physical")
-    assert "cannot be created" in error_of("compare", healthy, *unwritable)
-    still = rough_run(1, 5.0)
-    record(tmp_path / "still.mcap", Run("still", still.t_s, np.full_like(still.command, 50.0), still.speed_rad_s))
-    assert "command" in error_of("compare", tmp_path / "still.mcap")

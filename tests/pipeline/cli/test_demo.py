@@ -168,14 +168,6 @@ def test_a_browser_that_takes_no_picture_is_one_line_and_ends(program, tmp_path,
     assert not (tmp_path / "page.png").exists()
 
 
-def test_a_folder_that_cannot_be_used_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    done = fantwin("demo", "-o", tmp_path / "file" / "demo")
-    assert done.returncode == 1
-    assert "cannot be used for the demo's files" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 def test_a_demo_ignores_the_state_of_an_earlier_one_and_does_not_touch_other_files(tmp_path):
     for name in ("recording.mcap", "scorer-tray1.snapshot", "notes.txt"):
         (tmp_path / name).touch()

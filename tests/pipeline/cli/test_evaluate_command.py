@@ -241,20 +241,6 @@ def test_a_card_names_the_fans_it_is_of_and_a_fan_is_judged_by_its_own_parameter
     assert f'<data value="{parameters[0, 0]}">' not in page.read_text()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("three.mcap",), "has fans 0, 2, the runs have 0, 1, 2; choose its fans with --fans"),
-        (("three.mcap", "--fans", "0,1"), "has fans 0, 2, the runs have 0, 1;"),
-        (("two.mcap",), "has fans 0, 2, the runs have 0, 1;"),
-    ],
-)
-def test_fans_that_do_not_match_the_twin_are_a_one_line_error(tray: Path, arguments: tuple, words: str) -> None:
-    file, *options = arguments
-    assert words in error_of("evaluate", tray / "twin.onnx", tray / file, *options)
-    assert words in error_of("report", tray / "twin.onnx", tray / file, *options, "-o", tray / "none.html")
-
-
 def test_a_twin_made_before_cards_named_fans_is_still_read_and_serves_as_many(tray: Path) -> None:
     training = {"trainer": "none", "physics": "fixed", "seed": 0, "iterations": 0, "duration_s": 0.0, "data": []}
     old = write_twin(tray / "old.onnx", fans=2, training=training)
@@ -263,12 +249,3 @@ def test_a_twin_made_before_cards_named_fans_is_still_read_and_serves_as_many(tr
         result = json.loads(fantwin("evaluate", old, tray / options[0], *options[1:], "--json").stdout)
         assert len(result["fans"]) == 2
     assert "has 2 fans and does not say which" in error_of("evaluate", old, tray / "two.mcap", "--fans", "1")
-
-
-@pytest.mark.parametrize("rate", ["0", "-50", "fast", "nan", "inf"])
-def test_an_invalid_rate_is_a_one_line_error(recorded: tuple[Path, Path], rate: str) -> None:
-    assert f"--rate {rate}: give a rate in Hz" in error_of("evaluate", *recorded, f"--rate={rate}")
-
-
-def test_a_rate_too_low_for_the_recording_is_a_one_line_error(recorded: tuple[Path, Path]) -> None:
-    assert "no run is long enough to be evaluated at 0.01 Hz" in error_of("evaluate", *recorded, "--rate", "0.01")

@@ -246,21 +246,6 @@ def test_the_same_tray_of_two_sites_does_not_become_one_table(tmp_path):
     assert "would hold both" in error_of("export", path, "--to", "csv", "-o", tmp_path / "out")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--to", "csv", "--topic", "scor"), "no topic is called 'scor'; known: raw, grid"),
-        (("--to", "csv", "--topic", "grid"), "no grid in this recording; see --topic and --tray"),
-        (("--to", "csv", "--tray", "tray7"), "no score of a tray 'tray7' in this recording"),
-        (("--to", "csv", "-o", "x.parquet"), "x.parquet: name a file that ends in .csv with -o, or a folder"),
-    ],
-)
-def test_a_request_that_cannot_be_exported_is_a_one_line_error(tmp_path, monkeypatch, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    assert words in error_of("export", recording(tmp_path), *arguments)
-    assert names(tmp_path) == ["r.mcap"]
-
-
 def test_without_pyarrow_csv_works(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)

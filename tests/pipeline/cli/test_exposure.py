@@ -9,19 +9,9 @@ import pytest
 from pipeline.cli.exposure import checked_exposure
 from pipeline.config.models import BusConfig
 from pipeline.errors import UsageError
-from tests.support.running_chain import DEMO, fantwin
 
 OPEN = "tcp/0.0.0.0:7447"
 DRIVES = "whoever reaches it can drive the fans, forge samples and silence alarms"
-
-
-@pytest.mark.parametrize("words", [["up"], ["run", "scorer"], ["router"]])
-def test_each_command_that_stays_on_the_bus_ends_with_2_and_one_line(words, tmp_path):
-    settings = ["--set", f"bus.endpoint='{OPEN}'", "--set", f"run_folder='{tmp_path}'"]
-    done = fantwin(*words, "-c", DEMO / "demo.toml", *settings)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.count("\n") == 1
-    assert DRIVES in done.stderr and "fantwin certs init" in done.stderr and "--insecure" in done.stderr
 
 
 def test_who_accepts_it_is_reminded_until_the_end(monkeypatch):

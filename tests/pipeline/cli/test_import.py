@@ -185,20 +185,6 @@ def test_an_existing_recording_is_replaced_only_when_forced(tmp_path):
     assert len(list(read_recording(recording))) == 14
 
 
-def test_a_table_that_cannot_be_read_leaves_no_recording(tmp_path):
-    path, _ = measured(tmp_path)
-    assert "no column 'y3'; did you mean" in error_of(
-        "import", path, "--time", "t", "--command", "u", "--speed", "y3", "-o", tmp_path / "r.mcap"
-    )
-    assert [p.name for p in tmp_path.iterdir()] == ["measured.csv"]
-
-
-@pytest.mark.parametrize("tray", ["a/b", "", "health", "tray 1"])
-def test_a_tray_name_that_cannot_be_part_of_a_key_is_refused(tmp_path, tray):
-    path, _ = measured(tmp_path)
-    assert "use letters, digits" in error_of("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--tray", tray)
-
-
 def test_training_reads_the_numbers_of_the_table(tmp_path):
     path, values = measured(tmp_path)
     fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap")

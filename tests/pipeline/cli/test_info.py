@@ -314,11 +314,3 @@ def test_an_alarm_alone_has_no_rate(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
         writer.add_message(ALARM_KEY, alarm(0), 5)
     assert shown(tmp_path / "r.mcap")["topics"][ALARM_KEY]["rate_hz"] is None
-
-
-@pytest.mark.parametrize("content", [b"", b"t,u\n", None])
-def test_a_file_that_is_not_a_recording_is_refused_in_one_line(tmp_path, content):
-    path = tmp_path / "r.mcap"
-    if content is not None:
-        path.write_bytes(content)
-    assert f"{path}: " in error_of("info", path)

@@ -264,7 +264,3 @@ def test_a_command_that_is_ended_while_it_fetches_a_recording_leaves_no_copy(tmp
         server.shutdown()
     assert (command.returncode, errors) == (130, "interrupted: nothing was identified\n")
     assert [*temporary.iterdir()] == []
-
-
-def test_jobs_and_a_cluster_are_not_both_wanted_and_no_cluster_is_one_line(folder: Path) -> None:
-    assert "give one" in error_of("identify", folder / "a.mcap", "--jobs", 2, "--scheduler", "tcp://127.0.0.1:1")

@@ -17,7 +17,7 @@ from schemas.header import Header
 from schemas.health import Health, Output
 from schemas.topics import health_key
 from tests.pipeline.recordings.test_repair import chunk_ends, read_by_others, small
-from tests.support.fantwin_command import error_of, fantwin
+from tests.support.fantwin_command import fantwin
 from tests.support.written_recordings import RAW_KEY, raw
 
 
@@ -137,11 +137,6 @@ def test_info_reports_the_possible_losses_of_a_truncated_file_after_its_repair(t
         assert file["recovered"] == [f"{TRUNCATED}: messages of the unfinished chunk may be missing"]
 
 
-def test_an_output_that_cannot_be_written_is_refused_with_advice(tmp_path, whole):
-    error = error_of("recover", whole, "-o", tmp_path / "nowhere" / "out.mcap")
-    assert "No such file or directory; whole.mcap is left as it was; name another file with -o" in error
-
-
 def test_messages_that_health_reports_as_published_and_that_are_not_there_are_reported(tmp_path):
     writer = RecordingWriter(tmp_path / "r.mcap", {"flush_interval_s": "0.5"})
     writer.add_message(RAW_KEY, raw(0), 1)
@@ -164,20 +159,3 @@ def test_messages_that_health_reports_as_published_and_that_are_not_there_are_re
         f"{RAW_KEY}: 3 messages of acquisition-1 published after the last one here, according to its health"
         in done.stdout
     )
-
-
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [
-        (b"", "not a recording (MCAP)"),
-        (b"t,u,y\n1,2,3\n", "not a recording (MCAP)"),
-        (b"\x89MCAP0\r\n", "it holds no intact message: nothing can be recovered"),
-        (None, "cannot read the recording: No such file or directory"),
-    ],
-)
-def test_if_nothing_can_be_recovered_the_reason_is_shown_and_no_file_written(tmp_path, content, expected):
-    path = tmp_path / "r.mcap"
-    if content is not None:
-        path.write_bytes(content)
-    assert expected in error_of("recover", path, "-o", tmp_path / "out.mcap")
-    assert [p.name for p in tmp_path.iterdir()] == ([] if content is None else ["r.mcap"])

@@ -23,7 +23,6 @@ from scoring.diagnosis.shown_causes import short_name
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.killed_site import Site
 from tests.support.offline_replay import changed
-from tests.support.running_chain import fantwin as fantwin_process
 from tests.support.twin_files import write_twin
 
 GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
@@ -275,11 +274,6 @@ def test_a_truncated_recording_is_judged_as_far_as_it_can_be_read_exit_code_3(tm
     result = replay("--json", truncated)
     assert result.exit_code == 3
     assert "is truncated" in json.loads(result.stdout)["damage"][0]
-
-
-def test_a_file_that_is_not_there_is_one_line():
-    result = fantwin_process("replay", "--offline", "nothing.mcap")
-    assert result.returncode == 1 and len(result.stderr.strip().splitlines()) == 1
 
 
 def test_a_twin_that_is_set_by_a_key_is_the_one_that_judges(tmp_path):

@@ -16,9 +16,8 @@ import serial
 
 from pipeline.cli.simulation.simulate import simulate
 from pipeline.devices import simulated_device as simulated_line
-from pipeline.devices.measured_table import read_table
 from pipeline.devices.simulated_device import PseudoTerminal, play, wait_for_reader
-from pipeline.devices.table_device import TableDevice, TableSample
+from pipeline.devices.table_device import TableSample
 from pipeline.errors import UserError
 from pipeline.recordings.reading import read_metadata, read_recording
 from schemas import wire
@@ -362,31 +361,6 @@ def test_a_link_never_replaces_a_file_but_does_replace_a_stale_link(tmp_path: Pa
     assert not link.is_symlink()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"fault": ["inlte:fan=1"]}, "did you mean 'inlet'"),
-        ({"profile": "manuel"}, "did you mean 'manual'"),
-        ({"fans": 65}, "fans = 65"),
-        ({"tacho": "count"}, 'a tacho of kind "count" needs --window'),
-        ({"window": [1.0]}, '--window and --update are for a tacho of kind "count"'),
-        ({"tacho": "count", "window": [61.0]}, r"--window 61\.0: Input should be less than or equal to 60"),
-        ({"tacho": "count", "window": [1.0, 0.5]}, "2 tachos for 8 fans; give one for all fans, or one for each"),
-        ({"fan": "4-pin", "fault": ["inlet:fan=1"]}, "4-pin fans have no such fault; they have clog"),
-        ({"missing": 1.5}, r"missing readings = 1\.5"),
-        ({"fault": ["inlet:fan=8"]}, "fan 8 does not exist"),
-        ({"time": "t:s"}, "name it with --from-csv"),
-        ({"recording": Path("x.mcap")}, "--recording needs --duration"),
-        ({"from_csv": Path("x.csv"), "fault": ["inlet:fan=1"]}, "leave out --fault"),
-        ({"truth": Path("/nowhere/truth.json")}, "/nowhere/truth.json: cannot be written"),
-    ],
-)
-def test_a_wrong_option_is_a_one_line_error(options: dict, message: str) -> None:
-    with pytest.raises(UserError, match=message) as caught:
-        simulate(**options)
-    assert "\n" not in str(caught.value)
-
-
 def raw_of(path: Path) -> list[Raw]:
     return [entry.message for entry in read_recording(path) if isinstance(entry.message, Raw)]
 
@@ -467,17 +441,3 @@ def test_a_measured_file_is_played_with_its_recorded_times_and_units(tmp_path: P
     assert np.isnan(reader.samples[1].speed[1])
     truth = truth_of(tmp_path)
     assert (truth["complete"], truth["samples_sent"], truth["faults"]) == (True, 4, [])
-
-
-def test_a_part_of_a_file_without_rows_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "run.csv"
-    path.write_text(TABLE)
-    with pytest.raises(UserError, match=r"no row from 100 s to inf s; the table is 8 s long"):
-        TableDevice(read_table(path, "t ms:ms", ["duty"], ["rpm:rpm"]), 100.0, float("inf"))
-
-
-@pytest.mark.parametrize("duration", [float("inf"), float("nan")])
-def test_a_recording_without_an_end_is_refused(tmp_path, duration):
-    with pytest.raises(UserError, match="duration"):
-        simulate(duration=duration, recording=tmp_path / "x.mcap")
-    assert not (tmp_path / "x.mcap").exists()

@@ -33,7 +33,7 @@ from schemas.enums import StageStatus
 from schemas.header import Header
 from schemas.health import Counter, Health, Input, Note
 from schemas.messages import Command
-from tests.support.fantwin_command import error_of, usage_error_of
+from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO
 
 PERIOD_S = 0.1
@@ -148,67 +148,10 @@ def test_where_something_else_sets_the_command_it_says_so() -> None:
         swept(line)
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("--low 0.5 --high 0.4", "name a range within 0 to 1 of tray tray1"),
-        ("--high 255", "--high 255: name a range within 0 to 1 of tray tray1"),
-        ("--fans 0,8", "tray tray1 has fans 0 to 7"),
-        ("--fans both", "write all, or numbers with commas"),
-        ("--safe 2", "--safe 2: the command must be within 0 to 1"),
-    ],
-)
-def test_what_the_tray_cannot_do_is_refused_in_one_line(words: str, expected: str) -> None:
-    assert expected in error_of("sweep", "-c", DEMO / "demo.toml", *words.split())
-
-
-@pytest.mark.parametrize(
-    ("words", "error"),
-    [
-        ("--low 1", "--low 1: name a range within 0 to 1 of tray tray1"),
-        ("--high 0", "--high 0: name a range within 0 to 1 of tray tray1"),
-        (
-            "--high 0.1",
-            "--high 0.1: name --low, too: without it tray tray1 is swept from 0.2, because fans may stop below",
-        ),
-        (
-            "--high 0.2",
-            "--high 0.2: name --low, too: without it tray tray1 is swept from 0.2, because fans may stop below",
-        ),
-    ],
-)
-def test_only_options_that_were_given_are_refused(words: str, error: str) -> None:
-    assert usage_error_of("sweep", "-c", DEMO / "demo.toml", *words.split()) == error
-
-
-UNCOMMANDED = [
-    ('kind = "push"', "the program that pushes its samples moves the fans"),
-    ('kind = "http"', "the program that posts its samples moves the fans"),
-    ('kind = "mqtt", host = "broker", topic = "t"', "its source names no send_topic"),
-    ('kind = "hwmon", chip = "nct6798"', "its source does not have writable = true"),
-    ('kind = "redfish", url = "https://bmc"', "fans behind Redfish are only read"),
-]
-
-
 def configured(folder: Path, source: str) -> Path:
     path = folder / "fantwin.toml"
     path.write_text(f'[[tray]]\nname = "tray1"\nfans = 1\nspeed_unit = "rpm"\nsource = {{ {source} }}\n')
     return path
-
-
-@pytest.mark.parametrize(("source", "reason"), UNCOMMANDED)
-def test_a_tray_that_takes_no_commands_is_not_swept_and_one_line_says_what_to_do_instead(
-    tmp_path: Path, source: str, reason: str
-) -> None:
-    path = configured(tmp_path, source)
-    for words, instead in (
-        (("sweep",), "run `fantwin up` while the fans' own controller varies their commands; it is recorded"),
-        (("commission", "--sweep"), "leave out --sweep, and let the fans' own controller vary their commands"),
-        (("command", "--fan", "0", "0.5"), ""),
-    ):
-        error = error_of(words[0], "-c", path, *words[1:])
-        assert f"tray tray1 takes no commands ({reason})" in error
-        assert instead in error
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from schemas.messages import Raw
 from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
 from schemas.topics import tray_key
 from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, counted_run, published_run
-from tests.support.fantwin_command import error_of, fantwin, usage_error_of
+from tests.support.fantwin_command import error_of, fantwin
 from twin.export.onnx_twin import OnnxTwin
 from twin.runs import Run
 
@@ -87,13 +87,6 @@ def test_a_supply_voltage_that_is_ignored_is_as_if_it_were_not_there(folder, tmp
         assert (says in done.stdout) == bool(needed)
         conditions = OnnxTwin(twin).card.conditions
         assert (conditions.needed if conditions else ()) == needed
-
-
-@pytest.mark.parametrize("name", ["volts", "current_a"])
-def test_a_column_that_no_twin_uses_cannot_be_ignored(folder: Path, tmp_path: Path, name: str):
-    for command, options in (("identify", ()), ("train", ("-o", tmp_path / "t.onnx"))):
-        error = usage_error_of(command, folder / "healthy.mcap", *options, "--ignore", name)
-        assert f"--ignore {name}: known are supply_voltage_v, temperature_c, the columns that a twin can use" in error
 
 
 def test_the_tacho_of_a_recording_counts_and_readings_that_speak_for_another_are_pointed_out(tmp_path):
@@ -168,12 +161,6 @@ def test_each_model_is_trained_and_its_file_evaluates_to_the_printed_figures(fol
         assert evaluated[figure] == pytest.approx(result[figure], rel=1e-4), figure
     assert evaluated["samples"] == 4000
     assert OnnxTwin(file).card.training.networks == networks
-
-
-def test_several_networks_are_refused_where_there_is_one_result(folder, tmp_path):
-    error = error_of("train", folder / "healthy.mcap", "--model", "narx", "--networks", 2, "-o", tmp_path / "t.onnx")
-    assert "several networks cannot be averaged with model narx" in error
-    assert "ask for 1 to 6" in error_of("train", folder / "healthy.mcap", "--networks", 0, "-o", tmp_path / "t.onnx")
 
 
 def test_the_error_of_a_good_twin_is_the_noise(folder, twin):
@@ -263,18 +250,6 @@ def test_damage_of_a_recording_is_reported(folder, twin, tmp_path):
     assert "truncated.mcap: it is truncated" in result.stderr
 
 
-def test_invalid_input_is_a_one_line_error(folder, twin, tmp_path):
-    healthy, out = folder / "healthy.mcap", tmp_path / "t.onnx"
-    assert "in different units, rad/s" in error_of("train", healthy, folder / "healthy-rpm.mcap", "-o", out)
-    assert "cannot read the recording" in error_of("train", tmp_path / "nowhere.mcap", "-o", out)
-    assert "not a recording" in error_of("evaluate", twin, twin)
-    assert "nowhere.onnx" in error_of("evaluate", tmp_path / "nowhere.onnx", healthy)
-    assert "runs of [1, 2] fans are mixed" in error_of("train", healthy, folder / "two.mcap", "-o", out)
-    (tmp_path / "file").touch()
-    unwritable = tmp_path / "file" / "t.onnx"
-    assert "cannot be created" in error_of("train", healthy, "--model", "physical", "-o", unwritable)
-
-
 def test_a_recording_is_not_overwritten_and_training_data_are_not_used_for_validation(folder, tmp_path):
     healthy, physical = folder / "healthy.mcap", ("--model", "physical")
     before = healthy.read_bytes()
@@ -307,10 +282,3 @@ def test_outliers_are_left_out_in_every_evaluation_of_a_twin(tmp_path):
     assert result["rmse"] < 1.05 * NOISE_RAD_S
     assert any("of the speeds are outliers" in line for line in result["warnings"])
     assert any("of the speeds are outliers" in line for line in evaluated["warnings"])
-
-
-def test_a_command_that_never_changes_is_a_one_line_error(tmp_path):
-    run = published_run(1, duration_s=5.0)
-    still = Run("still", run.t_s, np.full_like(run.command, 50.0), run.speed_rad_s)
-    path = record(tmp_path / "still.mcap", still)
-    assert "command" in error_of("identify", path)
