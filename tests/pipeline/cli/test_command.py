@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
+import signal
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import Result
 
 from pipeline.bus.publisher import Publisher
 from pipeline.bus.session import Bus
@@ -26,7 +27,17 @@ from schemas.enums import StageStatus
 from schemas.header import Header
 from schemas.health import Counter, Health, Note
 from schemas.topics import BY_NAME, alive_key, health_key
-from tests.support.running_chain import Chain, RunningCommand, eventually, fantwin
+from tests.support.fantwin_command import error_of, fantwin
+from tests.support.running_chain import Chain, RunningCommand, eventually
+
+
+@pytest.fixture(autouse=True)
+def _restored_signals() -> Iterator[None]:
+    """The commands run in this process."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture
@@ -44,18 +55,14 @@ def acquisition(chain: Chain) -> Iterator[RunningCommand]:
 
 
 def test_a_command_that_the_line_did_not_take_is_one_line_that_says_why(chain, acquisition):
-    done = fantwin(*chain.words("command"), "--fan", 3, 0.5)  # there is no tray
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
-    assert "tray tray1: the command failed: " in done.stderr
-    assert str(chain.port) in done.stderr
+    error = error_of(*chain.words("command"), "--fan", 3, 0.5)  # there is no tray
+    assert "tray tray1: the command failed: " in error
+    assert str(chain.port) in error
 
 
 def test_without_an_acquisition_the_command_is_reported_as_not_received(chain):
-    done = fantwin(*chain.words("command"), "--fan", 3, 0.5)
-    assert done.returncode == 1
-    expected = "fantwin: no acquisition of tray tray1 received the command: is `fantwin up` running?\n"
-    assert done.stderr == expected
+    expected = "no acquisition of tray tray1 received the command: is `fantwin up` running?"
+    assert error_of(*chain.words("command"), "--fan", 3, 0.5) == expected
 
 
 def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
@@ -146,9 +153,9 @@ def test_a_note_names_the_range_and_the_command_that_was_probably_meant(chain, a
     chain.start_tray()
     words = (*chain.words("command"), "--set", "tray.0.command_max=255", "--json")
 
-    def sent() -> subprocess.CompletedProcess[str] | None:
+    def sent() -> Result | None:
         done = fantwin(*words, "--fan", 3, 0.6)
-        return None if done.returncode else done
+        return None if done.exit_code else done
 
     done = eventually(sent, "the acquisition that starts takes a command")
     assert json.loads(done.stdout)["value"] == 0.6

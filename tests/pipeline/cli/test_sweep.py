@@ -82,7 +82,7 @@ def swept(line: FirstOrderFans, rounds: int = 1, low: float = 0.2, high: float =
     return Excitation(line, list(fans), low, high, rounds, said.append).run(), said
 
 
-@pytest.mark.parametrize("slowest_s", [0.4, 1.5, 6.0])
+@pytest.mark.parametrize("slowest_s", [0.4, 6.0])
 def test_each_level_lasts_until_the_slowest_fan_has_settled(slowest_s: float) -> None:
     line = FirstOrderFans([slowest_s / 2, slowest_s])
     found, said = swept(line)
@@ -103,7 +103,7 @@ def test_all_levels_of_the_range_are_passed_and_none_outside() -> None:
     assert len(set(np.round(values, 3))) >= 15
 
 
-@pytest.mark.parametrize("fans", [2, 3, 4, 5, 6, 7, 8])
+@pytest.mark.parametrize("fans", [2, 5, 8])
 def test_the_load_of_all_fans_does_not_follow_any_one_of_them(fans: int) -> None:
     line = FirstOrderFans([0.5] * fans)
     swept(line)
@@ -131,7 +131,7 @@ def test_a_fan_that_does_not_follow_is_named_and_the_others_go_on() -> None:
     assert "fan 1: does not follow its command" in said
 
 
-@pytest.mark.parametrize("missing", [[0], [-1], [0, 30, 55, -1]])
+@pytest.mark.parametrize("missing", [[0, 30, 55, -1]])
 def test_readings_that_are_missing_hide_no_fan(missing: list[int]) -> None:
     t_s = np.arange(60) * PERIOD_S
     whole = (300.0 * (1.0 - np.exp(-t_s / 0.5)))[:, np.newaxis]
