@@ -1,4 +1,4 @@
-"""Simulated recordings of healthy fans, of other times for each seed, as those of a plant have."""
+"""Simulated recordings of healthy fans. Each seed has times of its own, as the recordings of a plant have."""
 
 from __future__ import annotations
 

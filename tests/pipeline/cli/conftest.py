@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,15 @@ from tests.support.fantwin_command import fantwin
 from tests.support.healthy_site import EPOCH_NS, PER_DAY, simulated
 
 MadeOnce = Callable[[str, Callable[[Path], None]], Path]
+
+
+@pytest.fixture(autouse=True)
+def _restored_signals() -> Iterator[None]:
+    """Commands run in the process of their tests: puts back its signal handlers."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")
@@ -37,8 +47,8 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
 
 @pytest.fixture(scope="session")
 def healthy(made_once: MadeOnce) -> Path:
-    """Recordings of two simulated fans at different times, one of them with a fault of fan 1; a twin, and the same with
-    limits and what `fantwin calibrate` printed of them."""
+    """Four recordings of two simulated fans, one of them with a fault of fan 1; their twin; the twin with limits, and
+    the JSON of its calibration."""
 
     def make(folder: Path) -> None:
         for seed, name, seconds in ((1, "training", 60), (2, "healthy", 120), (3, "other", 60)):

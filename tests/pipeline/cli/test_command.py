@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -29,15 +28,6 @@ from schemas.health import Counter, Health, Note
 from schemas.topics import BY_NAME, alive_key, health_key
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import Chain, RunningCommand, eventually
-
-
-@pytest.fixture(autouse=True)
-def _restored_signals() -> Iterator[None]:
-    """The commands run in this process."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
 
 
 @pytest.fixture

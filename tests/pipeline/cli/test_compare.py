@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.pipeline.cli.conftest import MadeOnce
 from tests.pipeline.cli.test_train_commands import record
 from tests.support.fan_data import rough_run
 from tests.support.fantwin_command import fantwin
@@ -16,20 +17,23 @@ FIGURES = ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("recordings")
-    for seed, name in ((1, "healthy"), (2, "held-out"), (3, "untouched")):
-        record(path / f"{name}.mcap", rough_run(seed, 12.0), unit="rpm")
-    return path
+def folder(made_once: MadeOnce) -> Path:
+    """Three recordings, and the twins of all models on them after few iterations."""
+
+    def make(path: Path) -> None:
+        for seed, name in ((1, "healthy"), (2, "held-out"), (3, "untouched")):
+            record(path / f"{name}.mcap", rough_run(seed, 12.0), unit="rpm")
+        parts = ("--validate", path / "held-out.mcap", "--test", path / "untouched.mcap")
+        result = fantwin("compare", path / "healthy.mcap", *parts, "--iterations", 3, "-o", path / "twins", "--json")
+        assert result.exit_code == 0, result.output
+        (path / "compared.json").write_text(result.stdout)
+
+    return made_once("compared", make)
 
 
 @pytest.fixture(scope="module")
 def compared(folder: Path) -> dict:
-    """All models on three recordings, few iterations, the twins kept."""
-    parts = ("--validate", folder / "held-out.mcap", "--test", folder / "untouched.mcap")
-    result = fantwin("compare", folder / "healthy.mcap", *parts, "--iterations", 3, "-o", folder / "twins", "--json")
-    assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
+    return json.loads((folder / "compared.json").read_text())
 
 
 def test_all_models_are_there_with_the_parameters_of_their_layers(compared):
@@ -48,16 +52,16 @@ def test_the_best_has_the_smallest_error_over_the_untouched_recordings(compared)
 
 def test_a_saved_twin_gives_on_each_recording_the_figures_that_were_printed(folder, compared):
     assert json.loads((folder / "twins" / "comparison.json").read_text()) == compared
-    for its in compared["models"]:
+    for its in (models := compared["models"]):
         evaluated = json.loads(fantwin("evaluate", its["twin"], folder / "untouched.mcap", "--json").stdout)
         for figure in FIGURES:
             assert evaluated[figure] == pytest.approx(its["figures"]["test"][figure], rel=1e-4), (its, figure)
     held_out, trained_on = (
-        json.loads(fantwin("evaluate", its["twin"], folder / f"{recording}.mcap", "--json").stdout)
+        json.loads(fantwin("evaluate", models[-1]["twin"], folder / f"{recording}.mcap", "--json").stdout)
         for recording in ("held-out", "healthy")
     )
-    assert held_out["rmse"] == pytest.approx(its["figures"]["held-out"]["rmse"], rel=1e-4)
-    assert trained_on["rmse"] == pytest.approx(its["training_rmse"], rel=1e-4)
+    assert held_out["rmse"] == pytest.approx(models[-1]["figures"]["held-out"]["rmse"], rel=1e-4)
+    assert trained_on["rmse"] == pytest.approx(models[-1]["training_rmse"], rel=1e-4)
 
 
 def test_the_untouched_recordings_take_no_part_in_training(folder, compared):

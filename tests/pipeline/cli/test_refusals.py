@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -54,14 +52,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "kept.onnx").write_bytes(b"kept")
     (folder / "folder").mkdir()
     return folder
-
-
-@pytest.fixture(autouse=True)
-def _restored_signals() -> Iterator[None]:
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
 
 
 def contents(folder: Path) -> dict[Path, bytes]:

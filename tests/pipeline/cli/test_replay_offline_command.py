@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 from dataclasses import replace
@@ -10,10 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 from typer.testing import Result
 
-from pipeline.cli.recordings.replay_offline import _table
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.enums import InvalidReason
@@ -115,23 +112,6 @@ def test_the_list_names_severity_and_probable_cause_and_is_not_wide(golden):
     (gone,) = [line for line in what_if if line.lstrip().startswith("tray1")]
     assert alarm["severity"] in gone and cause in gone
     assert max(map(len, lines + what_if)) <= 100
-
-
-def test_causes_that_are_equally_probable_are_all_in_the_table():
-    causes = [{"cause": cause, "probability": share} for cause, share in (("blocked", 0.402), ("no_power", 0.398))]
-    rest = {"cause": "no_tacho", "probability": 0.2}
-    alarm = {
-        "tray": "a",
-        "fan": 0,
-        "raised_ns": 0,
-        "cleared_ns": None,
-        "severity": "alarm",
-        "message": "fan 0: too slow",
-    }
-    console = Console(width=100, file=io.StringIO(), record=True)
-    console.print(_table("alarms", [{**alarm, "causes": [*causes, rest]}], 0))
-    text = console.export_text()
-    assert "blocked 40 %" in text and "no power 40 %" in text and "tacho" not in text
 
 
 def test_another_configuration_file_is_taken(golden, tmp_path):

@@ -133,7 +133,7 @@ def test_simulated_losses_are_gaps_in_the_sequence(tmp_path: Path) -> None:
         assert process.wait(10.0) == 0
     truth = truth_of(tmp_path)
     sequence = [sample.sequence for sample in reader.samples]
-    assert sequence == sorted(set(sequence) & set(range(100))), "text, each whole"
+    assert sequence == [number for number in range(100) if number in sequence], "text, each whole"
     assert truth["samples_sent"] == len(sequence)
     assert truth["samples_sent"] + truth["samples_dropped"] == 100
     assert 5 <= truth["samples_dropped"] <= 40
@@ -193,7 +193,7 @@ def test_commands_and_set_points_show_in_the_samples(tmp_path: Path) -> None:
         reader.send(wire.SetPointFrame((KEEP, 3000.0)))
         spoilt = bytearray(wire.encode("binary", wire.CommandFrame((0.75, KEEP))))
         spoilt[-3] ^= 3
-        reader.serial.write(spoilt)
+        reader.serial.write(b"\0hello\0" + spoilt)
         reader.read_until(300)
         process.send_signal(signal.SIGINT)
         reader.read_all()
@@ -201,19 +201,17 @@ def test_commands_and_set_points_show_in_the_samples(tmp_path: Path) -> None:
     assert reader.samples[299].command[0] == 0.25
     assert reader.samples[299].speed[1] == pytest.approx(3000.0, rel=0.05)
     truth = truth_of(tmp_path)
-    assert (truth["commands_received"], truth["set_points_received"], truth["commands_refused"]) == (1, 1, 1)
+    assert (truth["commands_received"], truth["set_points_received"], truth["commands_refused"]) == (1, 1, 2)
     assert [counters.uptime_s for counters in reader.counters[:3]] == [0, 1, 2]
     counts = dict(zip(wire.DEVICE_COUNTERS, reader.counters[2].counts, strict=True))
-    assert {name: count for name, count in counts.items() if count} == {"frames": 2, "bad_crc": 1}
+    assert {name: count for name, count in counts.items() if count} == {"frames": 2, "bad_length": 1, "bad_crc": 1}
 
 
 class Burst:
     """A device whose samples are all due at once."""
 
     def __init__(self, samples: int, fans: int) -> None:
-        self.fans = fans
-        self.left = samples
-        self.commands: list[np.ndarray] = []
+        self.fans, self.left = fans, samples
 
     def due_s(self) -> float | None:
         return 0.0 if self.left else None
@@ -223,7 +221,7 @@ class Burst:
         return TableSample(0.0, 7, self.left, np.zeros(self.fans), np.ones(self.fans))
 
     def command(self, values: np.ndarray) -> None:
-        self.commands.append(values)
+        raise AssertionError(values)
 
     def set_point(self, values_rad_s: np.ndarray) -> None:
         raise AssertionError(values_rad_s)
@@ -269,28 +267,12 @@ def test_a_delayed_device_sends_all_it_missed_and_reports_how_late_it_was(line: 
     bytes_to_come = 30 * len(wire.encode("binary", wire.Sample(7, 1, (0.0,) * 2, (1.0,) * 2)))
     reader = threading.Thread(target=port.read, args=(bytes_to_come,))
     reader.start()
-    nobody_stops_it = threading.Event()
-    played = play(
-        Burst(30, fans=2), line, "binary", 1.0, nobody_stops_it, on_start=lambda _: nobody_stops_it.wait(0.05)
-    )
+    stop = threading.Event()
+    played = play(Burst(30, fans=2), line, "binary", 1.0, stop, on_start=lambda _: stop.wait(0.05))
     reader.join(10.0)
     port.close()
     assert played.samples_sent == played.samples_late == 30
     assert played.worst_lateness_s >= 0.05
-
-
-def test_garbage_from_the_host_is_counted_and_harmless(line: PseudoTerminal) -> None:
-    port = os.open(line.port, os.O_RDWR | os.O_NOCTTY)
-    os.write(port, b"\0hello\0" + wire.encode("binary", wire.CommandFrame((0.5, KEEP))))
-    device = Burst(1, fans=2)
-    reader = threading.Thread(target=os.read, args=(port, 4096))
-    reader.start()
-    played = play(device, line, "binary", 1.0, threading.Event())
-    reader.join(10.0)
-    os.close(port)
-    assert played.commands_refused == 1
-    assert played.commands_received == 1
-    assert device.commands[0][0] == 0.5
 
 
 def test_waiting_for_a_reader_ends_when_one_takes_what_is_sent_or_when_stopped(line: PseudoTerminal) -> None:

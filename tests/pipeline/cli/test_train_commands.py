@@ -14,6 +14,7 @@ from schemas.header import Header
 from schemas.messages import Raw
 from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
 from schemas.topics import tray_key
+from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, counted_run, published_run
 from tests.support.fantwin_command import error_of, fantwin
 from twin.export.onnx_twin import OnnxTwin
@@ -40,20 +41,22 @@ def record(path: Path, run: Run, unit: str = "rad/s", tray: str = "tray1") -> Pa
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recordings of the published fan: one in rad/s, the same in rpm, one held out, one of two fans."""
-    path = tmp_path_factory.mktemp("recordings")
-    record(path / "healthy.mcap", published_run(1))
-    record(path / "healthy-rpm.mcap", published_run(1), unit="rpm")
-    record(path / "held-out.mcap", published_run(2))
-    record(path / "two.mcap", published_run(3, fans=2))
-    return path
+def folder(made_once: MadeOnce) -> Path:
+    """Recordings of the published fan: one in rad/s, the same in rpm, one held out, one of two fans; its twin."""
+
+    def make(path: Path) -> None:
+        record(path / "healthy.mcap", published_run(1))
+        record(path / "healthy-rpm.mcap", published_run(1), unit="rpm")
+        record(path / "held-out.mcap", published_run(2))
+        record(path / "two.mcap", published_run(3, fans=2))
+        result = fantwin("train", path / "healthy.mcap", "--model", "physical", "-o", path / "physical.onnx")
+        assert result.exit_code == 0, result.output
+
+    return made_once("published", make)
 
 
 @pytest.fixture(scope="module")
 def twin(folder: Path) -> Path:
-    result = fantwin("train", folder / "healthy.mcap", "--model", "physical", "-o", folder / "physical.onnx")
-    assert result.exit_code == 0, result.output
     return folder / "physical.onnx"
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
-import signal
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -21,6 +21,7 @@ from pipeline.runtime.stage import BuiltStage, Core, Stage
 from schemas.header import Header
 from schemas.messages import Message, ScorerSnapshot
 from schemas.topics import tray_key
+from tests.pipeline.cli.conftest import MadeOnce
 from tests.scoring.wear.test_wear_monitor import (
     DAY_NS,
     GROWTH_PER_DAY,
@@ -38,13 +39,17 @@ KEY = tray_key(SITE, TRAY, "snapshot")
 
 
 @pytest.fixture(scope="module")
-def notes() -> list[ScorerSnapshot]:
+def notes(made_once: MadeOnce) -> list[ScorerSnapshot]:
     """The snapshots of a scorer after three days and after six."""
-    worn, noted = core_for_days(), []
-    for number, (from_day, days) in enumerate(((0, 3), (3, 6))):
-        assert list(live_through(worn, days, from_day, swing=0.005)) == []
-        noted.append(replace(snapshot_of(worn), header=Header("scorer-1", number, TRAY)))
-    return noted
+
+    def make(folder: Path) -> None:
+        worn, noted = core_for_days(), []
+        for number, (from_day, days) in enumerate(((0, 3), (3, 6))):
+            assert list(live_through(worn, days, from_day, swing=0.005)) == []
+            noted.append(replace(snapshot_of(worn), header=Header("scorer-1", number, TRAY)))
+        (folder / "notes").write_bytes(pickle.dumps(noted))
+
+    return pickle.loads((made_once("wear", make) / "notes").read_bytes())
 
 
 def recording(path: Path, notes: Sequence[ScorerSnapshot]) -> Path:
@@ -176,13 +181,10 @@ def site(endpoint: str, request: pytest.FixtureRequest, notes: list[ScorerSnapsh
     words = ("-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
     runner = Runner(stage, load_config(DEMO / "demo.toml", [f"bus.endpoint='{endpoint}'"]), None, stop)
     thread = threading.Thread(target=runner.run)
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     thread.start()
     yield words
     stop.set()
     thread.join(20)
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize("site", [True], indirect=True)
