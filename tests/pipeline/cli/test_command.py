@@ -22,11 +22,10 @@ from pipeline.devices.source_kinds import build_source
 from pipeline.runtime.device_commands import DeviceCommands
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.header import Header
 from schemas.health import Counter, Health, Note
 from schemas.topics import BY_NAME, alive_key, health_key
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.made_up_health import health_of
 from tests.support.running_chain import Chain, RunningCommand, eventually
 
 
@@ -60,14 +59,7 @@ def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
         return Session("acquisition", f"{number}-of-2", number, f"acquisition-{number}-of-2-1", "board", number, trays)
 
     def beat(session: Session, publisher: Publisher) -> None:
-        health = Health(
-            header=Header(session.producer, publisher.published, ""),
-            stage=session.stage,
-            instance=session.instance,
-            status=StageStatus.OK,
-            t_ns=1,
-            uptime_s=0.0,
-        )
+        health = health_of(session.producer, session.stage, publisher.published, instance=session.instance)
         publisher.put(encode(health))
 
     config, stop = BusConfig(endpoint=endpoint), threading.Event()
@@ -93,16 +85,8 @@ def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
 
 def test_only_the_new_note_on_commands_of_the_tray_says_why_a_command_was_not_sent():
     def health(lost: int, *notes: Note) -> Health:
-        return Health(
-            header=Header("acquisition-all-1", 1, ""),
-            stage="acquisition",
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=1,
-            uptime_s=0.0,
-            counters=(Counter(name="lost_commands", value=lost),),
-            notes=notes,
-        )
+        counters = (Counter(name="lost_commands", value=lost),)
+        return health_of("acquisition-all-1", "acquisition", 1, counters=counters, notes=notes)
 
     tray = TrayConfig(name="a", fans=1, source=SerialConfig(port="line"))
     commands = DeviceCommands(tray, build_source(tray.source, SourceContext(1, tray.speed_unit, Path())))

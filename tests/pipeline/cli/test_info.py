@@ -20,6 +20,7 @@ from schemas.messages import ModelCard
 from schemas.topics import health_key, tray_key
 from tests.pipeline.recordings.test_parts import part, parts_in
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.made_up_health import health_of
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
 
 METADATA = {"site": "plant", "trays": "tray1", "fans.tray1": "2", "speed_unit.tray1": "rpm", "made_by": "fantwin"}
@@ -40,18 +41,9 @@ def recording(path: Path) -> Path:
         card = ModelCard(header=Header("ti-1", 0, "tray1"), t_ns=1, twin="demo", kind="hybrid", sha256="ab" * 32)
         writer.add_message(tray_key("plant", "tray1", "twin"), card, 5 * SECOND_NS)
         for number, problem in enumerate(("", "the line is silent: look at the cable")):
-            health = Health(
-                header=Header("acquisition-1", number, ""),
-                stage="acquisition",
-                instance="tray1",
-                status=StageStatus.DEGRADED,
-                t_ns=1,
-                uptime_s=1.0,
-                problem=problem,
-                counters=(Counter(name="lost_samples", value=3 * number),),
-                lost=3 * number,
-                notes=(Note(tray="tray1", text="grid of 10 Hz"),),
-            )
+            lost, note = Counter(name="lost_samples", value=3 * number), Note(tray="tray1", text="grid of 10 Hz")
+            more = {"instance": "tray1", "status": StageStatus.DEGRADED, "problem": problem, "lost": lost.value}
+            health = health_of("acquisition-1", "acquisition", number, counters=(lost,), notes=(note,), **more)
             writer.add_message(health_key("plant", "acquisition", "tray1"), health, 6 * SECOND_NS)
     return path
 
@@ -103,17 +95,8 @@ def healths_of(*sessions: tuple[str, int, tuple[Input, ...]], at_s: int = 0) -> 
     """Two healths of each session of the resampler (its name, what it lost, what it received), and their times."""
     for name, lost, inputs in sessions:
         for number in range(2):
-            health = Health(
-                header=Header(name, number, ""),
-                stage="resampler",
-                instance="all",
-                status=StageStatus.OK,
-                t_ns=1,
-                uptime_s=1.0,
-                inputs=inputs,
-                lost=lost * number,
-            )
-            yield health, (at_s := at_s + 1) * SECOND_NS
+            at_s += 1
+            yield health_of(name, "resampler", number, inputs=inputs, lost=lost * number), at_s * SECOND_NS
 
 
 def received(first: int, until: int) -> tuple[Input, ...]:

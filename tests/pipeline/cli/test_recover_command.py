@@ -12,12 +12,11 @@ from pipeline.recordings.contents import TRUNCATED, contents_of
 from pipeline.recordings.records import RecordReader
 from pipeline.recordings.repair import repair_in_place
 from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Output
+from schemas.health import Output
 from schemas.topics import health_key
 from tests.pipeline.recordings.test_repair import chunk_ends, read_by_others, small
 from tests.support.fantwin_command import fantwin
+from tests.support.made_up_health import health_of
 from tests.support.written_recordings import RAW_KEY, raw
 
 
@@ -83,17 +82,6 @@ def test_a_damaged_chunk_is_reported(whole):
     assert f"{RAW_KEY}: 5 messages of acquisition-1 missing in between" in done.stdout
 
 
-def healths_of(producer: str) -> Health:
-    return Health(
-        header=Header(producer, 0, ""),
-        stage="scorer",
-        instance="all",
-        status=StageStatus.OK,
-        t_ns=2,
-        uptime_s=1.0,
-    )
-
-
 @pytest.mark.parametrize("number", [0, 2])
 def test_info_reports_the_losses_of_a_repaired_file(tmp_path, number):
     """Whichever chunk is damaged: the ledger of the file still has its messages."""
@@ -102,7 +90,7 @@ def test_info_reports_the_losses_of_a_repaired_file(tmp_path, number):
         for chunk in range(3):
             for sequence in range(5):
                 writer.add_message(RAW_KEY, raw(5 * chunk + sequence), 1000)
-            writer.add_message(keys, healths_of(f"scorer-{chunk}"), 1000)
+            writer.add_message(keys, health_of(f"scorer-{chunk}", "scorer"), 1000)
             writer.flush()
     chunks = [record for record in RecordReader(path) if record.opcode == Opcode.CHUNK]
     content = bytearray(path.read_bytes())
@@ -135,15 +123,8 @@ def test_info_reports_the_possible_losses_of_a_truncated_file_after_its_repair(t
 def test_messages_that_health_reports_as_published_and_that_are_not_there_are_reported(tmp_path):
     writer = RecordingWriter(tmp_path / "r.mcap", {"flush_interval_s": "0.5"})
     writer.add_message(RAW_KEY, raw(0), 1)
-    health = Health(
-        header=Header("acquisition-1", 0, ""),
-        stage="acquisition",
-        instance="tray1",
-        status=StageStatus.OK,
-        t_ns=2,
-        uptime_s=1.0,
-        outputs=(Output(key=RAW_KEY, published=4),),
-    )
+    published = (Output(key=RAW_KEY, published=4),)
+    health = health_of("acquisition-1", "acquisition", instance="tray1", t_ns=2, outputs=published)
     writer.add_message(health_key("plant", "acquisition", "tray1"), health, 2)
     writer.flush()
     writer._file.close()

@@ -29,11 +29,10 @@ from pipeline.errors import UserError
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.runtime.device_commands import DeviceCommands
 from schemas.codec import decode
-from schemas.enums import StageStatus
-from schemas.header import Header
 from schemas.health import Counter, Health, Input, Note
 from schemas.messages import Command
 from tests.support.fantwin_command import error_of
+from tests.support.made_up_health import health_of
 from tests.support.running_chain import DEMO
 
 PERIOD_S = 0.1
@@ -223,17 +222,9 @@ class AcquisitionOfRefusals:
             key="", producer=self.producer, received=self.published, missing=0, duplicated=0, next_sequence=0
         )
         texts = (f"refused input: garbage {self.published}", *self.commands.notes())
-        return Health(
-            header=Header("acquisition-1", 1, ""),
-            stage="acquisition",
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=1,
-            uptime_s=0.0,
-            inputs=(received,),
-            counters=tuple(Counter(name=name, value=value) for name, value in self.commands.counts.items()),
-            notes=tuple(Note(tray="tray1", text=text) for text in texts),
-        )
+        counters = tuple(Counter(name=name, value=value) for name, value in self.commands.counts.items())
+        notes = tuple(Note(tray="tray1", text=text) for text in texts)
+        return health_of("acquisition-1", "acquisition", 1, inputs=(received,), counters=counters, notes=notes)
 
 
 def line_to(acquisition: AcquisitionOfRefusals, monkeypatch: pytest.MonkeyPatch) -> sweep_module._BusLine:
