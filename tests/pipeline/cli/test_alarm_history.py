@@ -88,17 +88,11 @@ def test_the_alarms_of_recordings_have_the_feedback_of_later_ones_and_the_rate_t
     assert (rate["false_alarms"], rate["unmarked"], rate["declared_per_day"]) == (1, 0, 24.0)
     assert rate["false_alarms_per_day"] == pytest.approx(1 / days)
     assert rate["interval_95"] == pytest.approx([0.02532 / days, 5.5716 / days], rel=1e-3)
+    alarm, line = fantwin("alarms", "--history", "--recordings", GOLDEN, "--recordings", later).stdout.splitlines()
+    assert "tray1 fan 1" in alarm and alarm.endswith("false alarm by ann: the door was open")
+    assert line.startswith("tray1: since ") and line.endswith("; declared 24")
     again = history("--recordings", later, GOLDEN, GOLDEN.parent / ".." / "data" / "golden.mcap")
     assert again["rates"] == found["rates"], "what two recordings have counts once"
-
-
-def test_people_read_one_line_for_an_alarm_and_one_for_the_rate(later: Path) -> None:
-    done = fantwin("alarms", "--history", "--recordings", GOLDEN, "--recordings", later)
-    alarm, rate = done.stdout.splitlines()
-    assert alarm.endswith("false alarm by ann: the door was open")
-    assert "tray1 fan 1" in alarm
-    assert rate.startswith("tray1: since ")
-    assert rate.endswith("; declared 24")
 
 
 def test_a_gateway_on_this_host_has_kept_the_history(tmp_path: Path) -> None:

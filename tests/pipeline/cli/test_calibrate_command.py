@@ -5,105 +5,50 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import onnx
 import pytest
 
 from pipeline.cli.main import expand_variadic
 from pipeline.cli.twins.calibration_check import Check
-from pipeline.replay.offline.healthy_runs import HealthyRuns
+from pipeline.recordings.reading import read_recording
+from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.tray_twin import load_tray_twin
-from scoring.calibration.healthy_statistics import RunWork
+from schemas.header import Header
+from schemas.messages import Raw
+from schemas.topics import tray_key
+from schemas.units import NS_PER_S
 from scoring.limits import Limits, default_timing
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.healthy_site import FANS, PER_DAY, simulated, start_ns
+from tests.support.twin_files import write_twin
+from twin.export.card_entries import with_card_entries
 
-FANS = 2
-PER_DAY = 1500
-
-
-def simulated(path: Path, seed: int, seconds: float, *more: object) -> Path:
-    result = fantwin(
-        "simulate", "--fans", FANS, "--profile", "multisine", "--seed", seed, "--duration", seconds,
-        "--epoch-ns", 0, "--recording", path, *more,
-    )  # fmt: skip
-    assert result.exit_code == 0, result.output
-    return path
+RATE = ("--false-alarms-per-day", PER_DAY)
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("calibrate")
-    simulated(path / "training.mcap", 1, 60)
-    simulated(path / "healthy.mcap", 2, 120)
-    simulated(path / "other.mcap", 3, 60)
-    result = fantwin("train", path / "training.mcap", "--model", "physical", "-o", path / "twin.onnx")
-    assert result.exit_code == 0, result.output
-    return path
-
-
-@pytest.fixture(scope="module")
-def output_of_calibration(folder: Path) -> str:
-    result = calibrate(folder, "-o", folder / "calibrated.onnx")
-    assert result.exit_code == 0, result.output
+def done(*words: object, exit_code: int = 0) -> str:
+    """Standard output of a command, whose variadic options are expanded as on the command line."""
+    name, *rest = expand_variadic(list(map(str, words)))
+    result = fantwin(name, *rest)
+    assert result.exit_code == exit_code, result.output
     return result.stdout
-
-
-@pytest.fixture(scope="module")
-def calibrated(folder: Path, output_of_calibration: str) -> Path:
-    return folder / "calibrated.onnx"
-
-
-def calibrate(folder: Path, *more: object):
-    return fantwin("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY, *more)
 
 
 def card(twin: Path) -> dict[str, Any]:
     return json.loads(load_tray_twin(twin).card_json)
 
 
-def test_the_limits_are_in_the_card_and_the_rest_of_the_twin_is_unchanged(folder: Path, calibrated: Path) -> None:
-    before, after = folder / "twin.onnx", calibrated
-    assert load_tray_twin(before).card.calibration is None
-    assert {**card(after), "calibration": None} == {**card(before), "calibration": card(before).get("calibration")}
-    graphs = [onnx.load(twin).graph.SerializeToString(deterministic=True) for twin in (before, after)]
-    assert graphs[0] == graphs[1]
-    limits = Limits.model_validate(load_tray_twin(after).card.calibration)
-    assert {"speed_smoothed", "balance_smoothed", "sensor"} <= limits.detectors.keys()
-    assert limits.declared_rate
-    assert limits.declared_rate.false_alarms_per_day == PER_DAY
-    assert limits.declared_rate.interval_95[0] < PER_DAY < limits.declared_rate.interval_95[1]
-    assert limits.declared_rate.data[0]["name"] == "healthy.mcap"
-    assert len(limits.declared_rate.data[0]["sha256"]) == 64
-
-
-def test_the_limits_decide_what_a_replay_finds(folder: Path, calibrated: Path) -> None:
-    """Of a healthy run, at limits for an alarm of each fan a minute, at three tenths of them, and at three times."""
-    twins = (calibrated, strict(folder, calibrated), with_limits(folder / "wide.onnx", calibrated, 3.0))
-    calibrated_s, strict_s, wide_s = (
-        alarmed_s(fantwin("replay", folder / "other.mcap", "--offline", "--twin", twin, "--json").stdout)
-        for twin in twins
-    )
-    assert strict_s > calibrated_s > wide_s
-
-
-def alarmed_s(replayed: str) -> float:
-    """How long fans were in alarm, all together."""
-    alarms = json.loads(replayed)["alarms"]
-    return sum((alarm["cleared_ns"] or 60_000_000_000) - alarm["raised_ns"] for alarm in alarms) / 1e9
-
-
-def strict(folder: Path, calibrated: Path) -> Path:
-    """The twin with limits that healthy fans exceed all the time, and a declared rate that is far lower."""
-    return with_limits(folder / "strict.onnx", calibrated, 0.3)
+def limits_of(twin: Path) -> Limits:
+    return Limits.model_validate(load_tray_twin(twin).card.calibration)
 
 
 def with_limits(path: Path, calibrated: Path, factor: float) -> Path:
     """The twin with so many times its limits, and a declared rate that is far lower."""
-    from twin.export.card_entries import with_card_entries  # noqa: PLC0415
-
-    was = Limits.model_validate(load_tray_twin(calibrated).card.calibration)
+    was = limits_of(calibrated)
     assert was.declared_rate
     rate = was.declared_rate.model_copy(update={"false_alarms_per_day": 0.1})
     limits = was.times(factor).model_copy(update={"declared_rate": rate})
@@ -111,281 +56,163 @@ def with_limits(path: Path, calibrated: Path, factor: float) -> Path:
     return path
 
 
-def test_the_output_is_readable(output_of_calibration: str) -> None:
-    assert "calibrated.onnx: alarms calibrated on 0.06" in output_of_calibration
-    assert f"declared: {PER_DAY} false alarms per fan and day" in output_of_calibration
-    assert "--verify" in output_of_calibration
-    assert re.search(r"found at \d+ rad/s: a drop of [\d.]+ rad/s at once", output_of_calibration)
-
-
-def test_the_page_of_a_report_says_what_raises_an_alarm_as_the_terminal_does(
-    folder: Path, calibrated: Path, output_of_calibration: str
-) -> None:
-    page = folder / "report.html"
-    lines = [line for line in output_of_calibration.splitlines() if line.startswith("found at")]
-    result = fantwin("report", calibrated, folder / "other.mcap", "-o", page)
-    assert result.exit_code == 0, result.output
-    assert lines and all(line in result.stdout and f"<li>{line}</li>" in page.read_text() for line in lines)
-
-
-def test_json_is_one_document_of_the_limits_and_the_test_of_them(folder: Path) -> None:
-    result = calibrate(folder, "-o", folder / "json.onnx", "--json", "--verify", folder / "other.mcap")
-    document = json.loads(result.stdout)
-    assert document["twin"].endswith("json.onnx")
-    assert document["speed_unit"] == "rad/s"
+def test_the_limits_are_in_the_card_and_in_one_document_and_the_rest_of_the_twin_is_unchanged(healthy: Path) -> None:
+    before, after = healthy / "twin.onnx", healthy / "calibrated.onnx"
+    assert {**card(after), "calibration": None} == {**card(before), "calibration": card(before).get("calibration")}
+    assert load_tray_twin(before).card.calibration is None
+    graphs = [onnx.load(twin).graph.SerializeToString(deterministic=True) for twin in (before, after)]
+    assert graphs[0] == graphs[1]
+    limits = limits_of(after)
+    assert {"speed_smoothed", "balance_smoothed", "sensor"} <= limits.detectors.keys()
+    rate = limits.declared_rate
+    assert rate and rate.false_alarms_per_day == PER_DAY
+    assert rate.interval_95[0] < PER_DAY < rate.interval_95[1]
+    assert (set(rate.data[0]), rate.data[0]["name"]) == ({"name", "sha256"}, "healthy.mcap")
+    assert len(rate.data[0]["sha256"]) == 64
+    document = json.loads((healthy / "calibrated.json").read_text())
+    assert Limits.model_validate(document["calibration"]) == limits
+    assert (document["twin"], document["speed_unit"]) == (str(after), "rad/s")
+    assert document["drops_found"] and document["warnings"] == []
     for drop in document["drops_found"]:
         assert 0 < drop["within_a_minute"] <= drop["at_once"] <= drop["speed"]
-    Limits.model_validate(document["calibration"])
     assert document["verify"]["kept"] is True
     assert document["verify"]["fan_hours"] == pytest.approx(FANS * 60 / 3600, rel=0.1)
 
 
-def test_without_an_output_the_twin_itself_is_calibrated(folder: Path) -> None:
-    twin = folder / "in-place.onnx"
-    twin.write_bytes((folder / "twin.onnx").read_bytes())
-    result = fantwin("calibrate", twin, folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY)
-    assert result.exit_code == 0, result.output
-    assert load_tray_twin(twin).card.calibration is not None
-
-
-def test_too_little_data_is_refused_with_the_amount_needed_and_the_twin_is_unchanged(folder: Path) -> None:
-    before = (folder / "twin.onnx").read_bytes()
-    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1)
-    assert "fan-hours of healthy running cannot support 1 false alarm per fan and day: that takes 72" in error
-    assert "--extrapolate" in error
-    assert (folder / "twin.onnx").read_bytes() == before
-
-
-def test_too_little_data_for_any_limit_is_refused_also_with_extrapolate(folder: Path) -> None:
-    before = (folder / "twin.onnx").read_bytes()
-    few = "--to", 40, "--false-alarms-per-day", 1, "--extrapolate"
-    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap", *few)
-    assert re.match(r"\d\d s of healthy running could be scored, all fans together: too little for any limit; ", error)
-    assert error.endswith("that takes 60 s of each fan: record two minutes or more, better ten")
-    assert (folder / "twin.onnx").read_bytes() == before
-
-
-def test_recordings_too_short_for_the_rate_are_refused_before_any_of_them_is_scored(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+def test_without_an_output_the_twin_itself_is_calibrated_and_people_read_what_raises_an_alarm(
+    healthy: Path, tmp_path: Path
 ) -> None:
-    def scored(self: HealthyRuns, work: RunWork) -> NoReturn:
-        raise AssertionError("scored")
-
-    monkeypatch.setattr(HealthyRuns, "__call__", scored)
-    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1)
-    assert error.startswith("0.068 fan-hours of healthy running cannot support 1 false alarm per fan and day")
-
-
-def test_extrapolated_limits_declare_a_target_only(folder: Path) -> None:
-    output = folder / "extrapolated.onnx"
-    result = fantwin(
-        "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1, "--extrapolate",
-        "-o", output,
-    )  # fmt: skip
-    assert result.exit_code == 0, result.output
-    assert "the data are too few to show whether these limits keep it" in result.stdout
-    rate = Limits.model_validate(load_tray_twin(output).card.calibration).declared_rate
-    assert rate
-    assert rate.extrapolated
+    twin, page = tmp_path / "twin.onnx", tmp_path / "report.html"
+    twin.write_bytes((healthy / "twin.onnx").read_bytes())
+    printed = done("calibrate", twin, healthy / "healthy.mcap", *RATE)
+    assert limits_of(twin).detectors == limits_of(healthy / "calibrated.onnx").detectors
+    assert "twin.onnx: alarms calibrated on 0.06" in printed
+    assert f"declared: {PER_DAY} false alarms per fan and day" in printed and "--verify" in printed
+    found = [line for line in printed.splitlines() if line.startswith("found at")]
+    assert re.search(r"found at \d+ rad/s: a drop of [\d.]+ rad/s at once", printed)
+    reported = done("report", twin, healthy / "other.mcap", "--to", 10, "-o", page)
+    assert found and all(line in reported and f"<li>{line}</li>" in page.read_text() for line in found)
 
 
-def test_only_the_wanted_part_of_each_recording_is_used(folder: Path) -> None:
-    def learned(*part: object) -> dict[str, Any]:
-        result = calibrate(folder, *part, "--extrapolate", "-o", folder / "part.onnx", "--json")
-        assert result.exit_code == 0, result.output
-        return json.loads(result.stdout)["calibration"]["declared_rate"]
-
-    whole, part = learned(), learned("--from", 20, "--to", 90)
-    assert set(whole["data"][0]) == {"name", "sha256"}
-    assert (part["data"][0]["from_s"], part["data"][0]["to_s"]) == (20.0, 90.0)
-    assert whole["fan_hours"] - part["fan_hours"] == pytest.approx(FANS * (120 - 70) / 3600, rel=0.05), (
-        "commissioning is repeated in each"
-    )
-    error = error_of(
-        "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1, "--from", 500
-    )
-    assert error.endswith("healthy.mcap: no samples from 500 s to inf s; see --from and --to")
-    negative = calibrate(folder, "--from", -5, "-o", folder / "part.onnx")
-    assert negative.exit_code == 2
-    assert "--from" in negative.stderr
-    verified = "--verify", folder / "other.mcap"
-    assert error_of("calibrate", folder / "twin.onnx", "--to", 9, *verified).startswith("--to needs recordings")
+def test_the_limits_decide_what_is_found_and_a_rate_that_is_not_kept_is_exit_code_3(
+    healthy: Path, tmp_path: Path
+) -> None:
+    calibrated, other = healthy / "calibrated.onnx", healthy / "other.mcap"
+    strict = with_limits(tmp_path / "strict.onnx", calibrated, 0.3)
+    alarmed_s, end_ns = [], start_ns(3) + 60 * NS_PER_S
+    for twin in (strict, calibrated):
+        alarms = json.loads(done("replay", other, "--offline", "--twin", twin, "--json"))["alarms"]
+        alarmed_s.append(sum((alarm["cleared_ns"] or end_ns) - alarm["raised_ns"] for alarm in alarms))
+    assert alarmed_s[0] > alarmed_s[1]
+    (kept,) = done("calibrate", calibrated, "--verify", other, "--set", "scorer.off_delay_s=2.0").splitlines()
+    assert f"declared {PER_DAY}" in kept and kept.endswith(": kept")
+    both = ("--verify", other, healthy / "faulty.mcap")
+    broken = json.loads(done("calibrate", strict, *both, "--json", exit_code=3))["verify"]
+    assert broken["kept"] is False
+    assert broken["fan_hours"] == pytest.approx(FANS * 120 / 3600, rel=0.1), "all that follows --verify"
 
 
-def test_the_declared_rate_is_kept_on_other_healthy_recordings(folder: Path, calibrated: Path) -> None:
-    result = fantwin("calibrate", calibrated, "--verify", folder / "other.mcap")
-    assert result.exit_code == 0, result.output
-    assert "kept" in result.stdout
-    assert f"declared {PER_DAY}" in result.stdout
-    assert len(result.stdout.strip().splitlines()) == 1
-
-
-def test_a_declared_rate_that_is_not_kept_is_exit_code_3(folder: Path, calibrated: Path) -> None:
-    result = fantwin("calibrate", strict(folder, calibrated), "--verify", folder / "other.mcap")
-    assert result.exit_code == 3, result.output
-    assert "declared 0.1: not kept" in result.stdout
-
-
-@pytest.mark.parametrize("alarms", range(20))
-def test_the_printed_interval_decides(alarms: int) -> None:
-    check = Check(alarms, 100.0, 1.0)
-    low, _ = check.interval_95
-    assert check.text.endswith(": not kept") == check.is_broken == (low > 1.0)
-    assert f"(95 %: {low:.2g} to " in check.text
-
-
-def test_a_twin_that_was_never_calibrated_has_nothing_to_verify(folder: Path) -> None:
-    error = error_of("calibrate", folder / "twin.onnx", "--verify", folder / "other.mcap")
-    assert "never calibrated" in error
-
-
-def test_missing_arguments_are_named(folder: Path) -> None:
-    assert "nothing to calibrate on" in error_of("calibrate", folder / "twin.onnx")
-    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap")
-    assert "--false-alarms-per-day" in error
-
-
-def test_a_missing_twin_is_reported_by_the_given_name(folder: Path) -> None:
-    error = error_of("calibrate", folder / "no.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY)
-    assert error == f"{folder / 'no.onnx'}: there is no such twin: name the file that `fantwin train` wrote"
-
-
-def test_all_that_follows_verify_is_verified(folder: Path, calibrated: Path) -> None:
-    more, other = folder / "more.mcap", folder / "other.mcap"
-    simulated(more, 4, 30)
-    words = expand_variadic(list(map(str, ("calibrate", calibrated, "--verify", other, more, "--json"))))
-    result = fantwin(*words)
-    assert json.loads(result.stdout)["verify"]["fan_hours"] == pytest.approx(FANS * 90 / 3600, rel=0.1)
-
-
-def test_arguments_consumed_by_verify_are_reported(folder: Path, calibrated: Path) -> None:
-    other, healthy, twin = folder / "other.mcap", folder / "healthy.mcap", folder / "twin.onnx"
-    for option in (("--false-alarms-per-day", PER_DAY), ("--extrapolate",), ("-o", folder / "never.onnx")):
-        words = expand_variadic(list(map(str, ("calibrate", twin, *option, "--verify", other, healthy))))
-        error = error_of(*words)
-        assert "those after --verify only test; name HEALTHY.mcap... before it" in error
-    words = expand_variadic(list(map(str, ("calibrate", calibrated, "--verify", other, twin))))
-    assert f"{twin}: --verify takes recordings" in error_of(*words)
-
-
-def test_a_recording_in_which_something_was_wrong_is_named(folder: Path) -> None:
-    bad = folder / "bad.mcap"
-    simulated(bad, 5, 60, "--fault", "inlet:fan=1,start=20,stop=50,size=1.6")
-    expected = (f"{bad}: tray1 fan 1 goes to", "times the limits that were found", "calibrate without this recording")
-    result = calibrate(folder, bad, "-o", folder / "doubtful.onnx", "--json")
-    (warning,) = json.loads(result.stdout)["warnings"]
-    assert all(part in warning for part in expected)
-    assert warning in result.stderr.splitlines()
-    result = calibrate(folder, folder / "other.mcap", "-o", folder / "sure.onnx", "--json")
-    assert json.loads(result.stdout)["warnings"] == []
-
-
-@pytest.mark.parametrize("wrong", ["twin", "recording", "missing"])
-def test_files_of_another_kind_are_named_in_one_line(folder: Path, wrong: str, tmp_path: Path) -> None:
-    twin, recording = folder / "twin.onnx", folder / "healthy.mcap"
-    if wrong == "twin":
-        twin = tmp_path / "not-a-twin.onnx"
-        twin.write_bytes(b"nothing of the kind")
-    elif wrong == "recording":
-        recording = tmp_path / "not-a-recording.mcap"
-        recording.write_bytes(b"nothing of the kind")
-    else:
-        recording = tmp_path / "missing.mcap"
-    error = error_of("calibrate", twin, recording, "--false-alarms-per-day", PER_DAY)
-    assert str(twin if wrong == "twin" else recording) in error
-
-
-def test_an_output_that_cannot_be_written_is_a_one_line_error(folder: Path) -> None:
-    error = error_of(
-        "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY,
-        "-o", folder / "no-folder" / "twin.onnx",
-    )  # fmt: skip
-    assert "cannot write the twin" in error
-
-
-def test_a_folder_as_output_is_refused_before_anything_is_judged(folder: Path) -> None:
-    error = error_of(
-        "calibrate", folder / "twin.onnx", folder / "missing.mcap", "--false-alarms-per-day", PER_DAY, "-o", folder
-    )
-    assert "cannot write the twin" in error
-    assert not folder.with_name(folder.name + ".new").exists()
-
-
-def test_a_recording_counts_once(folder: Path) -> None:
-    healthy, verify = folder / "healthy.mcap", ("--verify", folder / "healthy.mcap")
-    twin, rate = folder / "twin.onnx", ("--false-alarms-per-day", PER_DAY)
-    assert "named twice" in error_of("calibrate", twin, healthy, healthy, *rate)
-    assert "named twice" in error_of("calibrate", twin, healthy, *rate, *verify)
-
-
-def test_recordings_that_a_twin_was_made_from_cannot_verify_it_under_any_name(folder: Path, calibrated: Path) -> None:
-    copy = folder / "copy.mcap"
-    copy.write_bytes((folder / "healthy.mcap").read_bytes())
-    error = error_of("calibrate", calibrated, "--verify", folder / "other.mcap", "--verify", copy)
-    assert f"{copy}: {calibrated} was calibrated on it, so it proves nothing" in error
-    error = error_of("calibrate", calibrated, "--verify", folder / "training.mcap")
-    assert f"{calibrated} was trained on it" in error
-
-
-def test_limits_are_found_for_the_times_that_the_scorer_is_set_to(folder: Path, calibrated: Path) -> None:
-    output = folder / "slow.onnx"
-    result = calibrate(folder, "-o", output, "--set", "scorer.smoothing_s=1.0")
-    assert result.exit_code == 0, result.output
-    slow, default = (Limits.model_validate(load_tray_twin(twin).card.calibration) for twin in (output, calibrated))
+def test_of_the_wanted_part_limits_for_the_times_of_the_scorer_are_extrapolated_to_a_target(
+    healthy: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "part.onnx"
+    few = ("--from", 20, "--to", 90, "--false-alarms-per-day", 1, "--extrapolate", "--set", "scorer.smoothing_s=1.0")
+    printed = done("calibrate", healthy / "twin.onnx", healthy / "healthy.mcap", *few, "-o", output)
+    assert "the data are too few to show whether these limits keep it" in printed
+    part, whole = limits_of(output), limits_of(healthy / "calibrated.onnx")
+    assert part.declared_rate and part.declared_rate.extrapolated and whole.declared_rate
+    assert (part.declared_rate.data[0]["from_s"], part.declared_rate.data[0]["to_s"]) == (20.0, 90.0)
+    less = whole.declared_rate.fan_hours - part.declared_rate.fan_hours
+    assert less == pytest.approx(FANS * (120 - 70) / 3600, rel=0.05), "commissioning is repeated in each"
     of_tray = default_timing(2)
-    assert (default.timing, slow.timing) == (of_tray, of_tray.model_copy(update={"smoothing_s": 1.0}))
-    assert slow.detectors["speed_smoothed"] != default.detectors["speed_smoothed"]
+    assert (whole.timing, part.timing) == (of_tray, of_tray.model_copy(update={"smoothing_s": 1.0}))
+    assert part.detectors["speed_smoothed"] != whole.detectors["speed_smoothed"]
 
 
-def test_recordings_of_scorers_with_other_times_are_refused(folder: Path) -> None:
-    slow, twin = folder / "slow.mcap", folder / "twin.onnx"
-    result = fantwin(
-        "replay", folder / "other.mcap", "--offline", "--twin", twin, "--set", "scorer.on_delay_s=1.0", "-o", slow
-    )
-    assert result.exit_code == 0, result.output
-    error = error_of("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
-    assert f"healthy.mcap and {slow} differ in scorer.on_delay_s, which limits depend on: choose one" in error
-
-
-def test_settings_that_do_not_affect_calibration_are_refused(folder: Path, calibrated: Path) -> None:
-    error = error_of(
-        "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY,
-        "--set", "scorer.limit_factor=2",
-    )  # fmt: skip
-    assert "--set scorer.limit_factor: does not affect calibration" in error
-    result = fantwin("calibrate", calibrated, "--verify", folder / "other.mcap", "--set", "scorer.off_delay_s=2.0")
-    assert result.exit_code == 0, result.output
-
-
-def test_a_rate_is_broken_only_by_more_alarms_than_chance_explains() -> None:
-    assert not Check(0, 100.0, 1.0).is_broken
-    assert not Check(7, 100.0, 1.0).is_broken  # 4.2 expected
-    assert Check(10, 100.0, 1.0).is_broken
+def test_the_printed_interval_decides_and_a_rate_is_broken_only_by_more_alarms_than_chance_explains() -> None:
+    for alarms in range(20):
+        check = Check(alarms, 100.0, 1.0)
+        low, _ = check.interval_95
+        assert check.text.endswith(": not kept") == check.is_broken == (low > 1.0)
+        assert f"(95 %: {low:.2g} to " in check.text
+    assert [Check(alarms, 100.0, 1.0).is_broken for alarms in (0, 7, 10)] == [False, False, True]  # 4.2 expected
     assert not Check(0, 1e5, 1.0).is_broken, "fewer alarms than declared break nothing"
     low, high = Check(3, 72.0, 1.0).interval_95
     assert (low, high) == (pytest.approx(0.206, abs=0.001), pytest.approx(2.922, abs=0.001))
     assert math.isfinite(Check(0, 1.0, 1.0).interval_95[1])
 
 
-def test_recordings_with_grids_of_different_rates_are_refused_by_name(folder: Path) -> None:
-    slow, twin = folder / "half-rate.mcap", folder / "twin.onnx"
-    result = fantwin(
-        "replay", folder / "other.mcap", "--offline", "--twin", twin, "--set", "resampler.rate_hz=50", "-o", slow
+def test_recordings_that_a_twin_was_made_from_cannot_verify_it_under_any_name(healthy: Path, tmp_path: Path) -> None:
+    copy, calibrated = tmp_path / "copy.mcap", healthy / "calibrated.onnx"
+    copy.write_bytes((healthy / "healthy.mcap").read_bytes())
+    error = error_of("calibrate", calibrated, "--verify", healthy / "other.mcap", "--verify", copy)
+    assert f"{copy}: {calibrated} was calibrated on it, so it proves nothing" in error
+    error = error_of("calibrate", calibrated, "--verify", healthy / "training.mcap")
+    assert f"{calibrated} was trained on it" in error
+
+
+@pytest.mark.parametrize(
+    ("setting", "difference"),
+    [
+        ("scorer.on_delay_s=1.0", "differ in scorer.on_delay_s, which limits depend on: choose one"),
+        ("resampler.rate_hz=50", "have grids of different rates, 100 Hz and 50 Hz"),
+    ],
+)
+def test_recordings_of_sites_with_other_settings_are_refused_by_name(
+    healthy: Path, tmp_path: Path, setting: str, difference: str
+) -> None:
+    twin, other = healthy / "twin.onnx", tmp_path / "other.mcap"
+    done("replay", healthy / "other.mcap", "--offline", "--twin", twin, "--end", 9, "--set", setting, "-o", other)
+    assert f"healthy.mcap and {other} {difference}" in error_of(
+        "calibrate", twin, healthy / "healthy.mcap", other, *RATE
     )
-    assert result.exit_code == 0, result.output
-    error = error_of("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
-    assert f"healthy.mcap and {slow} have grids of different rates, 100 Hz and 50 Hz" in error
-    assert "\n" not in error
 
 
-def test_a_fan_alone_and_fans_beside_others_are_not_calibrated_together(folder: Path) -> None:
+def together(path: Path, **recordings: Path) -> Path:
+    """One recording of several trays, by name."""
+    with RecordingWriter(path, {"trays": ",".join(recordings), "speed_unit": "rad/s"}) as writer:
+        for tray, recording in recordings.items():
+            for sequence, envelope in enumerate(read_recording(recording, ("raw",))):
+                assert isinstance(envelope.message, Raw)
+                raw = replace(envelope.message, header=Header("simulate", sequence, tray))
+                writer.add_message(tray_key("simulated", tray, "raw"), raw, int(raw.host_receive_t_ns[-1]))
+    return path
+
+
+def test_of_several_trays_the_chosen_one_alone_is_calibrated_and_verified_and_without_a_choice_all_are(
+    healthy: Path, tmp_path: Path
+) -> None:
+    both = together(tmp_path / "both.mcap", a=healthy / "healthy.mcap", b=healthy / "other.mcap")
+    others = together(tmp_path / "others.mcap", a=healthy / "faulty.mcap", b=healthy / "healthy.mcap")
+    words = ("calibrate", healthy / "twin.onnx", both, *RATE, "-o", tmp_path / "o.onnx", "--json")
+    found = json.loads(done(*words, "--tray", "a", "--verify", others))
+    assert found["verify"]["fan_hours"] == pytest.approx(FANS * 60 / 3600, rel=0.1)
+    chosen, alone = found["calibration"], json.loads((healthy / "calibrated.json").read_text())["calibration"]
+    rates = [each.pop("declared_rate") for each in (alone, chosen)]
+    assert chosen == alone
+    assert rates[0]["fan_hours"] == rates[1]["fan_hours"]
+    assert [entry.get("tray") for rate in rates for entry in rate["data"]] == [None, "a"]
+    all_of_them = json.loads(done(*words))["calibration"]["declared_rate"]
+    assert all_of_them["fan_hours"] == pytest.approx(1.5 * rates[1]["fan_hours"], rel=0.05)
+    assert all_of_them["runs"] == 2
+
+
+def test_the_twin_of_a_tray_is_trained_on_its_samples_only(healthy: Path, tmp_path: Path) -> None:
+    both = together(tmp_path / "both.mcap", a=healthy / "training.mcap", b=healthy / "other.mcap")
+    words = ("train", both, "--model", "physical", "-o", tmp_path / "twin.onnx", "--json", "--tray")
+    chosen, other = (json.loads(done(*words, tray))["sigma"] for tray in "ab")
+    assert chosen == pytest.approx(load_tray_twin(healthy / "twin.onnx").card.sigma_rad_s)
+    assert other != chosen
+
+
+def test_a_fan_alone_and_fans_beside_others_are_not_calibrated_together(healthy: Path, tmp_path: Path) -> None:
     """What several share is followed apart, with slower baselines: limits hold for one of both."""
-    alone, healthy, twin = folder / "alone.mcap", folder / "healthy.mcap", folder / "twin-of-one.onnx"
-    simulated(alone, 4, 20, "--fans", 1)
-    result = fantwin("train", alone, "--model", "physical", "-o", twin)
-    assert result.exit_code == 0, result.output
-    for recordings in ((healthy, alone), (alone, healthy)):
-        error = error_of("calibrate", twin, *recordings, "--false-alarms-per-day", PER_DAY)
-        assert f"{alone} has a tray of one fan and {healthy} one of 2" in error
+    recording, alone = healthy / "healthy.mcap", simulated(tmp_path / "alone.mcap", 4, 20, fans=1)
+    for recordings in ((recording, alone), (alone, recording)):
+        error = error_of("calibrate", write_twin(tmp_path / "of-one.onnx"), *recordings, *RATE)
+        assert f"{alone} has a tray of one fan and {recording} one of 2" in error
         assert "calibrate twice, and write one of the twins to another file with -o" in error
-        assert "\n" not in error
+    both, twin = together(tmp_path / "both.mcap", a=recording, b=alone), healthy / "twin.onnx"
+    expected = f"{both}: several trays, a of 2 fans, b of 1 fan, and a twin of 2 fans: choose one with --tray"
+    assert error_of("calibrate", twin, both, *RATE) == expected
+    assert error_of("calibrate", healthy / "calibrated.onnx", "--verify", both) == expected

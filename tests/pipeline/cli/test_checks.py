@@ -11,8 +11,7 @@ from pipeline.config.models import TrayConfig
 from pipeline.devices.sample_blocks import SampleBlocks
 from pipeline.devices.serial_source import SerialSource
 from pipeline.runtime.stage import Context
-from stages import acquisition, recorder, twin_integrator, viewer
-from tests.support.twin_files import write_twin
+from stages import acquisition, recorder, viewer
 
 
 def context(folder: Path, config: Any, **tray: Any) -> Context:
@@ -37,15 +36,6 @@ def test_the_port_is_found_beside_the_configuration(tmp_path, monkeypatch):
     assert isinstance(source, SerialSource) and source._path == tmp_path / "line"
     (problem,) = acquisition.check(context(tmp_path, acquisition.AcquisitionConfig(), port="none"))
     assert f"{tmp_path / 'none'}: no such port" in problem
-
-
-def test_a_twin_is_loaded_to_see_whether_it_can_be(tmp_path):
-    config = twin_integrator.TwinIntegratorConfig()
-    write_twin(tmp_path / "twin.onnx")
-    assert twin_integrator.STAGE.check(context(tmp_path, config, twin="twin.onnx")) == []
-    (problem,) = twin_integrator.STAGE.check(context(tmp_path, config, twin="none.onnx"))
-    assert "cannot read the twin" in problem
-    assert twin_integrator.STAGE.check(context(tmp_path, config)) == [], "it is learned"
 
 
 def test_a_viewer_with_its_ports_taken_says_so(tmp_path):

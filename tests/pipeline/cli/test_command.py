@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -12,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import Result
 
 from pipeline.bus.publisher import Publisher
 from pipeline.bus.session import Bus
@@ -23,12 +22,11 @@ from pipeline.devices.source_kinds import build_source
 from pipeline.runtime.device_commands import DeviceCommands
 from pipeline.runtime.sessions import Session
 from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.header import Header
 from schemas.health import Counter, Health, Note
 from schemas.topics import BY_NAME, alive_key, health_key
-from tests.support.fantwin_command import error_of
-from tests.support.running_chain import DEMO, Chain, RunningCommand, eventually, fantwin
+from tests.support.fantwin_command import error_of, fantwin
+from tests.support.made_up_health import health_of
+from tests.support.running_chain import Chain, RunningCommand, eventually
 
 
 @pytest.fixture
@@ -46,18 +44,14 @@ def acquisition(chain: Chain) -> Iterator[RunningCommand]:
 
 
 def test_a_command_that_the_line_did_not_take_is_one_line_that_says_why(chain, acquisition):
-    done = fantwin(*chain.words("command"), "--fan", 3, 0.5)  # there is no tray
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
-    assert "tray tray1: the command failed: " in done.stderr
-    assert str(chain.port) in done.stderr
+    error = error_of(*chain.words("command"), "--fan", 3, 0.5)  # there is no tray
+    assert "tray tray1: the command failed: " in error
+    assert str(chain.port) in error
 
 
 def test_without_an_acquisition_the_command_is_reported_as_not_received(chain):
-    done = fantwin(*chain.words("command"), "--fan", 3, 0.5)
-    assert done.returncode == 1
-    expected = "fantwin: no acquisition of tray tray1 received the command: is `fantwin up` running?\n"
-    assert done.stderr == expected
+    expected = "no acquisition of tray tray1 received the command: is `fantwin up` running?"
+    assert error_of(*chain.words("command"), "--fan", 3, 0.5) == expected
 
 
 def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
@@ -65,14 +59,7 @@ def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
         return Session("acquisition", f"{number}-of-2", number, f"acquisition-{number}-of-2-1", "board", number, trays)
 
     def beat(session: Session, publisher: Publisher) -> None:
-        health = Health(
-            header=Header(session.producer, publisher.published, ""),
-            stage=session.stage,
-            instance=session.instance,
-            status=StageStatus.OK,
-            t_ns=1,
-            uptime_s=0.0,
-        )
+        health = health_of(session.producer, session.stage, publisher.published, instance=session.instance)
         publisher.put(encode(health))
 
     config, stop = BusConfig(endpoint=endpoint), threading.Event()
@@ -98,16 +85,8 @@ def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
 
 def test_only_the_new_note_on_commands_of_the_tray_says_why_a_command_was_not_sent():
     def health(lost: int, *notes: Note) -> Health:
-        return Health(
-            header=Header("acquisition-all-1", 1, ""),
-            stage="acquisition",
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=1,
-            uptime_s=0.0,
-            counters=(Counter(name="lost_commands", value=lost),),
-            notes=notes,
-        )
+        counters = (Counter(name="lost_commands", value=lost),)
+        return health_of("acquisition-all-1", "acquisition", 1, counters=counters, notes=notes)
 
     tray = TrayConfig(name="a", fans=1, source=SerialConfig(port="line"))
     commands = DeviceCommands(tray, build_source(tray.source, SourceContext(1, tray.speed_unit, Path())))
@@ -148,43 +127,10 @@ def test_a_note_names_the_range_and_the_command_that_was_probably_meant(chain, a
     chain.start_tray()
     words = (*chain.words("command"), "--set", "tray.0.command_max=255", "--json")
 
-    def sent() -> subprocess.CompletedProcess[str] | None:
+    def sent() -> Result | None:
         done = fantwin(*words, "--fan", 3, 0.6)
-        return None if done.returncode else done
+        return None if done.exit_code else done
 
     done = eventually(sent, "the acquisition that starts takes a command")
     assert json.loads(done.stdout)["value"] == 0.6
     assert done.stderr == "note: commands of tray tray1 go from 0 to 255, and 0.6 was sent; 60 % of this range is 153\n"
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("--fan 8 0.5", "tray tray1 has fans 0 to 7"),
-        ("--fan -1 0.5", "tray tray1 has fans 0 to 7"),
-        ("--fan 2 1.5", "the command must be within 0 to 1"),
-        ("--fan 2 -0.1", "the command must be within 0 to 1"),
-        ("--fan 2 nan", "the command must be within 0 to 1"),
-        ("--fan 2 20001 --set-point", "the set-point, rpm, must be within -20000 to 20000"),
-        ("--tray nobody --fan 2 0.5", "no tray called 'nobody'"),
-    ],
-)
-def test_a_command_that_the_tray_cannot_carry_out_is_refused_in_one_line(words, expected):
-    assert expected in error_of("command", "-c", DEMO / "demo.toml", *words.split())
-
-
-def test_a_command_imports_nothing_that_only_watching_and_judging_need():
-    """It is to be answered at once, and most of its time is imports."""
-    code = "import sys, pipeline.cli.watch.command; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    unneeded = (
-        "scoring",
-        "stages",
-        "twin",
-        "pipeline.launch",
-        "pipeline.runtime.stage",
-        "rich",
-        "scipy",
-        "onnxruntime",
-    )
-    assert [name for name in done.stdout.split() if name.startswith(unneeded)] == []

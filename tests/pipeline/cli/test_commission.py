@@ -18,11 +18,8 @@ from pipeline.recordings.recorder_config import RecorderConfig
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from schemas.messages import Raw
 from schemas.units import NS_PER_S
-from tests.support.fantwin_command import error_of
 from tests.support.running_chain import fantwin
 
-OTHER = '[[tray]]\nname = "b"\nfans = 1\nport = "other"\ncommand_max = 0.1'
-THIRD = '[[tray]]\nname = "kept"\nfans = 1\nport = "third"'
 TRAY = TrayConfig.model_validate({"name": "tray1", "fans": 2, "command_max": 100.0})
 
 
@@ -73,48 +70,6 @@ def test_a_command_that_flickers_between_two_ranges_does_not_change_and_gaps_do_
         sparse.missing()[0]
         == "fan 0: commands 20 to 45, 20 s each in 0 tenths of 0 to 100 (4 needed), 1 changes (10 needed)"
     )
-
-
-@pytest.mark.parametrize(
-    ("tray", "rest", "words", "error"),
-    [
-        ('twin = "old.onnx"', "", (), "tray tray1 has twin old.onnx already: remove `twin`, then start again"),
-        (
-            "",
-            '[launcher]\nstages = ["acquisition", "recorder"]',
-            (),
-            "launcher.stages leaves out twin_integrator, scorer",
-        ),
-        (
-            'twin = "old.onnx"',
-            '[[tray]]\nname = "b"\nfans = 1\ntwin = "b.onnx"',
-            (),
-            "tray tray1 has twin old.onnx, tray b has twin b.onnx already: remove `twin`",
-        ),
-        ("", OTHER, ("-o", "new.onnx"), "-o names one twin, and trays tray1, b get one each: choose one with --tray"),
-        ("", OTHER, ("--tray", "c"), "fantwin.toml: no tray called 'c'; known: tray1, b"),
-        ('twin = "old.onnx"', OTHER, ("--tray", "tray1"), "tray tray1 has twin old.onnx already: remove `twin`"),
-        ("", OTHER, ("--sweep", "--low", "0.2"), "--low 0.2: name a range within 0 to 0.1 of tray b"),
-        ("", OTHER, ("--sweep", "--safe", "0.5"), "--safe 0.5: the command must be within 0 to 0.1 of tray b"),
-        ("", f"{OTHER}\n{THIRD}", (), "kept.onnx: exists already: name another with --tray kept -o"),
-        ("", "", ("-o", "kept.onnx"), "kept.onnx: exists already: name another with -o"),
-        ("", "", ("-o", "twin.bin"), "name a file that ends in .onnx with -o"),
-        ("", "", ("--low", "0.2"), "--low needs --sweep, which moves the fans: add --sweep"),
-        ("", "", ("--sweep", "--high", "0.1"), "--high 0.1: name --low, too: without it tray tray1 is swept from 0.2"),
-        ("", "", ("--sweep", "--high", "7"), "--high 7: name a range within 0 to 1 of tray tray1"),
-        ("command_max = 0", "", (), "command_min and command_max of tray tray1 are equal"),
-    ],
-)
-def test_what_cannot_end_well_is_refused_before_anything_is_recorded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tray: str, rest: str, words: tuple[str, ...], error: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("kept.onnx").write_bytes(b"kept")
-    text = f'[[tray]]\nname = "tray1"\nfans = 1\nport = "line"\n{tray}\n{rest}\n'
-    Path("fantwin.toml").write_text(text, encoding="utf-8")
-    assert error in error_of("commission", *words)
-    assert Path("fantwin.toml").read_text(encoding="utf-8") == text
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["fantwin.toml", "kept.onnx"]
 
 
 def test_why_its_doctor_step_fails_is_on_standard_error(tmp_path: Path, endpoint: str) -> None:

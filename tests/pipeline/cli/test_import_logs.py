@@ -162,22 +162,3 @@ def test_a_mistake_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
     assert "no ROS 2 bag that can be read" in error_of("import", tmp_path / "bag", "--list")
     assert "cannot be read: No such file" in error_of("import", tmp_path / "none.ulg", "--list")
     assert list(tmp_path.glob("*.mcap")) == []
-
-
-def test_a_log_can_be_described_and_identified(tmp_path: Path) -> None:
-    recording = tmp_path / "r.mcap"
-    t_s = np.arange(0, 20, 0.01)
-    command = np.where(t_s % 4 < 2, 0.4, 0.8)
-    speed = np.zeros(len(t_s))
-    for row in range(1, len(t_s)):  # 12 w' = 3000 u - w, roughly a small fan
-        speed[row] = speed[row - 1] + 0.01 / 0.3 * (3000 * command[row - 1] - speed[row - 1])
-    rows = [
-        (k, round(t * 1e6) + 1, *[int(1000 * command[k])] * 2, *[int(speed[k] * 7 / 100)] * 2)
-        for k, t in enumerate(t_s)
-    ]
-    write_blackbox(tmp_path / "long.bbl", [rows], "motor_poles:14")
-    words = ("--command", "motor[0]", "--speed", "eRPM[0]:erpm", "-o", recording)
-    assert fantwin("import", tmp_path / "long.bbl", *words).exit_code == 0
-    assert "made from: long.bbl" in fantwin("info", recording).stdout
-    identified = fantwin("identify", recording, "--json")
-    assert identified.exit_code == 0, identified.output

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
 from mcap.writer import Writer
 
 from pipeline.recordings import contents
@@ -21,6 +20,7 @@ from schemas.messages import ModelCard
 from schemas.topics import health_key, tray_key
 from tests.pipeline.recordings.test_parts import part, parts_in
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.made_up_health import health_of
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
 
 METADATA = {"site": "plant", "trays": "tray1", "fans.tray1": "2", "speed_unit.tray1": "rpm", "made_by": "fantwin"}
@@ -41,25 +41,16 @@ def recording(path: Path) -> Path:
         card = ModelCard(header=Header("ti-1", 0, "tray1"), t_ns=1, twin="demo", kind="hybrid", sha256="ab" * 32)
         writer.add_message(tray_key("plant", "tray1", "twin"), card, 5 * SECOND_NS)
         for number, problem in enumerate(("", "the line is silent: look at the cable")):
-            health = Health(
-                header=Header("acquisition-1", number, ""),
-                stage="acquisition",
-                instance="tray1",
-                status=StageStatus.DEGRADED,
-                t_ns=1,
-                uptime_s=1.0,
-                problem=problem,
-                counters=(Counter(name="lost_samples", value=3 * number),),
-                lost=3 * number,
-                notes=(Note(tray="tray1", text="grid of 10 Hz"),),
-            )
+            lost, note = Counter(name="lost_samples", value=3 * number), Note(tray="tray1", text="grid of 10 Hz")
+            more = {"instance": "tray1", "status": StageStatus.DEGRADED, "problem": problem, "lost": lost.value}
+            health = health_of("acquisition-1", "acquisition", number, counters=(lost,), notes=(note,), **more)
             writer.add_message(health_key("plant", "acquisition", "tray1"), health, 6 * SECOND_NS)
     return path
 
 
-def test_topics_are_listed_with_missing_messages(tmp_path):
-    found = shown(recording(tmp_path / "r.mcap"), exit_code=3)
-    assert found["topics"][RAW_KEY] == {
+def test_topics_metadata_twins_and_stages_are_in_the_json_and_in_the_text(tmp_path):
+    whole = shown(recording(tmp_path / "r.mcap"), exit_code=3)
+    assert whole["topics"][RAW_KEY] == {
         "messages": 5,
         "missing": 2,
         "duplicated": 1,
@@ -67,29 +58,7 @@ def test_topics_are_listed_with_missing_messages(tmp_path):
         "last_ns": 4 * SECOND_NS,
         "rate_hz": 1.0,
     }
-
-
-@pytest.mark.parametrize(
-    ("stage", "widest"),
-    [("twin_integrator", 80), ("a_stage_with_a_name_that_no_terminal_of_80_columns_has_room_for", 999)],
-)
-def test_the_name_of_a_topic_is_whole_and_those_of_fantwin_have_room_in_80_columns(
-    tmp_path, monkeypatch, stage, widest
-):
-    monkeypatch.setenv("COLUMNS", "80")
-    with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
-        for number in range(2):
-            header = Header("stage-1", number, "")
-            health = Health(header=header, stage=stage, instance="all", status=StageStatus.OK, t_ns=1, uptime_s=1.0)
-            writer.add_message(health_key("plant", stage, "all"), health, (1_800_000_000 + number) * SECOND_NS)
-    (row,) = (line for line in fantwin("info", tmp_path / "r.mcap").stdout.splitlines() if line.startswith("health/"))
-    assert row.split()[:4] == [f"health/{stage}/all", "2", "0", "0"]
-    assert row.split()[-1] == "1.0"
-    assert len(row) <= widest
-
-
-def test_metadata_twins_and_stages_are_in_the_json(tmp_path):
-    (found,) = shown(recording(tmp_path / "r.mcap"), exit_code=3)["files"]
+    (found,) = whole["files"]
     assert found["metadata"] == METADATA | {"format": "1"}
     assert (found["messages"], found["duration_s"]) == (8, 6.0)
     assert found["size_bytes"] == (tmp_path / "r.mcap").stat().st_size
@@ -105,10 +74,7 @@ def test_metadata_twins_and_stages_are_in_the_json(tmp_path):
         }
     }
     assert found["damage"] == []
-
-
-def test_the_text_shows_the_same(tmp_path):
-    output = fantwin("info", recording(tmp_path / "r.mcap")).stdout
+    output = fantwin("info", tmp_path / "r.mcap").stdout
     for words in (
         "r.mcap: 0.0",
         "8 messages",
@@ -129,17 +95,8 @@ def healths_of(*sessions: tuple[str, int, tuple[Input, ...]], at_s: int = 0) -> 
     """Two healths of each session of the resampler (its name, what it lost, what it received), and their times."""
     for name, lost, inputs in sessions:
         for number in range(2):
-            health = Health(
-                header=Header(name, number, ""),
-                stage="resampler",
-                instance="all",
-                status=StageStatus.OK,
-                t_ns=1,
-                uptime_s=1.0,
-                inputs=inputs,
-                lost=lost * number,
-            )
-            yield health, (at_s := at_s + 1) * SECOND_NS
+            at_s += 1
+            yield health_of(name, "resampler", number, inputs=inputs, lost=lost * number), at_s * SECOND_NS
 
 
 def received(first: int, until: int) -> tuple[Input, ...]:
@@ -191,15 +148,12 @@ def test_a_file_without_an_index_is_read_in_full_with_the_same_result(tmp_path):
     assert different == {"file", "size_bytes", "damage"}
 
 
-def test_a_file_that_lacks_only_its_index_has_lost_nothing(tmp_path):
-    path = write(tmp_path / "r.mcap", 30)
-    path.write_bytes(path.read_bytes()[:-50])
-    shown(path, exit_code=0)
-
-
-def test_a_truncated_file_is_reported(tmp_path):
+def test_a_truncated_file_is_reported_and_one_that_lacks_only_its_index_has_lost_nothing(tmp_path):
     path = write(tmp_path / "r.mcap", 300)
-    path.write_bytes(path.read_bytes()[:40_000])
+    content = path.read_bytes()
+    path.write_bytes(content[:-50])
+    shown(path, exit_code=0)
+    path.write_bytes(content[:40_000])
     (found,) = shown(path, exit_code=3)["files"]
     assert found["damage"][0] == "it is truncated, as after a crash"
     assert "it is truncated, as after a crash; repair it with `fantwin recover`" in fantwin("info", path).stdout
@@ -224,50 +178,28 @@ def test_with_index_and_ledger_the_file_is_not_read_in_full(tmp_path, monkeypatc
     assert contents_of(path).messages == 8
 
 
-def test_parts_are_added_up_and_checked_for_continuity(tmp_path):
-    place, ledger = parts_in(tmp_path), SequenceLedger()
-    for first in (0, 10, 23):
+def three_parts(folder: Path, *firsts: int) -> list[Path]:
+    """r.mcap, r-2.mcap and r-3.mcap of ten messages each."""
+    place, ledger = parts_in(folder), SequenceLedger()
+    for first in firsts:
         part(place, range(first, first + 10), ledger).finish()
         ledger = ledger.for_next_part()
-    names = [tmp_path / name for name in ("r-3.mcap", "r.mcap", "r-2.mcap")]
-    found = shown(*names, exit_code=3)
-    assert found["topics"][RAW_KEY]["messages"] == 30
+    return [folder / name for name in ("r.mcap", "r-2.mcap", "r-3.mcap")]
+
+
+def test_parts_are_added_up_and_checked_for_continuity(tmp_path):
+    first, second, third = three_parts(tmp_path, 0, 10, 23)
+    found = shown(third, first, second, third, exit_code=3)
+    assert found["topics"][RAW_KEY]["messages"] == 30, "a file that is named twice counts once"
     assert found["topics"][RAW_KEY]["missing"] == 3
     assert [Path(each["file"]).name for each in found["files"]] == ["r.mcap", "r-2.mcap", "r-3.mcap"]
     assert found["continuity"] == []
-
-
-def test_parts_whose_oldest_were_deleted_are_continuous(tmp_path):
-    place, ledger = parts_in(tmp_path), SequenceLedger()
-    for first in (0, 10, 20):
-        part(place, range(first, first + 10), ledger).finish()
-        ledger = ledger.for_next_part()
-    (tmp_path / "r.mcap").unlink()
-    assert shown(tmp_path / "r-2.mcap", tmp_path / "r-3.mcap")["continuity"] == []
-    assert "continues r.mcap" in fantwin("info", tmp_path / "r-2.mcap", tmp_path / "r-3.mcap").stdout
-
-
-def test_a_file_that_is_named_twice_counts_once(tmp_path):
-    with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
-        writer.add_message(RAW_KEY, raw(0), 1)
-    assert shown(tmp_path / "r.mcap", tmp_path / "r.mcap")["topics"][RAW_KEY]["messages"] == 1
-
-
-def test_foreign_metadata_with_fantwin_keys_are_ignored(tmp_path):
-    with RecordingWriter(tmp_path / "r.mcap", {"paused_t_ns": "yesterday", "resumed_t_ns": "1"}):
-        pass
-    done = fantwin("info", tmp_path / "r.mcap")
-    assert (done.exit_code, "nothing was recorded" in done.stdout) == (0, False)
-
-
-def test_a_part_that_was_not_named_is_reported(tmp_path):
-    place, ledger = parts_in(tmp_path), SequenceLedger()
-    for first in (0, 10, 20):
-        part(place, range(first, first + 10), ledger).finish()
-        ledger = ledger.for_next_part()
-    found = shown(tmp_path / "r.mcap", tmp_path / "r-3.mcap", exit_code=3)
+    found = shown(first, third, exit_code=3)
     assert found["continuity"] == ["r-3.mcap continues r-2.mcap, which is not among these files"]
-    assert "which is not among these" in fantwin("info", tmp_path / "r.mcap", tmp_path / "r-3.mcap").stdout
+    assert "which is not among these" in fantwin("info", first, third).stdout
+    first.unlink()
+    assert shown(second, third, exit_code=3)["continuity"] == [], "the oldest were deleted"
+    assert "continues r.mcap" in fantwin("info", second, third).stdout
 
 
 def test_a_part_that_does_not_begin_where_the_one_before_ended_is_reported(tmp_path):
@@ -303,22 +235,13 @@ def test_a_file_without_fantwin_channels_is_shown_as_such(tmp_path):
     assert "/camera" in output
 
 
-def test_a_recording_without_messages_is_shown_too(tmp_path):
-    RecordingWriter(tmp_path / "r.mcap", METADATA).finish()
+def test_a_recording_without_messages_and_an_alarm_alone_are_shown_too(tmp_path):
+    """Foreign metadata with keys of fantwin are ignored, and one message has no rate."""
+    RecordingWriter(tmp_path / "r.mcap", {"paused_t_ns": "yesterday", "resumed_t_ns": "1"}).finish()
     (found,) = shown(tmp_path / "r.mcap")["files"]
     assert (found["messages"], found["first_ns"], found["duration_s"]) == (0, None, 0.0)
-    assert "0 messages" in fantwin("info", tmp_path / "r.mcap").stdout
-
-
-def test_an_alarm_alone_has_no_rate(tmp_path):
-    with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
+    text = fantwin("info", tmp_path / "r.mcap").stdout
+    assert "0 messages" in text and "nothing was recorded" not in text
+    with RecordingWriter(tmp_path / "alarm.mcap", METADATA) as writer:
         writer.add_message(ALARM_KEY, alarm(0), 5)
-    assert shown(tmp_path / "r.mcap")["topics"][ALARM_KEY]["rate_hz"] is None
-
-
-@pytest.mark.parametrize("content", [b"", b"t,u\n", None])
-def test_a_file_that_is_not_a_recording_is_refused_in_one_line(tmp_path, content):
-    path = tmp_path / "r.mcap"
-    if content is not None:
-        path.write_bytes(content)
-    assert f"{path}: " in error_of("info", path)
+    assert shown(tmp_path / "alarm.mcap")["topics"][ALARM_KEY]["rate_hz"] is None

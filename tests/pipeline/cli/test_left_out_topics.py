@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.offline_replay import changed, recorded, recording_of, without_topics
 
@@ -16,18 +17,23 @@ MADE = ("grid", "prediction", "score")
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return recording_of(tmp_path_factory.mktemp("whole"), 1, 300, calibrated=True)
+def whole(made_once: MadeOnce) -> Path:
+    def make(folder: Path) -> None:
+        path = recording_of(folder, 1, 300, calibrated=True).rename(folder / "whole.mcap")
+        without_topics(path, folder / "lean.mcap", *MADE)
+        without_topics(path, folder / "without-raw.mcap", "raw")
+
+    return made_once("left-out", make) / "whole.mcap"
 
 
 @pytest.fixture(scope="module")
 def lean(whole: Path) -> Path:
-    return without_topics(whole, whole.with_name("lean.mcap"), *MADE)
+    return whole.with_name("lean.mcap")
 
 
 @pytest.fixture(scope="module")
 def without_raw(whole: Path) -> Path:
-    return without_topics(whole, whole.with_name("without-raw.mcap"), "raw")
+    return whole.with_name("without-raw.mcap")
 
 
 def advice(path: Path, *topics: str) -> str:
@@ -50,9 +56,6 @@ def test_it_is_verified_by_its_alarms_and_snapshots(lean):
     assert done.exit_code == 0, done.output
     assert f"equal: {snapshots} snapshots and {alarms} alarms; all decisions are identical" in done.stdout
     assert "scores were not recorded (recorder.topics)" in done.stdout
-    found = json.loads(fantwin("replay", "--offline", "--verify", "--json", lean).stdout)["verified"]
-    assert (found["samples_equal"], found["snapshots_equal"], found["alarms_equal"]) == (0, snapshots, alarms)
-    assert found["left_out"] == list(MADE)
 
 
 def test_a_difference_is_exit_code_1(lean, tmp_path):
@@ -62,9 +65,12 @@ def test_a_difference_is_exit_code_1(lean, tmp_path):
             entry.message.speed_rad_s[:] *= 1.01
         return entry.message
 
-    done = fantwin("replay", "--offline", "--verify", changed(lean, tmp_path / "r.mcap", doubled))
+    different = changed(lean, tmp_path / "r.mcap", doubled)
+    done = fantwin("replay", "--offline", "--verify", different)
     assert done.exit_code == 1
     assert "DIFFERS" in done.stdout and "snapshots differ" in done.stdout and "tray1: snapshot of " in done.stdout
+    verified = json.loads(fantwin("replay", "--offline", "--verify", "--json", different).stdout)["verified"]
+    assert (verified["samples_equal"], verified["left_out"], verified["equal"]) == (0, list(MADE), False)
 
 
 def test_a_plot_makes_the_scores_again_and_shows_the_same(lean, whole, tmp_path):
@@ -92,23 +98,14 @@ def test_an_export_has_raw_samples_and_names_what_is_missing(lean, tmp_path):
     assert f"no score in this recording: {advice(lean, 'score')}" in done.stderr
 
 
-@pytest.mark.parametrize("words", [("--from", "grid"), ("--topics", "grid,alarm")])
-def test_topics_that_are_not_there_cannot_be_replayed(lean, words):
-    assert error_of("replay", lean, *words) == f"{lean}: {advice(lean, 'grid')}"
+def test_topics_that_are_not_there_cannot_be_replayed(lean):
+    for words in (("--from", "grid"), ("--topics", "grid,alarm")):
+        assert error_of("replay", lean, *words) == f"{lean}: {advice(lean, 'grid')}"
 
 
-@pytest.mark.parametrize("words", [("replay", "--offline"), ("identify",), ("evaluate", "t.onnx")])
-def test_without_raw_samples_there_is_nothing_to_make_the_rest_of(without_raw, whole, words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "t.onnx").write_bytes((whole.parent / "twin.onnx").read_bytes())
-    line = error_of(*words, without_raw)
-    assert line == (
-        f"{without_raw}: no raw samples in this recording: its recorder left out raw (recorder.topics), and without "
-        "raw nothing can be made again"
-    )
-
-
-def test_what_is_learned_of_a_recording_needs_raw_samples_only(whole, lean):
-    twin = whole.parent / "twin.onnx"
-    found = [json.loads(fantwin("evaluate", twin, path, "--json").stdout) for path in (whole, lean)]
-    assert json.dumps(found[0]).replace(str(whole), "") == json.dumps(found[1]).replace(str(lean), "")
+def test_without_raw_samples_there_is_nothing_to_make_the_rest_of(without_raw, whole):
+    for words in (("replay", "--offline"), ("identify",), ("evaluate", whole.with_name("twin.onnx"))):
+        assert error_of(*words, without_raw) == (
+            f"{without_raw}: no raw samples in this recording: its recorder left out raw (recorder.topics), and "
+            "without raw nothing can be made again"
+        )

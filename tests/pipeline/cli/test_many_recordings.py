@@ -9,9 +9,10 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -20,9 +21,11 @@ from typer.testing import Result
 from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.cli.twins.training_data import Part, read_recording_data
 from pipeline.errors import UserError
+from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.but_for_times import but_for_times, content_of
 from tests.support.fan_data import published_run
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.running_chain import DEADLINE_S
 from tests.support.written_recordings import write_run
 
 RECORDINGS = ("a.mcap", "b.mcap", "c.mcap")
@@ -30,37 +33,29 @@ BAD = "bad.mcap"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(made_once: MadeOnce) -> Path:
     """Three recordings of a healthy tray, a file that is none, and a twin."""
-    path = tmp_path_factory.mktemp("many")
-    for seed, name in enumerate(RECORDINGS, start=1):
-        write_run(path / name, published_run(seed, 40.0 + 5.0 * seed, fans=2))
-    (path / BAD).write_bytes(b"nothing that was recorded")
-    trained = fantwin("train", path / "a.mcap", "--model", "physical", "-o", path / "twin.onnx")
-    assert trained.exit_code == 0, trained.output
-    return path
+
+    def make(path: Path) -> None:
+        for seed, name in enumerate(RECORDINGS, start=1):
+            write_run(path / name, published_run(seed, 20.0 + 5.0 * seed, fans=2))
+        (path / BAD).write_bytes(b"nothing that was recorded")
+        trained = fantwin("train", path / "a.mcap", "--model", "physical", "-o", path / "twin.onnx")
+        assert trained.exit_code == 0, trained.output
+
+    return made_once("many-recordings", make)
 
 
-def words_of(
-    command: str, folder: Path, recordings: Sequence[Path | str], output: Path
-) -> tuple[str, *tuple[object, ...]]:
+def words_of(command: str, folder: Path, recordings: Sequence[Path | str], output: Path) -> list[Any]:
     """The words of a command, which writes into the folder `output` if it writes anything."""
-    twin = folder / "twin.onnx"
-    words: dict[str, list[object]] = {
-        "identify": [*recordings],
-        "train": [*recordings, "--model", "physical", "-o", output / "trained.onnx"],
-        "calibrate": [
-            twin,
-            *recordings,
-            "--false-alarms-per-day",
-            1500,
-            "--extrapolate",
-            "-o",
-            output / "calibrated.onnx",
-        ],
-        "replay": ["--offline", *recordings, "--twin", twin, "-o", output],
+    twin, rate = folder / "twin.onnx", ("--false-alarms-per-day", 1500, "--extrapolate")
+    words: dict[str, Sequence[object]] = {
+        "identify": recordings,
+        "train": (*recordings, "--model", "physical", "-o", output / "trained.onnx"),
+        "calibrate": (twin, *recordings, *rate, "-o", output / "calibrated.onnx"),
+        "replay": ("--offline", *recordings, "--twin", twin, "-o", output),
     }
-    return command, *words[command], "--json"
+    return [command, *words[command], "--json"]
 
 
 FITS, SCORES, WRITES = "train", "calibrate", "replay"
@@ -79,7 +74,7 @@ def run_all(command: str, folder: Path, names: tuple[str, ...], output: Path, *o
     return fantwin(*words_of(command, folder, [folder / name for name in names], output), *options)
 
 
-@pytest.mark.parametrize("command", [FITS, SCORES, WRITES])
+@pytest.mark.parametrize("command", [SCORES, WRITES])
 def test_one_process_and_two_print_and_write_the_same(folder: Path, tmp_path: Path, command: str) -> None:
     outcomes = []
     for jobs in (1, 2):
@@ -95,7 +90,7 @@ def test_networks_that_are_trained_two_at_a_time_give_the_same_twin(folder: Path
     for jobs in (1, 2):
         output = tmp_path / f"with-{jobs}"
         output.mkdir()
-        options = ("--networks", 3, "--iterations", 3, "--to", 15, "--json", "--jobs", jobs)
+        options = ("--networks", 2, "--iterations", 2, "--to", 10, "--json", "--jobs", jobs)
         result = fantwin("train", folder / RECORDINGS[0], *options, "-o", output / "trained.onnx")
         assert result.exit_code == 0, result.output
         assert ("training, 2 networks at a time" in result.stderr) == (jobs == 2)
@@ -103,8 +98,7 @@ def test_networks_that_are_trained_two_at_a_time_give_the_same_twin(folder: Path
     assert outcomes[0] == outcomes[1]
 
 
-@pytest.mark.parametrize("command", [FITS, WRITES])
-def test_recordings_at_urls_give_what_files_give(folder: Path, tmp_path: Path, command: str) -> None:
+def test_recordings_at_urls_give_what_files_give(folder: Path, tmp_path: Path) -> None:
     memory = pytest.importorskip("fsspec", reason="the extra `remote` is not installed").filesystem("memory")
     for name in RECORDINGS:
         memory.pipe_file(f"/many/{name}", (folder / name).read_bytes())
@@ -112,7 +106,7 @@ def test_recordings_at_urls_give_what_files_give(folder: Path, tmp_path: Path, c
     outcomes = []
     for output, place in zip(outputs, (str(folder), "memory://many"), strict=True):
         output.mkdir()
-        words = words_of(command, folder, [f"{place}/{name}" for name in RECORDINGS], output)
+        words = words_of(WRITES, folder, [f"{place}/{name}" for name in RECORDINGS], output)
         result = fantwin(*words, "--jobs", 1)
         assert result.exit_code == 0, result.output
         printed, written = outcome_of(result, output)
@@ -146,10 +140,9 @@ def test_a_bad_recording_stops_all_before_anything_is_written_or_is_skipped_and_
 
 def test_the_error_of_another_process_is_that_of_one_and_of_several_the_first_argument_s(folder: Path) -> None:
     bad = [folder / "none.mcap", folder / BAD]
-    alone = error_of("identify", folder / "a.mcap", *bad, "--jobs", 1)
-    assert alone == f"{folder / 'none.mcap'}: cannot read the recording: No such file or directory"
-    assert error_of("identify", folder / "a.mcap", *bad, "--jobs", 3) == alone
-    assert error_of("identify", *bad, "--jobs", 2, "--skip-bad") == alone, "where none is left, that is an error"
+    expected = f"{folder / 'none.mcap'}: cannot read the recording: No such file or directory"
+    assert error_of("identify", folder / "a.mcap", *bad, "--jobs", 3) == expected
+    assert error_of("identify", *bad, "--jobs", 2, "--skip-bad") == expected, "where none is left, that is an error"
 
 
 def test_a_recording_of_which_nothing_can_be_scored_is_bad_and_leaves_no_output(folder: Path, tmp_path: Path) -> None:
@@ -171,27 +164,17 @@ def test_a_recording_that_was_skipped_stays_so_in_all_that_follows(folder: Path)
     assert seen == [folder / "a.mcap"]
 
 
-def loaded_by(work: Callable[[Path], object]) -> Callable[[Path], bool]:
-    def is_loaded(path: Path) -> bool:
-        work(path)
-        return "torch" in sys.modules
-
-    return is_loaded
-
-
-def test_processes_that_read_recordings_do_not_load_torch(folder: Path) -> None:
-    paths = [folder / name for name in RECORDINGS[:2]]
-    read = loaded_by(lambda path: read_recording_data(path, Part()))
-    assert list(RecordingsInParallel(jobs=2).map(read, paths, "reading")) == [False, False]
-
-
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_linear_algebra_has_one_thread_in_every_process(folder: Path, jobs: int) -> None:
-    """With more it rounds in another order, so results would depend on the number of cores."""
+def test_in_every_process_linear_algebra_has_one_thread_and_torch_is_not_loaded(folder: Path, jobs: int) -> None:
+    """With more threads it rounds in another order, so results would depend on the number of cores."""
+
+    def found(path: Path) -> tuple[set[int], bool]:
+        read_recording_data(path, Part())
+        return {each["num_threads"] for each in threadpool_info()}, jobs > 1 and "torch" in sys.modules
+
     paths = [folder / name for name in RECORDINGS[:2]]
     with threadpool_limits(2), RecordingsInParallel(jobs) as pool:
-        found = pool.map(lambda _path: {each["num_threads"] for each in threadpool_info()}, paths, "counting")
-        assert list(found) == [{1}, {1}]
+        assert list(pool.map(found, paths, "counting")) == [({1}, False)] * 2
 
 
 def test_a_process_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
@@ -214,12 +197,12 @@ def test_ctrl_c_ends_all_processes_with_one_line(tmp_path: Path) -> None:
     )  # fmt: skip
     ends = [os.open(pipe, os.O_WRONLY) for pipe in pipes]  # returns when a worker has opened it
     os.killpg(command.pid, signal.SIGINT)
-    _, errors = command.communicate(timeout=60)
+    _, errors = command.communicate(timeout=DEADLINE_S)
     assert (command.returncode, errors) == (130, "interrupted: nothing was identified\n")
     closed = select.poll()
     for end in ends:
         closed.register(end, 0)
-        assert closed.poll(60_000), "the worker that read it has not ended"
+        assert closed.poll(1000 * DEADLINE_S), "the worker that read it has not ended"
         closed.unregister(end)
         os.close(end)
 
@@ -256,15 +239,11 @@ def test_a_command_that_is_ended_while_it_fetches_a_recording_leaves_no_copy(tmp
             [sys.executable, "-m", "pipeline", "identify", *urls, "--jobs", "2"],
             stderr=subprocess.PIPE, text=True, env=os.environ | {"TMPDIR": str(temporary)},
         )  # fmt: skip
-        assert begun.acquire(timeout=120) and begun.acquire(timeout=120)
+        assert begun.acquire(timeout=DEADLINE_S) and begun.acquire(timeout=DEADLINE_S)
         assert len([*temporary.glob("fantwin-copies-*/fantwin-copies-*")]) == 2
         command.terminate()
-        _, errors = command.communicate(timeout=60)
+        _, errors = command.communicate(timeout=DEADLINE_S)
         ended.set()
         server.shutdown()
     assert (command.returncode, errors) == (130, "interrupted: nothing was identified\n")
     assert [*temporary.iterdir()] == []
-
-
-def test_jobs_and_a_cluster_are_not_both_wanted_and_no_cluster_is_one_line(folder: Path) -> None:
-    assert "give one" in error_of("identify", folder / "a.mcap", "--jobs", 2, "--scheduler", "tcp://127.0.0.1:1")

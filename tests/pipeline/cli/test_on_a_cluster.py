@@ -28,12 +28,11 @@ def cluster_of(workers: int) -> Any:
 def test_two_workers_give_what_one_process_gives(folder: Path, tmp_path: Path) -> None:
     with cluster_of(2) as cluster:
         scheduler = "--scheduler", cluster.scheduler_address
-        for command in ("identify", "calibrate", "replay"):
-            alone, there = tmp_path / f"{command}-alone", tmp_path / command
-            expected = outcome_of(run_all(command, folder, RECORDINGS, alone, "--jobs", 1), alone)
-            result = run_all(command, folder, RECORDINGS, there, *scheduler)
-            assert result.exit_code == 0, result.output
-            assert outcome_of(result, there) == expected
+        alone, there = tmp_path / "alone", tmp_path / "there"
+        expected = outcome_of(run_all("replay", folder, RECORDINGS, alone, "--jobs", 1), alone)
+        result = run_all("replay", folder, RECORDINGS, there, *scheduler)
+        assert result.exit_code == 0, result.output
+        assert outcome_of(result, there) == expected
         bad = folder / "bad.mcap"
         assert error_of("identify", bad, folder / "a.mcap", *scheduler) == error_of("identify", bad, "--jobs", 1)
         result = run_all("identify", folder, ("a.mcap", "bad.mcap"), tmp_path / "skipped", *scheduler, "--skip-bad")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 from dataclasses import replace
@@ -10,20 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 from typer.testing import Result
 
-from pipeline.cli.recordings.replay_offline import _table
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.enums import InvalidReason
-from schemas.messages import Alarm, Raw
+from schemas.messages import Alarm, Raw, Score
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import short_name
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.killed_site import Site
 from tests.support.offline_replay import changed
-from tests.support.running_chain import fantwin as fantwin_process
 from tests.support.twin_files import write_twin
 
 GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
@@ -89,13 +85,17 @@ def test_no_scores_cannot_be_compared_exit_code_2(tmp_path):
     assert "nothing to compare with" in result.stderr
 
 
-def test_the_decision_as_json(golden):
+def test_the_decision_as_json_names_counts_and_reasons_for_unscored_samples_apart(golden):
     (alarm,) = golden["alarms"]
     assert alarm["fan"] == 1 and alarm["raised_ns"] < alarm["cleared_ns"]
     assert alarm["severity"] == "alarm" and alarm["residual"] < 0
     assert golden["samples"] > 400 and golden["lost"] == 0
     not_judged = sum(golden["not_judged"]["tray1"].values()) / 2
     assert golden["hours"] == pytest.approx((golden["samples"] - not_judged) * 0.02 / 3600, abs=1e-4)
+    reasons = {why.name.lower() for why in InvalidReason}
+    assert set(golden["not_judged"]["tray1"]) <= reasons
+    counts = golden["counts"]["tray1"]
+    assert reasons.isdisjoint(counts) and "not_predicted_out_of_range" in counts
 
 
 def test_the_list_names_severity_and_probable_cause_and_is_not_wide(golden):
@@ -114,36 +114,6 @@ def test_the_list_names_severity_and_probable_cause_and_is_not_wide(golden):
     assert max(map(len, lines + what_if)) <= 100
 
 
-def test_causes_that_are_equally_probable_are_all_in_the_table():
-    causes = [{"cause": cause, "probability": share} for cause, share in (("blocked", 0.402), ("no_power", 0.398))]
-    rest = {"cause": "no_tacho", "probability": 0.2}
-    alarm = {
-        "tray": "a",
-        "fan": 0,
-        "raised_ns": 0,
-        "cleared_ns": None,
-        "severity": "alarm",
-        "message": "fan 0: too slow",
-    }
-    console = Console(width=100, file=io.StringIO(), record=True)
-    console.print(_table("alarms", [{**alarm, "causes": [*causes, rest]}], 0))
-    text = console.export_text()
-    assert "blocked 40 %" in text and "no power 40 %" in text and "tacho" not in text
-
-
-def test_counts_of_stages_and_reasons_for_unscored_samples_have_distinct_names(golden):
-    reasons = {why.name.lower() for why in InvalidReason}
-    assert set(golden["not_judged"]["tray1"]) <= reasons
-    counts = golden["counts"]["tray1"]
-    assert reasons.isdisjoint(counts) and "not_predicted_out_of_range" in counts
-
-
-def test_another_threshold_shows_which_alarms_are_gained_and_lost():
-    document = json.loads(replay("--json", GOLDEN, "--set", "scorer.limit_factor=1000").stdout)
-    assert document["alarms"] == [] and document["what_if"]["gained"] == []
-    assert [alarm["fan"] for alarm in document["what_if"]["lost"]] == [1]
-
-
 def test_another_configuration_file_is_taken(golden, tmp_path):
     text = (
         read_metadata(GOLDEN).attachments["configuration.toml"].decode().replace("on_delay_s = 0.3", "on_delay_s = 2.5")
@@ -154,13 +124,12 @@ def test_another_configuration_file_is_taken(golden, tmp_path):
     assert now[0]["raised_ns"] - before[0]["raised_ns"] == pytest.approx(2.2e9, abs=0.2e9)
 
 
-def test_the_output_is_a_whole_recording(golden, output):
-    samples = [t_ns for entry in read_recording(output, ("score",)) for t_ns in entry.message.t_ns.tolist()]  # type: ignore[union-attr]
+def test_the_output_is_a_whole_recording_with_the_requests_that_its_alarms_answer(golden, output):
+    messages = [entry.message for entry in read_recording(output, ("score", "grid", "prediction"))]
+    samples = [t_ns for each in messages if isinstance(each, Score) for t_ns in each.t_ns.tolist()]
     assert len(samples) == len(set(samples)) == golden["samples"]
+    assert max(len(each.t_ns) for each in messages) == 100, "from second to second"  # type: ignore[union-attr]
     assert read_metadata(output).attachments.keys() == read_metadata(GOLDEN).attachments.keys()
-
-
-def test_the_output_has_the_requests_that_its_alarms_answer(output):
     made, recorded = ([entry.message for entry in read_recording(path, ("request",))] for path in (output, GOLDEN))
     assert list(map(repr, made)) == list(map(repr, recorded)) and len(made) > 0
     alarms = [entry.message for entry in read_recording(output, ("alarm",))]
@@ -178,9 +147,6 @@ def test_an_imported_table_is_judged_at_the_rate_of_the_twin(tmp_path):
         for entry in read_recording(table):
             writer.add_message(entry.key, entry.message, entry.received_t_ns)
     assert "--twin" in error("--json", bare)
-    result = replay("--json", bare, "--twin", tmp_path / "twin.onnx")
-    assert result.exit_code == 0, result.stderr
-    assert json.loads(result.stdout)["samples"] > 550
     document = json.loads(
         replay("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "scorer.limit_factor=1000").stdout
     )
@@ -192,8 +158,8 @@ def test_an_imported_table_is_judged_at_the_rate_of_the_twin(tmp_path):
     assert json.loads(replay("--json", out).stdout)["samples"] > 550, "the output made from a table can be judged again"
 
 
-@pytest.mark.parametrize("zero_ns", [0, 5 * NS_PER_S])
-def test_times_of_a_table_without_dates_are_seconds_since_its_first_sample(tmp_path, zero_ns):
+@pytest.mark.parametrize(("zero_ns", "part"), [(0, ()), (5 * NS_PER_S, ("--start", "1"))])
+def test_times_of_a_table_without_dates_are_seconds_since_its_first_sample(tmp_path, zero_ns, part):
     recorded = [entry.message for entry in read_recording(GOLDEN, ("raw",))]
     table, twin = tmp_path / "table.mcap", tmp_path / "twin.onnx"
     twin.write_bytes(read_metadata(GOLDEN).attachments["tray1.onnx"])
@@ -202,14 +168,13 @@ def test_times_of_a_table_without_dates_are_seconds_since_its_first_sample(tmp_p
             assert isinstance(raw, Raw) and isinstance(recorded[0], Raw)
             t_ns = raw.host_receive_t_ns - recorded[0].host_receive_t_ns[0] + zero_ns
             writer.add_message("fantwin/imported/tray1/raw", replace(raw, host_receive_t_ns=t_ns), int(t_ns[-1]))
-    for part in ((), ("--start", "1")):
-        document = json.loads(replay("--json", table, "--twin", twin, *part).stdout)
-        (alarm,) = document["alarms"]
-        assert document["start_ns"] == zero_ns
-        lines = replay(table, "--twin", twin, *part).stdout.splitlines()
-        assert lines[0] == "alarms, s since the first sample" and "1970" not in "".join(lines)
-        (row,) = [line for line in lines if line.lstrip().startswith("tray1")]
-        assert f" {(alarm['raised_ns'] - zero_ns) / NS_PER_S:.2f} " in row
+    document = json.loads(replay("--json", table, "--twin", twin, *part).stdout)
+    (alarm,) = document["alarms"]
+    assert document["start_ns"] == zero_ns
+    lines = replay(table, "--twin", twin, *part).stdout.splitlines()
+    assert lines[0] == "alarms, s since the first sample" and "1970" not in "".join(lines)
+    (row,) = [line for line in lines if line.lstrip().startswith("tray1")]
+    assert f" {(alarm['raised_ns'] - zero_ns) / NS_PER_S:.2f} " in row
     shown = fantwin("info", table).stdout
     assert f"from {zero_ns / NS_PER_S:.3f} s to" in shown and "1970" not in shown
 
@@ -277,11 +242,6 @@ def test_a_truncated_recording_is_judged_as_far_as_it_can_be_read_exit_code_3(tm
     assert "is truncated" in json.loads(result.stdout)["damage"][0]
 
 
-def test_a_file_that_is_not_there_is_one_line():
-    result = fantwin_process("replay", "--offline", "nothing.mcap")
-    assert result.returncode == 1 and len(result.stderr.strip().splitlines()) == 1
-
-
 def test_a_twin_that_is_set_by_a_key_is_the_one_that_judges(tmp_path):
     other = write_twin(tmp_path / "other.onnx", fans=1)
     by_option, by_key = (
@@ -290,8 +250,3 @@ def test_a_twin_that_is_set_by_a_key_is_the_one_that_judges(tmp_path):
     )
     assert by_key["alarms"] == by_option["alarms"] and by_key["what_if"]["gained"]
     assert "correct --twin" in error(GOLDEN, "--twin", tmp_path / "none.onnx")
-
-
-def test_the_output_goes_from_second_to_second(output):
-    sizes = [len(entry.message.t_ns) for entry in read_recording(output, ("grid", "prediction", "score"))]  # type: ignore[union-attr]
-    assert max(sizes) == 100

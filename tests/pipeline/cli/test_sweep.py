@@ -29,11 +29,10 @@ from pipeline.errors import UserError
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.runtime.device_commands import DeviceCommands
 from schemas.codec import decode
-from schemas.enums import StageStatus
-from schemas.header import Header
 from schemas.health import Counter, Health, Input, Note
 from schemas.messages import Command
-from tests.support.fantwin_command import error_of, usage_error_of
+from tests.support.fantwin_command import error_of
+from tests.support.made_up_health import health_of
 from tests.support.running_chain import DEMO
 
 PERIOD_S = 0.1
@@ -82,7 +81,7 @@ def swept(line: FirstOrderFans, rounds: int = 1, low: float = 0.2, high: float =
     return Excitation(line, list(fans), low, high, rounds, said.append).run(), said
 
 
-@pytest.mark.parametrize("slowest_s", [0.4, 1.5, 6.0])
+@pytest.mark.parametrize("slowest_s", [0.4, 6.0])
 def test_each_level_lasts_until_the_slowest_fan_has_settled(slowest_s: float) -> None:
     line = FirstOrderFans([slowest_s / 2, slowest_s])
     found, said = swept(line)
@@ -95,23 +94,21 @@ def test_each_level_lasts_until_the_slowest_fan_has_settled(slowest_s: float) ->
     assert said[-1].startswith("step 23 of 23: command ")
 
 
-def test_all_levels_of_the_range_are_passed_and_none_outside() -> None:
-    line = FirstOrderFans([0.5])
+@pytest.mark.parametrize("fans", [1, 2, 5, 8])
+def test_each_fan_passes_all_levels_of_the_range_and_the_load_of_all_does_not_follow_any_one_of_them(
+    fans: int,
+) -> None:
+    line = FirstOrderFans([0.5] * fans)
     swept(line, rounds=2)
     values = [value for _, sent in line.sent for value in sent.values()]
     assert (min(values), max(values)) == (0.2, 1.0)
     assert len(set(np.round(values, 3))) >= 15
-
-
-@pytest.mark.parametrize("fans", [2, 3, 4, 5, 6, 7, 8])
-def test_the_load_of_all_fans_does_not_follow_any_one_of_them(fans: int) -> None:
-    line = FirstOrderFans([0.5] * fans)
-    swept(line)
     commands = np.array([[sent[fan] for fan in range(fans)] for _, sent in line.sent[3:]])
-    for levels, rows in ((LEVELS, slice(len(LEVELS))), (SHORT_LEVELS, slice(len(LEVELS), None))):
+    for levels, rows in ((LEVELS, slice(len(LEVELS))), (SHORT_LEVELS, slice(len(LEVELS), len(commands) // 2))):
         for of_fan in commands[rows].T:
             assert sorted(of_fan) == pytest.approx(sorted(0.2 + 0.8 * level for level in levels))
-        assert commands[rows].mean(axis=1).std() < 0.6 * commands[rows, 0].std()
+        if fans > 1:
+            assert commands[rows].mean(axis=1).std() < 0.6 * commands[rows, 0].std()
 
 
 def test_ctrl_c_ends_it_at_once() -> None:
@@ -131,12 +128,11 @@ def test_a_fan_that_does_not_follow_is_named_and_the_others_go_on() -> None:
     assert "fan 1: does not follow its command" in said
 
 
-@pytest.mark.parametrize("missing", [[0], [-1], [0, 30, 55, -1]])
-def test_readings_that_are_missing_hide_no_fan(missing: list[int]) -> None:
+def test_readings_that_are_missing_hide_no_fan() -> None:
     t_s = np.arange(60) * PERIOD_S
     whole = (300.0 * (1.0 - np.exp(-t_s / 0.5)))[:, np.newaxis]
     holed = whole.copy()
-    holed[missing] = np.nan
+    holed[[0, 30, 55, -1]] = np.nan
     assert has_settled(t_s, holed)
     assert time_constants(t_s, holed) == pytest.approx(time_constants(t_s, whole), abs=2 * PERIOD_S)
 
@@ -148,67 +144,10 @@ def test_where_something_else_sets_the_command_it_says_so() -> None:
         swept(line)
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("--low 0.5 --high 0.4", "name a range within 0 to 1 of tray tray1"),
-        ("--high 255", "--high 255: name a range within 0 to 1 of tray tray1"),
-        ("--fans 0,8", "tray tray1 has fans 0 to 7"),
-        ("--fans both", "write all, or numbers with commas"),
-        ("--safe 2", "--safe 2: the command must be within 0 to 1"),
-    ],
-)
-def test_what_the_tray_cannot_do_is_refused_in_one_line(words: str, expected: str) -> None:
-    assert expected in error_of("sweep", "-c", DEMO / "demo.toml", *words.split())
-
-
-@pytest.mark.parametrize(
-    ("words", "error"),
-    [
-        ("--low 1", "--low 1: name a range within 0 to 1 of tray tray1"),
-        ("--high 0", "--high 0: name a range within 0 to 1 of tray tray1"),
-        (
-            "--high 0.1",
-            "--high 0.1: name --low, too: without it tray tray1 is swept from 0.2, because fans may stop below",
-        ),
-        (
-            "--high 0.2",
-            "--high 0.2: name --low, too: without it tray tray1 is swept from 0.2, because fans may stop below",
-        ),
-    ],
-)
-def test_only_options_that_were_given_are_refused(words: str, error: str) -> None:
-    assert usage_error_of("sweep", "-c", DEMO / "demo.toml", *words.split()) == error
-
-
-UNCOMMANDED = [
-    ('kind = "push"', "the program that pushes its samples moves the fans"),
-    ('kind = "http"', "the program that posts its samples moves the fans"),
-    ('kind = "mqtt", host = "broker", topic = "t"', "its source names no send_topic"),
-    ('kind = "hwmon", chip = "nct6798"', "its source does not have writable = true"),
-    ('kind = "redfish", url = "https://bmc"', "fans behind Redfish are only read"),
-]
-
-
 def configured(folder: Path, source: str) -> Path:
     path = folder / "fantwin.toml"
     path.write_text(f'[[tray]]\nname = "tray1"\nfans = 1\nspeed_unit = "rpm"\nsource = {{ {source} }}\n')
     return path
-
-
-@pytest.mark.parametrize(("source", "reason"), UNCOMMANDED)
-def test_a_tray_that_takes_no_commands_is_not_swept_and_one_line_says_what_to_do_instead(
-    tmp_path: Path, source: str, reason: str
-) -> None:
-    path = configured(tmp_path, source)
-    for words, instead in (
-        (("sweep",), "run `fantwin up` while the fans' own controller varies their commands; it is recorded"),
-        (("commission", "--sweep"), "leave out --sweep, and let the fans' own controller vary their commands"),
-        (("command", "--fan", "0", "0.5"), ""),
-    ):
-        error = error_of(words[0], "-c", path, *words[1:])
-        assert f"tray tray1 takes no commands ({reason})" in error
-        assert instead in error
 
 
 @pytest.mark.parametrize(
@@ -283,17 +222,9 @@ class AcquisitionOfRefusals:
             key="", producer=self.producer, received=self.published, missing=0, duplicated=0, next_sequence=0
         )
         texts = (f"refused input: garbage {self.published}", *self.commands.notes())
-        return Health(
-            header=Header("acquisition-1", 1, ""),
-            stage="acquisition",
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=1,
-            uptime_s=0.0,
-            inputs=(received,),
-            counters=tuple(Counter(name=name, value=value) for name, value in self.commands.counts.items()),
-            notes=tuple(Note(tray="tray1", text=text) for text in texts),
-        )
+        counters = tuple(Counter(name=name, value=value) for name, value in self.commands.counts.items())
+        notes = tuple(Note(tray="tray1", text=text) for text in texts)
+        return health_of("acquisition-1", "acquisition", 1, inputs=(received,), counters=counters, notes=notes)
 
 
 def line_to(acquisition: AcquisitionOfRefusals, monkeypatch: pytest.MonkeyPatch) -> sweep_module._BusLine:

@@ -1,0 +1,67 @@
+"""Recordings and twins that tests of several commands share, made once a session."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.fantwin_command import fantwin
+from tests.support.healthy_site import EPOCH_NS, PER_DAY, simulated
+
+MadeOnce = Callable[[str, Callable[[Path], None]], Path]
+
+
+@pytest.fixture(autouse=True)
+def _restored_signals() -> Iterator[None]:
+    """Commands run in the process of their tests: puts back its signal handlers."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
+    """The folder of a name, filled by whichever worker needs it first. Tests must not change what is in it."""
+    own = tmp_path_factory.getbasetemp()
+    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "made-once"
+    shared.mkdir(exist_ok=True)
+
+    def made(name: str, make: Callable[[Path], None]) -> Path:
+        folder, done = shared / name, shared / f"{name}.done"
+        with (shared / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                folder.mkdir()
+                make(folder)
+                done.touch()
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def healthy(made_once: MadeOnce) -> Path:
+    """Four recordings of two simulated fans, one of them with a fault of fan 1; their twin; the twin with limits, and
+    the JSON of its calibration."""
+
+    def make(folder: Path) -> None:
+        for seed, name, seconds in ((1, "training", 60), (2, "healthy", 120), (3, "other", 60)):
+            simulated(folder / f"{name}.mcap", seed, seconds)
+        simulated(folder / "faulty.mcap", 5, 60, "--fault", "inlet:fan=1,start=20,stop=50,size=1.6")
+        twin, calibrated = folder / "twin.onnx", folder / "calibrated.onnx"
+        for words in (
+            ("train", folder / "training.mcap", "--model", "physical", "-o", twin),
+            ("calibrate", twin, folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY, "-o", calibrated,
+             "--verify", folder / "other.mcap", "--json"),
+        ):  # fmt: skip
+            result = fantwin(*map(str, words))
+            assert result.exit_code == 0, result.output
+        (folder / "calibrated.json").write_text(result.stdout)
+
+    return made_once(f"healthy-{EPOCH_NS}", make)
