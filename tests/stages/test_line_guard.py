@@ -118,6 +118,13 @@ def test_row_02_a_second_acquisition_with_a_fast_clock_moves_nothing() -> None:
     assert "acquisition-fast" in core.problem()
 
 
+def test_row_02_a_report_ends_a_minute_later() -> None:
+    core = core_of()
+    (forged,) = shifted(iter([sample(1, producer="acquisition-forged")]), 3600.0)
+    grid_of(core, line(0, 5), [forged], line(5, 70))
+    assert core.problem() == ""
+
+
 def test_row_02_acquisition_that_returns_after_some_time_is_the_line_again() -> None:
     core, away_s = core_of(), 5.0
     grid = grid_of(core, line(0, 20), line(20 + away_s, 40 + away_s, producer="acquisition-b"))
