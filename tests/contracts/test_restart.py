@@ -108,12 +108,8 @@ def scored(core: ScorerCore, item: Any) -> list[Any]:
             names = [name for name, column in columns(Score).items() if not column.optional]
             made.append([(name, getattr(message, name).tobytes()) for name in names])
         elif isinstance(message, Alarm) and message.transition != Transition.DIAGNOSED:
-            numbers = (
-                dict.fromkeys(("residual_rad_s", "score", "torque_balance_command"), 0.0) if message.request else {}
-            )
-            made.append(
-                repr(replace(message, causes=(), message="", **numbers))
-            )  # an answer has those of the last cause
+            of_last_cause = ("residual_rad_s", "score", "torque_balance_command") if message.request else ()
+            made.append(repr(replace(message, causes=(), message="", **dict.fromkeys(of_last_cause, 0.0))))
     return made
 
 
@@ -165,6 +161,7 @@ KINDS = SCORERS | PARTS
 
 @pytest.fixture(autouse=True)
 def quiet() -> Iterator[None]:
+    """Samples that are no numbers are part of the runs."""
     with np.errstate(all="ignore"):
         yield
 
@@ -194,16 +191,7 @@ def test_one_that_is_cut_anywhere_goes_on_as_if_it_had_not_been(name: str) -> No
 def test_these_runs_raise_and_clear_alarms_answer_operators_and_measure_wear() -> None:
     """Else the claims would be of little."""
     emitted = repr(played(SCORERS["scorer"], eventful())[0])
-    wanted = (
-        "RAISED",
-        "CLEARED",
-        "ACKNOWLEDGED",
-        "MARKED_FALSE",
-        "SHELVED",
-        "UNSHELVED",
-        "SUPPRESSED",
-        "COMMISSIONING",
-    )
+    wanted = ("RAISED", "CLEARED", "ACKNOWLEDGED", "MARKED_FALSE", "SHELVED", "SUPPRESSED", "COMMISSIONING")
     assert [each for each in wanted if f"<Transition.{each}:" not in emitted] == []
     (*_, wear) = played(SCORERS["scorer over days"], days())[1]
     assert all(len(fan["parameters"]["friction"]["series"]["t_ns"]) > 3 for fan in wear["fans"])
@@ -212,17 +200,29 @@ def test_these_runs_raise_and_clear_alarms_answer_operators_and_measure_wear() -
 def damaged(state: Any) -> Iterator[Any]:
     """A snapshot without one of its parts, or with something else in its place."""
     yield from ({}, [], None, "x")
-    for key, value in state.items():
+    needed = {key: value for key, value in state.items() if key != "command_unit"}  # which is for people
+    for key, value in needed.items():
         yield {other: each for other, each in state.items() if other != key}
         yield state | {key: "x"}
         if isinstance(value, list):
             yield state | {key: value[:-1]}
 
 
-@pytest.mark.parametrize("name", PARTS)
+class Wear:
+    """What a scorer knows of wear, as a part of its own."""
+
+    def __init__(self, fans: int) -> None:
+        self.core = core_of(fans, calibration=CALIBRATION, off_delay_s=1.0)
+        self.snapshot, self.restore = self.core.tray.wear.snapshot, self.core.tray.wear.restore
+
+
+REFUSING = PARTS | {"wear": Kind(Wear, days, lambda one, item: one.core.step(item))}
+
+
+@pytest.mark.parametrize("name", REFUSING)
 def test_a_part_refuses_a_damaged_or_foreign_snapshot_and_keeps_its_state(name: str) -> None:
-    kind = PARTS[name]
-    items = kind.items()[:10]
+    kind = REFUSING[name]
+    items = kind.items()[:4]
     one, foreign = kind.new(FANS), kind.new(FANS + 1)
     for item in items:
         kind.take(one, item)
@@ -251,10 +251,8 @@ def not_understood(state: dict[str, Any]) -> Iterator[str]:
 
 def of_fans(item: Prediction, fans: int) -> Prediction:
     """The same of the first fans only."""
-    changed = {
-        name: getattr(item, name)[..., :fans] for name, column in columns(Prediction).items() if "fans" in column.shape
-    }
-    return replace(item, fans=fans, **changed)
+    names = [name for name, column in columns(Prediction).items() if "fans" in column.shape]
+    return replace(item, fans=fans, **{name: getattr(item, name)[..., :fans] for name in names})
 
 
 @pytest.mark.parametrize("fans", [FANS, FANS - 1])
