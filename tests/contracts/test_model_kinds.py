@@ -19,7 +19,7 @@ from twin.kinds import KINDS
 from twin.runs import Array
 
 MOST_ITERATIONS = 2
-RUN = fan_data.rough_run(1, 12.0, fans=2)
+RUN = fan_data.rough_run(1, 6.0, fans=2)
 every_kind = pytest.mark.parametrize("kind", [row.name for row in KINDS])
 Advance = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 

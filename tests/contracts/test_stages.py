@@ -55,7 +55,7 @@ from tests.support.twin_files import write_twin
 FANS = 2
 TRAYS = (TrayConfig(name="tray1", fans=FANS),)
 TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
-NO_SLOW_CHECK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+NO_SLOW_CHECK = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @pytest.mark.parametrize("row", STAGES.values(), ids=str)
@@ -152,7 +152,7 @@ def test_a_core_survives_any_message_of_its_topics_and_makes_the_same_of_the_sam
     assert made == again
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     st.sampled_from([1, 1000, 10_000_000, 1_000_000_000]),
     st.lists(st.tuples(st.floats(allow_nan=True), st.floats(allow_nan=True)), min_size=1, max_size=20),
@@ -168,7 +168,7 @@ def test_a_fan_of_any_speed_and_command_is_diagnosed(period_ns: int, values: lis
     survives(core, load_stage("scorer"), [prediction_of(np.zeros(3), first=-9, period_ns=period_ns), arbitrary])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(any_message(ScorerSnapshot))
 def test_the_scorer_survives_any_snapshot(memory: ScorerSnapshot) -> None:
     core = core_of(FANS)

@@ -19,8 +19,8 @@ SUPPLY_V = (10.5, 13.2)
 
 def test_a_twin_learns_the_supply_from_the_column_of_the_board(tmp_path: Path) -> None:
     trained, held_out = tmp_path / "trained.csv", tmp_path / "held-out.csv"
-    run_board(trained, [Staircase(FANS, 1, LOW, HIGH), Prbs(FANS, 3, 0.3, 0.9)], 40, SUPPLY_V)
-    run_board(held_out, [Multisine(FANS, 12, LOW, HIGH)], 40, SUPPLY_V)
+    run_board(trained, [Staircase(FANS, 1, LOW, HIGH), Prbs(FANS, 3, 0.3, 0.9)], 24, SUPPLY_V)
+    run_board(held_out, [Multisine(FANS, 12, LOW, HIGH)], 24, SUPPLY_V)
     rmse_rpm: dict[str, float] = {}
     for with_supply in (True, False):
         name = "with" if with_supply else "without"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 import struct
 import zlib
 from collections.abc import Iterable
@@ -65,21 +64,14 @@ def feed_sequences(core: SerialCore, sequences: Iterable[int]) -> list[int]:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_sample_becomes_a_raw_message_with_both_clocks(protocol: Protocol) -> None:
-    core = make_core(protocol=protocol)
-    (raw,) = feed(core, [sample(7, clock_us=123)], protocol, t_ns=5 * S)
-    assert raw.fans == 2
-    assert raw.host_receive_t_ns.tolist() == [5 * S]
-    assert raw.device_clock_us.tolist() == [123]
-    assert raw.device_sequence.tolist() == [7]
+def test_a_sample_becomes_a_raw_message_with_both_clocks_and_its_speed_in_rad_per_second(protocol: Protocol) -> None:
+    core = make_core(protocol=protocol, speed_unit="rpm")
+    (raw,) = feed(core, [sample(7, clock_us=123, speed=60.0)], protocol, t_ns=5 * S)
+    assert (raw.fans, raw.host_receive_t_ns.tolist()) == (2, [5 * S])
+    assert (raw.device_clock_us.tolist(), raw.device_sequence.tolist()) == ([123], [7])
     assert raw.command.tolist() == [[0.5, 0.25]]
-    assert raw.speed_rad_s.tolist() == [[100.0, 50.0]]
+    assert raw.speed_rad_s[0] == pytest.approx([2 * math.pi, 2 * math.pi * 50 / 60], rel=1e-15)
     assert core.counters()["samples"] == 1
-
-
-def test_speed_in_rpm_on_the_line_is_rad_per_second_in_the_message() -> None:
-    (raw,) = feed(make_core(speed_unit="rpm"), [sample(0, speed=60.0)])
-    assert raw.speed_rad_s[0, 0] == pytest.approx(2 * math.pi, rel=1e-15)
 
 
 def test_samples_that_arrive_together_share_the_time_at_which_they_arrived() -> None:
@@ -88,15 +80,6 @@ def test_samples_that_arrive_together_share_the_time_at_which_they_arrived() -> 
     assert core.step(ReceivedBytes(data[:10], S)) == []
     messages = core.step(ReceivedBytes(data[10:], 2 * S))
     assert [raw.host_receive_t_ns.tolist() for raw in messages] == [[2 * S] * 3]
-
-
-def test_refused_input_is_named_by_kind_with_what_was_wrong_with_the_first() -> None:
-    core = make_core()
-    assert core.notes() == []
-    feed(core, [sample(0), sample(1, command=7.0), sample(2, command=8.0), sample(3)])
-    assert core.notes() == [
-        "refused input: absurd_command 2, the first of them: command 7 is outside command_min = 0 to command_max = 1"
-    ]
 
 
 def feed_times(core: SerialCore, times_ms: Iterable[int]) -> list[tuple[int, list[int]]]:
@@ -116,18 +99,6 @@ def test_a_message_holds_the_samples_of_a_time_and_ends_with_the_last_that_is_ex
     assert core.close() == []
 
 
-@pytest.mark.parametrize(("block_s", "period_ms"), [(0.05, 50), (0.05, 500), (0.0, 1)])
-def test_a_line_without_a_second_sample_in_that_time_waits_for_nothing(block_s: float, period_ms: int) -> None:
-    times_ms = range(0, 10 * period_ms, period_ms)
-    assert [t_ms for t_ms, _ in feed_times(make_core(block_s=block_s), times_ms)] == [*times_ms]
-
-
-def test_a_message_of_a_fast_line_has_4096_samples_at_most() -> None:
-    core = make_core(block_s=1.0)
-    data = b"".join(encode("binary", sample(i)) for i in range(5000))
-    assert [len(raw.host_receive_t_ns) for raw in core.step(ReceivedBytes(data, S))] == [4096, 904]
-
-
 def test_a_device_without_clock_and_sequence_has_empty_columns_and_loses_nothing() -> None:
     core = make_core(protocol="text", block_s=0.05)
     frames = sample(None), sample(None), sample(5), sample(6), sample(7)
@@ -138,29 +109,21 @@ def test_a_device_without_clock_and_sequence_has_empty_columns_and_loses_nothing
     assert core.counters().get("lost_on_line", 0) == 0
 
 
-@pytest.mark.parametrize("fan", [0, 1])
-def test_a_missing_reading_stays_missing_and_is_counted(fan: int) -> None:
+def test_a_reading_of_any_source_whose_command_is_no_number_is_refused() -> None:
     core = make_core()
-    (raw,) = feed(core, [Sample(0, 0, (0.5, 0.25), (math.nan, 50.0) if fan == 0 else (50.0, math.nan))])
-    assert np.isnan(raw.speed_rad_s).tolist() == [[fan == 0, fan == 1]]
-    assert core.counters()["no_speed"] == 1
+    for command in ((0.5, math.nan), (math.inf, 0.5)):
+        assert core.step(ReadingBatch(S, (Reading(command, (50.0, 50.0)),))) == []
+    assert core.counters()["absurd_command"] == 2
 
 
-@pytest.mark.parametrize("command", [(0.5, math.nan), (math.nan, 0.5), (0.5, math.inf)])
-def test_a_reading_of_any_source_whose_command_is_no_number_is_refused(command: tuple[float, float]) -> None:
-    core = make_core()
-    assert core.step(ReadingBatch(S, (Reading(command, (50.0, 50.0)),))) == []
-    assert core.counters()["absurd_command"] == 1
-
-
-@pytest.mark.parametrize("speed", [1001.0, -1001.0, math.inf, -math.inf])
-def test_an_absurd_speed_removes_the_reading_of_that_fan_only(speed: float) -> None:
+@pytest.mark.parametrize("speed", [1001.0, -math.inf, math.nan])
+def test_a_speed_that_is_absurd_or_missing_is_none_of_that_fan_only_and_is_counted(speed: float) -> None:
     core = make_core(speed_max=1000)
     (raw,) = feed(core, [sample(0, speed=speed)])
     assert np.isnan(raw.speed_rad_s).tolist() == [[True, False]]
     assert raw.command.tolist() == [[0.5, 0.25]]
-    assert core.counters()["absurd_speed"] == 1
-    assert core.counters()["no_speed"] == 0
+    counts = core.counters()
+    assert (counts.get("absurd_speed", 0), counts["no_speed"]) == ((0, 1) if math.isnan(speed) else (1, 0))
 
 
 def test_an_absurd_command_removes_the_sample_and_shows_as_a_loss() -> None:
@@ -170,6 +133,8 @@ def test_an_absurd_command_removes_the_sample_and_shows_as_a_loss() -> None:
     assert core.counters()["absurd_command"] == core.counters()["refused_input"] == 1
     assert core.counters()["lost_on_line"] == 1
     assert core.counters().get("lost_refused", 0) == 0
+    why = "command 0.91 is outside command_min = 0 to command_max = 0.9"
+    assert core.notes() == [f"refused input: absurd_command 1, the first of them: {why}"]
 
 
 @pytest.mark.parametrize("sequences", [range(50), [None] * 50], ids=["numbered", "unnumbered"])
@@ -190,7 +155,7 @@ def test_a_refused_sample_is_counted_as_lost_once_and_a_corrupt_number_is_not_be
     assert core.counters()["device_restarts"] == 1
 
 
-@pytest.mark.parametrize("last", [100, 1_000_000, 3_000_000_000, 4_000_000_000])
+@pytest.mark.parametrize("last", [100, 4_000_000_000])
 def test_a_device_restart_is_not_a_loss_of_four_billion(last: int) -> None:
     core = make_core()
     assert feed_sequences(core, [last, last + 1, 0, 1, 2]) == [last, last + 1, 0, 1, 2]
@@ -240,38 +205,17 @@ def device_counts(core: SerialCore) -> dict[str, int]:
     return {name: count for name, count in core.counters().items() if name in names and count}
 
 
-def test_what_the_device_counts_is_counted_since_the_line_was_opened() -> None:
+def test_what_the_device_counts_is_counted_since_the_line_was_opened_and_from_0_after_its_restart() -> None:
     core = make_core()
     feed(core, [DeviceCounters(70, (9, 65_530, 4))])
     assert device_counts(core) == {}
     assert core.counters()["device_bad_crc"] == 0, "it is known to be none"
     feed(core, [sample(1), DeviceCounters(71, (9, 65_533, 4)), sample(2), DeviceCounters(72, (10, 2, 4))])
     assert device_counts(core) == {"device_frames": 1, "device_bad_length": 8}
-    assert core.counters()["samples"] == 2
-    assert core.problem() == ""
-
-
-def test_a_device_that_restarts_counts_from_0_again() -> None:
-    core = make_core()
-    feed(
-        core, [DeviceCounters(70, (9,) * 12), DeviceCounters(0, (0,) * 11 + (1,)), DeviceCounters(1, (0,) * 11 + (1,))]
-    )
-    assert device_counts(core) == {"device_watchdog_resets": 1}
-
-
-def test_what_the_device_counts_while_the_line_is_closed_is_not_counted_unless_it_restarts() -> None:
-    core = make_core()
-    feed(core, [DeviceCounters(70, (0, 0, 5))])
-    for frame, counted in (
-        (DeviceCounters(90, (0, 0, 3)), {}),
-        (DeviceCounters(1, (0, 0, 2)), {"device_bad_crc": 2}),
-    ):
-        core.step(LinkDown("gone"))
-        core.step(LinkUp())
-        feed(core, [frame])
-        assert device_counts(core) == counted
-    feed(core, [DeviceCounters(2, (0, 0, 3))])
-    assert device_counts(core) == {"device_bad_crc": 3}
+    assert (core.counters()["samples"], core.problem()) == (2, "")
+    once = (0,) * 11 + (1,)
+    feed(core, [DeviceCounters(0, once), DeviceCounters(1, once)])
+    assert device_counts(core)["device_watchdog_resets"] == 1
 
 
 def command(*values: float, set_point: tuple[float, ...] = (), fans: int = 2) -> Command:
@@ -295,14 +239,9 @@ def test_commands_and_set_points_are_sent_in_the_unit_of_the_tray(protocol: Prot
     ("refused", "reason"),
     [
         (command(1.5, 0.5), "the command of fan 0 is 1.5, outside 0 to 1"),
-        (command(0.5, -0.1), "the command of fan 1 is -0.1, outside 0 to 1"),
-        (command(math.inf, 0.5), "the command of fan 0 is inf, outside 0 to 1"),
-        (
-            command(0.5, 0.5, set_point=(2000.0, 0.0)),
-            "the set-point of fan 0 is 2000 rad/s, outside -1000 to 1000 rad/s",
-        ),
+        (command(0.5, -math.inf), "the command of fan 1 is -inf, outside 0 to 1"),
+        (command(0.5, 0.5, set_point=(2e3, 0.0)), "the set-point of fan 0 is 2000 rad/s, outside -1000 to 1000 rad/s"),
         (command(0.5, fans=1), "it is for 1 fans, the tray has 2"),
-        (command(0.5, 0.5, 0.5, fans=3), "it is for 3 fans, the tray has 2"),
     ],
 )
 def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_counted_with_the_reason(
@@ -318,36 +257,26 @@ def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_coun
     assert core.notes() == [f"2 commands refused, the last one: {reason}"]
 
 
-def test_a_command_that_was_not_written_is_counted_as_lost() -> None:
-    link = FakeLink()
-    link.up = False
-    core = make_core(link)
-    core.step(command(0.5, 0.5))
-    assert core.counters()["lost_commands"] == 1
-    assert core.notes()[0].startswith("1 command not taken by the device: ")
-
-
-def test_a_command_that_changes_nothing_is_not_sent() -> None:
+def test_a_command_that_was_not_written_is_lost_and_one_that_changes_nothing_is_not_sent() -> None:
     link = FakeLink()
     core = make_core(link)
     core.step(command(math.nan, math.nan))
     core.step(command())
     assert (link.written, dict(core.counters())) == (b"", {"line_up": 1})
+    link.up = False
+    core.step(command(0.5, 0.5))
+    assert core.counters()["lost_commands"] == 1
+    assert core.notes()[0].startswith("1 command not taken by the device: ")
 
 
-def test_a_line_that_is_down_is_a_problem_until_it_is_up_and_sends() -> None:
+def test_a_line_that_is_down_or_silent_for_two_seconds_is_a_problem_until_it_sends() -> None:
     core = make_core()
-    core.step(LinkDown("no such port; waiting for it; check [[tray]] port"))
-    assert core.problem() == "/dev/ttyTEST: no such port; waiting for it; check [[tray]] port"
-    core.step(LinkDown("not allowed"))
-    assert core.problem() == "/dev/ttyTEST: not allowed"
+    for reason in ("no such port; waiting for it; check [[tray]] port", "not allowed"):
+        core.step(LinkDown(reason))
+        assert core.problem() == f"/dev/ttyTEST: {reason}"
     core.step(LinkUp())
     assert core.problem() == ""
     assert core.counters()["line_down"] == 1
-
-
-def test_a_silent_line_is_a_problem_after_two_seconds_and_not_before() -> None:
-    core = make_core()
     feed(core, [sample(0)], t_ns=S)
     core.tick(3 * S)
     assert core.problem() == ""
@@ -364,33 +293,11 @@ def test_a_line_without_a_valid_frame_is_a_problem_that_names_the_setting() -> N
         core.step(ReceivedBytes(encode("binary", Sample(1, 1, (0.5,), (1.0,))), second * S))
     fault = "wrong_fan_count: frame of 1 fans, this tray has 2"
     assert core.problem() == f"/dev/ttyTEST: no valid sample ({fault}); check fans = 2 of the [[tray]]"
-
-
-def test_samples_outside_the_limits_of_the_tray_are_one_problem_whatever_their_values() -> None:
-    core = make_core()
-    problems = set()
-    for number in range(400):
-        feed(core, [sample(number, command=100.0 + number % 50)], t_ns=number * S // 10)
-        core.tick(number * S // 10)
-        problems.add(core.problem())
-    fault = "absurd_command: command 100 is outside command_min = 0 to command_max = 1"
-    expected = f"/dev/ttyTEST: no valid sample ({fault}); check command_min and command_max of the [[tray]]"
-    assert problems == {"", expected}
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_noise_on_the_line_is_one_problem_whatever_it_looks_like(protocol: Protocol) -> None:
-    chance, core = random.Random(3), make_core(protocol=protocol)
-    problems = set()
-    for number in range(600):  # a minute
-        t_ns = number * S // 10
-        core.step(ReceivedBytes(chance.randbytes(40), t_ns))
-        if chance.random() < 0.3:
-            feed(core, [sample(number)], protocol, t_ns)
-        core.tick(t_ns)
-        problems.add(core.problem())
-    assert len(problems - {""}) <= 3, problems
-    assert all("check " in problem for problem in problems - {""})
+    absurd = make_core()
+    for number in range(30):
+        feed(absurd, [sample(number, command=100.0)], t_ns=number * S // 10)
+        absurd.tick(number * S // 10)
+    assert absurd.problem().endswith("; check command_min and command_max of the [[tray]]")
 
 
 def test_mostly_faulty_frames_are_a_problem_although_some_are_valid() -> None:

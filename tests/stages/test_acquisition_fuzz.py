@@ -31,7 +31,6 @@ from tests.support.serial_core import FakeLink, SerialCore
 
 FANS = 2
 PROTOCOLS: tuple[Protocol, ...] = ("binary", "text")
-DELIMITER = {"binary": b"\0", "text": b"\n"}
 FIRST_SEQUENCE = 2**32 - 32  # the sequence wraps within the pool
 
 
@@ -180,9 +179,9 @@ def check_one_stream(protocol: Protocol, pool: list[tuple[Sample, bytes]], chanc
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_thousand_mutated_streams_are_counted_to_the_last_frame(protocol: Protocol) -> None:
+def test_mutated_streams_are_counted_to_the_last_frame(protocol: Protocol) -> None:
     chance, pool = random.Random(20), make_pool(protocol)
-    for _ in range(1000):
+    for _ in range(300):
         check_one_stream(protocol, pool, chance)
 
 
@@ -195,21 +194,8 @@ def test_no_bytes_and_no_disconnection_make_the_core_raise(protocol: Protocol, p
             core.step(LinkDown("gone"))
             core.step(LinkUp())
         else:
-            core.step(ReceivedBytes(piece, i))
+            for raw in core.step(ReceivedBytes(piece, i)):
+                assert raw.speed_rad_s.shape == raw.command.shape == (len(raw.host_receive_t_ns), FANS)
         core.tick(i * 1_000_000_000)
         assert isinstance(core.problem(), str)
     core.close()
-
-
-@given(
-    numbers=st.lists(
-        st.one_of(
-            st.floats().map(repr), st.integers().map(str), st.sampled_from(["-", "nan", "ovf", "1e999", "", "x"])
-        ),
-        max_size=10,
-    )
-)
-def test_no_numbers_in_a_text_line_make_the_core_raise(numbers: list[str]) -> None:
-    core = make_core("text")
-    for raw in core.step(ReceivedBytes(f"\nS {' '.join(numbers)}\n".encode(), 0)):
-        assert raw.speed_rad_s.shape == raw.command.shape == (1, FANS)

@@ -46,10 +46,7 @@ def pushed(client: str = "a", t_ns: tuple[int, ...] = (1, 2), **change: object) 
         ({"t_ns": (2, 1)}, "time_order"),
         ({"newest_t_ns": 0}, "absurd_age"),
         ({"newest_t_ns": (1 << 63) - 1}, "absurd_age"),
-        ({"newest_t_ns": -(1 << 63)}, "absurd_age"),
         ({"fans": 1, "command": np.zeros((2, 1)), "speed_rad_s": np.zeros((2, 1))}, "wrong_fan_count"),
-        ({"fans": 0, "command": np.zeros((2, 0)), "speed_rad_s": np.zeros((2, 0))}, "wrong_fan_count"),
-        ({"command": np.full((2, 2), np.nan)}, "absurd_command"),
         ({"command": np.full((2, 2), np.inf)}, "absurd_command"),
     ],
 )
@@ -60,14 +57,11 @@ def test_samples_that_cannot_be_used_are_counted_by_kind(tmp_path: Path, change:
     assert (counts[kind], counts["lost_refused"], counts["refused_input"]) == (2, 2, 2)
 
 
-def test_samples_for_a_tray_with_another_source_are_refused(tmp_path: Path) -> None:
+def test_only_a_tray_whose_samples_are_pushed_reads_and_takes_them(tmp_path: Path) -> None:
     core = make_core(tmp_path, source='{ kind = "serial", port = "/dev/ttyUSB0" }')
     assert core.step(pushed()) == []
     assert core.counters()["refused_readings"] == 2
     assert core.accepts() is None
-
-
-def test_only_a_site_with_pushed_trays_reads_them(tmp_path: Path) -> None:
     pushes = push_config("tcp/127.0.0.1:7447", tmp_path)
     serial = push_config("tcp/127.0.0.1:7447", tmp_path, source='{ kind = "serial" }')
     assert STAGE.reads_as_configured(pushes) == ("command", "reading")

@@ -7,7 +7,7 @@ import json
 import socket
 import ssl
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from pipeline.gateway import server
-from pipeline.gateway.config import GatewayConfig
 from pipeline.gateway.shared_answer import SharedAnswer
 from pipeline.presenting import login_failures
 from pipeline.presenting.users import UserRole
@@ -45,12 +44,8 @@ def users(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def gateway(tmp_path: Path, users: Path) -> Iterator[RunningGateway]:
-    running = RunningGateway(tmp_path, granted, users=users)
-    try:
-        yield running
-    finally:
-        running.close()
+def gateway(opened: Callable[..., RunningGateway], tmp_path: Path, users: Path) -> RunningGateway:
+    return opened(tmp_path, granted, users=users)
 
 
 def logged_in(gateway: RunningGateway, name: str = "ann") -> Client:
@@ -70,7 +65,7 @@ def said(capfd: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
     return [json.loads(text) for before, sign, text in lines if sign and not before]
 
 
-def test_a_login_holds_nobody_up(gateway, monkeypatch):
+def test_a_login_holds_nobody_up_and_guesses_side_by_side_are_as_few_as_one_after_the_other(gateway, monkeypatch):
     goes_on, is_checking = threading.Event(), threading.Event()
 
     def slowly(*_rest: object) -> bool:
@@ -80,23 +75,15 @@ def test_a_login_holds_nobody_up(gateway, monkeypatch):
 
     monkeypatch.setattr("pipeline.presenting.users.Users.is_password", slowly)
     answers: list[int] = []
-    guess = threading.Thread(target=lambda: answers.append(Client(gateway).log_in("ann", PASSWORD)))
-    guess.start()
-    assert is_checking.wait(30)
-    assert Client(gateway).ask("GET", "/api/v1/site")[0] == 200, "while a password is being checked"
-    goes_on.set()
-    guess.join()
-    assert answers == [401]
-
-
-def test_guesses_side_by_side_are_as_few_as_one_after_the_other(gateway):
-    answers: list[int] = []
     guesses = [
         threading.Thread(target=lambda: answers.append(Client(gateway).log_in("ann", "wrong wrong wrong")))
         for _ in range(12)
     ]
     for each in guesses:
         each.start()
+    assert is_checking.wait(30)
+    assert Client(gateway).ask("GET", "/api/v1/site")[0] == 200, "while a password is being checked"
+    goes_on.set()
     for each in guesses:
         each.join()
     assert sorted(answers) == [401] * login_failures.FAILURES + [429] * (12 - login_failures.FAILURES)
@@ -132,8 +119,11 @@ def test_guesses_from_elsewhere_do_not_lock_out_who_has_logged_in_where_he_is():
     assert guesses == login_failures.FAILURES, "there he has no more guesses than others"
 
 
-def test_a_new_password_and_another_login_end_the_session_of_before(gateway, users):
-    first = logged_in(gateway)
+def test_a_new_password_and_another_login_end_the_session_of_before(gateway, users, monkeypatch):
+    monkeypatch.setattr("pipeline.gateway.sessions.MOST_OF_A_USER", 2)
+    first, viewers = logged_in(gateway), [logged_in(gateway, "vic") for _ in range(3)]
+    assert [each.ask("GET", "/api/v1/me")[1]["name"] for each in viewers] == ["", "vic", "vic"], "his own only"
+    assert first.ask("GET", "/api/v1/me")[1]["name"] == "ann"
     again = Client(gateway)
     again.cookie = first.cookie
     assert again.log_in("ann", PASSWORD) == 200
@@ -147,7 +137,6 @@ def test_a_new_password_and_another_login_end_the_session_of_before(gateway, use
 @pytest.mark.parametrize(
     ("break_it", "why"),
     [
-        (Path.unlink, "there is no such file: `fantwin users add NAME` makes it"),
         (lambda path: path.chmod(0o644), "others may read it: chmod 600"),
         (lambda path: path.write_text("[ann", encoding="utf-8"), "the users cannot be read"),
     ],
@@ -167,13 +156,6 @@ def test_while_the_file_of_users_cannot_be_used_nobody_acts_or_logs_in(gateway, 
     assert gateway.problem() == ""
 
 
-def test_a_user_who_logs_in_again_and_again_ends_his_own_sessions_only(gateway, monkeypatch):
-    monkeypatch.setattr("pipeline.gateway.sessions.MOST_OF_A_USER", 2)
-    operator, viewers = logged_in(gateway), [logged_in(gateway, "vic") for _ in range(3)]
-    assert [each.ask("GET", "/api/v1/me")[1]["name"] for each in viewers] == ["", "vic", "vic"]
-    assert operator.ask("GET", "/api/v1/me")[1]["name"] == "ann"
-
-
 def test_live_events_end_for_who_may_not_read_any_more(gateway, users, monkeypatch):
     monkeypatch.setattr("pipeline.gateway.api.CHECKED_EVERY_S", 0.0)
     monkeypatch.setattr("pipeline.gateway.config.GatewayConfig.is_loopback", False)
@@ -187,47 +169,44 @@ def test_live_events_end_for_who_may_not_read_any_more(gateway, users, monkeypat
     assert stream.isclosed()
 
 
-def test_through_a_proxy_that_knows_no_users_nobody_reads_without_a_login(tmp_path, users, gateway):
+def test_through_a_proxy_that_knows_no_users_nobody_reads_without_a_login(opened, tmp_path, users, gateway):
     assert Client(gateway).ask("GET", "/api/v1/site")[0] == 200
     assert Client(gateway).ask("GET", "/api/v1/site", None, {"X-Forwarded-For": "192.0.2.1"})[0] == 401
-    named = RunningGateway(tmp_path / "named", users=users, hosts=("fans.plant.example",))
-    try:
-        client, host = Client(named), {"Host": "fans.plant.example"}
-        assert client.ask("GET", "/api/v1/site", None, host)[0] == 401
-        assert client.ask("GET", "/metrics", None, host)[0] == 401
-        own = {"Host": f"localhost:{named.port}"}, {"Host": f"[::1]:{named.port}"}
-        assert [client.ask("GET", "/healthz", None, each)[0] for each in ({}, *own)] == [200, 200, 200]
-        assert client.ask("GET", "/healthz", None, {"Host": "evil.example"})[0] == 400
-        assert logged_in(gateway).ask("GET", "/api/v1/site")[0] == 200
-    finally:
-        named.close()
+    named = opened(tmp_path / "named", users=users, hosts=("fans.plant.example",))
+    client, host = Client(named), {"Host": "fans.plant.example"}
+    assert client.ask("GET", "/api/v1/site", None, host)[0] == 401
+    assert client.ask("GET", "/metrics", None, host)[0] == 401
+    own = {"Host": f"localhost:{named.port}"}, {"Host": f"[::1]:{named.port}"}
+    assert [client.ask("GET", "/healthz", None, each)[0] for each in ({}, *own)] == [200, 200, 200]
+    assert client.ask("GET", "/healthz", None, {"Host": "evil.example"})[0] == 400
+    assert logged_in(gateway).ask("GET", "/api/v1/site")[0] == 200
 
 
-def test_a_header_of_the_proxy_that_comes_twice_names_nobody(tmp_path):
-    gateway = RunningGateway(tmp_path, granted, user_header="X-User", operators=("ann",))
-    try:
-        connection = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=20)
-        connection.putrequest("GET", "/api/v1/site")
-        connection.putheader("X-User", "ann")
-        connection.putheader("X-User", "vic")
-        connection.endheaders()
-        assert connection.getresponse().status == 401
-        connection.close()
-    finally:
-        gateway.close()
-    with pytest.raises(ValueError, match="address of the proxy, not its name"):
-        GatewayConfig(user_header="X-User", proxies=("proxy.plant.example",))
+def test_a_header_of_the_proxy_that_comes_twice_names_nobody(opened, tmp_path):
+    gateway = opened(tmp_path, granted, user_header="X-User", operators=("ann",))
+    connection = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=20)
+    connection.putrequest("GET", "/api/v1/site")
+    connection.putheader("X-User", "ann")
+    connection.putheader("X-User", "vic")
+    connection.endheaders()
+    assert connection.getresponse().status == 401
+    connection.close()
 
 
 def test_connections_that_ask_nothing_are_ended_and_those_that_are_answered_are_not(gateway, monkeypatch):
     monkeypatch.setattr(server, "REQUEST_WITHIN_S", 0.3)
+    monkeypatch.setattr("pipeline.gateway.api.BODY_WITHIN_S", 0.3)
     gateway.feed(score())
     stream = events(gateway)
-    silent, slow = (socket.create_connection(("127.0.0.1", gateway.port), timeout=30) for _ in range(2))
+    silent, slow, trickling = (socket.create_connection(("127.0.0.1", gateway.port), timeout=30) for _ in range(3))
     slow.sendall(b"GET / HTTP/1.1\r\nHost: loc")
+    head = ("POST /api/v1/login HTTP/1.1", "Host: localhost", "Content-Type: application/json", "Content-Length: 9")
+    trickling.sendall("\r\n".join((*head, "", "{")).encode())
     again = socket.create_connection(("127.0.0.1", gateway.port), timeout=30)
     again.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\nGET / HTTP")
     assert b"200 OK" in again.recv(4096)
+    assert trickling.recv(4096).startswith(b"HTTP/1.1 408"), "a body that comes little by little is given up"
+    trickling.close()
     for each in (silent, slow, again):
         assert is_ended(each)
     fleets = 0
@@ -247,7 +226,7 @@ def is_ended(connection: socket.socket) -> bool:
     return True
 
 
-def test_one_address_elsewhere_cannot_take_all_connections_and_all_are_never_too_many(tmp_path, monkeypatch):
+def test_one_address_elsewhere_cannot_take_all_connections_and_all_are_never_too_many(opened, tmp_path, monkeypatch):
     monkeypatch.setattr(server, "MOST_OF_AN_ADDRESS", 2)
     connections = server.Connections(frozenset({"127.0.0.1"}), most=7)
     assert [connections.begin("192.0.2.1") for _ in range(3)] == [False, False, True]
@@ -259,15 +238,12 @@ def test_one_address_elsewhere_cannot_take_all_connections_and_all_are_never_too
         connections.end(address)
     assert not connections.begin("192.0.2.1")
     monkeypatch.setattr(server, "most_connections", lambda: 3)
-    gateway = RunningGateway(tmp_path)
-    try:
-        held = [socket.create_connection(("127.0.0.1", gateway.port), timeout=30) for _ in range(5)]
-        assert is_ended(held[3])
-        assert is_ended(held[4])
-        held[0].close()
-        eventually(lambda: answers(gateway), "there is room again")
-    finally:
-        gateway.close()
+    gateway = opened(tmp_path)
+    held = [socket.create_connection(("127.0.0.1", gateway.port), timeout=30) for _ in range(5)]
+    assert is_ended(held[3])
+    assert is_ended(held[4])
+    held[0].close()
+    eventually(lambda: answers(gateway), "there is room again")
 
 
 def answers(gateway: RunningGateway) -> bool:
@@ -275,15 +251,6 @@ def answers(gateway: RunningGateway) -> bool:
         return Client(gateway).ask("GET", "/healthz")[0] == 200
     except (OSError, http.client.HTTPException):
         return False
-
-
-def test_a_body_that_comes_little_by_little_is_given_up(gateway, monkeypatch):
-    monkeypatch.setattr("pipeline.gateway.api.BODY_WITHIN_S", 0.3)
-    slow = socket.create_connection(("127.0.0.1", gateway.port), timeout=30)
-    head = ("POST /api/v1/login HTTP/1.1", "Host: localhost", "Content-Type: application/json", "Content-Length: 9")
-    slow.sendall("\r\n".join((*head, "", "{")).encode())
-    assert slow.recv(4096).startswith(b"HTTP/1.1 408")
-    slow.close()
 
 
 def test_what_fails_in_the_gateway_is_logged_and_says_nothing_to_whoever_asks(gateway, capfd, monkeypatch):
@@ -302,13 +269,14 @@ def test_what_fails_in_the_gateway_is_logged_and_says_nothing_to_whoever_asks(ga
     assert event["why"] == "RuntimeError: the secret"
 
 
-def test_logins_refusals_and_requests_are_logged_a_line_each(gateway, capfd):
+def test_logins_refusals_and_requests_are_logged_a_line_each_and_a_comment_is_one_line(gateway, capfd):
     gateway.feed(score(), alarm())
     Client(gateway).log_in('ann"}\nevent: {', "wrong wrong wrong")
     viewer, operator = logged_in(gateway, "vic"), logged_in(gateway)
     viewer.ask("POST", ACT, ASKED)
     operator.ask("POST", ACT, ASKED, {"X-CSRF-Token": "another"})
-    operator.ask("POST", ACT, ASKED)
+    comment = f"é 扇 \U0001f600 {SCRIPT}\x1b[2J\r\nfan 3: \u202etxet\x00\x9b"
+    assert operator.ask("POST", ACT, ASKED | {"comment": comment})[0] == 200
     operator.ask("POST", "/api/v1/logout", {})
     found = said(capfd)
     assert [(each["what"], each["user"]) for each in found] == [
@@ -322,42 +290,32 @@ def test_logins_refusals_and_requests_are_logged_a_line_each(gateway, capfd):
     ]
     assert (found[5]["action"], found[5]["fan"], found[5]["address"]) == ("acknowledge", f"{TRAY} 2", "127.0.0.1")
     assert PASSWORD not in json.dumps(found)
+    assert gateway.sent[0].comment == f"é 扇 \U0001f600 {SCRIPT} [2J  fan 3:  txet  ", "it shows what it says"
 
 
-def test_a_comment_is_one_line_that_shows_what_it_says(gateway):
-    gateway.feed(score(), alarm())
-    operator = logged_in(gateway)
-    comment = f"é 扇 \U0001f600 {SCRIPT}\x1b[2J\r\nfan 3: \u202etxet\x00\x9b"
-    assert operator.ask("POST", ACT, ASKED | {"comment": comment})[0] == 200
-    assert gateway.sent[0].comment == f"é 扇 \U0001f600 {SCRIPT} [2J  fan 3:  txet  "
-
-
-def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_named(tmp_path, users):
+def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_named(opened, tmp_path, users):
     certificates = SiteCertificates(tmp_path)
     certificates.issue("page", lifetime=timedelta(seconds=-1))
     files = {"certificate": tmp_path / "page.pem", "key": tmp_path / "page.key"}
-    gateway = RunningGateway(tmp_path, users=users, **files)
-    try:
-        gateway.feed(score())
-        unchecked = ssl.create_default_context()
-        unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
-        connection = http.client.HTTPSConnection("127.0.0.1", gateway.port, timeout=30, context=unchecked)
-        form = json.dumps({"name": "ann", "password": PASSWORD})
-        connection.request("POST", "/api/v1/login", form, {"Content-Type": "application/json"})
-        answer = connection.getresponse()
-        token, cookie = json.loads(answer.read())["csrf_token"], answer.getheader("set-cookie", "")
-        assert cookie.startswith("__Host-fantwin=")
-        assert "; Secure" in cookie
-        headers = {"Cookie": cookie.partition(";")[0], "X-CSRF-Token": token}
-        connection.request("POST", "/api/v1/logout", headers=headers)
-        answer = connection.getresponse()
-        gone = answer.getheader("set-cookie", "")
-        assert "Max-Age=0" in gone
-        assert "; Secure" in gone, "browsers refuse a cookie of this name without it"
-        connection.close()
-        assert "the certificate is over since" in gateway.problem()
-    finally:
-        gateway.close()
+    gateway = opened(tmp_path, users=users, **files)
+    gateway.feed(score())
+    unchecked = ssl.create_default_context()
+    unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
+    connection = http.client.HTTPSConnection("127.0.0.1", gateway.port, timeout=30, context=unchecked)
+    form = json.dumps({"name": "ann", "password": PASSWORD})
+    connection.request("POST", "/api/v1/login", form, {"Content-Type": "application/json"})
+    answer = connection.getresponse()
+    token, cookie = json.loads(answer.read())["csrf_token"], answer.getheader("set-cookie", "")
+    assert cookie.startswith("__Host-fantwin=")
+    assert "; Secure" in cookie
+    headers = {"Cookie": cookie.partition(";")[0], "X-CSRF-Token": token}
+    connection.request("POST", "/api/v1/logout", headers=headers)
+    answer = connection.getresponse()
+    gone = answer.getheader("set-cookie", "")
+    assert "Max-Age=0" in gone
+    assert "; Secure" in gone, "browsers refuse a cookie of this name without it"
+    connection.close()
+    assert "the certificate is over since" in gateway.problem()
     with pytest.raises(StageError, match="it is over since"):
         server.check_files(**files)
 
@@ -373,7 +331,6 @@ def encrypted(key: Path) -> None:
         ("key", encrypted, "the key has a password, which nobody is asked for"),
         ("key", lambda path: path.write_bytes((path.parent / "other.key").read_bytes()), "not the key of the certific"),
         ("key", lambda path: path.write_text("key", encoding="utf-8"), "this is no private key in PEM"),
-        ("key", Path.unlink, "No such file"),
         ("certificate", lambda path: path.write_text("c", encoding="utf-8"), "this is no certificate in PEM"),
         ("certificate", Path.unlink, "No such file"),
         ("key", lambda path: path.chmod(0o644), "everybody may read it"),

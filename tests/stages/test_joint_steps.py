@@ -25,20 +25,18 @@ from schemas.units import NS_PER_S
 from simulation.faults import Fault
 from simulation.tray import SimulatedTray, TraySettings
 
-EPOCH_NS, SECONDS, BLOCK = 1_700_000_000 * NS_PER_S, 40.0, 25
+EPOCH_NS, SECONDS, BLOCK = 1_700_000_000 * NS_PER_S, 30.0, 25
 TWIN = Path(__file__).parents[2] / "pipeline" / "demo" / "twin.onnx"
 FAULTS: tuple[tuple[Fault, ...], ...] = (
-    (),
-    (Fault("rotor", 3, 20.0, 26.0, 1.0),),
-    (Fault("tacho-dropout", 0, 15.0, 30.0, 0.6), Fault("inlet", 5, 22.0, 30.0, 1.6)),
-    (Fault("tacho-stuck", 7, 18.0, 24.0), Fault("tacho-dropout", 1, 3.0, 9.3, 1.0)),
-    (Fault("tacho-dropout", 6, 3.0, 9.3, 1.0),),
-    (Fault("supply", 2, 25.0, 31.0, 0.85),),
+    (Fault("rotor", 3, 13.0, 19.0, 1.0),),
+    (Fault("tacho-dropout", 0, 11.0, 19.0, 0.6), Fault("inlet", 5, 14.0, 20.0, 1.6)),
+    (Fault("tacho-stuck", 7, 12.0, 18.0), Fault("tacho-dropout", 1, 3.0, 9.3, 1.0)),
+    (Fault("supply", 2, 14.0, 20.0, 0.85),),
     (),
 )
-"""of each tray; the fifth loses samples, and the last one is silent for 3 s. In two trays one fan is commissioned later
+"""of each tray; the fourth loses samples, and the last one is silent for 3 s. In one tray a fan is commissioned later
 than the others."""
-LOSING, SILENT = 4, 6
+LOSING, SILENT = 3, 4
 
 
 class Counting:
@@ -87,7 +85,7 @@ def raws(number: int) -> Iterator[Raw]:
         samples.append(tray.take())
     for sequence, first in enumerate(range(0, len(samples), BLOCK)):
         block = samples[first : first + BLOCK]
-        if number == SILENT and 28.0 <= block[0].t_s < 31.0:
+        if number == SILENT and 15.0 <= block[0].t_s < 18.0:
             continue
         yield Raw(
             header=Header("source", sequence, f"tray{number}"),
@@ -154,14 +152,14 @@ def test_trays_in_one_pass_are_predicted_and_scored_as_each_alone(grids: list[li
     joint_integrators, joint_messages, trays = together("twin_integrator", grids)
     assert_equal(messages, joint_messages)
     assert [core.counters() for core in of_integrators] == [core.counters() for core in joint_integrators]
-    assert share_of_joint(trays) > 0.8
+    assert share_of_joint(trays) > 0.7
 
     predictions = [[each for each in of_tray if isinstance(each, Prediction)] for of_tray in messages]
     of_scorers, scored = alone("scorer", predictions)
     joint_scorers, joint_scored, trays = together("scorer", predictions)
     assert_equal(scored, joint_scored)
     assert [core.counters() for core in of_scorers] == [core.counters() for core in joint_scorers]
-    assert share_of_joint(trays) > 0.4, "not before fans are commissioned, nor where an interval of baselines ends"
+    assert share_of_joint(trays) > 0.2, "not before fans are commissioned, nor where an interval of baselines ends"
     assert len({each.fan for of_tray in scored for each in of_tray if isinstance(each, Alarm)}) >= 4
     for one, other in zip(of_scorers, joint_scorers, strict=True):
         assert_equal([list(one.close())], [list(other.close())])

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
 
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config, ConfigError
-from pipeline.devices.measured_table import Table, read_table
+from pipeline.devices.sample_blocks import ReadingBlock
 from pipeline.devices.sample_source import (
     MOST_FANS,
     LinkUp,
     Reading,
     ReadingBatch,
-    SourceConfig,
-    SourceContext,
-    SourceEvent,
 )
 from pipeline.devices.serial_config import MOST_FANS_ON_LINE
-from pipeline.devices.source_kinds import SOURCE_KINDS, SourceKind
-from pipeline.devices.table_device import TableDevice
 from pipeline.errors import UserError
 from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
@@ -37,7 +30,7 @@ from schemas.topics import BY_NAME, TOPICS, most_samples
 from schemas.units import NS_PER_S
 from tests.support.twin_files import small_hybrid, write_twin
 
-FANS, FAULTY, SAMPLES, RATE_HZ = 1024, 1000, 800, 100
+FANS, FAULTY, SAMPLES, RATE_HZ = 1024, 1000, 500, 100
 CHAIN = ("acquisition", "resampler", "twin_integrator", "scorer")
 CONFIGURATION = f"""
 [[tray]]
@@ -45,7 +38,7 @@ name = "hall"
 fans = {FANS}
 command_max = 100.0
 twin = "twin.onnx"
-source = {{ kind = "table", path = "hall.csv" }}
+source = {{ kind = "push" }}
 [acquisition]
 block_s = 1.0
 [resampler]
@@ -60,49 +53,9 @@ on_delay_s = 0.1
 TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 
 
-class TableConfig(SourceConfig, frozen=True):
-    """`source = { kind = "table", path = ... }`."""
-
-    kind: Literal["table"] = "table"
-    path: Path
-
-
-class TableSource:
-    """Delivers the rows of a table, each at its own time."""
-
-    name = "table"
-    settings_to_check = "path"
-
-    def __init__(self, config: TableConfig, context: SourceContext) -> None:
-        self._table = table_of(context.folder / config.path, context.fans)
-
-    def start(self, deliver: Callable[[SourceEvent], None]) -> None:
-        device = TableDevice(self._table, 0.0, np.inf)
-        deliver(LinkUp())
-        while device.due_s() is not None:
-            row = device.take()
-            reading = Reading(tuple(row.command.tolist()), tuple(row.speed_rad_s.tolist()), sequence=row.sequence)
-            deliver(ReadingBatch(round((1.0 + row.t_s) * NS_PER_S), (reading,)))
-
-    def stop(self) -> None:
-        pass
-
-    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
-        return "not connected"
-
-    def check(self) -> list[str]:
-        return []
-
-
-@pytest.fixture(autouse=True)
-def _table_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    kind = SourceKind(f"{__name__}:TableConfig", f"{__name__}:TableSource")
-    monkeypatch.setitem(SOURCE_KINDS, "table", kind)
-
-
 @pytest.fixture(scope="module")
-def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a twin of one fan, and the table of a hall of such fans, one of which becomes slow."""
+def hall(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[ReadingBatch]]:
+    """A folder with a twin of one fan, and the readings of a hall of such fans, one of which becomes slow."""
     folder = tmp_path_factory.mktemp("hall")
     write_twin(folder / "twin.onnx", small_hybrid(), fans=1)
     twin = TwinFile.load(folder / "twin.onnx", FANS)
@@ -113,14 +66,12 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     speed, _ = twin.advance(state, command, np.full(SAMPLES, 1.0 / RATE_HZ))
     speed = speed + rng.normal(0.0, 3.0, speed.shape)
     speed[SAMPLES // 2 :, FAULTY] -= 60.0
-    names = ",".join(f"s{fan}" for fan in range(FANS))
-    columns = np.column_stack((times_s, command[:, 0], speed))
-    np.savetxt(folder / "hall.csv", columns, "%.3f", ",", header=f"t,u,{names}", comments="")
-    return folder
-
-
-def table_of(path: Path, fans: int) -> Table:
-    return read_table(path, "t:s", ["u"], [f"s{fan}" for fan in range(fans)])
+    rows = zip(times_s.tolist(), command.tolist(), speed.tolist(), strict=True)
+    batches = [
+        ReadingBatch(round((1.0 + t_s) * NS_PER_S), (Reading(tuple(given), tuple(read), sequence=number),))
+        for number, (t_s, given, read) in enumerate(rows)
+    ]
+    return folder, batches
 
 
 def config_of(folder: Path, text: str = CONFIGURATION) -> Config:
@@ -132,9 +83,9 @@ def context_of(config: Config, stage: str) -> Context:
 
 
 def test_all_fans_of_a_large_tray_are_judged_and_its_messages_stay_within_their_limits(hall):
-    config = config_of(hall)
-    parts = {stage: load_stage(stage).build(context_of(config, stage)) for stage in CHAIN}
-    cores = [parts[stage].core for stage in CHAIN]
+    folder, batches = hall
+    config = config_of(folder)
+    cores = [load_stage(stage).build(context_of(config, stage)).core for stage in CHAIN]
     found: list[Message] = []
 
     def pass_on(made: list[Message], later: list[Core]) -> None:
@@ -147,9 +98,9 @@ def test_all_fans_of_a_large_tray_are_judged_and_its_messages_stay_within_their_
             if isinstance(arrived, Raw | Grid | Prediction):
                 pass_on(list(later[0].step(arrived)), later[1:])
 
-    source = parts["acquisition"].source
-    assert source
-    source.start(lambda event: pass_on(list(cores[0].step(event)), cores[1:]))
+    pass_on(list(cores[0].step(LinkUp())), cores[1:])
+    for first in range(0, SAMPLES, 300):
+        pass_on(list(cores[0].step(ReadingBlock(tuple(batches[first : first + 300])))), cores[1:])
     for number, core in enumerate(cores):
         pass_on(list(core.close()), cores[number + 1 :])
     raws = [message for message in found if isinstance(message, Raw)]
@@ -168,7 +119,7 @@ def test_a_tray_has_at_most_the_fans_that_its_source_carries():
     assert tray.fans == FANS
     with pytest.raises(ConfigError, match=r"tray.0.fans = 1025: input should be less than or equal to 1024"):
         config_of(Path(), CONFIGURATION.replace(str(FANS), "1025"))
-    line = CONFIGURATION.replace('{ kind = "table", path = "hall.csv" }', '{ kind = "serial", port = "/dev/ttyUSB0" }')
+    line = CONFIGURATION.replace('{ kind = "push" }', '{ kind = "serial", port = "/dev/ttyUSB0" }')
     refused = "fans = 1024: a serial source carries at most 64 fans; make several trays of them"
     with pytest.raises(ConfigError) as caught:
         config_of(Path(), line)

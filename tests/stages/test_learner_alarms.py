@@ -13,19 +13,10 @@ from schemas.units import NS_PER_S
 from stages.learner import LearnerConfig
 from tests.support.one_learner import START_NS, Learner, restarted
 
-SAY_NOTHING = [FanState.UNKNOWN, FanState.STOPPED]
 
-
-def test_nothing_is_learned_beside_an_alarm(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    learner.run(600)
-    before = len(learner.learning.starts)
-    learner.run(3000, state=FanState.ALARM)
-    assert len(learner.learning.starts) == before
-    assert all(each.span[1] < START_NS + 600 * NS_PER_S for each in healthy_recordings(tmp_path))
-
-
-def test_fans_are_checked_each_day_beside_an_alarm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_beside_an_alarm_nothing_is_learned_and_fans_are_checked_each_day(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("pipeline.learning.learning_schedule.CHECK_AFTER_S", 2 * 3600.0)
     learner = Learner(tmp_path)
     learner.run(600)
@@ -35,6 +26,7 @@ def test_fans_are_checked_each_day_beside_an_alarm(tmp_path: Path, monkeypatch: 
     assert 2.0 < first_h < 2.5
     assert second_h - first_h == pytest.approx(2.0, abs=0.1)
     assert len(learner.learning.starts) == before
+    assert all(each.span[1] < START_NS + 600 * NS_PER_S for each in healthy_recordings(tmp_path))
 
 
 def test_after_commissioning_the_fans_are_checked_as_soon_as_one_kind_of_running_is_enough(tmp_path: Path) -> None:
@@ -49,17 +41,6 @@ def test_after_commissioning_the_fans_are_checked_as_soon_as_one_kind_of_running
         learner.run(2 * 3600, state=state)
         (checked_t_ns,) = learner.learning.checked_t_ns
         assert 4000 < (checked_t_ns - began_t_ns) / NS_PER_S < 5000
-
-
-def test_a_restarted_learner_publishes_the_version_in_force_at_once(tmp_path: Path) -> None:
-    first = Learner(tmp_path)
-    first.run(600)
-    first.core.close()
-    second = Learner(tmp_path)
-    second.emitted += second.core.tick(START_NS)
-    (message,) = second.emitted
-    assert isinstance(message, NewTwin)
-    assert (message.twin, message.content) == ("tray1-1", b"tray1-1")
 
 
 def test_a_version_waits_for_the_end_of_an_alarm_unless_an_operator_chose_it(tmp_path: Path) -> None:
@@ -79,20 +60,22 @@ def test_a_version_waits_for_the_end_of_an_alarm_unless_an_operator_chose_it(tmp
     assert learner.put_in_force == ["tray1-1", "tray1-2", "tray1-3"]
 
 
-@pytest.mark.parametrize("state", SAY_NOTHING)
-def test_an_alarm_is_not_forgotten_while_scores_say_nothing_about_it(tmp_path: Path, state: FanState) -> None:
+def test_an_alarm_is_not_forgotten_while_scores_say_nothing_about_it(tmp_path: Path) -> None:
     learner = Learner(tmp_path)
     learner.run(600)
-    made = len(learner.learning.starts)
+    seconds, made = learner.history.seconds, len(learner.learning.starts)
     learner.run(100, state=FanState.ALARM)
     began_t_ns = START_NS + 600 * NS_PER_S
     learner.add_version("tray1-2")
-    learner.run(3000, state=state)
+    for state in (FanState.UNKNOWN, FanState.STOPPED):
+        learner.run(1500, state=state)
     assert learner.put_in_force == ["tray1-1"]
     assert len(learner.learning.starts) == made
     assert all(each.span[1] < began_t_ns for each in healthy_recordings(tmp_path))
     learner.run(20)
     assert learner.put_in_force == ["tray1-1", "tray1-2"]
+    learner.run(500, state=FanState.STOPPED)
+    assert learner.history.seconds > seconds + 350.0, "samples of stopped fans are learned from"
 
 
 def test_a_restarted_learner_publishes_the_version_before_while_a_fan_may_have_an_alarm(tmp_path: Path) -> None:
@@ -113,34 +96,20 @@ def test_a_restarted_learner_publishes_the_version_before_while_a_fan_may_have_a
     assert second.versions.read().published == "tray1-2"
 
 
-def test_a_restarted_learner_publishes_at_once_what_an_operator_chose(tmp_path: Path) -> None:
+@pytest.mark.parametrize("because", ["an operator chose it", "the one before is gone"])
+def test_a_restarted_learner_publishes_the_version_in_force_at_once(tmp_path: Path, because: str) -> None:
     first = Learner(tmp_path)
     first.run(600)
     first.run(20, state=FanState.ALARM)
     first.add_version("tray1-2")
-    first.versions.use("tray1-2")
+    if because == "an operator chose it":
+        first.versions.use("tray1-2")
+    else:
+        first.versions.file("tray1-1").unlink()
     second = restarted(first)
     second.run(10, state=None)
     assert second.put_in_force == ["tray1-2"]
-
-
-def test_a_restarted_learner_publishes_the_version_in_force_if_the_one_before_is_gone(tmp_path: Path) -> None:
-    first = Learner(tmp_path)
-    first.run(600)
-    first.run(20, state=FanState.ALARM)
-    first.add_version("tray1-2")
-    first.versions.file("tray1-1").unlink()
-    second = restarted(first)
-    second.run(10, state=None)
-    assert second.put_in_force == ["tray1-2"]
-
-
-def test_samples_of_stopped_fans_are_learned_from(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    learner.run(600)
-    seconds = learner.history.seconds
-    learner.run(500, state=FanState.STOPPED)
-    assert learner.history.seconds > seconds + 400.0
+    assert [each.content for each in second.emitted if isinstance(each, NewTwin)] == [b"tray1-2"]
 
 
 def test_when_an_alarm_begins_its_time_is_listed(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,20 @@ def listener(broker: Mosquitto) -> Iterator[Listener]:
     listener.close()
 
 
+@pytest.fixture
+def started(broker: Mosquitto) -> Iterator[Callable[..., RunningMqtt]]:
+    """Starts stages, which are closed before the broker."""
+    running: list[RunningMqtt] = []
+
+    def start(*words: Any, **settings: Any) -> RunningMqtt:
+        running.append(RunningMqtt(*words, **settings))
+        return running[-1]
+
+    yield start
+    for each in running:
+        each.close()
+
+
 def state_of(listener: Listener, topic: str = FAN) -> dict[str, Any]:
     return json.loads(listener.last(f"{topic}/state") or "{}")
 
@@ -56,72 +70,69 @@ def refused(_request: Request) -> list[Alarm]:
     return [alarm(Transition.REFUSED, message="fan 2: there is nothing to acknowledge")]
 
 
-def test_states_alarms_and_status_are_retained(tmp_path, broker, listener):
-    stage = RunningMqtt(tmp_path, broker.port)
-    try:
-        stage.feed(score())
-        eventually(lambda: state_of(listener).get("state") == "normal", "the state is there")
-        assert state_of(listener) == {
-            "state": "normal",
-            "in_alarm": False,
-            "judged": True,
-            "score": 0.5,
-            "speed": 1000.0,
-            "predicted_speed": 1010.0,
-            "speed_unit": "rpm",
-            "since": "2026-09-21T14:13:20.040Z",
-            "time": "2026-09-21T14:13:20.040Z",
-        }
-        unjudged = state_of(listener, f"{ROOT}/{TRAY}/3")
-        assert (unjudged["state"], unjudged["judged"]) == ("unknown: gap", False)
-        assert (unjudged["predicted_speed"], unjudged["score"]) == (None, 0.5)
-        eventually(lambda: listener.last(f"{FAN}/alarm") == "null", "without an alarm it says so")
-        stage.feed(alarm())
-        eventually(lambda: state_of(listener)["in_alarm"], "an alarm changes the state at once")
-        shown = json.loads(listener.last(f"{FAN}/alarm") or "")
-        assert (shown["severity"], shown["causes"][0]["cause"], shown["presented"]) == ("alarm", "drag", True)
-        assert json.loads(listener.last(f"{FAN}/alarm/transitions") or "")["transition"] == "raised"
-        eventually(lambda: listener.last(f"{ROOT}/summary"), "the summary is there")
-        assert isinstance(json.loads(listener.last(f"{ROOT}/stages") or ""), list)
-        kept = retained_by(broker.port)
-        assert kept[f"{ROOT}/status"] == "online"
-        assert f"{FAN}/alarm/transitions" not in kept
-        stage.feed(alarm(Transition.CLEARED, 1, active=False, acknowledged=True, confirmed=True))
-        eventually(lambda: listener.last(f"{FAN}/alarm") == "null", "the alarm is over")
-    finally:
-        stage.close()
+def test_states_alarms_and_status_are_retained(tmp_path, broker, listener, started):
+    stage = started(tmp_path, broker.port)
+    stage.feed(score())
+    eventually(lambda: state_of(listener).get("state") == "normal", "the state is there")
+    listener.publish(f"{FAN}/request", '{"action": "acknowledge"}')  # not heard by default
+    assert state_of(listener) == {
+        "state": "normal",
+        "in_alarm": False,
+        "judged": True,
+        "score": 0.5,
+        "speed": 1000.0,
+        "predicted_speed": 1010.0,
+        "speed_unit": "rpm",
+        "since": "2026-09-21T14:13:20.040Z",
+        "time": "2026-09-21T14:13:20.040Z",
+    }
+    unjudged = state_of(listener, f"{ROOT}/{TRAY}/3")
+    assert (unjudged["state"], unjudged["judged"]) == ("unknown: gap", False)
+    assert (unjudged["predicted_speed"], unjudged["score"]) == (None, 0.5)
+    eventually(lambda: listener.last(f"{FAN}/alarm") == "null", "without an alarm it says so")
+    stage.feed(alarm())
+    eventually(lambda: state_of(listener)["in_alarm"], "an alarm changes the state at once")
+    shown = json.loads(listener.last(f"{FAN}/alarm") or "")
+    assert (shown["severity"], shown["causes"][0]["cause"], shown["presented"]) == ("alarm", "drag", True)
+    assert json.loads(listener.last(f"{FAN}/alarm/transitions") or "")["transition"] == "raised"
+    eventually(lambda: listener.last(f"{ROOT}/summary"), "the summary is there")
+    assert isinstance(json.loads(listener.last(f"{ROOT}/stages") or ""), list)
+    kept = retained_by(broker.port)
+    assert kept[f"{ROOT}/status"] == "online"
+    assert f"{FAN}/alarm/transitions" not in kept
+    stage.feed(alarm(Transition.CLEARED, 1, active=False, acknowledged=True, confirmed=True))
+    eventually(lambda: listener.last(f"{FAN}/alarm") == "null", "the alarm is over")
+    assert (stage.sent, listener.of(f"{FAN}/request/answer")) == ([], [])
+    stage.close()
     assert retained_by(broker.port)[f"{ROOT}/status"] == "offline"
 
 
-def test_a_broker_that_was_away_gets_all_that_is_retained_and_all_transitions_in_order(tmp_path, broker):
-    stage = RunningMqtt(tmp_path, broker.port)
-    try:
-        stage.feed(score())
-        eventually(lambda: f"{FAN}/state" in retained_by(broker.port), "it is published")
-        broker.stop()
-        eventually(lambda: "is away" in stage.problem(), "it says that the broker is away")
-        said = stage.problem()
-        for number in range(600):  # more than are under way at once
-            raised = number % 2 == 0
-            stage.feed(alarm(Transition.RAISED if raised else Transition.CLEARED, number, active=raised))
-        stage.feed(score(1.0, state=FanState.ALARM))
-        assert stage.counters()["waiting_transitions"] == 600
-        assert stage.problem() == said, "it is said once, not at each try"
-        broker.start()
-        listener = Listener(broker.port)
-        topic = f"{FAN}/alarm/transitions"
-        eventually(lambda: len(listener.of(topic)) >= 600, "all transitions have come")
-        numbers = [json.loads(text)["number"] for text in listener.of(topic)]
-        assert numbers == sorted(numbers)
-        assert len(set(numbers)) == 600
-        kept = retained_by(broker.port)
-        assert {kept[f"{ROOT}/status"], json.loads(kept[f"{FAN}/state"])["state"]} == {"online", "alarm"}
-        assert f"{ROOT}/{TRAY}/0/state" in kept, "also what has not changed: the broker had forgotten it"
-        eventually(lambda: stage.counters()["waiting_transitions"] == 0, "all are acknowledged")
-        assert stage.problem() == ""
-        listener.close()
-    finally:
-        stage.close()
+def test_a_broker_that_was_away_gets_all_that_is_retained_and_all_transitions_in_order(tmp_path, broker, started):
+    stage = started(tmp_path, broker.port)
+    stage.feed(score())
+    eventually(lambda: f"{FAN}/state" in retained_by(broker.port), "it is published")
+    broker.stop()
+    eventually(lambda: "is away" in stage.problem(), "it says that the broker is away")
+    said = stage.problem()
+    for number in range(300):  # more than are under way at once
+        raised = number % 2 == 0
+        stage.feed(alarm(Transition.RAISED if raised else Transition.CLEARED, number, active=raised))
+    stage.feed(score(1.0, state=FanState.ALARM))
+    assert stage.counters()["waiting_transitions"] == 300
+    assert stage.problem() == said, "it is said once, not at each try"
+    broker.start()
+    listener = Listener(broker.port)
+    topic = f"{FAN}/alarm/transitions"
+    eventually(lambda: len(listener.of(topic)) >= 300, "all transitions have come")
+    numbers = [json.loads(text)["number"] for text in listener.of(topic)]
+    assert numbers == sorted(numbers)
+    assert len(set(numbers)) == 300
+    kept = retained_by(broker.port)
+    assert {kept[f"{ROOT}/status"], json.loads(kept[f"{FAN}/state"])["state"]} == {"online", "alarm"}
+    assert f"{ROOT}/{TRAY}/0/state" in kept, "also what has not changed: the broker had forgotten it"
+    eventually(lambda: stage.counters()["waiting_transitions"] == 0, "all are acknowledged")
+    assert stage.problem() == ""
+    listener.close()
 
 
 def test_a_broker_that_hangs_holds_nobody_up_and_is_named(tmp_path, broker, monkeypatch):
@@ -144,23 +155,22 @@ def test_a_broker_that_hangs_holds_nobody_up_and_is_named(tmp_path, broker, monk
     assert time.monotonic() - began_s < 10
 
 
-def test_the_last_will_of_a_connection_that_is_dead_comes_before_the_next_one_says_online(tmp_path, broker, listener):
+def test_the_last_will_of_a_connection_that_is_dead_comes_before_the_next_one_says_online(
+    tmp_path, broker, listener, started
+):
     dead = paho.Client(CallbackAPIVersion.VERSION2, f"fantwin-{SITE}-all")
     dead.will_set(f"{ROOT}/status", "offline", 1, retain=True)
     dead.connect("127.0.0.1", broker.port, keepalive=60)
     dead.loop_start()
     eventually(dead.is_connected, "it is connected")
     dead._thread_terminate = True  # its thread ends, as if the host had gone: its connection stays
-    stage = RunningMqtt(tmp_path, broker.port)
-    try:
-        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
-        assert listener.of(f"{ROOT}/status") == ["offline", "online"]
-    finally:
-        stage.close()
+    started(tmp_path, broker.port)
+    eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
+    assert listener.of(f"{ROOT}/status") == ["offline", "online"]
 
 
-def test_requests_are_passed_on_under_the_configured_name_and_answered(tmp_path, broker, listener):
-    stage = RunningMqtt(tmp_path, broker.port, granted, **ACCEPTING)
+def test_requests_are_passed_on_under_the_configured_name_and_answered(tmp_path, broker, listener, started):
+    stage = started(tmp_path, broker.port, granted, **ACCEPTING)
     topic = f"{FAN}/request"
 
     def ask(text: str, where: str = topic) -> dict[str, Any]:
@@ -169,67 +179,43 @@ def test_requests_are_passed_on_under_the_configured_name_and_answered(tmp_path,
         eventually(lambda: len(listener.of(f"{where}/answer")) > before, "it is answered")
         return json.loads(listener.last(f"{where}/answer") or "")
 
-    try:
-        stage.feed(score(), alarm())
-        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
-        answer = ask('{"action": "acknowledge", "comment": "seen", "name": "ann", "id": "7"}')
-        assert (answer["ok"], answer["id"], answer["answers"][0]["transition"]) == (True, "7", "acknowledged")
-        (sent,) = stage.sent
-        assert (sent.action, sent.fan, sent.header.tray) == (Action.ACKNOWLEDGE, 2, TRAY)
-        assert (sent.operator_name, sent.comment) == ("mqtt:desk", "seen (sent as ann)"), "nobody chooses his name"
-        assert ask('{"action": "commission"}')["error"].startswith("commission is not accepted by MQTT here")
-        assert "no such fan" in ask('{"action": "acknowledge"}', f"{ROOT}/{TRAY}/9/request")["error"]
-        for malformed in ("{", "[]", '{"action": "explode"}', '{"action": "shelve", "duration_s": -1}', "x" * 9999):
-            assert not ask(malformed)["ok"]
-        wrong = ask('{"action": "shelve", "duration_s": "1h", "id": "8"}')
-        assert (wrong["id"], wrong["ok"], wrong["error"].partition(":")[0]) == ("8", False, "duration_s")
-        assert "operator_name" in ask('{"action": "acknowledge", "operator_name": "root"}')["error"]
-        counts = stage.counters()
-        assert (counts["malformed_requests"], counts["refused_requests"], counts["accepted_requests"]) == (7, 2, 1)
-        assert len(stage.sent) == 1
-    finally:
-        stage.close()
+    stage.feed(score(), alarm())
+    eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
+    answer = ask('{"action": "acknowledge", "comment": "seen", "name": "ann", "id": "7"}')
+    assert (answer["ok"], answer["id"], answer["answers"][0]["transition"]) == (True, "7", "acknowledged")
+    (sent,) = stage.sent
+    assert (sent.action, sent.fan, sent.header.tray) == (Action.ACKNOWLEDGE, 2, TRAY)
+    assert (sent.operator_name, sent.comment) == ("mqtt:desk", "seen (sent as ann)"), "nobody chooses his name"
+    assert ask('{"action": "commission"}')["error"].startswith("commission is not accepted by MQTT here")
+    assert "no such fan" in ask('{"action": "acknowledge"}', f"{ROOT}/{TRAY}/9/request")["error"]
+    for malformed in ("{", "[]", '{"action": "explode"}', '{"action": "shelve", "duration_s": -1}', "x" * 9999):
+        assert not ask(malformed)["ok"]
+    wrong = ask('{"action": "shelve", "duration_s": "1h", "id": "8"}')
+    assert (wrong["id"], wrong["ok"], wrong["error"].partition(":")[0]) == ("8", False, "duration_s")
+    assert "operator_name" in ask('{"action": "acknowledge", "operator_name": "root"}')["error"]
+    counts = stage.counters()
+    assert (counts["malformed_requests"], counts["refused_requests"], counts["accepted_requests"]) == (7, 2, 1)
+    assert len(stage.sent) == 1
 
 
-def test_what_the_scorer_refuses_is_an_error_and_a_scorer_that_is_silent_too(tmp_path, broker, listener, monkeypatch):
-    stage = RunningMqtt(tmp_path, broker.port, refused, **ACCEPTING)
-    try:
-        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
-        listener.publish(f"{FAN}/request", '{"action": "acknowledge"}')
-        answer = json.loads(eventually(lambda: listener.last(f"{FAN}/request/answer"), "it is answered"))
-        assert (answer["ok"], answer["error"]) == (False, "fan 2: there is nothing to acknowledge")
-        monkeypatch.setattr("pipeline.broker.requests.ANSWERED_WITHIN_S", 0.1)
-        listener.publish(f"{ROOT}/{TRAY}/all/request", '{"action": "acknowledge"}')
-        silent = eventually(lambda: listener.last(f"{ROOT}/{TRAY}/all/request/answer"), "it is answered")
-        assert json.loads(silent)["error"] == f"tray {TRAY}: no scorer has answered"
-        assert stage.sent[-1].fan == -1
-    finally:
-        stage.close()
-
-
-def test_a_retained_request_is_not_acted_on_again(tmp_path, broker, listener):
-    listener.publish(f"{FAN}/request", '{"action": "acknowledge"}', retain=True)
-    stage = RunningMqtt(tmp_path, broker.port, granted, **ACCEPTING)
-    try:
-        answer = eventually(lambda: listener.last(f"{FAN}/request/answer"), "it is answered")
-        assert "retained requests are ignored" in answer
-        assert (stage.counters()["retained_requests"], stage.sent) == (1, [])
-    finally:
-        stage.close()
-
-
-def test_by_default_no_request_is_heard(tmp_path, broker, listener):
-    stage = RunningMqtt(tmp_path, broker.port, granted)
-    try:
-        stage.feed(score(), alarm())
-        eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
-        listener.publish(f"{FAN}/request", '{"action": "acknowledge"}')
-        before = len(listener.of(f"{FAN}/state"))
-        stage.feed(score(1.0, state=FanState.SUSPECT))
-        eventually(lambda: len(listener.of(f"{FAN}/state")) > before, "it goes on")
-        assert (stage.sent, listener.of(f"{FAN}/request/answer")) == ([], [])
-    finally:
-        stage.close()
+def test_what_the_scorer_refuses_is_an_error_a_silent_scorer_too_and_a_retained_request_is_ignored(
+    tmp_path, broker, listener, started, monkeypatch
+):
+    retained, answer_of = f"{ROOT}/{TRAY}/1/request", "{}/answer".format
+    listener.publish(retained, '{"action": "acknowledge"}', retain=True)
+    stage = started(tmp_path, broker.port, refused, **ACCEPTING)
+    ignored = eventually(lambda: listener.last(answer_of(retained)), "it is answered")
+    assert "retained requests are ignored" in ignored
+    assert (stage.counters()["retained_requests"], stage.sent) == (1, [])
+    eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
+    listener.publish(f"{FAN}/request", '{"action": "acknowledge"}')
+    answer = json.loads(eventually(lambda: listener.last(f"{FAN}/request/answer"), "it is answered"))
+    assert (answer["ok"], answer["error"]) == (False, "fan 2: there is nothing to acknowledge")
+    monkeypatch.setattr("pipeline.broker.requests.ANSWERED_WITHIN_S", 0.1)
+    listener.publish(f"{ROOT}/{TRAY}/all/request", '{"action": "acknowledge"}')
+    silent = eventually(lambda: listener.last(f"{ROOT}/{TRAY}/all/request/answer"), "it is answered")
+    assert json.loads(silent)["error"] == f"tray {TRAY}: no scorer has answered"
+    assert stage.sent[-1].fan == -1
 
 
 def test_home_assistant_loses_the_fans_that_are_gone_and_all_on_request(tmp_path, broker, listener):

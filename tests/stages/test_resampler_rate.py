@@ -66,12 +66,12 @@ def test_a_first_sample_that_arrived_late_does_not_make_all_times_late() -> None
 @pytest.mark.parametrize("clock", [True, False], ids=["clock", "no clock"])
 @pytest.mark.parametrize(
     ("line_hz", "jitter", "grid_hz"),
-    [(1, 0.05, 1), (2, 0.0, 2), (2.1, 0.3, 2), (10, 0.3, 10), (64, 0.3, 50), (100, 0.3, 100), (1000, 0.2, 100)],
+    [(1, 0.05, 1), (2.1, 0.3, 2), (64, 0.3, 50), (1000, 0.2, 100)],
 )
 def test_the_grid_has_the_rate_of_the_line_and_no_sample_of_it_is_a_gap(
     line_hz: float, jitter: float, grid_hz: int, clock: bool
 ) -> None:
-    line_s = times(line_hz, 30, jitter)
+    line_s = times(line_hz, 30 if line_hz < 1000 else 6, jitter)
     grid, core = grid_of(samples(line_s, clock=clock))
     assert grid.period_ns == NS_PER_S // grid_hz
     assert grid.valid.all()
@@ -86,7 +86,7 @@ def test_the_grid_has_the_rate_of_the_line_and_no_sample_of_it_is_a_gap(
     np.testing.assert_allclose(grid.speed_rad_s[:, 0] - 100.0, (grid.t_ns - EPOCH_NS) / NS_PER_S, atol=0.012)
 
 
-@pytest.mark.parametrize(("line_hz", "bridged_s"), [(1, 4.0), (10, 0.4), (100, 0.09)])
+@pytest.mark.parametrize(("line_hz", "bridged_s"), [(1, 4.0), (100, 0.09)])
 def test_a_real_gap_is_still_one(line_hz: float, bridged_s: float) -> None:
     line_s = times(line_hz, 60)
     lost = (line_s > 20) & (line_s < 20 + 8 / line_hz + 0.1)
@@ -100,19 +100,10 @@ def test_a_real_gap_is_still_one(line_hz: float, bridged_s: float) -> None:
     assert (at_s[in_gap] < 30).all()
 
 
-@pytest.mark.parametrize("line_hz", [2, 10, 64, 100])
-def test_a_line_of_the_rate_of_its_grid_gives_the_grid_of_that_setting(line_hz: float) -> None:
-    messages = samples(times(line_hz, 20, 0.2))
-    found, _ = grid_of(messages)
-    given, _ = grid_of(messages, rate_hz=NS_PER_S / found.period_ns)
-    for name in ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason"):
-        assert getattr(found, name).tobytes() == getattr(given, name).tobytes(), name
-
-
 def test_a_restarted_resampler_comes_to_the_same_rate_wherever_it_begins() -> None:
-    for line_hz in (1, 2, 4.8, 10, 20, 25, 64, 100):
-        messages = samples(times(line_hz, 60, 0.3))
-        starts = range(0, len(messages) // 2, max(1, len(messages) // 20))
+    for line_hz, seconds in ((1, 60), (4.8, 30), (20, 20), (100, 10)):
+        messages = samples(times(line_hz, seconds, 0.3))
+        starts = range(0, len(messages) // 2, max(1, len(messages) // 10))
         periods = {grid_of(messages[start:])[0].period_ns for start in starts}
         assert periods == {NS_PER_S // grid_rate_hz(line_hz)}, line_hz
 
@@ -130,7 +121,6 @@ def refused_at_first(line_hz: float, how: str) -> Array:
 @pytest.mark.parametrize(
     ("line_hz", "clock", "how"),
     [
-        (10, False, "half of them"),
         (25, False, "half of them"),
         (100, True, "half of them"),
         (10, False, "while the device reboots"),
@@ -144,29 +134,22 @@ def test_a_line_whose_first_samples_are_refused_gets_the_grid_that_it_sends(
     assert (grid.period_ns, core.problem()) == (NS_PER_S // line_hz, "")
 
 
-@pytest.mark.parametrize("uneven", ["by chance", "read every 40 ms"])
-def test_a_line_without_a_period_gets_the_rate_at_which_samples_arrive(uneven: str) -> None:
-    steps_s = np.random.default_rng(7).exponential(0.1, 300)
-    line_s = {"by chance": np.cumsum(steps_s), "read every 40 ms": np.floor(times(64, 5) / 0.04) * 0.04}[uneven]
-    grid, _ = grid_of(samples(line_s, clock=False))
-    assert grid.period_ns == NS_PER_S // {"by chance": 10, "read every 40 ms": 50}[uneven]
+def test_a_line_without_a_period_gets_the_rate_at_which_samples_arrive() -> None:
+    by_chance = np.cumsum(np.random.default_rng(7).exponential(0.1, 300))
+    read_together = (np.floor(times(line_hz, 5) / 0.04) * 0.04 for line_hz in (64, 100))  # every 40 ms
+    for line_s, grid_hz in zip((by_chance, *read_together), (10, 50, 100), strict=True):
+        grid, _ = grid_of(samples(line_s, clock=False))
+        assert grid.period_ns == NS_PER_S // grid_hz
 
 
-@pytest.mark.parametrize("lost_share", [0.05, 0.15])
-def test_lost_samples_and_pauses_while_it_is_measured_do_not_change_the_rate(lost_share: float) -> None:
+def test_lost_samples_and_pauses_while_it_is_measured_do_not_change_the_rate() -> None:
     rng = np.random.default_rng(4)
-    for line_hz in (1, 2, 10, 100):
-        line_s = times(line_hz, 60)
-        line_s = line_s[rng.random(len(line_s)) > lost_share]
+    for line_hz, seconds in ((1, 60), (10, 20), (100, 10)):
+        line_s = times(line_hz, seconds)
+        line_s = line_s[rng.random(len(line_s)) > 0.15]
         line_s[3:] += 1.5  # acquisition had to connect again
         grid, _ = grid_of(samples(line_s))
         assert grid.period_ns == NS_PER_S // line_hz
-
-
-def test_samples_read_together_without_a_clock_count_as_those_of_their_line() -> None:
-    line_s = np.floor(times(100, 5) / 0.04) * 0.04  # a host that reads every 40 ms
-    grid, _ = grid_of(samples(line_s, clock=False))
-    assert grid.period_ns == NS_PER_S // 100
 
 
 def test_few_samples_get_a_grid_at_the_end() -> None:
@@ -218,30 +201,17 @@ def test_a_line_that_becomes_faster_or_slower_is_named() -> None:
     assert core.problem().endswith("too few for gap_limit_s = 0.1: restart the resampler")
 
 
-def test_samples_of_the_wrong_number_of_fans_are_reported_before_there_is_a_grid() -> None:
-    core = ResamplerCore(2, ResamplerConfig())
-    for message in samples(times(10, 5)):
-        core.step(message)
-    assert "fans = 2" in core.problem()
-    assert core.counters()["lost_wrong_fan_count"] == 50
-
-
-@pytest.mark.parametrize(
-    ("given", "expected_s"),
-    [
+def test_limits_that_are_not_given_follow_and_keep_their_order() -> None:
+    for given, expected_s in (
         ({}, (0.1, 0.5, 5.0)),
         ({"gap_limit_s": 1.0}, (1.0, 1.0, 5.0)),
         ({"watermark_s": 8.0}, (0.1, 8.0, 16.0)),
         ({"watermark_s": 0.05}, (0.05, 0.05, 5.0)),
         ({"stale_for_s": 0.2}, (0.1, 0.2, 0.2)),
-    ],
-)
-def test_limits_that_are_not_given_follow_and_keep_their_order(
-    given: dict[str, float], expected_s: tuple[float, float, float]
-) -> None:
-    timing = ResamplerConfig.model_validate(given).timing(100.0)
-    limits_ns = (timing.gap_limit_ns, timing.watermark_ns, timing.stale_for_ns)
-    assert limits_ns == tuple(round(limit_s * NS_PER_S) for limit_s in expected_s)
+    ):
+        timing = ResamplerConfig.model_validate(given).timing(100.0)
+        limits_ns = (timing.gap_limit_ns, timing.watermark_ns, timing.stale_for_ns)
+        assert limits_ns == tuple(round(limit_s * NS_PER_S) for limit_s in expected_s)
     for rate_hz in RATES_HZ:
         timing = ResamplerConfig().timing(rate_hz)
         assert 3 * timing.period_ns <= timing.gap_limit_ns <= timing.watermark_ns <= timing.stale_for_ns

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from schemas.blocks import join
-from schemas.enums import InvalidReason, Statistic, Transition
+from schemas.enums import Statistic, Transition
 from schemas.messages import Prediction, Raw
 from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
@@ -71,11 +71,10 @@ def on_the_grid(missing: Floats) -> Prediction:
     return replace(made, invalid_reason=grid.invalid_reason, reading_missing=grid.reading_missing)
 
 
-@pytest.mark.parametrize("healthy", [0.005, 0.02])
-def test_a_loose_wire_is_one_alarm_though_the_grid_bridges_its_missing_readings(healthy: float) -> None:
+def test_a_loose_wire_is_one_alarm_though_the_grid_bridges_its_missing_readings() -> None:
     time_s = np.arange(460 * SECOND) / SECOND
     item = on_the_grid(np.where(time_s < 60, 0.002, np.where(time_s < 360, 0.35, 0.002)))
-    own = {"missing_readings": {"healthy_share": healthy}}
+    own = {"missing_readings": {"healthy_share": 0.02}}
     core = core_of(calibration=CARD | {"detectors": CARD["detectors"] | own})
     feed(core, [prediction(noise(30 * SECOND, seed=9), first=-30 * SECOND)])
     _, alarms = feed(core, [item])
@@ -83,19 +82,9 @@ def test_a_loose_wire_is_one_alarm_though_the_grid_bridges_its_missing_readings(
     after_s = [(alarm.t_ns - EPOCH_NS) / 1e9 - 60.0 for alarm in found]
     assert [alarm.transition for alarm in found] == [Transition.RAISED, Transition.CLEARED]
     assert found[0].statistic == Statistic.SENSOR
-    assert 0.0 < after_s[0] < (3.0 if healthy < 0.01 else 6.0)
+    assert 0.0 < after_s[0] < 6.0
     assert 330.0 < after_s[1] < 360.0
     assert re.search(r"; a tacho that drops out, \d+ %: [34]\d % of the readings of the last ", found[0].message)
-
-
-def test_a_loose_tacho_wire_is_one_alarm() -> None:
-    samples = 250 * SECOND
-    loose = prediction(noise(samples))
-    lost = np.random.default_rng(2).random(samples) < np.where(np.arange(samples) < 200 * SECOND, 0.28, 0.0)
-    loose.measured_speed_rad_s[lost] = loose.torque_balance_command[lost] = np.nan
-    loose.valid[lost] = False
-    loose.invalid_reason[lost] = InvalidReason.NO_SPEED
-    assert raised_and_cleared(core_after_commissioning(), loose) == [Transition.RAISED, Transition.CLEARED]
 
 
 def test_a_touched_blade_is_one_alarm_while_a_thermostat_moves_the_fan() -> None:

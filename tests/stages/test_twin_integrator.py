@@ -119,40 +119,6 @@ def stairs(samples: int, fans: int = 1, seed: int = 2) -> Floats:
     return np.repeat(rng.uniform(10, 90, (samples // 50 + 1, fans)), 50, axis=0)[:samples]
 
 
-def eventful_grid(fans: int) -> Grid:
-    """Steps, noise, a tacho that fails, a short silence, a long one, and a fan that first reads late."""
-    rng = np.random.default_rng(4)
-    grid = grid_of(stairs(900, fans), 100 + rng.normal(0, 3, (900, fans)))
-    invalid_reason = grid.invalid_reason.copy()
-    invalid_reason[:30, 0] = invalid_reason[200:260, 1] = InvalidReason.NO_SPEED
-    invalid_reason[300:330] = invalid_reason[500:600] = InvalidReason.GAP
-    valid = invalid_reason == InvalidReason.NONE
-    speed = np.where(valid, grid.speed_rad_s, NAN)
-    return Grid(
-        fans=fans,
-        period_ns=STEP_NS,
-        t_ns=grid.t_ns,
-        command=grid.command,
-        speed_rad_s=speed,
-        valid=valid,
-        invalid_reason=invalid_reason,
-    )
-
-
-@pytest.mark.parametrize("kind", ["physical", "hybrid"])
-@pytest.mark.parametrize("size", [1, 7, 50])
-def test_the_block_size_does_not_change_a_bit_of_the_prediction(tmp_path: Path, kind: str, size: int) -> None:
-    path = write_twin(tmp_path / "twin.onnx", small_hybrid() if kind == "hybrid" else None)
-    grid = eventful_grid(fans=3)
-    whole, blocks = (
-        feed(core_of(TwinFile.load(path, 3), start_samples=5, warm_up_s=1.0), grids)
-        for grids in ([grid], split(grid, size))
-    )
-    assert 500 < whole.valid.sum() < whole.valid.size
-    for name in ("t_ns", "predicted_speed_rad_s", "valid", "invalid_reason"):
-        np.testing.assert_array_equal(getattr(blocks, name), getattr(whole, name), err_msg=name)
-
-
 def test_the_grid_rate_changes_the_prediction_by_the_integration_error_only(tmp_path: Path) -> None:
     """Order four without a lag, order two with one: the lagged command acts by its mean over each step. The training
     data of this twin were so slow that it takes one step in each sample."""
@@ -167,7 +133,7 @@ def test_the_grid_rate_changes_the_prediction_by_the_integration_error_only(tmp_
         assert np.ptp(fast) > 100
         return float(np.abs(fast[::every] - slow).max())
 
-    command = stairs(2000)
+    command = stairs(1000)
     assert 0 < difference_rad_s(0.0, 2) < 1e-4
     lagged = difference_rad_s(0.05, 2)
     assert 0 < lagged < 0.01 * SIGMA_RAD_S
@@ -182,12 +148,14 @@ def test_the_prediction_is_never_corrected_by_a_measurement() -> None:
     other[1:] += 500 * np.random.default_rng(1).normal(size=499)
     other[100:200] = NAN
     a, b = (feed(core_of(), [grid_of(command, speed)]) for speed in (measured, other))
+    np.testing.assert_array_equal(b.measured_speed_rad_s[:, 0], other)
+    np.testing.assert_array_equal(b.sigma_rad_s, [3.0])
     np.testing.assert_array_equal(a.predicted_speed_rad_s, b.predicted_speed_rad_s)
     assert (b.invalid_reason[100:200] == InvalidReason.NO_SPEED).all()
     assert b.valid[200:].all()
 
 
-def test_the_free_run_is_the_model_run_from_the_mean_of_the_first_readings() -> None:
+def test_the_free_run_is_the_model_run_from_the_mean_of_the_first_readings_and_valid_after_it_has_warmed_up() -> None:
     speed = np.array([NAN, 10.0, 20.0, 60.0, 0.0, 0.0])
     command = np.array([5.0, 5.0, 5.0, 40.0, 41.0, 42.0])
     prediction = feed(core_of(start_samples=3), [grid_of(command, speed)])
@@ -195,15 +163,10 @@ def test_the_free_run_is_the_model_run_from_the_mean_of_the_first_readings() -> 
     expected, _ = run_freely(np.array([[30.0, 40.0]]), command[3:, np.newaxis], np.full(3, 0.01))
     assert np.isnan(predicted[:3]).all()
     np.testing.assert_allclose(predicted[3:], expected[:, 0], rtol=1e-12)
-    assert (
-        prediction.invalid_reason[:, 0].tolist()
-        == [InvalidReason.NO_SPEED] + [InvalidReason.WARMING_UP] * 2 + [InvalidReason.NONE] * 3
-    )
-
-
-def test_a_free_run_is_not_valid_while_it_warms_up() -> None:
+    none, young = InvalidReason.NONE, InvalidReason.WARMING_UP
+    assert prediction.invalid_reason[:, 0].tolist() == [InvalidReason.NO_SPEED] + [young] * 2 + [none] * 3
     prediction = feed(core_of(warm_up_s=0.5, start_samples=2), [grid_of(stairs(100))])
-    assert prediction.invalid_reason[:, 0].tolist() == [InvalidReason.WARMING_UP] * 51 + [InvalidReason.NONE] * 49
+    assert prediction.invalid_reason[:, 0].tolist() == [young] * 51 + [none] * 49
 
 
 def test_a_free_run_continues_through_a_short_silence_on_the_held_command() -> None:
@@ -233,24 +196,17 @@ def test_a_long_silence_ends_the_free_run_and_a_new_one_starts_after_it() -> Non
     assert core.counters()["free_runs"] == 2
 
 
-def test_row_16_missing_grid_samples_are_counted_once_and_simulated() -> None:
+def test_row_16_missing_grid_samples_are_counted_once_and_simulated_and_many_restart_the_free_run() -> None:
     grid = grid_of(np.full(300, 40.0))
     whole = feed(core_of(), [grid])
     core = core_of()
     holed = feed(core, [cut(grid, 0, 100), cut(grid, 120, 300)])
     assert core.counters()["missing_grid_samples"] == 20
     np.testing.assert_allclose(holed.predicted_speed_rad_s[100:], whole.predicted_speed_rad_s[120:], rtol=1e-12)
-
-
-def test_a_large_loss_restarts_the_free_run() -> None:
     core = core_of()
     feed(core, [grid_of(np.full(100, 40.0)), grid_of(np.full(100, 40.0), np.full(100, 7.0), first=200)])
-    assert core.counters()["missing_grid_samples"] == 100
-    assert core.counters()["free_runs"] == 2
-
-
-def test_a_gap_that_the_resampler_announced_is_not_a_loss() -> None:
-    core = core_of()
+    assert (core.counters()["missing_grid_samples"], core.counters()["free_runs"]) == (100, 2)
+    core = core_of()  # a gap that the resampler announced is no loss
     later = grid_of(np.full(100, 40.0), first=1_000_000)
     feed(core, [grid_of(np.full(100, 40.0)), silent(500, 100, 40.0, InvalidReason.STALE), later])
     assert "missing_grid_samples" not in core.counters()
@@ -279,29 +235,20 @@ def test_row_13_a_grid_that_has_gone_back_for_good_is_reported_until_there_are_n
     assert core.problem() == ""
 
 
-def test_a_command_outside_the_training_range_is_not_valid() -> None:
+def test_a_command_outside_the_training_range_is_not_valid_and_with_a_table_of_its_error_one_further_out() -> None:
+    out, good = InvalidReason.OUT_OF_RANGE, InvalidReason.NONE
     core = core_of()
     prediction = feed(core, [grid_of(np.array([40.0, 104.9, 105.1, -5.1, -4.9]))])
-    out = InvalidReason.OUT_OF_RANGE
-    assert prediction.invalid_reason[:, 0].tolist() == [
-        InvalidReason.NONE,
-        InvalidReason.NONE,
-        out,
-        out,
-        InvalidReason.NONE,
-    ]
+    assert prediction.invalid_reason[:, 0].tolist() == [good, good, out, out, good]
     assert core.counters()["not_predicted_out_of_range"] == 2
-
-
-def test_with_a_table_of_its_own_error_commands_further_outside_are_valid() -> None:
-    """By a quarter of the range."""
     square = ((1.0, 1.0), (1.0, 1.0))
     around = ModelUncertainty((0.0, 1.0), (0.0, 1.0), (square,), (1.0,), settled_speed_rad_s=((0.0, 1.0),))
-    core = core_of(physical_twin(model_uncertainty=around))
-    low, high = -25.0, 125.0
-    prediction = feed(core, [grid_of(np.array([low, high, np.nextafter(low, -99.0), np.nextafter(high, 199.0)]))])
-    out, good = InvalidReason.OUT_OF_RANGE, InvalidReason.NONE
+    low, high = -25.0, 125.0  # a quarter of the range
+    grid = grid_of(np.array([low, high, np.nextafter(low, -99.0), np.nextafter(high, 199.0)]))
+    prediction = feed(core_of(physical_twin(model_uncertainty=around)), [grid])
     assert prediction.invalid_reason[:, 0].tolist() == [good, good, out, out]
+    reversing = physical_twin(command_range=(-100.0, 100.0))
+    assert feed(core_of(reversing), [grid_of(np.array([40.0, 0.0, -50.0, -104.0]))]).valid.all(), "without friction"
 
 
 def why_not_of(command: list[float]) -> list[int]:
@@ -309,7 +256,7 @@ def why_not_of(command: list[float]) -> list[int]:
     return feed(core, [grid_of(np.array([40.0] * 5 + command))]).invalid_reason[5:, 0].tolist()
 
 
-@pytest.mark.parametrize("out", [9.9, 0.0, -50.0, 105.1, 1e6])
+@pytest.mark.parametrize("out", [9.9, 1e6])
 def test_after_a_command_out_of_range_or_too_small_to_turn_the_rotor_the_twin_must_settle(out: float) -> None:
     beyond, young, good = InvalidReason.OUT_OF_RANGE, InvalidReason.WARMING_UP, InvalidReason.NONE
     assert why_not_of([out, out, 40.0, 10.0, 40.0, 40.0]) == [beyond, beyond, young, young, good, good]
@@ -319,23 +266,12 @@ def test_after_an_unknown_command_the_twin_need_not_settle() -> None:
     assert why_not_of([NAN, 40.0, np.inf, 40.0]) == [InvalidReason.OUT_OF_RANGE, InvalidReason.NONE] * 2
 
 
-def test_the_twin_must_settle_across_the_end_of_a_block_too() -> None:
-    core = core_of(twin_with_friction(10.0), warm_up_s=0.03)
-    grid = grid_of(np.array([40.0] * 5 + [0.0] + [40.0] * 4))
-    assert feed(core, split(grid, 6)).valid[:, 0].tolist() == [False] * 3 + [True] * 2 + [False] * 3 + [True] * 2
-
-
 def test_friction_within_the_commands_of_a_fan_held_at_one_speed_is_not_a_dead_zone() -> None:
     held = twin_with_friction(25.6)
     held = replace(held, card=replace(held.card, command_range=(24.5, 27.3)))
     prediction = feed(core_of(held), [grid_of(np.full(100, 25.0), np.full(100, 31.0))])
     assert prediction.valid.all()
     assert np.isfinite(prediction.torque_balance_command[40:]).all()
-
-
-def test_without_friction_a_small_or_reversed_command_is_valid() -> None:
-    reversing = physical_twin(command_range=(-100.0, 100.0))
-    assert feed(core_of(reversing), [grid_of(np.array([40.0, 0.0, -50.0, -104.0]))]).valid.all()
 
 
 def test_an_unknown_command_of_one_fan_never_reaches_the_graph_and_leaves_the_other_alone() -> None:
@@ -364,20 +300,6 @@ def test_a_twin_that_diverges_is_not_valid_and_is_restarted() -> None:
     assert (core.counters()["diverged"], core.counters()["free_runs"]) == (1, 2)
 
 
-def test_a_fan_whose_twin_diverged_never_feeds_nan_to_the_graph() -> None:
-    def advance(state: Floats, command: Floats, period_s: Floats) -> tuple[Floats, Floats]:
-        assert np.isfinite(state).all()
-        speed = np.where(command > 50, np.inf, command)
-        return speed, np.column_stack((speed[-1], command[-1]))
-
-    core = core_of(replace(physical_twin(2), advance_with=lambda _: advance), start_samples=2)
-    command = np.full((20, 2), 40.0)
-    command[5, 0] = 60.0
-    prediction = feed(core, split(grid_of(command), 1))
-    assert prediction.valid[2:, 1].all()
-    assert prediction.invalid_reason[4:9, 0].tolist() == [0, InvalidReason.OUT_OF_RANGE, InvalidReason.WARMING_UP, 0, 0]
-
-
 def test_readings_from_before_a_silence_do_not_start_a_free_run_after_it() -> None:
     after = grid_of(np.full(5, 40.0), np.full(5, 7.0), first=104)
     prediction = feed(core_of(start_samples=5), [grid_of(np.full(4, 40.0)), silent(100, 4, 40.0), after])
@@ -403,19 +325,6 @@ def test_on_a_grid_slower_than_its_training_the_twin_takes_steps_as_long_as_thos
     np.testing.assert_array_equal(found, expected[::per_second])
 
 
-def test_the_whole_block_of_all_fans_is_one_run_of_the_graph() -> None:
-    twin, shapes = physical_twin(4), []
-
-    def counted(state: Floats, command: Floats, period_s: Floats) -> tuple[Floats, Floats]:
-        shapes.append(command.shape)
-        return twin.advance(state, command, period_s)
-
-    core = core_of(replace(twin, advance_with=lambda _: counted))
-    core.step(grid_of(stairs(50, 4)))
-    core.step(grid_of(stairs(50, 4), first=50))
-    assert shapes == [(50, 4), (50, 4)]
-
-
 def test_the_card_is_published_once() -> None:
     core = core_of()
     first = [*core.tick(0), *core.step(grid_of(stairs(5))), *core.tick(1)]
@@ -426,18 +335,13 @@ def test_the_card_is_published_once() -> None:
     assert [type(m) for m in replayed] == [ModelCard, Prediction]
 
 
-def test_measured_speeds_are_passed_on_unchanged() -> None:
-    speed = np.random.default_rng(0).normal(size=(20, 1))
-    prediction = feed(core_of(), [grid_of(stairs(20), speed)])
-    np.testing.assert_array_equal(prediction.measured_speed_rad_s, speed)
-    np.testing.assert_array_equal(prediction.sigma_rad_s, [3.0])
-
-
-def test_a_block_with_another_number_of_fans_is_counted_as_lost_and_reported() -> None:
+def test_a_block_with_another_number_of_fans_is_lost_and_reported_until_a_matching_grid_arrives() -> None:
     core = core_of()
     core.step(grid_of(stairs(5, 2)))
     assert core.counters()["lost_wrong_fan_count"] == 5
-    assert "fans = 1" in core.problem()
+    assert core.problem() == "grid of 2 fans, [[tray]] says fans = 1: correct one of them"
+    core.step(grid_of(np.zeros(1)))
+    assert core.problem() == ""
 
 
 def _context(folder: Path, twin: Path | None, *tacho: Tacho) -> Context:
@@ -446,6 +350,8 @@ def _context(folder: Path, twin: Path | None, *tacho: Tacho) -> Context:
 
 
 def test_without_a_twin_samples_pass_and_none_is_valid(tmp_path: Path) -> None:
+    write_twin(tmp_path / "twin.onnx")
+    assert STAGE.build(_context(tmp_path, Path("twin.onnx"))).core.tick(0), "it is found beside the configuration"
     core = STAGE.build(_context(tmp_path, None)).core
     grid = grid_of(np.full((5, 2), 50.0))
     (made,) = core.step(grid)
@@ -455,11 +361,6 @@ def test_without_a_twin_samples_pass_and_none_is_valid(tmp_path: Path) -> None:
     assert core.step(grid_of(np.full(5, 50.0))) == []
     assert core.counters() == {"lost_wrong_fan_count": 5}
     assert core.problem() == "grid of 1 fans, [[tray]] says fans = 2: correct one of them"
-
-
-def test_the_twin_is_found_beside_the_configuration(tmp_path: Path) -> None:
-    write_twin(tmp_path / "twin.onnx")
-    assert STAGE.build(_context(tmp_path, Path("twin.onnx"))).core.tick(0)
 
 
 def test_a_bridge_of_absurdly_many_samples_is_not_run() -> None:
@@ -476,14 +377,6 @@ def test_a_bridge_of_absurdly_many_samples_is_not_run() -> None:
     core.step(grid)
     assert sum(steps) <= 4
     assert core.counters()["free_runs"] == 2
-
-
-def test_a_problem_is_reported_only_until_a_matching_grid_arrives() -> None:
-    core = core_of()
-    core.step(grid_of(np.zeros((1, 2))))
-    assert "grid of 2 fans" in core.problem()
-    core.step(grid_of(np.zeros(1)))
-    assert core.problem() == ""
 
 
 def test_another_session_of_the_resampler_starts_the_twin_again() -> None:
@@ -503,7 +396,7 @@ def test_another_session_of_the_resampler_starts_the_twin_again() -> None:
     assert [np.isnan(m.torque_balance_command[0, 0]) for m in made] == [True, False, True, False]
 
 
-@pytest.mark.parametrize("moves_to", [50.0, 51.0, 70.0])
+@pytest.mark.parametrize("moves_to", [51.0, 70.0])
 def test_a_gap_in_which_the_command_has_moved_starts_the_twin_again(moves_to: float) -> None:
     """The command was held meanwhile, and the twin is wrong by what the fan has done on the real one."""
     core = core_of()
@@ -543,9 +436,9 @@ def counted(speed: Floats, period_s: float, ends_s: float) -> Floats:
 
 def test_a_healthy_fan_is_within_the_readings_of_a_counting_tacho_through_steps_and_not_without_one() -> None:
     """Fans with windows that begin at different times; the reading is up to two seconds old."""
-    fans, period_s = 4, 0.1
-    command = np.repeat(stairs(1200), fans, axis=1)
-    speed = run_freely(np.zeros((fans, 2)), command, np.full(1200, period_s))[0]
+    fans, period_s = 2, 0.1
+    command = np.repeat(stairs(600), fans, axis=1)
+    speed = run_freely(np.zeros((fans, 2)), command, np.full(600, period_s))[0]
     readings = np.column_stack([counted(speed[:, fan], period_s, 0.3 * fan) for fan in range(fans)])
     grid = grid_of(command, readings, period_ns=100_000_000)
 
@@ -554,15 +447,15 @@ def test_a_healthy_fan_is_within_the_readings_of_a_counting_tacho_through_steps_
         return np.where(prediction.valid, np.abs(speed_residual_rad_s(prediction)), 0.0)
 
     known, unknown = physical_twin(fans, tacho=(COUNTING,)), physical_twin(fans)
-    residual = residual_of(known, 1200)
-    assert residual.max() < 0.05 * residual_of(unknown, 1200).max()
+    residual = residual_of(known, 600)
+    assert residual.max() < 0.05 * residual_of(unknown, 600).max()
     np.testing.assert_array_equal(residual_of(known, 7), residual)
 
 
 def test_the_torque_balance_of_counted_readings_is_taken_with_the_averaged_command() -> None:
     period_s = 0.1
-    command = 20.0 + 5.0 * np.sin(np.arange(1200)[:, np.newaxis] * period_s / 2.0)
-    speed = run_freely(np.full((1, 2), 5.0), command, np.full(1200, period_s))[0]
+    command = 20.0 + 5.0 * np.sin(np.arange(600)[:, np.newaxis] * period_s / 2.0)
+    speed = run_freely(np.full((1, 2), 5.0), command, np.full(600, period_s))[0]
     grid = grid_of(command, counted(speed[:, 0], period_s, 0.0)[:, np.newaxis], period_ns=100_000_000)
 
     def balance_of(**changes: Any) -> Floats:

@@ -115,7 +115,7 @@ def predicted(core: TwinIntegratorCore, grids: Iterable[Grid]) -> tuple[Any, ...
     return bits, core.counters(), core.problem()
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     name=st.sampled_from(["demo", "physical", "hybrid", "unstable", "stiff"]),
     happenings=st.lists(st.tuples(st.sampled_from(WHAT_HAPPENS), st.integers(1, 30)), min_size=1, max_size=10),

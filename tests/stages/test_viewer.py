@@ -1,10 +1,7 @@
 from __future__ import annotations
 
-import os
+import shutil
 import socket
-import subprocess
-import sys
-import textwrap
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,28 +14,24 @@ import pytest
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Context, Core, StageError
-from pipeline.viewing.alarm_log import LINE_LENGTH, LogLine, log_line
+from pipeline.viewing.alarm_log import LogLine
 from pipeline.viewing.fleet import Fan
 from pipeline.viewing.fleet_view import Overview
-from pipeline.viewing.loopback import check_free
 from pipeline.viewing.trace import Trace
 from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, PAGE_PERIOD_NS, REPEAT_STATES_NS, SAMPLES_HELD, ViewerCore
 from pipeline.viewing.wear_points import WearPoints
 from schemas.codec import encode
-from schemas.enums import FanState, InvalidReason, Severity, StageStatus, Statistic, Transition
+from schemas.enums import FanState, InvalidReason, StageStatus
 from schemas.envelope import Envelope
 from schemas.header import Header
 from schemas.health import Health
-from schemas.messages import Alarm, Diagnosis, Message, ModelCard, Score
+from schemas.messages import Message, ModelCard, Score
 from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
-from stages.viewer import ViewerConfig, build
+from stages.viewer import ViewerConfig, build, check
 from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
 
 LATER_NS = START_NS + 400 * 86_400 * 1_000_000_000  # the host's time while what was recorded at START_NS is replayed
-
-TORQUE = Diagnosis(cause="external_torque", probability=0.64, parameter="", change=0.1)
-CAUSES = (TORQUE, replace(TORQUE, cause="drag_up", probability=0.36))
 
 
 @dataclass
@@ -124,65 +117,35 @@ def play(core: Core, scores: Sequence[Score]) -> None:
         core.tick(int(score.t_ns[-1]))
 
 
-REPUBLISHED = {"transition": Transition.REPUBLISHED, "severity": Severity.ALARM}
-
-
-@pytest.mark.parametrize(
-    ("more", "level", "text"),
-    [
-        (
-            {"statistic": Statistic.BALANCE_DRIFT, "score": 1.73},
-            "WARN",
-            "warning raised, torque balance 1.7 x its",
-        ),
-        ({"transition": Transition.DIAGNOSED, "causes": CAUSES}, "INFO", "fan 0: probably an external torque 64 %"),
-        (REPUBLISHED, "ERROR", "fan 0: alarm goes on, after a restart"),
-        (REPUBLISHED | {"active": False}, "INFO", "fan 0: back to normal, after a restart"),
-        ({"transition": Transition(88)}, "INFO", "fan 0: unknown (88)"),
-        ({"transition": Transition.ACKNOWLEDGED, "operator_name": "ann"}, "INFO", "fan 0: acknowledged by ann"),
-        ({"transition": Transition.REFUSED, "message": "fan 0: refused: " + "it is not so " * 20}, "INFO", "not so…"),
-    ],
-)
-def test_the_log_says_what_happened_in_a_line_short_enough_to_be_read(
-    more: dict[str, Any], level: str, text: str
-) -> None:
-    fields = {"fan": 0, "active": True, "severity": Severity.WARNING, "t_ns": 1, "onset_t_ns": 1, "acknowledged": True}
-    fields |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so " * 99, "transition": Transition.RAISED}
-    line = log_line(Alarm(header=Header("p", 0, "tray1"), **fields | more))
-    assert line[:3] == ("tray1", 1, level)
-    assert text in line.text and len(line.text) <= LINE_LENGTH
-
-
-def test_samples_are_drawn_twice_a_second_and_each_exactly_once() -> None:
+def test_samples_are_drawn_twice_a_second_each_exactly_once_and_without_ticks_a_bounded_number_is_held() -> None:
     sink = FakeSink()
     scores, _ = made_up_tray(seconds=10, block=5)
     core = core_of(sink)
     play(core, scores)
-    drawn_before_close = len(sink.traces)
+    assert len(sink.traces) in (20, 21)
     core.close()
-    assert FLUSH_PERIOD_NS == 500_000_000
-    assert drawn_before_close in (20, 21)
     assert sink.closed and sink.flushed == len(sink.traces)
     times = np.concatenate([trace.t_ns for trace in sink.traces])
     assert times.tolist() == np.concatenate([score.t_ns for score in scores]).tolist()
     assert core.counters()["samples_drawn"] == 1000
-
-
-def test_without_ticks_a_bounded_number_of_samples_is_held() -> None:
     sink = FakeSink()
-    scores, _ = made_up_tray(seconds=100, fans=1, block=64, gap_fan=None, faulty_fan=None)
     core = core_of(sink, fans=1)
-    for score in scores:
+    for score in made_up_tray(seconds=50, fans=1, block=64, gap_fan=None, faulty_fan=None)[0]:
         core.step(sent(score))
-    assert [len(trace.t_ns) for trace in sink.traces] == [SAMPLES_HELD, SAMPLES_HELD]
+    assert [len(trace.t_ns) for trace in sink.traces] == [SAMPLES_HELD]
 
 
-def test_a_lane_follows_the_states_to_the_sample_and_shows_the_reason_of_an_unknown_state() -> None:
+def test_a_lane_follows_the_states_to_the_sample_and_repeats_a_steady_one_for_viewers_that_join_late() -> None:
     sink = FakeSink()
     scores, _ = made_up_tray(seconds=4, fans=2, faulty_fan=0, fault_s=(1.0, 2.0), gap_fan=1, gap_s=(2.5, 3.0))
     play(core_of(sink, fans=2), scores)
     assert sink.lane(0) == [(0, "normal"), (1, "suspect"), (1.5, "alarm"), (2, "returning"), (2.5, "normal")]
     assert sink.lane(1) == [(0, "normal"), (2.5, "unknown: gap"), (3, "normal")]
+    sink = FakeSink()
+    play(core_of(sink, fans=1), made_up_tray(seconds=16, fans=1, faulty_fan=None, gap_fan=None)[0])
+    times = [t for t, _ in sink.lane(0)]
+    assert len(times) == 4
+    assert (np.diff(times)[1:] * 1e9 >= REPEAT_STATES_NS).all()
 
 
 def test_a_change_of_reason_is_a_change_of_state_and_what_is_not_known_is_shown_with_its_number() -> None:
@@ -196,26 +159,6 @@ def test_a_change_of_reason_is_a_change_of_state_and_what_is_not_known_is_shown_
     core.close()
     unknowns = [(0, "unknown: warming up"), (0.02, f"unknown: unknown ({newer})")]
     assert sink.lane(0) == [*unknowns, (0.04, "normal"), (0.07, "unknown (99)")]
-
-
-def test_a_taken_port_is_reported_under_the_setting_that_names_it() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(StageError, match=rf"^board\.port: port {port} on .* is taken .*; set another one$"):
-            check_free(port, "board.port")
-        with pytest.raises(StageError, match="; set another one, or board.serve = false$"):
-            check_free(port, "board.port", "board.serve = false")
-
-
-def test_a_steady_state_is_sent_again_for_viewers_that_join_late() -> None:
-    sink = FakeSink()
-    scores, _ = made_up_tray(seconds=16, fans=1, faulty_fan=None, gap_fan=None)
-    play(core_of(sink, fans=1), scores)
-    times = [t for t, _ in sink.lane(0)]
-    assert len(times) == 4
-    assert (np.diff(times)[1:] * 1e9 >= REPEAT_STATES_NS).all()
 
 
 def test_a_sample_without_a_score_has_no_band_and_is_never_outside_it() -> None:
@@ -248,27 +191,13 @@ def test_health_and_twins_are_a_page_that_is_replaced_when_it_changes() -> None:
     assert "f40" not in sink.pages[0] and "f40" in sink.pages[1] and "the port is gone" in sink.pages[1]
 
 
-def test_what_the_source_measures_beside_is_drawn_from_its_first_sample_on(tmp_path: Path) -> None:
-    scores, _ = made_up_tray(seconds=4)
-    half = len(scores) // 2
-    volts = [np.full(score.score.shape, 12.0 + number, np.float32) for number, score in enumerate(scores)]
-    with_supply = [replace(score, supply_voltage_v=of) for score, of in zip(scores[half:], volts[half:], strict=True)]
-    core = build(context(tmp_path)).core
-    for item in (*scores[:half], *with_supply):
-        core.step(sent(item))
-        core.tick(int(item.t_ns[-1]))
-    core.close()
-    rows = rows_of(tmp_path / "view.rrd")
-    shown = [row["Scalars:scalars"][0] for _, row in rows["/tray1/supply_voltage_v/fan_1"]]
-    known = [value for value in shown if np.isfinite(value)]
-    np.testing.assert_allclose(known, np.concatenate(volts[half:])[:, 1])
-    assert not any("temperature_c" in path for path in rows)
-
-
 def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp_path: Path) -> None:
     scores, alarms = made_up_tray(seconds=20)
+    half = len(scores) // 2
+    volts = [np.full(score.score.shape, 12.0 + number, np.float32) for number, score in enumerate(scores)]
+    measured_beside = [replace(score, supply_voltage_v=of) for score, of in zip(scores, volts, strict=True)]
     core = build(context(tmp_path, speed_unit="rpm")).core
-    for item in (*scores, *alarms):
+    for item in (*scores[:half], *measured_beside[half:], *alarms):
         core.step(sent(item))
         core.tick(item.t_ns if isinstance(item.t_ns, int) else int(item.t_ns[-1]))
     core.close()
@@ -289,6 +218,10 @@ def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp
     states = [row["StateChange:state"][0] for _, row in rows["/tray1/state/fan_2"]]
     assert [name for name, _ in groupby(states)] == ["normal", "suspect", "alarm", "returning", "normal"]
     assert [row["TextLog:level"][0] for _, row in rows["/tray1/log"]] == ["ERROR", "INFO"]
+    shown = [row["Scalars:scalars"][0] for _, row in rows["/tray1/supply_voltage_v/fan_1"]]
+    known = [value for value in shown if np.isfinite(value)]
+    np.testing.assert_allclose(known, np.concatenate(volts[half:])[:, 1], err_msg="from its first sample on")
+    assert not any("temperature_c" in path for path in rows)
 
 
 def test_a_replay_of_an_old_recording_has_no_data_at_the_host_time(tmp_path: Path) -> None:
@@ -307,8 +240,10 @@ def test_a_replay_of_an_old_recording_has_no_data_at_the_host_time(tmp_path: Pat
     assert r"- **scorer**: two \| \*lines\*" in page and "f40" in page
 
 
-def test_in_an_alarm_the_area_between_twin_and_measured_speed_is_red(tmp_path: Path) -> None:
-    scores, _ = made_up_tray(seconds=20, fault_s=(8.0, 14.0))
+def test_in_an_alarm_the_area_between_twin_and_measured_speed_is_red_also_over_the_end_of_a_flush(
+    tmp_path: Path,
+) -> None:
+    scores, _ = made_up_tray(seconds=8, fault_s=(2.0, 5.0))
     core = build(context(tmp_path)).core
     play(core, scores)
     core.close()
@@ -316,7 +251,7 @@ def test_in_an_alarm_the_area_between_twin_and_measured_speed_is_red(tmp_path: P
     area = rows["/tray1/fan_2/deviation"]
     drawn = dict(rows["/tray1/fan_2/speed"])
     red = [(t, row) for t, row in area if np.isfinite(row["Measurements:values"]).all()]
-    assert [(t - START_NS) / 1e9 for t, _ in (red[0], red[-1])] == [8.5, 14.5 - STEP_NS / 1e9]
+    assert [(t - START_NS) / 1e9 for t, _ in (red[0], red[-1])] == [2.5, 5.5 - STEP_NS / 1e9]
     assert np.isnan(area[-1][1]["Measurements:values"]).all()
     for t, row in red:
         (middle,), (variance,) = row["Measurements:values"], row["Measurements:variances"]
@@ -324,19 +259,6 @@ def test_in_an_alarm_the_area_between_twin_and_measured_speed_is_red(tmp_path: P
         ends = middle - np.sqrt(variance), middle + np.sqrt(variance)
         assert ends == pytest.approx(sorted((measured, predicted)))
     assert "/tray1/fan_0/deviation" not in rows
-
-
-def test_an_area_open_at_the_end_of_a_flush_is_ended_by_the_next_one(tmp_path: Path) -> None:
-    scores, _ = made_up_tray(seconds=0.3, fans=1, faulty_fan=None, gap_fan=None)
-    in_alarm = np.full((10, 1), FanState.ALARM, np.uint8)
-    core = build(context(tmp_path, fans=1)).core
-    for number, score in enumerate((changed(scores[0], state=in_alarm), *scores[1:])):
-        core.step(sent(score))
-        core.tick((number + 1) * FLUSH_PERIOD_NS)
-    core.close()
-    area = rows_of(tmp_path / "view.rrd")["/tray1/fan_0/deviation"]
-    drawn = [bool(np.isfinite(row["Measurements:values"]).all()) for _, row in area]
-    assert drawn == [True] * 10 + [False] * 10
 
 
 def test_samples_without_a_score_are_drawn_apart_in_grey(tmp_path: Path) -> None:
@@ -354,59 +276,43 @@ def test_samples_without_a_score_are_drawn_apart_in_grey(tmp_path: Path) -> None
     assert np.isnan(np.delete(grey, np.arange(5, 10))).all()
 
 
-def test_an_existing_view_is_not_overwritten(tmp_path: Path) -> None:
+def test_an_existing_view_is_not_overwritten_and_a_file_that_cannot_be_written_is_a_one_line_error(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "view.rrd").write_bytes(b"earlier")
     for _ in range(2):
         build(context(tmp_path)).core.close()
     assert (tmp_path / "view.rrd").read_bytes() == b"earlier"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["view-2.rrd", "view-3.rrd", "view.rrd"]
-
-
-def test_a_file_that_cannot_be_written_is_a_one_line_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StageError, match="cannot write the view") as caught:
-        build(context(tmp_path, file="file/view.rrd"))
+        build(context(tmp_path, file="view.rrd/view.rrd"))
     assert "\n" not in str(caught.value)
 
 
-def test_live_viewers_are_served_on_the_loopback_only(tmp_path: Path) -> None:
+def test_live_viewers_are_served_on_the_loopback_only_and_a_second_shard_takes_another_port(tmp_path: Path) -> None:
     port = free_port()
-    core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core
+    live = context(tmp_path, serve=True, grpc_port=port, web_port=0)
+    core = build(live).core
     with socket.create_connection(("127.0.0.1", port), timeout=5):
         listening = Path("/proc/net/tcp")
         if listening.exists():
             locals_ = [line.split()[1] for line in listening.read_text().splitlines()[1:] if line.split()[3] == "0A"]
             assert f"0100007F:{port:04X}" in locals_
             assert f"00000000:{port:04X}" not in locals_
+    shards = [replace(live, instance=f"{number}-of-2", shard_number=number) for number in (1, 2)]
+    taken = f"port {port} on 127.0.0.1 is taken"
+    assert [any(taken in problem for problem in check(shard)) for shard in shards] == [True, False]
     core.close()
 
 
 def test_a_killed_viewer_leaves_a_file_that_opens_and_holds_what_was_flushed(tmp_path: Path) -> None:
-    code = """
-    import sys
-    from pathlib import Path
-    from tests.support.score_data import made_up_tray
-    from tests.stages.test_viewer import context, play
-    from stages.viewer import build
-    core = build(context(Path(sys.argv[1]))).core
+    core = build(context(tmp_path)).core
     play(core, made_up_tray(seconds=20)[0])
-    print("played", flush=True)
-    sys.stdin.read()
-    """
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code), str(tmp_path)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        cwd=Path(__file__).parents[2],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
-    )
-    assert process.stdout is not None and process.stdin is not None
-    assert process.stdout.readline() == b"played\n"
-    process.kill()
-    process.communicate()
-    rows = rows_of(tmp_path / "view.rrd")
+    left = Path(shutil.copy(tmp_path / "view.rrd", tmp_path / "left.rrd"))  # what a process that is killed now leaves
+    core.close()
+    rows = rows_of(left)
     assert len(rows["/tray1/fan_0/speed"]) >= 1900
-    assert styles_of(tmp_path / "view.rrd", "/tray1/fan_0/speed", "Measurements:names")[0] == "measured (rad/s)"
+    assert styles_of(left, "/tray1/fan_0/speed", "Measurements:names")[0] == "measured (rad/s)"
 
 
 def context(folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", serve: bool = False, **config: Any) -> Context:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pipeline.runtime.clock import StageClock, is_of_replay
+from pipeline.runtime.clock import StageClock
 from schemas.header import Header
 from schemas.messages import Clock
 
@@ -34,13 +34,10 @@ def clock_message(t_ns: int, rate: float, tray: str = "a", producer: str = "repl
     return Clock(header=Header(producer, 0, tray), t_ns=t_ns, rate=rate)
 
 
-def test_without_a_replay_the_time_is_the_hosts():
-    clock = StageClock(Host())
-    assert clock.tick_ns("a") == clock.now_ns("a", HOST_NS) == HOST_NS
-
-
 def test_a_tick_stays_at_the_last_time_of_the_replay_and_ages_advance_at_its_rate():
     host = Host()
+    alone = StageClock(host)
+    assert alone.tick_ns("a") == alone.now_ns("a", HOST_NS) == HOST_NS, "without a replay"
     clock = clock_of(host)
     assert clock.update(clock_message(1000, 2.0))
     host.ns += 50
@@ -99,9 +96,3 @@ def test_row_12_a_clock_that_is_not_renewed_expires_and_another_replay_may_follo
     clock.add_replay_health("replay-all-2", has_ended=False)
     assert clock.update(clock_message(3000, 1.0, producer="replay-all-2"))
     assert clock.tick_ns("a") == 3000
-
-
-def test_only_the_replayers_sessions_count_as_a_replay():
-    assert is_of_replay("replay-all-12ab")
-    assert not is_of_replay("acquisition-replay-12ab")
-    assert not is_of_replay("replayer")

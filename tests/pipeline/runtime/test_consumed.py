@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.runtime.consumed import PERIOD_NS, ConsumedReports
-from schemas.enums import Severity
 from schemas.header import Header, InputPosition
-from schemas.messages import Alarm, Consumed, Grid
+from schemas.messages import Consumed, Grid
 from schemas.streams import continues
 
 STEP_NS = 1_000_000_000
@@ -82,18 +81,3 @@ def test_a_run_without_a_break_is_reported_each_two_minutes():
     assert [report.header.sequence for report in stage.reported] == [0, 120, 240]
     assert [report.header.sequence for report in stage.reports.last()] == [249]
     assert stage.reports.last() == [], "the end is reported once"
-
-
-def test_outputs_that_are_no_samples_are_not_reported():
-    alarm = Alarm(
-        header=Header("scorer-1", 0, "a", InputPosition("prediction", "p", 0, 1, 0)),
-        fan=0,
-        active=True,
-        severity=Severity.ALARM,
-        t_ns=1,
-        onset_t_ns=1,
-        residual_rad_s=0.0,
-        limit_rad_s=0.0,
-        message="",
-    )
-    assert ConsumedReports().after("alarm", alarm) == []

@@ -55,14 +55,11 @@ def begun() -> DueMessages:
     return due
 
 
-def test_the_first_message_of_a_key_comes_alone():
+def test_messages_of_a_tray_come_together_after_the_first_and_trays_take_turns():
     due = DueMessages(TRAYS, joins=True)
-    a = [raw("a", k) for k in range(3)]
-    due.add(a)
-    assert popped(due) == [a[:1], a[1:]]
-
-
-def test_messages_of_a_tray_come_together_and_trays_take_turns():
+    first = [raw("a", k) for k in range(3)]
+    due.add(first)
+    assert popped(due) == [first[:1], first[1:]], "the first message of a key comes alone"
     due = begun()
     a, b = [raw("a", k) for k in range(3)], [raw("b", k) for k in range(2)]
     between = request("a", 0)
@@ -71,47 +68,29 @@ def test_messages_of_a_tray_come_together_and_trays_take_turns():
     assert due.bytes == sum(len(each.payload) for each in (*a, *b, between))
     assert popped(due) == [a[:2], b, [between], [a[2]]]
     assert due.bytes == 0
-
-
-def test_another_producer_or_number_of_fans_is_not_joined():
-    due = begun()
     mixed = [raw("a", 0), raw("a", 0, producer="acquisition-2"), raw("a", 1, fans=3)]
     due.add(mixed)
-    assert popped(due) == [[each] for each in mixed]
+    assert popped(due) == [[each] for each in mixed], "another producer or number of fans is not joined"
+    due.add([*a, between, *b])
+    assert due.pop_of_each() == [a, b]
+    assert [len(group) for group in due.pop_of_each()] == [1], "the request comes after what was sent before it"
+    of_all = DueMessages([""], joins=True)
+    of_all.add([*a, *b, request("", 0)])
+    assert popped(of_all) == [[each] for each in (*a, *b, request("", 0))], "one core for all trays gets each alone"
 
 
-def test_so_many_values_come_together_at_most():
+def test_no_more_values_come_together_than_are_joined_at_most():
     due = begun()
     half = [raw("a", k, samples=MOST_JOINED_VALUES // 4, fans=2) for k in range(3)]
     larger = raw("a", 3, samples=MOST_JOINED_VALUES, fans=2)
     due.add([*half, larger])
     assert popped(due) == [half[:2], half[2:], [larger]]
-
-
-def test_of_several_trays_comes_at_once_what_waits_of_each():
-    due = begun()
-    a, b = [raw("a", k) for k in range(5)], [raw("b", k) for k in range(2)]
-    due.add([*a, request("a", 0), *b])
-    assert due.pop_of_each() == [a, b]
-    assert [len(group) for group in due.pop_of_each()] == [1], "the request comes after what was sent before it"
-    assert not due
-
-
-def test_of_large_trays_no_more_are_taken_at_once_than_are_joined_of_one():
-    due = begun()
     large = [raw(tray, k, samples=MOST_JOINED_VALUES // 4, fans=2) for k in range(3) for tray in TRAYS]
     due.add(large)
     assert due.pop_of_each() == [large[0:4:2], large[1:4:2]], "two of each, as if there were no other tray"
-    larger = DueMessages(TRAYS, joins=True)
-    larger.add([raw(tray, 0, samples=MOST_JOINED_VALUES, fans=2) for tray in TRAYS])
-    assert [len(group) for group in larger.pop_of_each()] == [1]
-
-
-def test_one_core_for_all_trays_gets_every_message_in_order():
-    due = DueMessages([""], joins=True)
-    mixed = [raw("a", 0), raw("a", 1), raw("b", 0), request("", 0), raw("a", 2)]
-    due.add(mixed)
-    assert popped(due) == [[each] for each in mixed]
+    larger_trays = DueMessages(TRAYS, joins=True)
+    larger_trays.add([raw(tray, 0, samples=MOST_JOINED_VALUES, fans=2) for tray in TRAYS])
+    assert [len(group) for group in larger_trays.pop_of_each()] == [1]
 
 
 STEPS = st.lists(st.one_of(st.none(), st.tuples(st.sampled_from(["a", "b", "c"]), st.booleans())), max_size=40)

@@ -42,7 +42,7 @@ def unanswered(_request: Request) -> Found:
     return Found()
 
 
-@pytest.mark.parametrize("forged", [12, 10**6, 2**40, 2**64 - 1])
+@pytest.mark.parametrize("forged", [12, 2**64 - 1])
 def test_row_10_a_number_that_its_producer_has_not_reached_is_refused(forged):
     producer = RealProducer(10)
     tracker = SequenceTracker(producer.ask)
@@ -55,12 +55,9 @@ def test_row_10_a_number_that_its_producer_has_not_reached_is_refused(forged):
     assert (line.received, line.missing, line.duplicated) == (12, 0, 0)
     assert tracker.counters() == {"refused_numbers": 1}
     assert f"{KEY}: {PRODUCER} cannot have published {forged + 1} messages after 10" in tracker.problem()
-
-
-def test_row_10_a_first_message_with_a_number_that_its_producer_has_not_reached_is_refused():
-    tracker = SequenceTracker(RealProducer(2).ask)
-    assert sequences(tracker.accept(packet(10**9))) == []
-    assert sequences(tracker.accept(packet(1))) == [0, 1]
+    first = SequenceTracker(RealProducer(2).ask)
+    assert sequences(first.accept(packet(10**9))) == [], "also as the first message"
+    assert sequences(first.accept(packet(1))) == [0, 1]
 
 
 def test_row_10_without_an_answer_a_number_is_believed_as_far_as_its_producer_can_have_come():
@@ -78,7 +75,7 @@ def test_row_10_without_an_answer_a_number_is_believed_as_far_as_its_producer_ca
     assert not tracker.problem()
 
 
-@pytest.mark.parametrize("claimed", [10**9, 2**53 + 1, 2**64 - 1])
+@pytest.mark.parametrize("claimed", [10**9, 2**64 - 1])
 def test_row_10_a_health_that_claims_more_than_possible_is_not_believed(claimed):
     tracker = SequenceTracker(unanswered)
     tracker.accept(packet(0))

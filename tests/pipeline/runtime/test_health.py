@@ -52,15 +52,19 @@ def test_row_01_the_times_of_the_newest_input_and_output_are_given(builder):
     assert found.latency_p50_ms == 0.0, "the time of a paused replay is not known"
 
 
-def test_latencies_are_of_the_last_ten_seconds(builder, monkeypatch):
+def test_latencies_are_of_the_last_ten_seconds_and_the_histogram_is_of_the_session(builder, monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr("pipeline.runtime.latencies.time.monotonic", lambda: now_s[0])
-    builder.add_output(START_NS, START_NS, START_NS + 47_000_000_000)
-    assert health(builder, START_NS).latency_p50_ms == 47_000.0
-    now_s[0] += LATENCY_WINDOW_S / 2
-    builder.add_output(START_NS, START_NS, START_NS + 1_000_000)
-    now_s[0] += LATENCY_WINDOW_S / 2 + 0.1
-    assert health(builder, START_NS).latency_p50_ms == 1.0
+    assert health(builder, START_NS).latencies == ()
+    for latency_ms in (-1, 1, 2, 3, 700, 60_000):  # -1: the clock of another host is ahead
+        now_s[0] += LATENCY_WINDOW_S + 1
+        builder.add_output(START_NS, START_NS, START_NS + latency_ms * 1_000_000)
+    found = health(builder, START_NS)
+    assert found.latency_p50_ms == 60_000.0, "the only one of the last ten seconds"
+    counts = {bucket.upper_s: bucket.count for bucket in found.latencies}
+    assert [counts[upper] for upper in (0.002, 0.005, 0.5, 1.0, 30.0, math.inf)] == [3, 4, 4, 5, 5, 6]
+    assert found.latency_sum_s == pytest.approx(60.706)
+    assert decode(Health, encode(found)).latencies == found.latencies
 
 
 def test_what_was_sent_while_catching_up_is_no_latency(builder):
@@ -70,24 +74,3 @@ def test_what_was_sent_while_catching_up_is_no_latency(builder):
     found = health(builder, START_NS)
     assert found.latency_p99_ms == 1.0
     assert (found.latencies[-1].count, found.latency_sum_s) == (1, 0.001)
-
-
-def test_the_histogram_of_latencies_counts_every_output_of_the_session(builder, monkeypatch):
-    now_s = [100.0]
-    monkeypatch.setattr("pipeline.runtime.latencies.time.monotonic", lambda: now_s[0])
-    assert health(builder, START_NS).latencies == ()
-    for latency_ms in (-1, 1, 2, 3, 700, 60_000):  # -1: the clock of another host is ahead
-        builder.add_output(START_NS, START_NS, START_NS + latency_ms * 1_000_000)
-        now_s[0] += LATENCY_WINDOW_S + 1
-    found = health(builder, START_NS)
-    counts = {bucket.upper_s: bucket.count for bucket in found.latencies}
-    assert (counts[0.002], counts[0.005], counts[0.5], counts[1.0], counts[30.0], counts[math.inf]) == (
-        3,
-        4,
-        4,
-        5,
-        5,
-        6,
-    )
-    assert found.latency_sum_s == pytest.approx(60.706)
-    assert decode(Health, encode(found)).latencies == found.latencies

@@ -47,19 +47,13 @@ def woken_by(put_last: Callable[[Inbox], object], patient: int) -> Item | None:
     return getter.got
 
 
-def test_an_urgent_item_wakes_the_stage_which_takes_the_others_first() -> None:
+def test_an_urgent_item_or_many_wake_the_stage_which_takes_the_others_first() -> None:
     assert woken_by(lambda inbox: inbox.put(item(99)), patient=2) == item(0)
     assert woken_by(lambda inbox: inbox.put_at_once(item(99)), patient=2) == item(0)
-
-
-def test_many_items_wake_the_stage_although_none_is_urgent() -> None:
     assert woken_by(lambda inbox: inbox.put(item(99), is_urgent=False), patient=MOST_PATIENT) == item(0)
-
-
-def test_a_stage_that_asks_gets_what_is_there() -> None:
     inbox = Inbox(drops_oldest=False)
     inbox.put(item(1), is_urgent=False)
-    assert inbox.get(LONG_S) == item(1)
+    assert inbox.get(LONG_S) == item(1), "a stage that asks gets what is there"
     assert inbox.get(0) is None
 
 

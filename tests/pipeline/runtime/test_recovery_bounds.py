@@ -70,15 +70,12 @@ def test_row_11_messages_of_a_stream_wait_in_order_for_those_that_were_missed_an
     assert tracker.answer(requests[0], Found([packet(1)])) == [], "a second answer changes nothing"
 
 
-def test_row_11_a_stream_that_has_waited_for_too_much_goes_on_without():
+def test_row_11_a_stream_that_has_waited_for_too_many_messages_or_bytes_goes_on_without(monkeypatch):
     tracker = SequenceTracker(late)
     tracker.accept(packet(0))
     due = [s for number in range(2, MOST_HELD_MESSAGES + 4) for s in sequences(tracker.accept(packet(number)))]
     assert due == list(range(2, MOST_HELD_MESSAGES + 4))
     assert tracker.inputs()[0].missing == 1
-
-
-def test_row_11_a_stream_that_waits_is_bounded_in_bytes(monkeypatch):
     monkeypatch.setattr("pipeline.runtime.sequence_tracker.MOST_HELD_BYTES", 100)
     tracker = SequenceTracker(late)
     tracker.accept(packet(0))
@@ -86,24 +83,18 @@ def test_row_11_a_stream_that_waits_is_bounded_in_bytes(monkeypatch):
     assert [len(tracker.accept(each)) for each in large] == [0, 0, 0, 4]
 
 
-def test_row_11_a_flood_of_producers_leaves_the_real_one_in_sequence_and_few_others():
-    tracker = SequenceTracker(lambda _request: Found())
-    for number in range(2_000):
+def test_row_11_a_flood_of_producers_leaves_the_real_one_in_sequence_few_others_and_room_for_a_stage():
+    sessions, flood = Sessions(), 4 * MOST_PRODUCERS
+    sessions.update(Session("acquisition", "tray", 1, "acquisition-tray-restarted", "host", 1).key("site"), alive=True)
+    tracker = SequenceTracker(lambda _request: Found(), sessions=sessions)
+    for number in range(flood):
         assert sequences(tracker.accept(packet(number, "real"))) == [number]
         tracker.accept(packet(1, f"false-{number}"))
     assert len(list(tracker._streams)) == MOST_PRODUCERS
-    assert sum(line.received for line in tracker.inputs()) == 2_000 + MOST_PRODUCERS - 1
-    assert tracker.counters() == {"refused_producers": 2_000 - MOST_PRODUCERS + 1}
+    assert sum(line.received for line in tracker.inputs()) == flood + MOST_PRODUCERS - 1
+    assert tracker.counters() == {"refused_producers": flood - MOST_PRODUCERS + 1}
     real = next(line for line in tracker.inputs() if line.producer == "real")
-    assert (real.received, real.missing, real.duplicated) == (2_000, 0, 0)
-
-
-def test_row_11_in_a_flood_of_producers_a_session_of_a_stage_is_admitted():
-    sessions = Sessions()
-    sessions.update(Session("acquisition", "tray", 1, "acquisition-tray-restarted", "host", 1).key("site"), alive=True)
-    tracker = SequenceTracker(lambda _request: Found(), sessions=sessions)
-    for number in range(2 * MOST_PRODUCERS):
-        tracker.accept(packet(1, f"false-{number}"))
+    assert (real.received, real.missing, real.duplicated) == (flood, 0, 0)
     assert sequences(tracker.accept(packet(0, "acquisition-tray-restarted"))) == [0]
     assert sequences(tracker.accept(packet(0, "stranger"))) == []
 
@@ -145,7 +136,7 @@ def test_row_11_a_flood_of_healths_is_remembered_in_part():
     assert len(list(tracker._streams)) == MOST_HEALTH_PRODUCERS + MOST_PRODUCERS
 
 
-def test_row_11_a_producer_that_was_silent_for_long_makes_room_first():
+def test_row_11_a_producer_that_was_silent_for_long_makes_room_and_while_all_wait_others_are_refused_and_named():
     now_s = [0.0]
     tracker = SequenceTracker(lambda _request: Found(), lambda: now_s[0])
     for number in range(10):
@@ -154,9 +145,6 @@ def test_row_11_a_producer_that_was_silent_for_long_makes_room_first():
     for number in range(MOST_PRODUCERS):
         tracker.accept(packet(0, f"new-{number}"))
     assert {line.producer for line in tracker.inputs()} == {"", *(f"new-{n}" for n in range(MOST_PRODUCERS))}
-
-
-def test_row_11_while_all_remembered_producers_wait_others_are_refused_and_named():
     tracker = SequenceTracker(late)
     for number in range(MOST_PRODUCERS + 1):
         tracker.accept(packet(1, f"p{number}"))
@@ -315,16 +303,11 @@ def test_row_11_a_message_larger_than_any_of_its_topic_is_refused(endpoint):
     assert bus.refused_too_large == 1
 
 
-def test_row_11_the_inbox_is_bounded_in_bytes():
+def test_row_11_the_inbox_is_bounded_in_bytes_and_what_must_not_be_missed_is_not_dropped():
     inbox = Inbox(drops_oldest=True)
-    payload = bytes(INBOX_BYTES // 2)
     for number in range(5):
-        inbox.put(FromBus("k", payload, number))
-    assert inbox.waiting() == 2
-    assert inbox.dropped == 3
-
-
-def test_row_11_what_must_not_be_missed_is_not_dropped_from_a_full_inbox():
+        inbox.put(FromBus("k", bytes(INBOX_BYTES // 2), number))
+    assert (inbox.waiting(), inbox.dropped) == (2, 3)
     inbox = Inbox(drops_oldest=True)
     answer = Recovered(request(), Answer())
     inbox.put(answer)

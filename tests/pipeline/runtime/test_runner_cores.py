@@ -21,15 +21,6 @@ from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, toy
 
 
-def test_each_tray_has_its_own_core_and_sequence(config):
-    bench = Bench(toy(), config)
-    bench.feed(TRAY_A, 1)
-    bench.feed(TRAY_B, 2)
-    got = {(g.header.tray, g.header.sequence) for g in (bench.next(Grid), bench.next(Grid))}
-    bench.end()
-    assert got == {(TRAY_A, 0), (TRAY_B, 0)}
-
-
 class Joined(Passer):
     """A core whose blocks are processed in one pass with those of other trays; the first one waits."""
 
@@ -123,34 +114,6 @@ def test_a_core_finishes_its_step_when_its_messages_are_taken():
     assert finished == [TRAY_A], "what the other would save must not be ahead of what is published of it"
     next(steps)
     assert finished == [TRAY_A, TRAY_B]
-
-
-def test_items_a_source_delivers_while_stopping_are_processed_before_the_end(config):
-    items = [raw(t_ns) for t_ns in range(50)]
-    stage = toy(lambda _context: BuiltStage(Passer(), Burst(items)), name="acquisition")
-    bench = Bench(stage, config, TRAY_A)
-    last = bench.end()
-    grids = []
-    while not bench.heard.empty():
-        grids += [m.t_ns.tolist() for _, m in [bench.heard.get()] if isinstance(m, Grid)]
-    assert grids == [[t] for t in range(50)] + [[-1]]
-    assert last.status == StageStatus.STOPPED
-    assert last.outputs[0].published == 51
-
-
-def test_the_last_health_of_a_stage_that_crashed_says_why(config):
-    class Broken(Passer):
-        def step(self, item: Any) -> Sequence[Message]:
-            raise ZeroDivisionError("on purpose")
-
-    bench = Bench(toy(lambda _context: BuiltStage(Broken())), config)
-    bench.feed(TRAY_A, 1)
-    last = bench.health_with(lambda health: "crashed" in health.problem)
-    bench.thread.join(20)
-    bench.bus.close()
-    assert bench.crashes
-    assert last.status == StageStatus.DEGRADED
-    assert "ZeroDivisionError: on purpose" in last.problem
 
 
 class CrashesOnce(Passer):
@@ -253,35 +216,39 @@ def test_a_core_of_all_trays_publishes_from_tick_and_close_for_the_tray_in_the_h
     ]
 
 
-def test_an_output_without_a_tray_is_refused_in_one_line(config):
+@pytest.mark.parametrize(
+    ("tray", "declared", "why"),
+    [
+        ("", {}, "'resampler' serves all trays and returned a grid without one: set header"),
+        (TRAY_B, {"writes": ()}, "message of topic 'grid': add it to `writes` of its declaration"),
+    ],
+)
+def test_an_output_without_a_tray_or_a_declaration_is_refused_in_one_line(config, tray, declared, why):
     stop = threading.Event()
     stop.set()
-    runner = Runner(toy(lambda _context: BuiltStage(OfAllTrays("")), core_per_tray=False), config, None, stop)
-    with pytest.raises(StageError, match="'resampler' serves all trays and returned a grid without one: set header"):
-        runner.run()
+    stage = toy(lambda _context: BuiltStage(OfAllTrays(tray)), core_per_tray=False, **declared)
+    with pytest.raises(StageError, match=why):
+        Runner(stage, config, None, stop).run()
 
 
-def test_an_output_that_is_not_declared_is_refused_in_one_line(config):
-    stop = threading.Event()
-    stop.set()
-    runner = Runner(toy(lambda _context: BuiltStage(OfAllTrays()), core_per_tray=False, writes=()), config, None, stop)
-    with pytest.raises(StageError, match="message of topic 'grid': add it to `writes` of its declaration"):
-        runner.run()
-
-
-def test_sources_in_one_process_for_all_trays_feed_each_the_core_of_its_tray(config):
+def test_items_that_sources_deliver_while_stopping_come_to_the_core_of_their_tray_before_the_end(config):
     def build(context: Context) -> BuiltStage:
-        return BuiltStage(Passer(), Burst([raw(1 if context.tray.name == TRAY_A else 2)]))
+        first = 0 if context.tray.name == TRAY_A else 100
+        return BuiltStage(Passer(), Burst([raw(first + number) for number in range(50)]))
 
     bench = Bench(toy(build, reads=()), config)
-    bench.end()
-    grids = []
+    last = bench.end()
+    grids: dict[str, list[int]] = {TRAY_A: [], TRAY_B: []}
     while not bench.heard.empty():
-        grids += [(m.header.tray, m.t_ns.tolist()) for _, m in [bench.heard.get()] if isinstance(m, Grid)]
-    assert sorted(grids) == [(TRAY_A, [-1]), (TRAY_A, [1]), (TRAY_B, [-1]), (TRAY_B, [2])]
+        _, message = bench.heard.get()
+        if isinstance(message, Grid):
+            grids[message.header.tray] += message.t_ns.tolist()
+    assert grids == {TRAY_A: [*range(50), -1], TRAY_B: [*range(100, 150), -1]}
+    assert last.status == StageStatus.STOPPED
+    assert _published(last, "grid") == {TRAY_A: 51, TRAY_B: 51}
 
 
-def test_a_stage_that_crashes_with_a_full_inbox_leaves_the_bus_at_once(config):
+def test_a_stage_that_crashes_with_a_full_inbox_says_why_and_leaves_the_bus_at_once(config):
     fed = threading.Event()
 
     class BrokenLater(Passer):
@@ -290,10 +257,13 @@ def test_a_stage_that_crashes_with_a_full_inbox_leaves_the_bus_at_once(config):
             raise ZeroDivisionError("on purpose")
 
     bench = Bench(toy(lambda _context: BuiltStage(BrokenLater())), config)
-    for t_ns in range(INBOX_SIZE + 500):
+    for t_ns in range(INBOX_SIZE + 100):
         bench.feed(TRAY_A, t_ns)
     fed.set()
+    last = bench.health_with(lambda health: "crashed" in health.problem)
     bench.thread.join(20)
     bench.bus.close()
     assert not bench.thread.is_alive()
     assert str(bench.crashes[0]) == "on purpose"  # and not that the bus could not be closed
+    assert last.status == StageStatus.DEGRADED
+    assert "ZeroDivisionError: on purpose" in last.problem

@@ -33,12 +33,6 @@ ONE_LINE = (
 )
 
 
-def test_row_07_a_session_is_read_from_the_key_of_its_token():
-    assert Session.of_key(FIRST.key("s")) == FIRST
-    assert Session.of_key(sessions_key("s")) is None
-    assert Session.of_key(FIRST.key("s").replace("4711", "x")) is None
-
-
 @pytest.mark.parametrize(
     ("stage", "instance"),
     [("viewer", "all"), ("acquisition", "b"), ("acquisition", f"{TRAY_A}-b")],
@@ -78,7 +72,7 @@ def test_row_07_of_two_sessions_the_later_owns_the_stage_until_it_ends(order):
     assert not sessions.problem()
 
 
-def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict():
+def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict_and_the_remembered_ones_are_bounded():
     sessions = Sessions()
     of_b = replace(SECOND, instance="b", producer="acquisition-b-1", trays=("b",))
     scorer = replace(SECOND, stage="scorer", producer="scorer-a-1")
@@ -86,6 +80,10 @@ def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict():
         sessions.update(session.key("s"), alive=True)
         assert sessions.named(session.stage, session.instance) == session
     assert not sessions.problem()
+    for number in range(MOST_SESSIONS + 5):
+        sessions._alive[f"key {number}"] = FIRST
+    sessions.update(SECOND.key("s"), alive=True)
+    assert SECOND.key("s") not in sessions._alive
 
 
 def shard(name: str, started_t_ns: int, *trays: str) -> Session:
@@ -99,11 +97,11 @@ def known(*sessions: Session) -> Sessions:
     return found
 
 
-@pytest.mark.parametrize(
-    "session", [shard("all", 1), shard("a", 2, "a"), shard("2-of-4", 3, "b", "c-d"), shard("all", 4, "all")]
-)
-def test_row_07_a_token_says_the_trays_of_its_session(session):
-    assert Session.of_key(session.key("s")) == session
+def test_row_07_a_session_and_its_trays_are_read_from_the_key_of_its_token():
+    for session in (FIRST, shard("all", 1), shard("2-of-4", 3, "b", "c-d"), shard("all", 4, "all")):
+        assert Session.of_key(session.key("s")) == session
+    assert Session.of_key(sessions_key("s")) is None
+    assert Session.of_key(FIRST.key("s").replace("4711", "x")) is None
 
 
 def test_row_07_only_the_trays_that_two_sessions_have_change_their_owner():
@@ -145,14 +143,6 @@ def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(
             "or give this one other trays"
         )
         Runner(toy(), config, Shard(TRAY_B, (TRAY_B,), ("--trays", TRAY_B)), stop).run()
-
-
-def test_row_07_the_sessions_remembered_are_bounded():
-    sessions = Sessions()
-    for number in range(MOST_SESSIONS + 5):
-        sessions._alive[f"key {number}"] = FIRST
-    sessions.update(SECOND.key("s"), alive=True)
-    assert SECOND.key("s") not in sessions._alive
 
 
 def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_the_first(config, monkeypatch):
@@ -268,8 +258,4 @@ def test_row_07_a_snapshot_that_another_process_uses_is_refused_in_one_line(tmp_
     )
     first.unlock()
     SnapshotStore(path).lock("site two")
-
-
-def test_row_07_a_snapshot_in_a_folder_that_cannot_be_written_is_not_locked(tmp_path: Path):
-    (tmp_path / "file").write_text("")
-    SnapshotStore(tmp_path / "file" / "scorer-tray1.snapshot").lock("site one")
+    SnapshotStore(path / "scorer-tray1.snapshot").lock("in a folder that cannot be written, nothing is locked")

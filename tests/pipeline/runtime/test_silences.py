@@ -68,26 +68,20 @@ def consumer() -> Consumer:
     return Consumer()
 
 
-def test_row_16_a_silence_is_shown_once_by_each_health_that_says_that_all_has_arrived(consumer):
+def test_row_16_a_silence_is_shown_once_by_each_health_that_says_that_all_was_processed_and_has_arrived(consumer):
     assert consumer.is_shown(), "a producer that never publishes health shows nothing else"
     consumer.hear(5)
     assert not consumer.is_shown(), "five messages are on the way"
     consumer.arrived = 5
     assert not consumer.is_shown(), "that they have arrived now says nothing about later ones"
+    consumer.hear(5, has_more=True)
+    assert not consumer.is_shown(), "it could not send for a while, and samples wait in it"
     consumer.hear(5)
     assert consumer.is_shown()
     assert not consumer.is_shown()
 
 
-def test_row_16_a_producer_that_has_not_processed_its_input_shows_nothing(consumer):
-    consumer.arrived = 5
-    consumer.hear(5, has_more=True)
-    assert not consumer.is_shown(), "it could not send for a while, and samples wait in it"
-    consumer.hear(5)
-    assert consumer.is_shown()
-
-
-def test_row_16_a_health_that_was_cut_off_on_its_way_shows_nothing(consumer):
+def test_row_16_a_health_that_was_cut_off_on_its_way_shows_nothing_also_after_one_of_another_producer(consumer):
     consumer.arrived = 5
     consumer.hear(5)
     assert consumer.is_shown()
@@ -97,6 +91,10 @@ def test_row_16_a_health_that_was_cut_off_on_its_way_shows_nothing(consumer):
     assert not consumer.is_shown(), "samples were sent after it, and come next"
     consumer.hear(5)
     assert consumer.is_shown()
+    consumer.now_s += 30.0
+    consumer.hear(0, STARTING, "q")
+    consumer.hear(5, t_ns=sent_ns)
+    assert not consumer.is_shown()
 
 
 def test_a_clock_that_is_set_back_delays_what_is_shown_for_a_while_only(consumer):
@@ -128,29 +126,21 @@ def test_row_16_a_session_that_has_just_begun_shows_nothing_before_its_first_mes
     assert consumer.is_shown()
 
 
-def test_a_session_whose_device_is_silent_from_the_beginning_shows_it(consumer):
-    consumer.hear(0, STARTING)
-    consumer.hear(0)
-    consumer.now_s += BEGINS_NS / NS_PER_S
-    consumer.hear(0)
-    assert consumer.is_shown()
-
-
-@pytest.mark.parametrize("status", [STOPPED, DEGRADED])
-def test_what_a_producer_that_has_ended_has_sent_is_still_waited_for(consumer, status):
-    consumer.hear(5, status, is_last=True)
+@pytest.mark.parametrize("ends", [STOPPED, DEGRADED, "killed"])
+def test_row_11_what_a_producer_that_has_ended_has_sent_is_still_waited_for(consumer, ends):
+    if ends == "killed":
+        consumer.hear(5)
+        consumer.silences.end("another")
+        consumer.silences.end("p")
+    else:
+        consumer.hear(5, ends, is_last=True)
     consumer.now_s += RESTART_S
     assert not consumer.is_shown(), "its last messages are still being fetched"
     consumer.arrived = 5
     assert consumer.is_shown()
     assert consumer.is_shown()
-
-
-def test_a_producer_that_begins_again_is_waited_for_again(consumer):
-    consumer.hear(5, STOPPED, is_last=True)
     consumer.hear(7)
-    consumer.arrived = 5
-    assert not consumer.is_shown(), "the seventh is on the way"
+    assert not consumer.is_shown(), "it has begun again, and the seventh is on the way"
 
 
 def test_row_11_after_a_crash_the_next_session_is_waited_for_a_few_seconds_only(consumer):
@@ -177,17 +167,6 @@ def test_row_11_a_stage_that_crashes_at_each_start_does_not_hide_it(consumer):
     consumer.arrived = 3
     consumer.hear(3, DEGRADED, "t", is_last=True)
     assert not consumer.is_shown(), "this one has worked: its successor may read what its device keeps"
-
-
-def test_row_11_a_killed_session_has_ended(consumer):
-    consumer.hear(5)
-    consumer.silences.end("another")
-    consumer.silences.end("p")
-    consumer.now_s += RESTART_S
-    assert not consumer.is_shown(), "its last messages are still being fetched"
-    consumer.arrived = 5
-    assert consumer.is_shown()
-    assert consumer.is_shown()
 
 
 FIRST, SECOND = (
@@ -226,17 +205,6 @@ def test_row_11_a_session_that_has_become_the_owner_shows_a_silence(of_two):
 def test_row_11_a_producer_that_is_no_session_shows_nothing_where_a_session_publishes(of_two, stage):
     of_two.hear(5, OK, "stranger", stage=stage)
     assert not of_two.is_shown()
-
-
-def test_row_16_a_late_health_is_late_also_after_one_of_another_producer(consumer):
-    consumer.arrived = 5
-    consumer.hear(5)
-    assert consumer.is_shown()
-    sent_ns = round(consumer.now_s * NS_PER_S)
-    consumer.now_s += 30.0
-    consumer.hear(0, STARTING, "q")
-    consumer.hear(5, t_ns=sent_ns)
-    assert not consumer.is_shown()
 
 
 def test_a_session_has_begun_also_where_another_one_reports_by_turns(consumer):
@@ -293,16 +261,16 @@ def test_row_11_a_session_without_a_token_was_killed_if_its_process_runs_no_more
 
 
 def test_row_11_sessions_that_come_and_go_are_remembered_up_to_a_limit(monkeypatch):
-    monkeypatch.setattr("pipeline.runtime.lost_sessions.MOST_SESSIONS", 3)
+    monkeypatch.setattr("pipeline.runtime.lost_sessions.MOST_SESSIONS", 2)
     sessions = LostSessions(this_host())
-    processes = [subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) for _ in range(5)]
+    processes = [subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) for _ in range(3)]
     for process in processes:
         sessions.update(token(process.pid), alive=True)
         sessions.update(token(process.pid), alive=False)
     for process in processes:
         process.kill()
         process.communicate()
-    assert len(sessions.take_killed()) == 3
+    assert len(sessions.take_killed()) == 2
 
 
 def test_row_11_whether_a_process_elsewhere_runs_is_not_known():
