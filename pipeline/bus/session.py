@@ -10,7 +10,6 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
@@ -20,7 +19,15 @@ from pipeline.bus.access_rules import SiteRoles
 from pipeline.bus.endpoint import endpoint_problem, somebody_listens
 from pipeline.bus.errors import BusError, NoAnswerError
 from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept, kept_key
-from pipeline.bus.opening import MEETING_LIMIT_S, ROUTER_RETRY_S, answers, credentials_of, open_session
+from pipeline.bus.meeting import Meeting
+from pipeline.bus.opening import (
+    MEETING_LIMIT_S,
+    ROUTER_RETRY_S,
+    answers,
+    credentials_of,
+    open_session,
+    zenoh_config,
+)
 from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
 from pipeline.bus.rights import UNANSWERED_LIMIT_S, OwnRights, granted_rights
@@ -32,8 +39,6 @@ from schemas.topics import Topic, key_in_words, largest_bytes
 SAID_AFTER_S = 3.0
 """a client that waits so long for its router says so"""
 _MEETING_POLL_S = 0.01
-_MEETING_S, _BETWEEN_MEETINGS_S = 2.0, 3.0
-"""how long a session stays through which others meet again, and how long the next one waits at least"""
 _ALIVE_TIMEOUTS = 2
 """`Bus.alive` asks again for so many times `recovery_timeout_s`"""
 
@@ -76,7 +81,7 @@ class Bus:
             role, is_client = self.credentials.role, config.mode == "client"
             self.rights = OwnRights(self._session, site, role, is_client=is_client)
         self._site = site
-        self._meeting = threading.Thread()
+        self._meeting = Meeting()
         self._stop = stop or threading.Event()
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
@@ -159,21 +164,9 @@ class Bus:
                 return
 
     def meet_again(self) -> None:
-        """Let peers meet again that a cut link has left apart, in a thread of its own; to be called while they are.
-
-        Zenoh does not connect again two peers that had found each other through a third one. But whoever joins is told
-        of all peers, and tells them of one another. So another session joins for a moment.
-        """
-        if self._config.mode == "peer" and not self._meeting.is_alive():
-            self._meeting = threading.Thread(target=self._meet, name="meet again", daemon=True)
-            self._meeting.start()
-
-    def _meet(self) -> None:
-        with suppress(BusError, zenoh.ZError):  # the next time it may work
-            session = open_session(self._config, self.credentials, None, listens=False, site=self._site)
-            self._stop.wait(_MEETING_S)
-            session.close()
-        self._stop.wait(_BETWEEN_MEETINGS_S)
+        """Let peers meet again that a cut link has left apart; to be called while they are. A router does so itself."""
+        if self._config.mode == "peer":
+            self._meeting.begin(zenoh_config(self._config, self.credentials, self._site, listens=False))
 
     def alive(self, key_expression: str) -> set[str]:
         """The keys of the tokens that exist now. Asks again if there is no complete answer. That there is none must be

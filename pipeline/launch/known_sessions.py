@@ -69,6 +69,10 @@ class KnownSessions:
         """Whether the token of this session is there now."""
         return self._sessions.is_alive(producer)
 
+    def may_return(self, producer: str) -> bool:
+        """Whether the token of this session has gone, but nothing says that it has ended."""
+        return self._sessions.may_return(producer)
+
     def is_known(self, producer: str) -> bool:
         """Whether this session has shown its token."""
         return producer in self._known

@@ -107,7 +107,7 @@ class SiteWatcher:
         """The latest session of every stage instance, by name; one whose token is there, if there is one. A session
         whose link was cut is looked for."""
         with self._lock:
-            if self._lost.are_apart():
+            if any(map(self._sessions.may_return, self._lost.cut_off())):
                 self._bus.meet_again()
             latest: dict[tuple[str, str], StageView] = {}
             at_work = self._sessions.alive()

@@ -53,10 +53,11 @@ class LostSessions:
             del self._gone[key]
         return [each.producer for each in killed.values()]
 
-    def are_apart(self) -> bool:
-        """Whether the link to a session was cut that still runs."""
+    def cut_off(self) -> list[str]:
+        """The producers of the sessions that still run."""
         now_s = self.now_s()
-        return any(
-            APART_S <= now_s - since_s < APART_LIMIT_S and each.may_live(self.host)
+        return [
+            each.producer
             for each, since_s in self._gone.values()
-        )
+            if APART_S <= now_s - since_s < APART_LIMIT_S and each.may_live(self.host)
+        ]

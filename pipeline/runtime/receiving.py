@@ -146,7 +146,7 @@ class Receiver:
         self._recovery.send_due()
         for producer in self._lost.take_killed():
             self._silences.end(producer)
-        if self._lost.are_apart():
+        if any(map(self._sessions.may_return, self._lost.cut_off())):
             self._bus.meet_again()
 
     def is_complete(self, tray: str) -> bool:

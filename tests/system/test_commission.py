@@ -37,7 +37,20 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
 @contextmanager
 def playing(link: Path, fans: int) -> Iterator[RunningCommand]:
     """A simulated tray, whose plant moves its fans."""
-    words = ("simulate", "--fans", fans, "--speed-unit", "rpm", "--link", link, "--profile", "prbs", "--json")
+    words = (
+        "simulate",
+        "--fans",
+        fans,
+        "--rate",
+        20,
+        "--speed-unit",
+        "rpm",
+        "--link",
+        link,
+        "--profile",
+        "prbs",
+        "--json",
+    )
     tray = RunningCommand(words)
     try:
         tray.line_with(" on ")

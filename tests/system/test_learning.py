@@ -26,7 +26,7 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
     path.write_text(
         f'run_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "tray1"\nfans = {FANS}\n'
         f'command_max = 100\nport = "{tmp_path / "line"}"\n[learner]\nfirst_minutes = 2\n'
-        '[recorder]\ntopics = ["raw", "score"]\n',
+        '[recorder]\ntopics = ["raw", "score"]\n[viewer]\nserve = false\n',
         encoding="utf-8",
     )
     folder = learning_folder(tmp_path / "runs", "tray1")
@@ -36,7 +36,9 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
 
 @pytest.fixture
 def tray(tmp_path: Path) -> Iterator[RunningCommand]:
-    tray = RunningCommand(["simulate", "--fans", FANS, "--link", tmp_path / "line", "--profile", "prbs", "--json"])
+    tray = RunningCommand(
+        ["simulate", "--fans", FANS, "--link", tmp_path / "line", "--profile", "prbs", "--rate", 20, "--json"]
+    )
     try:
         tray.line_with("fans on")
         yield tray

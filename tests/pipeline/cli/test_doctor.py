@@ -42,7 +42,8 @@ def port() -> Iterator[str]:
 def examine(capsys: pytest.CaptureFixture[str], config: Path | None = None, *settings: str) -> tuple[int, dict]:
     code = 0
     try:
-        doctor(config, list(settings), json_output=True, listen_s=0.0)
+        # the ports of the viewer may be taken on this computer
+        doctor(config, ["viewer.serve=false", *settings] if config else [], json_output=True, listen_s=0.0)
     except typer.Exit as end:
         code = end.exit_code
     return code, json.loads(capsys.readouterr().out)
@@ -142,7 +143,12 @@ def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_strange
     with socket.create_server(("127.0.0.1", 0)) as taken, Bus(BusConfig(endpoint=endpoint)) as bus:
         viewer_port = taken.getsockname()[1]
         settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]
-        settings += [f"viewer.grpc_port={viewer_port}", "viewer.web_port=0", "launcher.stages=['resampler', 'viewer']"]
+        settings += [
+            "viewer.serve=true",
+            f"viewer.grpc_port={viewer_port}",
+            "viewer.web_port=0",
+            "launcher.stages=['resampler', 'viewer']",
+        ]
         code, found = examine(capsys, DEMO / "demo.toml", *settings)
         assert code == 1
         assert f"viewer: viewer.grpc_port: port {viewer_port} on 127.0.0.1 is taken" in found["problems"][0]

@@ -111,7 +111,7 @@ def test_columns_that_the_messages_lack_are_empty_and_alarms_are_a_separate_tabl
     assert (len(twin), twin[0]["kind"], pd.isna(twin[0]["sigma_rad_s"])) == (1, "hybrid", True)
     (row,) = table(tmp_path / f"r.tray1.alarm.{form}").to_dict("records")
     assert (row["t_ns"], row["onset_t_ns"], row["fan"], row["active"]) == (70, 50, 0, True)
-    assert (row["severity"], row["message"], row["producer"]) == ("ALARM", "alarm 0", "s")
+    assert (row["severity"], row["message"], row["producer"]) == ("ALARM", "alarm 0", "scorer-1")
     assert (row["transition"], row["statistic"]) == ("RAISED", "SPEED_DRIFT")
 
 

@@ -245,17 +245,17 @@ def test_row_11_a_session_without_a_token_was_killed_if_its_process_runs_no_more
         assert sessions.take_killed() == [], "only its link was cut"
         cut_off: list[bool] = []
         for now_s in (1.9, 2.0, 59.9, 60.0):  # noqa: B007  read by the sessions
-            cut_off.append(sessions.are_apart())
+            cut_off.append(bool(sessions.cut_off()))
         assert cut_off == [False, True, True, False]
         now_s = 10.0
         sessions.update(key, alive=True)
-        assert not sessions.are_apart(), "it is back"
+        assert not sessions.cut_off(), "it is back"
         sessions.update(key, alive=False)
     finally:
         process.kill()
         process.communicate()
     now_s = 15.0
-    assert not sessions.are_apart(), "it was killed"
+    assert not sessions.cut_off(), "it was killed"
     assert sessions.take_killed() == ["acquisition-a-01"]
     assert sessions.take_killed() == []
 
