@@ -36,7 +36,7 @@ test: $(VENV)/.development check
 check: $(VENV)/.development
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
-	$(BIN)/pyright
+	$(BIN)/pyright --threads 2
 	$(BIN)/lint-imports
 
 selftest: $(VENV)/.runtime

@@ -38,14 +38,14 @@ def white(rng: np.random.Generator) -> Array:
 def slow(rng: np.random.Generator) -> Array:
     """Autocorrelation exp(-t / 0.5 s)."""
     drawn = rng.normal(size=SAMPLES + 1000)
-    return np.asarray(signal.lfilter([1.0], [1.0, -np.exp(-STEP_S / 0.5)], drawn))[1000:]
+    return np.asarray(signal.lfilter([1.0], [1.0, -np.exp(-STEP_S / 0.5)], drawn), float)[1000:]
 
 
 def oscillating(rng: np.random.Generator) -> Array:
     """A resonance at 1 Hz."""
     pole = 0.98 * np.exp(2j * np.pi * STEP_S)
     drawn = rng.normal(size=SAMPLES + 1000)
-    return np.asarray(signal.lfilter([1.0], np.poly([pole, pole.conj()]).real, drawn))[1000:]
+    return np.asarray(signal.lfilter([1.0], np.poly([pole, pole.conj()]).real, drawn), float)[1000:]
 
 
 def stairs(rng: np.random.Generator) -> Array:
