@@ -1,13 +1,14 @@
 """A process that joins the bus for a moment, through which peers meet again that a cut link has left apart.
 
-Zenoh does not connect again two peers that had found each other through a third one. But whoever joins is told of all
-peers, and tells them of one another. It is a process of its own because a session that cannot reach its endpoint takes
-ten seconds to close, and Zenoh ends a process that ends meanwhile with an abort.
+Zenoh does not reconnect two peers that discovered each other through a third one. A new peer, however, is told of all
+peers and introduces them to one another. It runs in a process of its own, because a session that cannot reach its
+endpoint takes ten seconds to close, and a process that ends meanwhile is aborted.
 """
 
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -16,18 +17,20 @@ from contextlib import suppress
 import zenoh
 
 STAYS_S = 5.0
-"""long enough for all to connect, and the time between two attempts"""
+"""time that the process stays: enough for all peers to connect, and the interval between two attempts"""
+MOST_S = 30.0
+"""after this long it ends, also if Zenoh hangs"""
 
 
 class Meeting:
-    """The process, which ends by itself."""
+    """Starts the process, one at a time. It ends by itself."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
 
     def begin(self, conf: zenoh.Config) -> None:
-        """Let a process join with these settings, unless one is there. A system that has no process left is asked the
-        next time."""
+        """Start the process with these settings unless one is running. If the system cannot start it, the next call
+        tries again."""
         if self._process is not None and self._process.poll() is None:
             return
         with suppress(OSError):
@@ -39,12 +42,13 @@ class Meeting:
                 start_new_session=True,
             )
             assert self._process.stdin
-            self._process.stdin.write(str(conf).encode())
-            self._process.stdin.close()
+            with self._process.stdin as settings:
+                settings.write(str(conf).encode())
 
 
 def main() -> None:
     """Join with the settings from standard input, and leave."""
+    signal.alarm(round(MOST_S))
     session = zenoh.open(zenoh.Config.from_json5(sys.stdin.read()))
     time.sleep(STAYS_S)
     del session

@@ -164,9 +164,9 @@ class Outbox:
         with self._lock:
             row = self._file.execute(
                 "SELECT number, made_ns, title, body, level, may_be_repeated,"
-                " coalesce((SELECT count FROM lost WHERE target = ?1), 0)"
-                " FROM message WHERE target = ?1 AND number > ?2 ORDER BY number LIMIT 1",
-                (target, after),
+                " coalesce((SELECT count FROM lost WHERE target = :target), 0)"
+                " FROM message WHERE target = :target AND number > :after ORDER BY number LIMIT 1",
+                {"target": target, "after": after},
             ).fetchone()
         if row is None:
             return None
@@ -233,7 +233,8 @@ class Outbox:
         counts = Counter(target for (target,) in rows)
         self.lost.update(counts)
         self._file.executemany(
-            "INSERT INTO lost VALUES (?1, ?2) ON CONFLICT (target) DO UPDATE SET count = count + ?2", counts.items()
+            "INSERT INTO lost VALUES (?, ?) ON CONFLICT (target) DO UPDATE SET count = count + excluded.count",
+            counts.items(),
         )
 
 

@@ -55,9 +55,9 @@ ON CONFLICT DO UPDATE SET
 """
 """keeps the rowid, by which the oldest ones are deleted"""
 _COUNT_WHILE_JUDGED = """
-SELECT feedback, COUNT(*) FROM alarm WHERE tray = ?1 AND ?2 = (
+SELECT feedback, COUNT(*) FROM alarm WHERE tray = :tray AND :twin = (
     SELECT CASE WHEN last_t_ns >= raised_t_ns THEN twin END FROM judged
-    WHERE judged.tray = ?1 AND first_t_ns <= raised_t_ns ORDER BY first_t_ns DESC LIMIT 1
+    WHERE judged.tray = :tray AND first_t_ns <= raised_t_ns ORDER BY first_t_ns DESC LIMIT 1
 ) GROUP BY feedback
 """
 """by the last stretch that had begun, which the key finds: 200,000 alarms and as many stretches are a second"""
@@ -140,7 +140,7 @@ class AlarmRates:
         since_t_ns, fan_ns = self._file.execute(
             "SELECT MIN(first_t_ns), SUM(fan_ns) FROM judged WHERE tray = ? AND twin = ?", (tray, twin)
         ).fetchone()
-        rows = self._file.execute(_COUNT_WHILE_JUDGED, (tray, twin))
+        rows = self._file.execute(_COUNT_WHILE_JUDGED, {"tray": tray, "twin": twin})
         counts = {Feedback.known(feedback): count for feedback, count in rows}
         return ObservedRate(
             since_t_ns=since_t_ns,

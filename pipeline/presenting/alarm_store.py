@@ -157,9 +157,9 @@ class AlarmStore:
             UserError: the file cannot be read.
         """
         rows = self._read(
-            "SELECT number, alarm FROM transition WHERE (?1 = '' OR tray = ?1) AND (?2 < 0 OR fan = ?2)"
-            " AND (?3 IS NULL OR number < ?3) ORDER BY number DESC LIMIT ?4",
-            (tray, fan, before, most),
+            "SELECT number, alarm FROM transition WHERE (:tray = '' OR tray = :tray) AND (:fan < 0 OR fan = :fan)"
+            " AND (:before IS NULL OR number < :before) ORDER BY number DESC LIMIT :most",
+            {"tray": tray, "fan": fan, "before": before, "most": most},
         )
         return [(number, alarm) for number, data in rows if (alarm := _decoded(data)) is not None]
 
@@ -173,9 +173,9 @@ class AlarmStore:
         """
         order = "DESC" if is_backwards else "ASC"
         rows = self._read(
-            "SELECT alarm FROM transition WHERE t_ns >= ?1 AND t_ns < ?2 AND (?3 = '' OR tray = ?3)"
-            f" AND (?4 < 0 OR fan = ?4) ORDER BY t_ns {order}, number {order} LIMIT ?5",
-            (begin_ns, end_ns, tray, fan, most),
+            "SELECT alarm FROM transition WHERE t_ns >= :begin_ns AND t_ns < :end_ns AND (:tray = '' OR tray = :tray)"
+            f" AND (:fan < 0 OR fan = :fan) ORDER BY t_ns {order}, number {order} LIMIT :most",
+            {"begin_ns": begin_ns, "end_ns": end_ns, "tray": tray, "fan": fan, "most": most},
         )
         return [alarm for (data,) in rows if (alarm := _decoded(data)) is not None]
 
@@ -221,7 +221,7 @@ class AlarmStore:
             self._save_waiting()
         self._file.close()
 
-    def _read(self, query: str, values: tuple[object, ...] = ()) -> list[Any]:
+    def _read(self, query: str, values: tuple[object, ...] | dict[str, object] = ()) -> list[Any]:
         try:
             rows = self._file.execute(query, values).fetchall()
         except sqlite3.Error as error:

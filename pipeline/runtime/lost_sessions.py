@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from pipeline.runtime.sessions import MOST_SESSIONS, Session
 
 APART_S, APART_LIMIT_S = 2.0, 60.0
-"""so long after its token has disappeared, a session whose process still runs counts as cut off: before, it may be
-about to end; after, the number of its process may be that of another one"""
+"""time after a token has disappeared in which a session whose process still runs counts as cut off: earlier, it may be
+about to end; later, its process id may be reused"""
 
 
 @dataclass
