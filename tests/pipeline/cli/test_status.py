@@ -89,13 +89,7 @@ class Site:
         """What a listener knows after a score; reasons: why fans are not judged, beginning with fan 0."""
         config = load_config(DEMO / "demo.toml")
         listener = JudgedFans(self.outside, SITE, config.trays, SiteWatcher(self.outside, SITE))
-        score = one_sample(FANS, *reasons)
-
-        def heard() -> bool:  # and no score that an earlier listener was sent
-            self.score.put(encode(score))
-            return bool(listener._seen_s) and listener._reasons[TRAY].tolist() == score.invalid_reason[-1].tolist()
-
-        eventually(heard, "the listener hears it")
+        listener.add(TRAY, encode(one_sample(FANS, *reasons)))
         return listener
 
     def close(self) -> None:
