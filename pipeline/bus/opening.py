@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 ONE_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 """Of two peers that discover each other, the one with the greater id connects. By default both connect at once, and
-each may refuse the other's link as a duplicate. Over 2,000 restarts of sessions this took a fifth of the CPU time."""
+each may refuse the other's link as a duplicate. Over 2,000 restarts, one took a fifth of the CPU time of both."""
 _ROUTER_TIMEOUT_MS = 1000
 ROUTER_RETRY_S = 0.2
 MEETING_LIMIT_S = 10.0

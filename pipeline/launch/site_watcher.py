@@ -107,8 +107,10 @@ class SiteWatcher:
         """The latest session of every stage instance, by name; one whose token is there, if there is one. A session
         whose link was cut is looked for."""
         with self._lock:
-            if any(map(self._sessions.may_return, self._lost.cut_off())):
-                self._bus.meet_again()
+            are_apart = any(map(self._sessions.may_return, self._lost.cut_off()))
+        if are_apart:
+            self._bus.meet_again()
+        with self._lock:
             latest: dict[tuple[str, str], StageView] = {}
             at_work = self._sessions.alive()
             heard = self._believed()  # as heard: a host's clock may be set back

@@ -54,7 +54,7 @@ class LostSessions:
         return [each.producer for each in killed.values()]
 
     def cut_off(self) -> list[str]:
-        """The producers of the sessions that still run."""
+        """The producers of the sessions that still run, and whose token disappeared a while ago."""
         now_s = self.now_s()
         return [
             each.producer

@@ -11,7 +11,7 @@ from schemas.messages import Alarm
 
 
 def health(stage: str, instance: str = "all", producer: str = "", sequence: int = 0, **more: Any) -> Health:
-    """Of a process that is at work; its first one signs as `stage-instance-1`."""
+    """Health of a process that is at work. Without `producer` it signs as `stage-instance-1`."""
     header = Header(producer or f"{stage}-{instance}-1", sequence, "")
     fields: dict[str, Any] = {"status": StageStatus.OK, "t_ns": 1, "uptime_s": 1.0, **more}
     return Health(header=header, stage=stage, instance=instance, **fields)
@@ -20,7 +20,7 @@ def health(stage: str, instance: str = "all", producer: str = "", sequence: int 
 def alarm(
     fan: int = 0, t_ns: int = 7, tray: str = "tray1", producer: str = "scorer-1", sequence: int = 0, **more: Any
 ) -> Alarm:
-    """An alarm that is active, since it is there."""
+    """An active alarm; its onset is its own time."""
     fields: dict[str, Any] = {"active": True, "severity": Severity.ALARM, "t_ns": t_ns, "onset_t_ns": t_ns}
     fields |= {"residual_rad_s": 0.0, "limit_rad_s": 1.0, "message": "", **more}
     return Alarm(header=Header(producer, sequence, tray), fan=fan, **fields)

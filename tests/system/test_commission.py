@@ -38,18 +38,8 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
 def playing(link: Path, fans: int) -> Iterator[RunningCommand]:
     """A simulated tray, whose plant moves its fans."""
     words = (
-        "simulate",
-        "--fans",
-        fans,
-        "--rate",
-        20,
-        "--speed-unit",
-        "rpm",
-        "--link",
-        link,
-        "--profile",
-        "prbs",
-        "--json",
+        *("simulate", "--fans", fans, "--rate", 20, "--speed-unit", "rpm"),
+        *("--link", link, "--profile", "prbs", "--json"),
     )
     tray = RunningCommand(words)
     try:

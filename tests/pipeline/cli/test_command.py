@@ -24,8 +24,8 @@ from pipeline.runtime.sessions import Session
 from schemas.codec import encode, type_name
 from schemas.health import Counter, Health, Note
 from schemas.topics import BY_NAME, alive_key, health_key
+from tests.support import made_messages
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.made_up_health import health_of
 from tests.support.running_chain import Chain, RunningCommand, eventually
 
 
@@ -59,7 +59,7 @@ def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
         return Session("acquisition", f"{number}-of-2", number, f"acquisition-{number}-of-2-1", "board", number, trays)
 
     def beat(session: Session, publisher: Publisher) -> None:
-        health = health_of(session.producer, session.stage, publisher.published, instance=session.instance)
+        health = made_messages.health(session.stage, session.instance, session.producer, publisher.published)
         publisher.put(encode(health))
 
     config, stop = BusConfig(endpoint=endpoint), threading.Event()
@@ -86,7 +86,7 @@ def test_the_process_that_has_the_tray_answers_whatever_it_is_called(endpoint):
 def test_only_the_new_note_on_commands_of_the_tray_says_why_a_command_was_not_sent():
     def health(lost: int, *notes: Note) -> Health:
         counters = (Counter(name="lost_commands", value=lost),)
-        return health_of("acquisition-all-1", "acquisition", 1, counters=counters, notes=notes)
+        return made_messages.health("acquisition", sequence=1, counters=counters, notes=notes)
 
     tray = TrayConfig(name="a", fans=1, source=SerialConfig(port="line"))
     commands = DeviceCommands(tray, build_source(tray.source, SourceContext(1, tray.speed_unit, Path())))

@@ -19,8 +19,8 @@ from schemas.health import Counter, Health, Input, Note
 from schemas.messages import ModelCard
 from schemas.topics import health_key, tray_key
 from tests.pipeline.recordings.test_parts import part, parts_in
+from tests.support import made_messages
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.made_up_health import health_of
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
 
 METADATA = {"site": "plant", "trays": "tray1", "fans.tray1": "2", "speed_unit.tray1": "rpm", "made_by": "fantwin"}
@@ -43,7 +43,9 @@ def recording(path: Path) -> Path:
         for number, problem in enumerate(("", "the line is silent: look at the cable")):
             lost, note = Counter(name="lost_samples", value=3 * number), Note(tray="tray1", text="grid of 10 Hz")
             more = {"instance": "tray1", "status": StageStatus.DEGRADED, "problem": problem, "lost": lost.value}
-            health = health_of("acquisition-1", "acquisition", number, counters=(lost,), notes=(note,), **more)
+            health = made_messages.health(
+                "acquisition", producer="acquisition-1", sequence=number, counters=(lost,), notes=(note,), **more
+            )
             writer.add_message(health_key("plant", "acquisition", "tray1"), health, 6 * SECOND_NS)
     return path
 
@@ -96,7 +98,10 @@ def healths_of(*sessions: tuple[str, int, tuple[Input, ...]], at_s: int = 0) -> 
     for name, lost, inputs in sessions:
         for number in range(2):
             at_s += 1
-            yield health_of(name, "resampler", number, inputs=inputs, lost=lost * number), at_s * SECOND_NS
+            yield (
+                made_messages.health("resampler", producer=name, sequence=number, inputs=inputs, lost=lost * number),
+                at_s * SECOND_NS,
+            )
 
 
 def received(first: int, until: int) -> tuple[Input, ...]:

@@ -15,8 +15,8 @@ from pipeline.recordings.writing import RecordingWriter
 from schemas.health import Output
 from schemas.topics import health_key
 from tests.pipeline.recordings.test_repair import chunk_ends, read_by_others, small
+from tests.support import made_messages
 from tests.support.fantwin_command import fantwin
-from tests.support.made_up_health import health_of
 from tests.support.written_recordings import RAW_KEY, raw
 
 
@@ -90,7 +90,7 @@ def test_info_reports_the_losses_of_a_repaired_file(tmp_path, number):
         for chunk in range(3):
             for sequence in range(5):
                 writer.add_message(RAW_KEY, raw(5 * chunk + sequence), 1000)
-            writer.add_message(keys, health_of(f"scorer-{chunk}", "scorer"), 1000)
+            writer.add_message(keys, made_messages.health("scorer", producer=f"scorer-{chunk}"), 1000)
             writer.flush()
     chunks = [record for record in RecordReader(path) if record.opcode == Opcode.CHUNK]
     content = bytearray(path.read_bytes())
@@ -124,7 +124,7 @@ def test_messages_that_health_reports_as_published_and_that_are_not_there_are_re
     writer = RecordingWriter(tmp_path / "r.mcap", {"flush_interval_s": "0.5"})
     writer.add_message(RAW_KEY, raw(0), 1)
     published = (Output(key=RAW_KEY, published=4),)
-    health = health_of("acquisition-1", "acquisition", instance="tray1", t_ns=2, outputs=published)
+    health = made_messages.health("acquisition", "tray1", "acquisition-1", t_ns=2, outputs=published)
     writer.add_message(health_key("plant", "acquisition", "tray1"), health, 2)
     writer.flush()
     writer._file.close()

@@ -31,8 +31,8 @@ from pipeline.runtime.device_commands import DeviceCommands
 from schemas.codec import decode
 from schemas.health import Counter, Health, Input, Note
 from schemas.messages import Command
+from tests.support import made_messages
 from tests.support.fantwin_command import error_of
-from tests.support.made_up_health import health_of
 from tests.support.running_chain import DEMO
 
 PERIOD_S = 0.1
@@ -224,7 +224,9 @@ class AcquisitionOfRefusals:
         texts = (f"refused input: garbage {self.published}", *self.commands.notes())
         counters = tuple(Counter(name=name, value=value) for name, value in self.commands.counts.items())
         notes = tuple(Note(tray="tray1", text=text) for text in texts)
-        return health_of("acquisition-1", "acquisition", 1, inputs=(received,), counters=counters, notes=notes)
+        return made_messages.health(
+            "acquisition", producer="acquisition-1", sequence=1, inputs=(received,), counters=counters, notes=notes
+        )
 
 
 def line_to(acquisition: AcquisitionOfRefusals, monkeypatch: pytest.MonkeyPatch) -> sweep_module._BusLine:
