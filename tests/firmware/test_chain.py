@@ -20,10 +20,11 @@ from schemas.messages import Alarm, Array, Raw
 from schemas.units import NS_PER_S
 from schemas.wire import CommandFrame, encode
 from tests.support.fan_board import FANS
+from tests.support.fantwin_command import as_typed
 from tests.support.firmware_build import FIRMWARE, firmware_file, simulator_file
 from tests.support.make_board_twin import BOARD_TWIN
 from tests.support.pin_trace import PinTrace, read_pin_trace
-from tests.support.running_chain import DEADLINE_S, SITE, Chain, eventually, fantwin, published, view_of
+from tests.support.running_chain import DEADLINE_S, SITE, Chain, eventually, published, view_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
@@ -81,7 +82,7 @@ def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: C
     up = chain.start_up()
     with chain.watcher() as watcher:
         eventually(lambda: published(view_of(watcher, "scorer")) > 0, "scores flow")
-        moved = fantwin(*chain.words("command"), "--fan", FAN, DUTY)
+        moved = as_typed(*chain.words("command"), "--fan", FAN, DUTY)
         assert moved.returncode == 0, moved.stderr
         scored = published(view_of(watcher, "scorer"))
         board.order(f"send {spoilt_frame().hex()}")

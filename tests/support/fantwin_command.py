@@ -1,10 +1,16 @@
 """Commands of `fantwin` called in this process, as the command line calls them."""
 
+import io
+import subprocess
+import sys
+from contextlib import redirect_stderr, redirect_stdout
 from importlib import import_module
+from unittest.mock import patch
 
 import typer
 from typer.testing import CliRunner, Result
 
+from pipeline.cli import main as command_line
 from pipeline.cli.main import COMMANDS
 from pipeline.errors import UsageError, UserError
 
@@ -15,6 +21,22 @@ def fantwin(name: str, *arguments: object, typed: str | None = None) -> Result:
     app = typer.Typer(pretty_exceptions_enable=False)
     app.command(name)(getattr(import_module(f"pipeline.cli.{module}"), module.rpartition(".")[2]))
     return CliRunner().invoke(app, [str(argument) for argument in arguments], input=typed)
+
+
+def as_typed(*words: object) -> subprocess.CompletedProcess[str]:
+    """What a person sees who types `fantwin` and these words: exit code, output, and errors as lines.
+
+    The command must come to its end by itself. One that runs until it is stopped needs a process of its own.
+    """
+    shown, said, code = io.StringIO(), io.StringIO(), 0
+    line = ["fantwin", *map(str, words)]
+    only_this = patch.object(command_line.app, "registered_commands", [])
+    with patch.object(sys, "argv", line), only_this, redirect_stdout(shown), redirect_stderr(said):
+        try:
+            command_line.main()
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+    return subprocess.CompletedProcess(line, code, shown.getvalue(), said.getvalue())
 
 
 def error_of(name: str, *arguments: object) -> str:

@@ -26,7 +26,8 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
     path.write_text(
         f'run_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "tray1"\nfans = {FANS}\n'
         f'command_max = 100\nport = "{tmp_path / "line"}"\n[learner]\nfirst_minutes = 2\n'
-        '[recorder]\ntopics = ["raw", "score"]\n[viewer]\nserve = false\n',
+        '[recorder]\ntopics = ["raw", "score"]\n'
+        '[launcher]\nstages = ["acquisition", "resampler", "twin_integrator", "scorer", "recorder", "learner"]\n',
         encoding="utf-8",
     )
     folder = learning_folder(tmp_path / "runs", "tray1")

@@ -58,9 +58,8 @@ endpoint = "{endpoint}"
 watermark_s = 5  # a host that runs other tests may stall for more than the default, and late samples would be lost
 [recorder]
 topics = ["raw", "score"]
-[viewer]
-serve = false
-file = "view.rrd"
+[launcher]
+stages = ["acquisition", "resampler", "twin_integrator", "scorer", "recorder"]
 """
 TRAY = """
 [[tray]]

@@ -21,7 +21,8 @@ from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.reading import read_recording
 from schemas.enums import Transition
 from schemas.messages import Alarm, Grid
-from tests.support.running_chain import SITE, TRAY, Chain, RunningCommand, eventually, fantwin, published, view_of
+from tests.support.fantwin_command import as_typed
+from tests.support.running_chain import SITE, TRAY, Chain, RunningCommand, eventually, published, view_of
 from tests.support.tcp_relay import TcpRelay
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
@@ -105,5 +106,5 @@ def test_row_16_a_cut_that_hides_a_whole_fault_loses_nothing_and_no_alarm(site):
     transitions = [alarm.transition for alarm in alarms(site) if alarm.fan == FAULTY]
     assert (transitions[0], transitions[-1]) == (Transition.RAISED, Transition.CLEARED)
     assert transitions.count(Transition.RAISED) == 1
-    verified = fantwin("replay", "--offline", "--verify", *site.judges.recordings())
+    verified = as_typed("replay", "--offline", "--verify", *site.judges.recordings())
     assert verified.returncode == 0, verified.stdout + verified.stderr

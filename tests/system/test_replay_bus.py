@@ -27,6 +27,7 @@ from schemas.header import Header
 from schemas.health import Health
 from schemas.messages import Clock, Grid, Message, ModelCard
 from schemas.topics import health_key, tray_key
+from tests.support.fantwin_command import as_typed
 from tests.support.killed_site import Site as RecordedSite
 from tests.support.replay_data import START_NS, STEP_NS, write_raw
 from tests.support.running_chain import (
@@ -44,6 +45,7 @@ from tests.support.score_data import made_up_tray
 from tests.support.twin_files import small_hybrid, write_twin
 
 pytestmark = pytest.mark.real_time
+MANY = 1500
 WORKING = ["resampler", "twin_integrator", "scorer", "recorder"]
 
 
@@ -154,7 +156,7 @@ def columns(grids: list[Grid]) -> dict[str, np.ndarray]:
 
 @pytest.mark.slow
 def test_at_full_speed_the_stages_take_every_message_and_decide_every_sample(tmp_path, endpoint):
-    recording = write_raw(tmp_path / "source.mcap", 3000)
+    recording = write_raw(tmp_path / "source.mcap", MANY)
     chain = Chain(tmp_path, endpoint, f"launcher.stages={json.dumps(WORKING)}", viewer=False)
     try:
         up = chain.start_up()
@@ -166,7 +168,7 @@ def test_at_full_speed_the_stages_take_every_message_and_decide_every_sample(tmp
         chain.close()
     report = json.loads(done.stdout)
     assert done.returncode == 0, (report, done.stderr)
-    assert report["messages"] == {"raw": 3000}
+    assert report["messages"] == {"raw": MANY}
     assert (report["lost"], report["behind"], report["stopped"]) == ({}, [], False)
     assert set(report["listeners"]) == {"recorder", "resampler"}
     assert status == 0, account
@@ -174,9 +176,9 @@ def test_at_full_speed_the_stages_take_every_message_and_decide_every_sample(tmp
     found = {
         topic: [e.message for e in entries if e.topic == topic] for topic in ("raw", "grid", "prediction", "score")
     }
-    assert [raw.header.sequence for raw in found["raw"]] == list(range(3000))
+    assert [raw.header.sequence for raw in found["raw"]] == list(range(MANY))
     assert {raw.header.producer.startswith("replay-") for raw in found["raw"]} == {True}
-    last_ns = START_NS + 2999 * STEP_NS
+    last_ns = START_NS + (MANY - 1) * STEP_NS
     for topic in ("grid", "prediction", "score"):
         times = [t for m in found[topic] for t in m.t_ns.tolist() if t <= last_ns]  # type: ignore[union-attr]
         assert times == list(range(START_NS, last_ns + 1, STEP_NS)), topic
@@ -312,24 +314,21 @@ def test_the_viewer_draws_every_score_of_a_replay(site, tmp_path):
     assert "dropped" not in counters
 
 
-def test_replay_beside_a_stage_that_writes_the_same_topic_is_refused_with_the_from_option(site, tmp_path):
-    recording = write_raw(tmp_path / "source.mcap", 100)
-    site.start("resampler")
-    refused = site.replay(recording)
-    assert refused.returncode == 1
-    expected = "resampler of site 'demo' is running and writes grid itself: replay with --from raw, or stop it"
-    assert refused.stderr == f"fantwin: {expected}\n"
-    assert all(q.empty() for q in site.heard.values()), "nothing was published, not even health"
-    assert site.replay(recording, "--from", "raw", "--rate", "max").returncode == 0
-
-
-def test_a_stage_that_comes_later_and_writes_the_same_ends_the_replay(site, tmp_path):
-    replay = RunningCommand(site.words(write_raw(tmp_path / "source.mcap", 3000), "--topics", "raw,grid"))
-    site.running.append(replay)
+def test_a_stage_that_writes_what_a_replay_writes_ends_it_and_keeps_the_next_from_starting(site, tmp_path):
+    recording = write_raw(tmp_path / "source.mcap", 3000)
+    running = RunningCommand(site.words(recording, "--topics", "raw,grid"))
+    site.running.append(running)
     site.next(Clock)
     site.start("resampler")
-    assert replay.process.wait(DEADLINE_S) == 1
-    assert "resampler of site 'demo' is running and writes grid itself" in replay.lines[-1]
+    assert running.process.wait(DEADLINE_S) == 1
+    writes = "resampler of site 'demo' is running and writes grid itself"
+    assert writes in running.lines[-1]
+    while site.next(Health).status != StageStatus.STOPPED:
+        pass
+    heard = {kind: q.qsize() for kind, q in site.heard.items() if kind is not Grid}
+    refused = site.replay(recording)
+    assert (refused.returncode, refused.stderr) == (1, f"fantwin: {writes}: replay with --from raw, or stop it\n")
+    assert {kind: q.qsize() for kind, q in site.heard.items() if kind is not Grid} == heard, "not even health"
 
 
 def test_row_07_beside_a_replay_neither_a_site_nor_an_acquisition_starts_and_the_replay_goes_on(site, tmp_path):
@@ -358,7 +357,7 @@ def test_unreadable_parts_are_reported_in_the_output_and_the_exit_code(tmp_path,
     whole = write_raw(tmp_path / "whole.mcap", 2000)
     truncated = tmp_path / "truncated.mcap"
     truncated.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    done = fantwin("replay", truncated, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
+    done = as_typed("replay", truncated, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
     assert done.returncode == 3
     assert "truncated.mcap" in done.stderr
     report = json.loads(done.stdout)

@@ -15,7 +15,8 @@ import pytest
 from pipeline.bus.session import join_bus
 from pipeline.config.loading import load_config
 from pipeline.launch.site_watcher import SiteWatcher
-from tests.support.running_chain import DEMO, TRAY, Chain, RunningCommand, eventually, fantwin, received, view_of
+from tests.support.fantwin_command import as_typed
+from tests.support.running_chain import DEMO, TRAY, Chain, RunningCommand, eventually, received, view_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
@@ -38,7 +39,7 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
 def test_a_site_with_certificates_comes_from_nothing_to_an_alarm(chain):
     authority = ("--authority", chain.folder / "authority")
     for words in (["init", *authority], ["issue", *authority]):
-        done = fantwin(*chain.words("certs"), *words)
+        done = as_typed(*chain.words("certs"), *words)
         assert done.returncode == 0, done.stderr
     router = RunningCommand(chain.words("router"))
     try:
@@ -58,10 +59,10 @@ def run(chain: Chain) -> None:
         chain.kill(watcher, "scorer")
         (alarm,) = eventually(watcher.current_alarms, "an alarm stands")
         assert (alarm.newest.header.tray, alarm.newest.fan) == (TRAY, FAULTY)
-        acknowledged = fantwin(*chain.words("alarms"), "ack", TRAY, FAULTY)
+        acknowledged = as_typed(*chain.words("alarms"), "ack", TRAY, FAULTY)
         assert acknowledged.returncode == 0, acknowledged.stderr
         assert not any(view.health.problem for view in watcher.stages() if "certificate" in view.health.problem)
-    doctor = fantwin(*chain.words("doctor"), "--listen-s", 0, "--json")
+    doctor = as_typed(*chain.words("doctor"), "--listen-s", 0, "--json")
     good = json.loads(doctor.stdout)["good"]
     assert "certificate of scorer: the router grants its rights" in good
     assert up.end() == 0, up.lines

@@ -26,7 +26,8 @@ from schemas.enums import Transition
 from schemas.header import Header
 from schemas.messages import Alarm, Score, ScorerSnapshot
 from schemas.topics import BY_NAME, tray_key
-from tests.support.running_chain import RunningCommand, eventually, fantwin
+from tests.support.fantwin_command import as_typed
+from tests.support.running_chain import RunningCommand, eventually
 from tests.support.scored_blocks import EPOCH_NS, LIVELY, STEP_NS, prediction_of
 from tests.support.twin_files import write_twin
 
@@ -169,7 +170,7 @@ def counter(shards: Shards, stage: str, name: str) -> int:
 def alarm_is_raised_and_acknowledged(shards: Shards) -> Alarm:
     shards.feed(20)
     eventually(lambda: shards.heard(Transition.DIAGNOSED), "the fault has an alarm and a cause")
-    asked = fantwin("alarms", "ack", "b", FAULTY, *shards.words("here"))
+    asked = as_typed("alarms", "ack", "b", FAULTY, *shards.words("here"))
     assert asked.returncode == 0, asked.stderr
     (acknowledged,) = eventually(lambda: shards.heard(Transition.ACKNOWLEDGED), "it is acknowledged")
     assert (acknowledged.header.tray, acknowledged.fan, acknowledged.active) == ("b", FAULTY, True)
@@ -253,7 +254,7 @@ def test_up_starts_the_shards_restarts_one_that_dies_and_accounts_for_all(shards
     assert outcome["restarts"] == {"scorer/2-of-2": 1}
     assert outcome["lost"] == dict.fromkeys(sorted(labels), 0)
     assert [Path(name).name for name in outcome["recordings"]] == ["1-of-2.recording.mcap", "2-of-2.recording.mcap"]
-    info = fantwin("info", shards.folder / "here", "--json")
+    info = as_typed("info", shards.folder / "here", "--json")
     assert info.returncode == 0, info.stdout
     found = json.loads(info.stdout)
     assert {key.split("/")[2] for key in found["topics"]} == {*TRAYS, "health"}

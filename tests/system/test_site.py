@@ -20,8 +20,9 @@ from pipeline.recordings.reading import read_recording
 from schemas.enums import Transition
 from schemas.messages import Alarm, Request
 from tests.stages.test_viewer import rows_of
+from tests.support.fantwin_command import as_typed
 from tests.support.offline_replay import without_topics
-from tests.support.running_chain import FANS, TRAY, Chain, eventually, fantwin, is_running, published, received, view_of
+from tests.support.running_chain import FANS, TRAY, Chain, eventually, is_running, published, received, view_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
@@ -43,14 +44,14 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
 
 def current_alarms(chain: Chain) -> list[dict[str, Any]]:
     """The alarms that `fantwin alarms` lists, without what keeps changing."""
-    done = fantwin(*chain.words("alarms"), "--json")
+    done = as_typed(*chain.words("alarms"), "--json")
     assert done.returncode == 0, done.stderr
     return [{name: alarm[name] for name in OF_THE_OCCURRENCE} for alarm in json.loads(done.stdout)["alarms"]]
 
 
 def ask(chain: Chain, *words: object) -> dict[str, Any]:
     """The answer for the one fan."""
-    done = fantwin(*chain.words("alarms"), *words, "--json")
+    done = as_typed(*chain.words("alarms"), *words, "--json")
     assert done.returncode == 0, done.stderr
     (answer,) = json.loads(done.stdout)["answers"]
     return answer
@@ -63,7 +64,7 @@ def operate(chain: Chain) -> list[dict[str, Any]]:
     ask(chain, "ack", TRAY, FAULTY, "--operator", "Ann")
     ask(chain, "shelve", TRAY, FAULTY, "--for", "30m", "--operator", "Bob")
     ask(chain, "out-of-service", TRAY, 5)
-    refused = fantwin(*chain.words("alarms"), "ack", TRAY, FAULTY)
+    refused = as_typed(*chain.words("alarms"), "ack", TRAY, FAULTY)
     expected = f"fantwin: {TRAY}: fan {FAULTY}: refused: it is acknowledged already\n"
     assert (refused.returncode, refused.stderr) == (1, expected)
     alarms = current_alarms(chain)
@@ -168,7 +169,7 @@ def check_replay(chain: Chain) -> None:
     made_again = ("grid", "prediction", "score")
     lean = [without_topics(path, path.with_name(f"lean-{path.name}"), *made_again) for path in recordings]
     for paths, compared in ((recordings, "samples_equal"), (lean, "snapshots_equal")):
-        done = fantwin("replay", "--offline", "--verify", "--json", *paths)
+        done = as_typed("replay", "--offline", "--verify", "--json", *paths)
         verified = json.loads(done.stdout)["verified"]
         assert verified["equal"], verified["differences"]
         assert verified[compared] > (1_000 if paths is recordings else 5)
@@ -196,7 +197,7 @@ def test_operators_are_answered_and_killed_stages_come_back_without_losing_state
         assert (answer["presented"], answer["onset_t_ns"]) == (True, before[0]["onset_t_ns"])
 
         kill(chain, watcher, chain.stages[0])
-        shown = fantwin(*chain.words("status"), "--json")
+        shown = as_typed(*chain.words("status"), "--json")
         (resampler,) = (stage for stage in json.loads(shown.stdout)["stages"] if stage["stage"] == "resampler")
         assert shown.returncode == 3, "a running site says that it has lost something"
         # what the killed process had read and not yet sent is lost as well, and counted beside it
