@@ -86,12 +86,18 @@ def never_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.presenting.site_model.SILENT_AFTER_S", 600.0)
 
 
+@pytest.fixture(scope="module")
+def own_certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the clients: they show one certificate, which takes seconds to make."""
+    return tmp_path_factory.mktemp("client")
+
+
 @pytest.fixture
-def new_client(tmp_path: Path) -> Iterator[Callable[[], NodeOpcua]]:
+def new_client(own_certificate: Path) -> Iterator[Callable[[], NodeOpcua]]:
     clients: list[NodeOpcua] = []
 
     def new() -> NodeOpcua:
-        clients.append(NodeOpcua(tmp_path / f"client{len(clients)}"))
+        clients.append(NodeOpcua(own_certificate))
         return clients[-1]
 
     yield new

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import RunningCommand
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
-FANS = 2
+FANS = 1
 
 
 @pytest.fixture
@@ -34,14 +33,11 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
     return path
 
 
-@contextmanager
-def playing(link: Path, fans: int) -> Iterator[RunningCommand]:
-    """A simulated tray, whose plant moves its fans."""
-    words = (
-        *("simulate", "--fans", fans, "--rate", 20, "--speed-unit", "rpm"),
-        *("--link", link, "--profile", "prbs", "--json"),
-    )
-    tray = RunningCommand(words)
+@pytest.fixture
+def tray(tmp_path: Path) -> Iterator[RunningCommand]:
+    """A simulated one, whose plant moves its fans."""
+    line = ("--rate", 20, "--speed-unit", "rpm", "--link", tmp_path / "line", "--json")
+    tray = RunningCommand(("simulate", "--fans", FANS, "--profile", "prbs", *line))
     try:
         tray.line_with(" on ")
         yield tray
@@ -49,40 +45,29 @@ def playing(link: Path, fans: int) -> Iterator[RunningCommand]:
         tray.kill()
 
 
-@pytest.fixture
-def tray(tmp_path: Path) -> Iterator[RunningCommand]:
-    with playing(tmp_path / "line", FANS) as tray:
-        yield tray
-
-
-def test_trays_that_their_plant_moves_get_calibrated_twins(
+def test_a_tray_that_its_plant_moves_gets_a_calibrated_twin(
     configuration: Path, tray: RunningCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(commission, "stop_on_signals", lambda _stop: None)  # this process has its own
     for name, least in (("NEEDED_RANGES", 2), ("NEEDED_S", 3.0), ("NEEDED_CHANGES", 2)):
         monkeypatch.setattr(ordinary_operation, name, least)
-    line = configuration.with_name("other-line")
-    other = f'[[tray]]  # other\nname = "b"\nfans = 1\nspeed_unit = "rpm"\nport = "{line}"\n'
-    before = configuration.read_text(encoding="utf-8") + other
-    configuration.write_text(before, encoding="utf-8")
-    with playing(line, 1):
-        result = fantwin("commission", "-c", configuration, "--minutes", 0.7, "--json")
+    before = configuration.read_text(encoding="utf-8")
+    result = fantwin("commission", "-c", configuration, "--minutes", 0.7, "--json")
     assert not result.exception, result.exception
     found = json.loads(result.stdout)
     after = before.replace("# of the laboratory\n", '# of the laboratory\ntwin = "tray1.onnx"\n')
-    after = after.replace("# other\n", '# other\ntwin = "b.onnx"\n')
     assert configuration.read_text(encoding="utf-8") == after
-    assert [tray.twin for tray in load_config(configuration).trays] == [Path("tray1.onnx"), Path("b.onnx")]
-    for its, fans in zip(found["trays"], (FANS, 1), strict=True):
-        twin = load_tray_twin(configuration.with_name(its["entry"]), fans)
-        declared = Limits.model_validate(twin.card.calibration).declared_rate
-        assert declared
-        assert declared.extrapolated
-        assert its["extrapolated"]
-        assert its["false_alarms_per_day"] == 1.0
-        assert its["fan_hours"] == pytest.approx(fans * 2 * 0.7 / 60, rel=0.25)
-        assert twin.card.training.data[0].name == "commissioned-1.mcap"
-        assert twin.card.fans == fans
+    assert [tray.twin for tray in load_config(configuration).trays] == [Path("tray1.onnx")]
+    (its,) = found["trays"]
+    twin = load_tray_twin(configuration.with_name(its["entry"]), FANS)
+    declared = Limits.model_validate(twin.card.calibration).declared_rate
+    assert declared
+    assert declared.extrapolated
+    assert its["extrapolated"]
+    assert its["false_alarms_per_day"] == 1.0
+    assert its["fan_hours"] == pytest.approx(FANS * 2 * 0.7 / 60, rel=0.25)
+    assert twin.card.training.data[0].name == "commissioned-1.mcap"
+    assert twin.card.fans == FANS
     recordings = [configuration.parent / f"runs/commissioned-{n}/commissioned-{n}.mcap" for n in (1, 2, 3)]
     assert found["recordings"] == list(map(str, recordings))
     assert all(path.exists() for path in recordings)
