@@ -8,7 +8,8 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib.abc import MetaPathFinder
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -42,16 +43,29 @@ def names(requirements: list[str]) -> set[str]:
     return {re.split("[<>=!~;[]", each)[0].strip() for each in requirements}
 
 
+@cache
+def installed() -> Mapping[str, list[str]]:
+    """The packages that have each module: to find them takes a second."""
+    return packages_distributions()
+
+
 def packages_of(modules: set[str]) -> set[str]:
-    known = packages_distributions()
-    return {known[PARTS.get(module, module)][0].lower().replace("_", "-") for module in modules}
+    return {installed()[PARTS.get(module, module)][0].lower().replace("_", "-") for module in modules}
+
+
+def statements_in(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements, however deep, without the expressions in them, which are most of a tree."""
+    for field in ("body", "orelse", "handlers", "finalbody", "cases"):
+        for statement in getattr(node, field, ()):
+            yield statement
+            yield from statements_in(statement)
 
 
 def imported() -> dict[str, set[str]]:
     """The modules of others that the product imports, each with the files that import it."""
     found: dict[str, set[str]] = {}
     for path in (path for folder in PRODUCT for path in (ROOT / folder).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in statements_in(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom):
                 full = [node.module or ""] if not node.level else []
             else:

@@ -9,6 +9,7 @@ import hashlib
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import join
 from schemas.enums import Action
 from schemas.header import Header, InputPosition
-from schemas.messages import Consumed, Message, NewTwin, Raw, Request
+from schemas.messages import Array, Consumed, Message, NewTwin, Raw, Request
 from schemas.topics import BY_NAME, TOPICS, tray_key
 from schemas.units import NS_PER_S
 from tests.support.twin_files import small_hybrid, write_twin
@@ -48,6 +49,9 @@ CALIBRATION = {
 """limits of no particular fan, such that alarms come and go"""
 EPOCH_NS = 1_800_000_000_000_000_000
 TICK_NS = 50_000_000
+AHEAD = 50
+"""samples whose healthy speeds are computed at once"""
+declaration_of = cache(load_stage)
 TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 
 CONFIGURATION = f"""
@@ -145,7 +149,7 @@ class Stages:
         self.stages[stage] = self._begin(stage)
         feeding = self.source if stage == "resampler" else self.stages[CHAIN[CHAIN.index(stage) - 1]]
         kept = (*feeding.kept, *self.operator.kept, *self.learner.kept)
-        for read in sorted(load_stage(stage).reads, key=lambda name: (not BY_NAME[name].is_needed_first, name)):
+        for read in sorted(declaration_of(stage).reads, key=lambda name: (not BY_NAME[name].is_needed_first, name)):
             for topic, message in kept:
                 if topic == read:
                     self._step(stage, topic, message)
@@ -183,7 +187,7 @@ class Stages:
             snapshot_folder=self.config.folder if self.remembers else None,
             is_replayed=lambda: self.is_replayed,
         )
-        return Session(f"{stage}-{self._lives}", load_stage(stage).build(context).core)
+        return Session(f"{stage}-{self._lives}", declaration_of(stage).build(context).core)
 
     def _core(self, stage: str) -> Core:
         core = self.stages[stage].core
@@ -192,7 +196,7 @@ class Stages:
 
     def _step(self, stage: str, topic: str, message: Message) -> None:
         session = self.stages[stage]
-        if topic == load_stage(stage).reads[0]:
+        if topic == declaration_of(stage).reads[0]:
             session.position = InputPosition.after(session.position, topic, message.header)
         self._put_out(stage, self._core(stage).step(message), from_timer=False)
 
@@ -213,7 +217,7 @@ class Stages:
         if topic == "raw" and self.lost_on_the_bus:
             self.lost_on_the_bus -= 1
             return
-        reader = next((name for name in CHAIN if topic in load_stage(name).reads), None)
+        reader = next((name for name in CHAIN if topic in declaration_of(name).reads), None)
         if reader:
             self._step(reader, topic, stamped)
 
@@ -259,6 +263,8 @@ class Site(Stages):
         self._device_sequence = 0
         self._healthy = TwinFile.load(folder / "twin.onnx", FANS)
         self._state = self._healthy.initial_state(np.full(FANS, 100.0), np.full(FANS, 50.0))
+        self._next: deque[tuple[Array, Array]] = deque()
+        """commands and healthy speeds of the next samples"""
 
     def run(self, samples: int) -> None:
         """Raw samples as they come: with jitter, without some readings, now and then two in one piece."""
@@ -298,9 +304,13 @@ class Site(Stages):
     def _raw(self) -> Raw:
         self._device_us += 10_000
         self._device_sequence += 1
-        command = 50.0 + 40.0 * np.sin(self._device_sequence / 150.0 + np.arange(FANS))
-        healthy, self._state = self._healthy.advance(self._state, command[np.newaxis], np.full(1, 0.01))
-        speed = healthy[0] + self.rng.normal(0.0, 3.0, FANS)
+        if not self._next:
+            samples = np.arange(self._device_sequence, self._device_sequence + AHEAD)
+            commands = 50.0 + 40.0 * np.sin(samples[:, np.newaxis] / 150.0 + np.arange(FANS))
+            speeds, self._state = self._healthy.advance(self._state, commands, np.full(AHEAD, 0.01))
+            self._next.extend(zip(commands, speeds, strict=True))
+        command, healthy = self._next.popleft()
+        speed = healthy + self.rng.normal(0.0, 3.0, FANS)
         speed[0] += 20.0 * (150 < self._device_sequence % 400 < 220)  # a fault that comes and goes
         speed[self.rng.random(FANS) < 0.01] = np.nan
         return Raw(

@@ -81,9 +81,11 @@ def remade(lean: Path, whole: Path) -> Comparison:
         return verifier.finish(plan.last, alarms, recorded_alarms)
 
 
-def recording_of(folder: Path, seed: int, *samples: int, killed: str = "", calibrated: bool = False) -> Path:
+def recording_of(
+    folder: Path, seed: int, *samples: int, raw_samples: int = 1, killed: str = "", calibrated: bool = False
+) -> Path:
     """A recording of so many samples, with a stage killed after each number of them but the last."""
-    site = Site(folder, seed, calibrated=calibrated)
+    site = Site(folder, seed, raw_samples, calibrated=calibrated)
     for number, count in enumerate(samples):
         if number:
             site.kill(killed)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.fantwin_command import fantwin
-from tests.support.healthy_site import EPOCH_NS, PER_DAY, simulated
+from tests.support.healthy_site import EPOCH_NS, PER_DAY, recorded
 
 MadeOnce = Callable[[str, Callable[[Path], None]], Path]
 
@@ -52,8 +52,8 @@ def healthy(made_once: MadeOnce) -> Path:
 
     def make(folder: Path) -> None:
         for seed, name, seconds in ((1, "training", 60), (2, "healthy", 120), (3, "other", 60)):
-            simulated(folder / f"{name}.mcap", seed, seconds)
-        simulated(folder / "faulty.mcap", 5, 60, "--fault", "inlet:fan=1,start=20,stop=50,size=1.6")
+            recorded(folder / f"{name}.mcap", seed, seconds)
+        recorded(folder / "faulty.mcap", 5, 60, has_fault=True)
         twin, calibrated = folder / "twin.onnx", folder / "calibrated.onnx"
         for words in (
             ("train", folder / "training.mcap", "--model", "physical", "-o", twin),

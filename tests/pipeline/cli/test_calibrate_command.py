@@ -23,7 +23,7 @@ from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 from scoring.limits import Limits, default_timing
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.healthy_site import FANS, PER_DAY, simulated, start_ns
+from tests.support.healthy_site import FANS, PER_DAY, recorded, start_ns
 from tests.support.twin_files import write_twin
 from twin.export.card_entries import with_card_entries
 
@@ -90,7 +90,7 @@ def test_without_an_output_the_twin_itself_is_calibrated_and_people_read_what_ra
     assert f"declared: {PER_DAY} false alarms per fan and day" in printed and "--verify" in printed
     found = [line for line in printed.splitlines() if line.startswith("found at")]
     assert re.search(r"found at \d+ rad/s: a drop of [\d.]+ rad/s at once", printed)
-    reported = done("report", twin, healthy / "other.mcap", "--to", 10, "-o", page)
+    reported = done("report", twin, healthy / "other.mcap", "--to", 10, "--fans", 0, "-o", page)
     assert found and all(line in reported and f"<li>{line}</li>" in page.read_text() for line in found)
 
 
@@ -155,7 +155,7 @@ def test_recordings_that_a_twin_was_made_from_cannot_verify_it_under_any_name(he
     ("setting", "difference"),
     [
         ("scorer.on_delay_s=1.0", "differ in scorer.on_delay_s, which limits depend on: choose one"),
-        ("resampler.rate_hz=50", "have grids of different rates, 100 Hz and 50 Hz"),
+        ("resampler.rate_hz=10", "have grids of different rates, 20 Hz and 10 Hz"),
     ],
 )
 def test_recordings_of_sites_with_other_settings_are_refused_by_name(
@@ -175,7 +175,7 @@ def together(path: Path, **recordings: Path) -> Path:
             for sequence, envelope in enumerate(read_recording(recording, ("raw",))):
                 assert isinstance(envelope.message, Raw)
                 raw = replace(envelope.message, header=Header("simulate", sequence, tray))
-                writer.add_message(tray_key("simulated", tray, "raw"), raw, int(raw.host_receive_t_ns[-1]))
+                writer.add_message(tray_key("plant", tray, "raw"), raw, int(raw.host_receive_t_ns[-1]))
     return path
 
 
@@ -207,7 +207,7 @@ def test_the_twin_of_a_tray_is_trained_on_its_samples_only(healthy: Path, tmp_pa
 
 def test_a_fan_alone_and_fans_beside_others_are_not_calibrated_together(healthy: Path, tmp_path: Path) -> None:
     """What several share is followed apart, with slower baselines: limits hold for one of both."""
-    recording, alone = healthy / "healthy.mcap", simulated(tmp_path / "alone.mcap", 4, 20, fans=1)
+    recording, alone = healthy / "healthy.mcap", recorded(tmp_path / "alone.mcap", 4, 20, fans=1)
     for recordings in ((recording, alone), (alone, recording)):
         error = error_of("calibrate", write_twin(tmp_path / "of-one.onnx"), *recordings, *RATE)
         assert f"{alone} has a tray of one fan and {recording} one of 2" in error

@@ -19,7 +19,7 @@ MADE = ("grid", "prediction", "score")
 @pytest.fixture(scope="module")
 def whole(made_once: MadeOnce) -> Path:
     def make(folder: Path) -> None:
-        path = recording_of(folder, 1, 300, calibrated=True).rename(folder / "whole.mcap")
+        path = recording_of(folder, 1, 300, raw_samples=4, calibrated=True).rename(folder / "whole.mcap")
         without_topics(path, folder / "lean.mcap", *MADE)
         without_topics(path, folder / "without-raw.mcap", "raw")
 

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 def _in_minutes() -> Iterator[None]:
     """What a site does in hours, with twins that are trained at once: what is chosen and why is the same."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.learning.versions.REFERENCE_S", 300.0)
+        patch.setattr("pipeline.learning.versions.REFERENCE_S", 230.0)
         patch.setattr(next_version, "CHECKED_S", 100.0)
         patch.setattr(next_version, "LEAST_CHECKED_S", 60.0)
         patch.setattr(next_version, "fit_twin", partial(fit_twin, settings=TrainingSettings("physical")))
@@ -47,7 +47,7 @@ def two_versions(made_once: MadeOnce) -> Path:
     """The learning folder of a tray with two versions."""
 
     def make(folder: Path) -> None:
-        for first_s, seconds, seed in ((0, 120.0, 1), (1000, 300.0, 2)):
+        for first_s, seconds, seed in ((0, 70.0, 1), (1000, 230.0, 2)):
             add_recording(folder, first_s, seconds, seed)
             assert made(folder)
 

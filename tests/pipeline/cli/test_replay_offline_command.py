@@ -138,7 +138,7 @@ def test_the_output_is_a_whole_recording_with_the_requests_that_its_alarms_answe
 
 
 def test_an_imported_table_is_judged_at_the_rate_of_the_twin(tmp_path):
-    site = Site(tmp_path, seed=1)
+    site = Site(tmp_path, seed=1, raw_samples=4)
     site.run(600)
     path = site.finished()
     table = changed(path, tmp_path / "table.mcap", lambda entry: entry.message if entry.topic == "raw" else None)
@@ -197,7 +197,7 @@ def test_a_time_range_is_judged_and_compared_with_the_recorded_alarms_of_that_ra
 
 
 def test_files_of_two_runs_are_two_recordings(tmp_path):
-    site = Site(tmp_path, seed=1)
+    site = Site(tmp_path, seed=1, raw_samples=4)
     site.run(100)
     other = site.finished()
     both = json.loads(replay("--json", "--verify", GOLDEN, other).stdout)

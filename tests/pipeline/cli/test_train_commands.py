@@ -220,7 +220,7 @@ def test_train_reports_the_healthy_torque_balance_and_that_nothing_was_held_out(
 
 def test_the_same_seed_gives_the_same_figures(folder, tmp_path):
     def train(seed: int) -> dict:
-        arguments = ("--model", "hybrid", "--iterations", 1, "--to", 4, "--seed", seed, "--json")
+        arguments = ("--networks", 2, "--iterations", 1, "--to", 4, "--seed", seed, "--json")
         result = json.loads(fantwin("train", folder / "healthy.mcap", *arguments, "-o", tmp_path / "t.onnx").stdout)
         del result["duration_s"]
         return result

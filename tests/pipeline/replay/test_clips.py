@@ -57,12 +57,12 @@ def test_a_clip_has_every_message_of_its_time_with_its_bytes(undisturbed, clip):
     window = range(alarm.t_ns - S // 2, alarm.t_ns + 2 * S + 1)
     wanted = [(e.key, e.payload, e.received_t_ns) for e in read_recording(undisturbed) if e.received_t_ns in window]
     found = [(e.key, e.payload, e.received_t_ns) for e in read_recording(clip) if e.received_t_ns in window]
-    assert len(wanted) > 900
+    assert len(wanted) > 225
     assert [each for each in found if each in wanted] == wanted
     (snapshot, *_) = recorded(clip, "snapshot")
     (taken_ns, *_) = [each.received_t_ns for each in read_recording(undisturbed, ("snapshot",))]
-    before_s = (taken_ns - recorded(clip, "raw")[0].host_receive_t_ns[0]) / S
-    assert MARGIN_S - 0.03 < before_s <= MARGIN_S
+    before_s = (taken_ns - recorded(clip, "raw")[0].host_receive_t_ns[-1]) / S
+    assert MARGIN_S - 0.05 < before_s <= MARGIN_S
     assert recorded(clip, "prediction")[0].t_ns[0] == snapshot.t_ns + 10_000_000
     contents = contents_of(clip)
     assert not contents.damage and not any(counts.missing for counts in contents.streams.values())

@@ -113,7 +113,7 @@ def test_a_twin_that_cannot_be_used_is_refused_and_the_former_one_stays(tmp_path
 
 
 def test_with_new_limits_alone_baselines_and_alarms_go_on(tmp_path: Path) -> None:
-    site = Site(tmp_path, 9, raw_samples=4, learns=True)
+    site = Site(tmp_path, 9, raw_samples=10, learns=True)
     model = small_hybrid(1)
     first = write_twin(tmp_path / "1.onnx", model, fans=FANS, name="tray1-1", calibration=CALIBRATION).read_bytes()
     detectors = {

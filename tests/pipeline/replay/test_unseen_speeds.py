@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ from twin.runs import Run
 
 KNEE, HIGHEST = 70.0, 77.0
 BLOCKED_S = 40.0
+KEPT_EVERY = 4
+"""sample of the simulation: 25 Hz, of which a network is trained in a quarter of the time"""
 
 
 def saturating(run: Run) -> Run:
@@ -40,7 +43,7 @@ def blocked_at_its_highest_command(run: Run) -> tuple[Run, float]:
 
 def recording(folder: Path, name: str, run: Run) -> Path:
     table, made = folder / f"{name}.csv", folder / f"{name}.mcap"
-    columns = np.column_stack((run.t_s, run.command, run.speed_rad_s))
+    columns = np.column_stack((run.t_s, run.command, run.speed_rad_s))[::KEPT_EVERY]
     np.savetxt(table, columns, delimiter=",", header="t,u,y", comments="", fmt="%.6f")
     result = fantwin("import", table, "--time", "t:s", "--command", "u", "--speed", "y:rad/s", "-o", made)
     assert result.exit_code == 0, result.output
@@ -62,6 +65,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@cache
 def beyond() -> Run:
     return saturating(rough_run(7, 60.0, low=40.0, high=HIGHEST))
 
@@ -96,7 +100,7 @@ def test_a_speed_that_training_has_not_seen_widens_the_band_and_raises_no_alarm(
     assert not alarms
     command, valid = joined(scores, "command"), joined(scores, "valid")
     unseen = valid & (command > 1.1 * KNEE)
-    assert unseen.sum() > 500, "it is judged there"
+    assert unseen.sum() > 500 / KEPT_EVERY, "it is judged there"
     half_rad_s = (joined(scores, "upper_bound_rad_s") - joined(scores, "lower_bound_rad_s")) / 2.0
     seen = valid & (command < 0.9 * KNEE)
     assert np.median(half_rad_s[unseen]) > 1.5 * np.median(half_rad_s[seen])
