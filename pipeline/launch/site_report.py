@@ -10,9 +10,10 @@ from pipeline.launch.site_state import OFF_THE_BUS, WHY_SILENT, StageState, Word
 from pipeline.launch.site_watcher import StageView
 from pipeline.launch.stage_notes import note_lines
 from pipeline.runtime.latencies import LATENCY_WINDOW_S
+from schemas.enums import Severity
 from schemas.health import Health
 from schemas.units import NS_PER_S
-from scoring.alarms.current_alarms import CurrentAlarm
+from scoring.alarms.current_alarms import CurrentAlarm, clock
 
 _ALL = "all stages"
 _NOTE_AFTER_NS = 5 * NS_PER_S
@@ -43,8 +44,8 @@ class SiteReport:
         self._notes: dict[str, dict[str, int]] = {}
         """by label: the statements of its notes, and since when each stands"""
         self._said_notes: set[str] = set()
-        self._alarms: dict[tuple[str, int], str] = {}
-        """by tray and fan: what was said of its alarm last"""
+        self._alarms: dict[tuple[str, int], tuple[str, int]] = {}
+        """by tray and fan: what was said of its alarm last, and the onset of that alarm"""
 
     def stages(self, states: Sequence[StageState], processes: Mapping[str, RunningProcess]) -> None:
         """Report how the stages have changed. processes: those that run and have been on the bus, by label; the
@@ -101,13 +102,19 @@ class SiteReport:
         return t_ns - self._late_since_t_ns.setdefault(state.label, t_ns) <= LATENCY_WINDOW_S * NS_PER_S
 
     def alarms(self, alarms: Iterable[CurrentAlarm]) -> None:
-        """Say how the alarms have changed. alarms: the current one of each fan that had one."""
+        """Say how the alarms have changed, and of one that has come and gone since the last call that it was raised:
+        what was missed is judged in a moment. alarms: the current one of each fan that had one."""
         before, self._alarms = self._alarms, {}
         for current in alarms:
-            fan, line = (current.newest.header.tray, current.newest.fan), current.line()
-            self._alarms[fan] = line
-            if line != before.get(fan):
-                self._say(line)
+            alarm, fan = current.newest, (current.newest.header.tray, current.newest.fan)
+            said, onset_t_ns = before.get(fan, ("", 0))
+            is_new = alarm.onset_t_ns >= self._started_t_ns and alarm.onset_t_ns != onset_t_ns
+            if is_new and not alarm.active and alarm.severity != Severity.NONE:
+                at = clock(alarm.onset_t_ns)
+                self._say(f"{alarm.severity.name}  {fan[0]}  fan {fan[1]}: raised for what began at {at}, and over")
+            self._alarms[fan] = (current.line(), alarm.onset_t_ns)
+            if self._alarms[fan] != (said, onset_t_ns):
+                self._say(current.line())
 
     def _change(self, subject: str, fault: str, when_over: str, name: str = "") -> None:
         meaning = without_figures(fault)

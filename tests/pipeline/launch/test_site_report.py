@@ -9,8 +9,12 @@ import pytest
 from pipeline.launch.site_report import RunningProcess, SiteReport
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import StageView
+from schemas.enums import Severity, Transition
+from schemas.header import Header
 from schemas.health import Note
+from schemas.messages import Alarm
 from schemas.units import NS_PER_S
+from scoring.alarms.current_alarms import clock, current_alarms
 from tests.pipeline.launch.test_site_state import CONSUMER, view
 
 IDS = {"resampler": RunningProcess(11, is_at_work=True), "scorer": RunningProcess(12, is_at_work=True)}
@@ -128,3 +132,35 @@ def test_a_stage_that_works_off_what_was_missed_during_a_restart_is_not_late(rep
     for second in range(20, 40):
         hear(second, Word.LATE)
     assert lines == ["scorer: late: its outputs are 60 s old when they are sent"]
+
+
+def test_an_alarm_that_came_and_went_between_two_looks_is_said_to_have_been_raised(report, lines):
+    def alarm(onset_t_ns: int, transition: Transition, *, active: bool, message: str) -> Alarm:
+        return Alarm(
+            header=Header("scorer-1", 0, "tray1"),
+            fan=2,
+            t_ns=onset_t_ns + NS_PER_S,
+            onset_t_ns=onset_t_ns,
+            transition=transition,
+            severity=Severity.ALARM,
+            active=active,
+            message=f"fan 2: {message}",
+            residual_rad_s=1.0,
+            limit_rad_s=1.0,
+        )
+
+    def cleared(onset_t_ns: int) -> Alarm:
+        return alarm(onset_t_ns, Transition.CLEARED, active=False, message="back to normal")
+
+    from_before, seen, missed = (CONSUMER.t_ns + seconds * NS_PER_S for seconds in (-60, 10, 20))
+    for newest in (
+        cleared(from_before),
+        alarm(seen, Transition.RAISED, active=True, message="214 rpm below the twin"),
+        cleared(seen),
+        cleared(missed),
+        cleared(missed),
+    ):
+        report.alarms(current_alarms([newest]))
+    over = "cleared  tray1  fan 2: back to normal"
+    raised = f"ALARM  tray1  fan 2: raised for what began at {clock(missed)}, and over"
+    assert lines == [over, "ALARM  tray1  fan 2: 214 rpm below the twin", over, raised, over]
