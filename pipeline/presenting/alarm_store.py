@@ -65,7 +65,7 @@ class AlarmStore:
                 self._file.execute("SELECT 1 FROM transition LIMIT 1")
                 return
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = sqlite3.connect(path, WAIT_S, check_same_thread=False, isolation_level=None)
+            self._file = sqlite3.connect(path, timeout=WAIT_S, check_same_thread=False, isolation_level=None)
             self._file.executescript(f"PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; {_SCHEMA}")
         except (OSError, sqlite3.Error) as error:
             what = "it has no history of alarms" if read_only else "the history of alarms cannot be kept there"

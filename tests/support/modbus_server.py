@@ -31,7 +31,8 @@ class Drive:
     def __init__(self, tray: SimulatedTray) -> None:
         self.tray = tray
         self.started_s = time.monotonic()
-        self.delay_s = 0.0
+        self.is_silent = False
+        """it answers when this is over"""
         self.speed_rad_s = 0.0
         self.duty = 0.0
 
@@ -45,7 +46,8 @@ class Drive:
         values: list[int] | list[bool] | None,
     ) -> ExcCodes | None:
         """Let the fan turn until now, and show it; take a command."""
-        await asyncio.sleep(self.delay_s)
+        while self.is_silent:
+            await asyncio.sleep(0.01)
         if address <= REFUSED < address + count:
             return ExcCodes.ILLEGAL_ADDRESS
         if values is not None and address == WANTED:
