@@ -135,8 +135,6 @@ def _simulate(
     command: list[float], torque: Torque, inertia: float, viscous: float, drag: float, lag_s: float
 ) -> list[float]:
     """Speeds in rad/s at each sample, before its command acts. The lagged command is exact at the stages of RK4."""
-    if torque is _published_torque and lag_s == 0.0:
-        return _simulate_published(command, inertia, viscous, drag)
     steps = round(1.0 / (RATE_HZ * SOLVER_STEP_S))
     h = SOLVER_STEP_S
     half_decay = math.exp(-0.5 * h / lag_s) if lag_s > 0.0 else 0.0
@@ -156,23 +154,4 @@ def _simulate(
             k3 = slope(w + 0.5 * h * k2, middle)
             k4 = slope(w + h * k3, lagged)
             w += h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
-    return speeds
-
-
-def _simulate_published(command: list[float], inertia: float, viscous: float, drag: float) -> list[float]:
-    """The same to the bit, in half the time, where the torque is the command: most tests begin here."""
-    steps = round(1.0 / (RATE_HZ * SOLVER_STEP_S))
-    h, half_h, sixth_h = SOLVER_STEP_S, 0.5 * SOLVER_STEP_S, SOLVER_STEP_S / 6.0
-    speeds, w = [], 0.0
-    for held in command:
-        speeds.append(w)
-        for _ in range(steps):
-            k1 = (held - (viscous + drag * (w if w >= 0.0 else -w)) * w) / inertia
-            at = w + half_h * k1
-            k2 = (held - (viscous + drag * (at if at >= 0.0 else -at)) * at) / inertia
-            at = w + half_h * k2
-            k3 = (held - (viscous + drag * (at if at >= 0.0 else -at)) * at) / inertia
-            at = w + h * k3
-            k4 = (held - (viscous + drag * (at if at >= 0.0 else -at)) * at) / inertia
-            w += sixth_h * (k1 + 2.0 * (k2 + k3) + k4)
     return speeds

@@ -106,15 +106,16 @@ class SiteReport:
         what was missed is judged in a moment. alarms: the current one of each fan that had one."""
         before, self._alarms = self._alarms, {}
         for current in alarms:
-            alarm, fan = current.newest, (current.newest.header.tray, current.newest.fan)
-            said, onset_t_ns = before.get(fan, ("", 0))
-            is_new = alarm.onset_t_ns >= self._started_t_ns and alarm.onset_t_ns != onset_t_ns
+            alarm, line = current.newest, current.line()
+            fan = (alarm.header.tray, alarm.fan)
+            last_line, last_onset_t_ns = before.get(fan, ("", 0))
+            is_new = last_onset_t_ns != alarm.onset_t_ns >= self._started_t_ns
             if is_new and not alarm.active and alarm.severity != Severity.NONE:
                 at = clock(alarm.onset_t_ns)
                 self._say(f"{alarm.severity.name}  {fan[0]}  fan {fan[1]}: raised for what began at {at}, and over")
-            self._alarms[fan] = (current.line(), alarm.onset_t_ns)
-            if self._alarms[fan] != (said, onset_t_ns):
-                self._say(current.line())
+            if is_new or line != last_line:
+                self._say(line)
+            self._alarms[fan] = (line, alarm.onset_t_ns)
 
     def _change(self, subject: str, fault: str, when_over: str, name: str = "") -> None:
         meaning = without_figures(fault)

@@ -53,19 +53,11 @@ def packages_of(modules: set[str]) -> set[str]:
     return {installed()[PARTS.get(module, module)][0].lower().replace("_", "-") for module in modules}
 
 
-def statements_in(node: ast.AST) -> Iterator[ast.AST]:
-    """All statements, however deep, without the expressions in them, which are most of a tree."""
-    for field in ("body", "orelse", "handlers", "finalbody", "cases"):
-        for statement in getattr(node, field, ()):
-            yield statement
-            yield from statements_in(statement)
-
-
 def imported() -> dict[str, set[str]]:
     """The modules of others that the product imports, each with the files that import it."""
     found: dict[str, set[str]] = {}
     for path in (path for folder in PRODUCT for path in (ROOT / folder).rglob("*.py")):
-        for node in statements_in(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom):
                 full = [node.module or ""] if not node.level else []
             else:

@@ -8,16 +8,7 @@ from bench.training.published_fan import DRAG, INERTIA, NOISE_RAD_S, RATE_HZ, RO
 from schemas.tacho import Tacho
 from twin.runs import Array, Run
 
-__all__ = [
-    "NOISE_RAD_S",
-    "PUBLISHED_PARAMETERS",
-    "RATE_HZ",
-    "counted_run",
-    "published_run",
-    "rough_run",
-    "stairs",
-    "thinned",
-]
+__all__ = ["NOISE_RAD_S", "PUBLISHED_PARAMETERS", "RATE_HZ", "counted_run", "published_run", "rough_run", "stairs"]
 
 PUBLISHED_PARAMETERS = np.array([INERTIA, VISCOUS, DRAG])
 
@@ -33,11 +24,6 @@ def published_run(seed: int, duration_s: float = 40.0, fans: int = 1) -> Run:
     """The published simulated fan: exact physics, noise variance 10."""
     command = published_fan.random_stairs(seed, duration_s, fans, *ROUGH_RANGE)
     return published_fan.published_fan(command, seed, f"published {seed}").run
-
-
-def thinned(run: Run, every: int) -> Run:
-    """A run that was sampled so many times more rarely: what is done with it takes less time."""
-    return Run(run.name, run.t_s[::every], run.command[::every], run.speed_rad_s[::every], run.tacho)
 
 
 def rough_run(

@@ -13,6 +13,7 @@ from tests.support.fantwin_command import error_of
 from tests.support.trained_once import TrainedOnce
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
+from twin.evaluation.resampling import thinned
 from twin.export.onnx_twin import OnnxTwin
 from twin.finishing import TrainedTwin
 from twin.placing import place_twin
@@ -24,7 +25,7 @@ OWN_S, TEST_S = 20.0, 40.0
 @pytest.fixture(scope="module")
 def type_twin(tmp_path_factory: pytest.TempPathFactory, trained_once: TrainedOnce) -> Path:
     """Five rough fans, whose physics differ by up to 10 %."""
-    run = fan_data.thinned(fan_data.rough_run(1, 60.0, 5), 2)
+    run = thinned(fan_data.rough_run(1, 60.0, 5), 2)
     twin = trained_once([run], [], "hybrid", name="type", max_iterations=25)
     return twin.save(tmp_path_factory.mktemp("type") / "type.onnx")
 

@@ -23,10 +23,11 @@ from pipeline.cli.twins.training_data import Part, read_recording_data
 from pipeline.errors import UserError
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.but_for_times import but_for_times, content_of
-from tests.support.fan_data import published_run, thinned
+from tests.support.fan_data import published_run
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEADLINE_S
 from tests.support.written_recordings import write_run
+from twin.evaluation.resampling import thinned
 
 RECORDINGS = ("a.mcap", "b.mcap", "c.mcap")
 BAD = "bad.mcap"
@@ -75,7 +76,6 @@ def run_all(command: str, folder: Path, names: tuple[str, ...], output: Path, *o
 
 
 def test_one_process_and_two_print_and_write_the_same(folder: Path, tmp_path: Path) -> None:
-    """Of a command that writes recordings, the workers of a cluster are compared with one process."""
     outcomes = []
     for jobs in (1, 2):
         output = tmp_path / f"with-{jobs}"

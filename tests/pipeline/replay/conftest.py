@@ -9,7 +9,7 @@ import pytest
 from tests.support.offline_replay import recording_of
 
 SAMPLES = 4
-"""in a raw message: four take hardly more time than one"""
+"""number in a raw message: four take hardly more time than one"""
 
 
 @pytest.fixture(scope="session")

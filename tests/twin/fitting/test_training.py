@@ -7,6 +7,7 @@ from tests.support import fan_data
 from tests.support.trained_once import TrainedOnce
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
+from twin.evaluation.resampling import thinned
 from twin.finishing import TrainedTwin
 from twin.fitting import training
 from twin.fitting.identification import identify
@@ -86,15 +87,15 @@ def test_fans_that_differ_share_one_network_and_keep_their_own_physics() -> None
     assert times_noise(together, test) < 1.1
 
 
-def thinned(run: Run, keep: np.ndarray) -> Run:
+def with_samples(run: Run, keep: np.ndarray) -> Run:
     """The kept samples, each with the mean of the held command until the next one."""
     command = np.add.reduceat(run.command, keep, axis=0) / np.diff(keep, append=run.samples)[:, None]
-    return Run("thinned", run.t_s[keep], command, run.speed_rad_s[keep])
+    return Run("irregular", run.t_s[keep], command, run.speed_rad_s[keep])
 
 
 def test_irregular_samples_dropouts_of_the_tacho_and_outliers_hardly_matter(rough, part) -> None:
     rng = np.random.default_rng(6)
-    irregular = thinned(part, np.sort(rng.choice(part.samples, part.samples * 2 // 3, replace=False)))
+    irregular = with_samples(part, np.sort(rng.choice(part.samples, part.samples * 2 // 3, replace=False)))
     speed = irregular.speed_rad_s.copy()
     speed[rng.random(speed.shape) < 0.1] = np.nan
     speed[rng.random(speed.shape) < 0.03] = 0.0
@@ -147,7 +148,7 @@ def test_progress_is_reported_of_each_part_of_the_work(rough) -> None:
 def test_adam_lowers_the_free_run_error_from_the_physics_on(rough) -> None:
     from twin.fitting.torch_reference import train_adam  # noqa: PLC0415  torch takes seconds to import
 
-    short = fan_data.thinned(rough[0].between(0.0, 2.0), 2)  # the cost is that of the steps
+    short = thinned(rough[0].between(0.0, 2.0), 2)  # the cost is that of the steps
     found = identify([short])
     network = TanhNetwork.zero(10, ("speed", "command"), data_scaling([short], found))
     theta = np.random.default_rng(0).normal(scale=0.5, size=network.parameter_count)
