@@ -53,7 +53,6 @@ class TorqueBalance(ColumnState):
         self._lagged = np.full(fans, np.nan)
         self._lag_step_s = np.nan
         self._lag_shares = (np.zeros(fans), np.zeros(fans))
-        _lfilter()  # now, not under load with the first long block: it is large
         self._filtered = np.zeros(fans)
         self._weight = np.zeros(fans)
 
@@ -178,7 +177,7 @@ def filter_rows(keep: float, rows: Array, state: Array) -> tuple[Array, Array]:
 
 
 def _lfilter() -> Any:
-    # a process that only shows alarms never filters, and this import takes longer than all its others
+    # A live scorer filters its short blocks row by row and never needs it, and this import takes longer than all others.
     from scipy.signal import lfilter  # noqa: PLC0415
 
     return lfilter

@@ -21,12 +21,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
-from scipy.stats import theilslopes
 
 from schemas.units import NS_PER_S
 
@@ -132,8 +130,8 @@ class WearSeries:
             return None
         origin_ns = int(t_ns[0]) + round(float((t_ns - t_ns[0]).mean()))
         day = (t_ns - origin_ns) / NS_PER_DAY
-        fitted: Any = theilslopes(value, day)
-        slope = float(fitted.slope)
+        rise, run = value[:, np.newaxis] - value, day[:, np.newaxis] - day
+        slope = float(np.median(rise[run > 0.0] / run[run > 0.0]))
         level = float(np.median(value - slope * day))
         residual = value - level - slope * day
         effective = n / _inflation(residual)
