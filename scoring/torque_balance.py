@@ -177,7 +177,7 @@ def filter_rows(keep: float, rows: Array, state: Array) -> tuple[Array, Array]:
 
 
 def _lfilter() -> Any:
-    # A live scorer filters its short blocks row by row and never needs it, and this import takes longer than all others.
+    # a live scorer filters its short blocks row by row, and this import takes longer than all its others
     from scipy.signal import lfilter  # noqa: PLC0415
 
     return lfilter
