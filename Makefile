@@ -31,7 +31,7 @@ demo: $(VENV)/.runtime
 	$(BIN)/fantwin demo
 
 test: $(VENV)/.development check
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 3 --dist worksteal
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 4 --dist worksteal
 
 check: $(VENV)/.development
 	$(BIN)/ruff format --check $(SOURCES)

@@ -27,6 +27,8 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
         f'run_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "tray1"\nfans = {FANS}\n'
         f'command_max = 100\nport = "{tmp_path / "line"}"\n[learner]\nfirst_minutes = 2\n'
         '[recorder]\ntopics = ["raw", "score"]\n'
+        # beside the training the line may stand still for longer than the default, and late samples would be lost
+        "[resampler]\nwatermark_s = 5\n"
         '[launcher]\nstages = ["acquisition", "resampler", "twin_integrator", "scorer", "recorder", "learner"]\n',
         encoding="utf-8",
     )

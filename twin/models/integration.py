@@ -23,7 +23,7 @@ from twin.runs import Array
 Acceleration = Callable[[Array, Array], Array]
 
 NEWTON_ITERATIONS = 25
-NEWTON_TOLERANCE = 1e-9
+NEWTON_TOLERANCE = 1e-7
 SHORTEST_WINDOW = 16
 """samples up to which stepping is as cheap as one solution for all"""
 WIDE_BATCH = 64
@@ -126,7 +126,7 @@ def _solve(
         if not np.all(np.isfinite(largest)):
             return None
         if np.all(largest <= NEWTON_TOLERANCE * (1.0 + np.abs(speed).max(axis=0))):
-            # Convergence is quadratic: the remaining error is the square of this.
+            # Convergence is quadratic: the remaining error is about the square of this.
             return speed[:-1], speed[-1].copy()
     return None
 
