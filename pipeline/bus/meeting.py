@@ -28,11 +28,13 @@ class Meeting:
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
 
+    @property
+    def is_under_way(self) -> bool:
+        """Whether the process is running."""
+        return self._process is not None and self._process.poll() is None
+
     def begin(self, conf: zenoh.Config) -> None:
-        """Start the process with these settings unless one is running. If the system cannot start it, the next call
-        tries again."""
-        if self._process is not None and self._process.poll() is None:
-            return
+        """Start the process with these settings. If the system cannot start it, the next call tries again."""
         with suppress(OSError):
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "pipeline.bus.meeting"],

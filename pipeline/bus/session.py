@@ -165,7 +165,7 @@ class Bus:
 
     def meet_again(self) -> None:
         """Let peers meet again that a cut link has left apart; to be called while they are. A router does so itself."""
-        if self._config.mode == "peer":
+        if self._config.mode == "peer" and not self._meeting.is_under_way:
             self._meeting.begin(zenoh_config(self._config, self.credentials, self._site, listens=False))
 
     def alive(self, key_expression: str) -> set[str]:

@@ -48,14 +48,38 @@ def load_for_this_host(path: Path, overrides: Sequence[str] = (), stages: Sequen
         ConfigError: see `load_config`.
     """
     config = load_config(path, overrides, stages)
-    names_stages = config.launcher.stages is not None
-    missing = {} if names_stages else {name: _missing(name) for name in config.stages}
+    missing = {name: _missing(name) for name in _with_extra(config)}
     lines = tuple(filter(None, missing.values()))
-    if not lines:
-        return ThisHost(config, tuple(overrides), ())
-    without = [*config.launcher.without, *(name for name, line in missing.items() if line)]
-    chosen = (*overrides, f"launcher.without={json.dumps(without)}")
-    return ThisHost(load_config(path, chosen, stages), chosen, lines)
+    left_out = [name for name, line in missing.items() if line]
+    return ThisHost(*_without(config, left_out, overrides, stages), lines)
+
+
+def load_for_any_host(path: Path, overrides: Sequence[str] = (), stages: Sequence[str] | None = None) -> Config:
+    """Load a configuration without the stages that need an extra, unless `launcher.stages` names them.
+
+    The host that runs the site may lack what is installed here.
+
+    Raises:
+        ConfigError: see `load_config`.
+    """
+    config = load_config(path, overrides, stages)
+    return _without(config, _with_extra(config), overrides, stages)[0]
+
+
+def _with_extra(config: Config) -> list[str]:
+    if config.launcher.stages is not None:
+        return []
+    return [name for name in config.stages if STAGES[name].extra]
+
+
+def _without(
+    config: Config, left_out: Sequence[str], overrides: Sequence[str], stages: Sequence[str] | None
+) -> tuple[Config, tuple[str, ...]]:
+    """The configuration without some stages, and the overrides that say so."""
+    if not left_out:
+        return config, tuple(overrides)
+    chosen = (*overrides, f"launcher.without={json.dumps([*config.launcher.without, *left_out])}")
+    return load_config(config.path, chosen, stages), chosen
 
 
 def _missing(stage: str) -> str:

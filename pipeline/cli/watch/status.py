@@ -29,7 +29,7 @@ from pipeline.launch.refused_input import refused_lines
 from pipeline.launch.site_state import AT_WORK, StageState, Word, site_states
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.launch.stage_notes import note_lines, notes_as_json
-from pipeline.launch.this_host import load_for_this_host
+from pipeline.launch.this_host import load_for_any_host
 from pipeline.runtime.signals import stop_on_signals
 from schemas.enums import Severity
 from schemas.streams import LOSS_PREFIX
@@ -59,7 +59,8 @@ def status(
 ) -> None:
     """Show stages, rates, latency, losses and alarms of a running site.
 
-    Each stage that the configuration asks for has a row. Stays live on a terminal, until Ctrl-C. Into a pipe or a file
+    Each stage that the configuration asks for has a row; one that needs an extra only if it was heard, or if
+    `launcher.stages` names it. Stays live on a terminal, until Ctrl-C. Into a pipe or a file
     it prints once and exits. Losses count from the start of a stage (column `up`: how long ago), over all sessions
     heard while this command runs; `fantwin up` at its end and `fantwin info` count all sessions.
 
@@ -74,7 +75,7 @@ def status(
 
     Example: fantwin status -c fantwin.toml --stage scorer --shard 2/8
     """
-    settings = load_for_this_host(config, overrides or (), stages=()).config
+    settings = load_for_any_host(config, overrides or (), stages=())
     stop = threading.Event()
     stop_on_signals(stop)
     if stage is not None:

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline import extras
 from pipeline.config.models import ConfigError
-from pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port
+from pipeline.launch.this_host import load_for_any_host, load_for_this_host, page_addresses, with_free_port
 
 TRAYS = "".join(f'[[tray]]\nname = "{name}"\nfans = 1\nport = "x"\ntwin = "t.onnx"\n' for name in "ab")
 
@@ -52,6 +52,12 @@ def test_without_rerun_the_viewer_is_left_out_with_one_line_unless_it_is_named(
     assert (named.config.stages, named.left_out) == (("scorer", "viewer"), ())
     with pytest.raises(ConfigError, match="unknown stage 'viwer'; did you mean 'viewer'"):
         load_for_this_host(path, ['launcher.without=["viwer"]'])
+
+
+def test_of_a_site_on_another_host_only_a_viewer_that_is_named_is_expected(path: Path) -> None:
+    assert "viewer" in load_for_this_host(path).config.stages
+    assert "viewer" not in load_for_any_host(path).stages
+    assert load_for_any_host(path, ['launcher.stages=["viewer"]']).stages == ("viewer",)
 
 
 def test_the_page_takes_the_next_free_port_where_none_is_set(
