@@ -14,7 +14,7 @@ from pipeline.runtime.stage import Context, StageError
 from pipeline.viewing.fleet import SILENT, Fan, class_names
 from pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
 from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
-from pipeline.viewing.viewer_core import ViewerCore
+from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from schemas.messages import Alarm, Score
 from stages.viewer import ViewerConfig, build, check, topics_read
 from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
@@ -147,6 +147,28 @@ def test_the_lane_of_a_silent_fan_says_so_until_it_is_heard_again() -> None:
         (2.99, SILENT),
         (10.0, "normal"),
     ]
+
+
+@pytest.mark.parametrize("is_fleet", [False, True], ids=["few fans", "fleet"])
+def test_scores_that_do_not_fit_or_decode_are_counted_and_reported_until_they_do(is_fleet: bool) -> None:
+    sink = FakeSink()
+    core = fleet_core(sink) if is_fleet else ViewerCore([TrayConfig(name="tray1", fans=3)], sink)
+
+    def score(tray: str = "tray1", fans: int = 3) -> Any:
+        return sent(made_up_tray(tray=tray, fans=fans, seconds=0.1, faulty_fan=None, gap_fan=None)[0][0])
+
+    damaged = score()
+    damaged.payload += b"\xff"
+    for number, message in enumerate((score("elsewhere"), damaged, score(fans=2)), 1):
+        core.step(message)
+        core.tick(START_NS + number * FLUSH_PERIOD_NS)
+    counts = core.counters()
+    assert [counts[name] for name in ("unknown_tray", "undecodable", "wrong_fan_count")] == [1, 1, 1]
+    assert core.problem() == "scores have 2 fans, [[tray]] tray1 has fans = 3: correct `fans`"
+    assert sink.traces == []
+    core.step(score())
+    core.tick(START_NS + 4 * FLUSH_PERIOD_NS)
+    assert core.problem() == "" and len(sink.overviews if is_fleet else sink.traces) > 0
 
 
 def context(folder: Path, trays: int, fans: int, **config: Any) -> Context:
