@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -195,10 +196,16 @@ def test_a_site_of_more_than_64_fans_is_a_fleet(tmp_path: Path, fans: int, is_fl
     assert ("snapshot" in topics_read(ViewerConfig(), trays)) == (not is_fleet), "wear is not drawn of a fleet"
 
 
+def with_supply(message: Score | Alarm) -> Score | Alarm:
+    if isinstance(message, Alarm):
+        return message
+    return replace(message, supply_voltage_v=np.full(message.score.shape, 12.5, np.float32))
+
+
 def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Path) -> None:
     core = build(context(tmp_path, 3, 3, fleet_above=3, show=("tray1/0",), alarm_plot_hold_s=HOLD_S)).core
     assert isinstance(core, ViewerCore)
-    play(core, messages_of())
+    play(core, [with_supply(each) if each.header.tray == "tray2" else each for each in messages_of()])
     core.close()
     path = tmp_path / "view.rrd"
     rows = rows_of(path)
@@ -208,6 +215,8 @@ def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Pa
     assert styles_of(path, "/shown/plot_2/tray2/fan_2/speed", "Measurements:names")[0] == "tray2/2 measured (rad/s)"
     speed = rows["/shown/plot_2/tray2/fan_2/speed"]
     assert np.isnan(np.array(speed[-1][1]["Measurements:values"], float)).all(), "its lines end"
+    *volts, last_v = [row["Scalars:scalars"][0] for _, row in rows["/shown/supply_voltage_v/plot_2"]]
+    assert set(volts) == {12.5} and np.isnan(last_v), "that of what is measured beside, too"
     states = [row["StateChange:state"][0] for _, row in rows["/shown/state/plot_2"]]
     assert states[0] in ("normal", "suspect") and "alarm" in states and states[-1] == "free"
     cells = {t_ns: row["Points2D:class_ids"] for t_ns, row in rows["/fleet/map/cells"]}
