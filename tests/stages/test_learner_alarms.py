@@ -152,7 +152,7 @@ def test_samples_that_no_score_judged_are_not_learned_from(tmp_path: Path, state
     learner.run(600)
     learner = restarted(learner)
     seconds = learner.history.seconds
-    learner.run(5000, state=state)
+    learner.run(1000, state=state)
     assert learner.history.seconds == seconds
     learner.run(300)
     assert learner.history.seconds > seconds + 200.0
