@@ -113,6 +113,8 @@ def test_another_number_of_shards_is_another_set_with_pods_and_a_service_of_its_
 
 
 def test_the_pods_of_a_stage_share_the_trays_and_keep_what_must_survive_them(stages):
+    assert list(yaml.safe_load((CHART / "values.yaml").read_text())["stages"]) == list(STAGES)
+    assert stages.keys() == STAGES.keys()
     for stage, stateful_set in stages.items():
         spec, pod = stateful_set["spec"], container(stateful_set)
         assert (spec["replicas"], spec["ordinals"]) == (3, {"start": 1})

@@ -16,6 +16,7 @@ import fantwin_client
 from fantwin_client import (
     BusError,
     Client,
+    ClientError,
     CommandError,
     FanCountError,
     NoAcquisitionError,
@@ -32,6 +33,7 @@ from pipeline.bus.router import open_router
 from pipeline.config.loading import parse_config
 from schemas.topics import BY_NAME
 from tests.support.running_acquisition import SITE, TRAY, Raws, acquisition, push_config, raws_of
+from tests.support.running_chain import eventually
 from tests.support.secured_site import SecuredSite, free_endpoint
 from tests.support.site_certificates import SiteCertificates
 
@@ -156,8 +158,13 @@ def test_what_ends_the_thread_is_raised_by_publish_and_check(
 
 
 def test_without_such_a_tray_one_line_says_so(endpoint: str, client: Client, raws: Raws, tmp_path: Path) -> None:
-    with pytest.raises(NoAcquisitionError, match="no acquisition of tray tray1 of site plant is at work"):
-        client.tray(TRAY, timeout_s=0.1)
+    before = len(client._bus._declared)
+    for _ in range(2):
+        with pytest.raises(NoAcquisitionError, match="no acquisition of tray tray1 of site plant is at work"):
+            client.tray(TRAY, timeout_s=0.1)
+    assert len(client._bus._declared) == before, "a program may try for as long as it runs"
+    with pytest.raises(ClientError, match="speed_unit 'RPM' is not known; known: .*rpm"):
+        client.tray(TRAY, speed_unit="RPM")  # pyright: ignore[reportArgumentType]
     with (
         acquisition(push_config(endpoint, tmp_path, source='{ kind = "serial", port = "no" }')),
         pytest.raises(NoAcquisitionError, match='takes no pushed samples: write source = { kind = "push" }'),
@@ -206,6 +213,26 @@ def test_an_acquisition_that_is_restarted_gets_what_was_published_meanwhile(
     np.testing.assert_allclose(np.diff(raws.column("host_receive_t_ns"))[10:], 1e6, atol=2000)
 
 
+def test_messages_that_acquisition_missed_are_fetched_by_it(
+    endpoint: str, client: Client, raws: Raws, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fantwin_client.tray.ASK_AGAIN_S", 0.2)
+    with acquisition(push_config(endpoint, tmp_path)):
+        tray = client.tray(TRAY)
+        tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])
+        tray.check()
+        real, dropped = tray._publisher._publisher, []
+        tray._publisher._publisher = type("Dropping", (), {"put": dropped.append})()  # type: ignore[assignment]
+        for number in range(1, 5):
+            tray.publish(T_S + number, [0.5, 0.5], [1.0, 1.0])
+        eventually(lambda: dropped and not tray._outbox.waiting, "they are sent in vain")
+        tray._publisher._publisher = real
+        losses = tray.check(10)
+        assert (losses.received, losses.any) == (5, False)
+        raws.wait_for(5)
+    np.testing.assert_array_equal(raws.column("device_sequence"), np.arange(5))
+
+
 def test_no_more_is_sent_than_can_be_asked_for_again() -> None:
     assert BY_NAME["reading"].history >= 2 * MOST_SENT_MESSAGES
 
@@ -220,6 +247,7 @@ def test_the_client_that_came_last_has_the_tray(endpoint: str, client: Client, r
         first.publish(T_S + 1, [0.1, 0.1], [1.0, 1.0])
         with pytest.raises(fantwin_client.SamplesLostError, match=r"1 refused \(second_client\); two clients push"):
             first.check()
+        assert first.check().refused == {"second_client": 1}, "an old loss is not raised twice"
         raws.wait_for(2)
     assert raws.column("command").tolist() == [[0.1, 0.1], [0.2, 0.2]]
 

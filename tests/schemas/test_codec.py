@@ -195,7 +195,10 @@ def test_a_value_that_no_version_can_have_is_refused_and_not_wrapped(value):
             decode(getattr(messages, type(proto).__name__), proto.SerializeToString())
 
 
-def test_an_enum_value_above_127_is_not_encoded():
+def test_an_enum_value_above_127_or_a_time_beyond_2116_is_not_encoded():
+    for t_ns in (2**62, -(2**62)):
+        with pytest.raises(CodecError, match="2116"):
+            encode(grid_with(1, t_ns))
     with pytest.raises(CodecError, match="invalid_reason"):
         encode(replace(grid_with(1, 1), invalid_reason=np.full((1, 1), 128)))
 

@@ -275,6 +275,7 @@ def test_a_person_can_type_commands() -> None:
         ("text", Sample(2**32, 1, (0.5,), (1.0,)), "does not fit 32 bits"),
         ("binary", Sample(1, -1, (0.5,), (1.0,)), "does not fit 32 bits"),
         ("text", Sample(1, 1, (0.5,), (1.0, 2.0)), "zip"),
+        ("text", replace(SAMPLE, current_a=(1.0,)), "does not have 2 values"),
         ("binary", CommandFrame(()), "0 fans"),
         ("binary", SetPointFrame((0.0,) * 65), "65 fans"),
     ],

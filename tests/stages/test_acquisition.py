@@ -97,6 +97,10 @@ def test_a_message_holds_the_samples_of_a_time_and_ends_with_the_last_that_is_ex
     assert messages == [(0, [0]), (50, [1, 2, 3, 4, 5]), (100, [6, 7, 8, 9, 10])]
     assert [raw.device_sequence.tolist() for raw in core.close()] == [[11, 12]]
     assert core.close() == []
+    core = make_core(block_s=0.05)
+    assert feed_times(core, [0, 10, 20]) == [(0, [0])]
+    assert core.tick(S + 59 * S // 1000) == []
+    assert [raw.device_sequence.tolist() for raw in core.tick(S + 60 * S // 1000)] == [[1, 2]], "no more has come"
 
 
 def test_a_device_without_clock_and_sequence_has_empty_columns_and_loses_nothing() -> None:

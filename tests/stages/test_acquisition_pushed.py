@@ -70,6 +70,7 @@ def test_only_a_tray_whose_samples_are_pushed_reads_and_takes_them(tmp_path: Pat
 
 def test_a_lost_sample_shows_in_the_numbers(tmp_path: Path) -> None:
     core = make_core(tmp_path)
+    assert core.step(pushed(t_ns=())) == [], "it asks whether all has arrived"
     core.step(pushed(first_number=0))
     core.step(pushed(t_ns=(5, 6), first_number=4))
     assert core.counters()["lost_on_line"] == 2

@@ -132,6 +132,8 @@ def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(g
     assert unjudged["predicted"] == [None, None], "where nothing is judged, there is no twin to see"
     assert client.ask("GET", f"/api/v1/fans/{TRAY}/{FANS}")[0] == 404
     assert client.ask("GET", "/api/v1/fans/nowhere/0")[0] == 404
+    described = client.ask("GET", "/api/v1/openapi.json")[1]
+    assert {"/api/v1/fans/{tray}/{fan}/requests", "/api/v1/alarms/history"} <= described["paths"].keys()
     monkeypatch.setattr("pipeline.presenting.site_model.SILENT_AFTER_S", 0.0)
     silent = f"/api/v1/fans/{TRAY}/0"
     eventually(lambda: client.ask("GET", silent)[1]["state"] == "silent", "the tray is silent")
@@ -291,6 +293,9 @@ def test_the_history_begins_with_the_first_start_and_survives_a_restart(tmp_path
             gateway.feed(alarm(sequence=sequence, t_ns=NOW_NS + sequence, message=f"{sequence}"))
         assert [each["message"] for each in history(gateway)["transitions"]] == ["2", "1", "0"]
         before = history(gateway)
+        number = before["transitions"][0]["number"]
+        page = Client(gateway).ask("GET", f"/api/v1/alarms/history?limit=1&before={number}")[1]
+        assert page["transitions"] == before["transitions"][1:2]
     finally:
         gateway.close()
     gateway = RunningGateway(tmp_path, started_t_ns=NOW_NS + 60 * 10**9)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from cryptography.hazmat.primitives.serialization import (
@@ -22,6 +23,7 @@ from cryptography.hazmat.primitives.serialization import (
 from starlette.requests import Request
 from starlette.responses import Response
 
+from pipeline.errors import UserError
 from pipeline.gateway import server
 from pipeline.gateway.shared_answer import SharedAnswer
 from pipeline.presenting import login_failures
@@ -267,6 +269,8 @@ def test_what_fails_in_the_gateway_is_logged_and_says_nothing_to_whoever_asks(ga
     (event,) = said(capfd)
     assert (event["what"], event["path"], event["address"]) == ("gateway failed", "/api/v1/stages", "127.0.0.1")
     assert event["why"] == "RuntimeError: the secret"
+    monkeypatch.setattr(gateway.core._model, "past_alarms", Mock(side_effect=UserError("alarms.sqlite is damaged")))
+    assert Client(gateway).ask("GET", "/api/v1/alarms/history")[0] == 503
 
 
 def test_logins_refusals_and_requests_are_logged_a_line_each_and_a_comment_is_one_line(gateway, capfd):

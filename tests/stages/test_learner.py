@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.learning.versions import Check
@@ -12,7 +14,7 @@ from schemas.enums import Action, FanState
 from schemas.messages import Request
 from schemas.units import NS_PER_S
 from tests.pipeline.learning.test_versions import version
-from tests.support.one_learner import START_NS, Learner, restarted
+from tests.support.one_learner import START_NS, Learner, raw, restarted
 
 
 def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path: Path) -> None:
@@ -60,6 +62,7 @@ def test_an_offered_version_is_reported_and_put_in_force_only_by_the_operator(tm
     learner.run(1500)
     assert set(learner.put_in_force) == {"tray1-1"}
     offered = learner.versions.all()[-1].name
+    assert "next version" not in "; ".join(learner.core.notes()), "none is made before it is decided"
     assert learner.core.problem() == f"{offered} is offered: it is better (fantwin twins)"
     learner.versions.use(offered)
     learner.run(10)
@@ -210,3 +213,35 @@ def test_a_failure_is_over_although_the_version_was_made_before_the_failure_was_
     learner.add_version("tray1-9")
     learner.run(20)
     assert learner.core.problem() == ""
+
+
+def test_samples_of_another_number_of_fans_are_not_learned_from(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    one = raw(0, moves=True)
+    two = replace(one, fans=2, command=np.tile(one.command, 2), speed_rad_s=np.tile(one.speed_rad_s, 2))
+    assert not learner.core.step(two)
+    assert learner.history.seconds == 0.0
+
+
+def test_that_samples_are_older_than_the_history_is_said_as_a_clock_that_was_set_back(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(1000)
+    learner.now_s -= 100_000
+    learner.run(100)
+    assert "the samples are older: was the clock set back?" in learner.core.problem()
+    assert "\n" not in learner.core.problem()
+    learner.now_s += 100_000
+    learner.run(100)
+    assert learner.core.problem() == ""
+
+
+def test_what_was_learned_from_is_on_the_disk_every_ten_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner = Learner(tmp_path)
+    learner.run(100)
+    flushed: list[int] = []
+    monkeypatch.setattr(learner.history, "flush", lambda: flushed.append(1))
+    for second in range(1, 101):
+        learner.core.tick(START_NS + (learner.now_s + second) * NS_PER_S)
+    assert len(flushed) == 10

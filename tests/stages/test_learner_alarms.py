@@ -50,6 +50,7 @@ def test_a_version_waits_for_the_end_of_an_alarm_unless_an_operator_chose_it(tmp
     learner.add_version("tray1-2")
     learner.run(100, state=FanState.ALARM)
     assert learner.put_in_force == ["tray1-1"]
+    assert "no version takes over while fan 0 has an alarm" in learner.core.notes()
     learner.versions.use("tray1-1")
     learner.versions.use("tray1-2")
     learner.run(100, state=FanState.ALARM)
@@ -143,3 +144,15 @@ def test_an_alarm_that_cannot_be_listed_is_a_problem_and_nothing_more(tmp_path: 
     learner.run(20)
     learner.run(20, state=FanState.ALARM)
     assert learner.core.problem() == ""
+
+
+@pytest.mark.parametrize("state", [None, FanState.UNKNOWN])
+def test_samples_that_no_score_judged_are_not_learned_from(tmp_path: Path, state: FanState | None) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    learner = restarted(learner)
+    seconds = learner.history.seconds
+    learner.run(1000, state=state)
+    assert learner.history.seconds == seconds
+    learner.run(300)
+    assert learner.history.seconds > seconds + 200.0

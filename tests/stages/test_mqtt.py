@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -25,7 +26,7 @@ from tests.stages.test_gateway import alarm, granted, score
 from tests.support.mosquitto import Listener, Mosquitto, needs_mosquitto, retained_by
 from tests.support.mqtt_broker import free_port
 from tests.support.running_chain import eventually
-from tests.support.running_core import SITE, TRAY
+from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_mqtt import ROOT, RunningMqtt
 
 pytestmark = needs_mosquitto
@@ -95,7 +96,8 @@ def test_states_alarms_and_status_are_retained(tmp_path, broker, listener, start
     shown = json.loads(listener.last(f"{FAN}/alarm") or "")
     assert (shown["severity"], shown["causes"][0]["cause"], shown["presented"]) == ("alarm", "drag", True)
     assert json.loads(listener.last(f"{FAN}/alarm/transitions") or "")["transition"] == "raised"
-    eventually(lambda: listener.last(f"{ROOT}/summary"), "the summary is there")
+    summary = {"fans": FANS, "in_alarm": 1, "suspect": 0, "not_judged": 1, "silenced": 0}
+    eventually(lambda: json.loads(listener.last(f"{ROOT}/summary") or "{}") == summary, "the summary is there")
     assert isinstance(json.loads(listener.last(f"{ROOT}/stages") or ""), list)
     kept = retained_by(broker.port)
     assert kept[f"{ROOT}/status"] == "online"
@@ -135,6 +137,13 @@ def test_a_broker_that_was_away_gets_all_that_is_retained_and_all_transitions_in
     listener.close()
 
 
+def test_of_too_many_transitions_that_wait_the_oldest_are_lost_counted_and_said(tmp_path, started):
+    stage = started(tmp_path, free_port(), most_waiting=3)
+    stage.feed(*(alarm(Transition.SEVERITY, number) for number in range(5)))
+    assert (stage.counters()["waiting_transitions"], stage.counters()["lost_transitions"]) == (3, 2)
+    assert stage.problem().endswith("; more than 3 transitions of alarms wait, the oldest are lost")
+
+
 def test_a_broker_that_hangs_holds_nobody_up_and_is_named(tmp_path, broker, monkeypatch):
     monkeypatch.setattr("pipeline.broker.link.SILENT_AFTER_S", 0.2)
     stage = RunningMqtt(tmp_path, broker.port)
@@ -164,9 +173,12 @@ def test_the_last_will_of_a_connection_that_is_dead_comes_before_the_next_one_sa
     dead.loop_start()
     eventually(dead.is_connected, "it is connected")
     dead._thread_terminate = True  # its thread ends, as if the host had gone: its connection stays
-    started(tmp_path, broker.port)
+    stage = started(tmp_path, broker.port)
     eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is there")
     assert listener.of(f"{ROOT}/status") == ["offline", "online"]
+    stage.core._link._client.socket().shutdown(socket.SHUT_RDWR)  # as if its process had been killed
+    eventually(lambda: "offline" in listener.of(f"{ROOT}/status")[2:], "its own last will")
+    eventually(lambda: listener.last(f"{ROOT}/status") == "online", "it is back")
 
 
 def test_requests_are_passed_on_under_the_configured_name_and_answered(tmp_path, broker, listener, started):

@@ -29,6 +29,7 @@ from pipeline.recordings.reading import RecordingError, read_metadata, read_reco
 from pipeline.recordings.scan import scan
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
 from pipeline.recordings.stored_recordings import Stored, StoredPart
+from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.stage import Context, StageError
 from schemas.codec import encode
 from schemas.enums import StageStatus
@@ -512,6 +513,17 @@ def test_after_a_kill_what_was_recorded_is_not_recorded_again_and_what_was_lost_
     assert counts[RAW_KEY, "acquisition-2"].missing == 3
 
 
+def test_that_the_recording_of_a_killed_recorder_was_repaired_is_said_with_its_name(tmp_path, caplog):
+    run = context(tmp_path)
+    with RecordingWriter(run.run_folder / "recording.mcap", {}) as writer:
+        writer.add_message(RAW_KEY, raw(0), 1)
+    writer.path.rename(run.run_folder / "recording.mcap.active")
+    with caplog.at_level(logging.WARNING):
+        STAGE.build(run).core.close()
+    assert f"its recording was repaired and is {run.run_folder}/recording.mcap: 1 messages" in caplog.text
+    assert sorted(p.name for p in run.run_folder.iterdir()) == ["recording-2.mcap", "recording.mcap"]
+
+
 def test_messages_that_the_bus_repeated_are_in_the_ledger_of_their_part():
     disk = Disk()
     core = recorder(disk, part_s=60.0)
@@ -685,6 +697,7 @@ def test_a_recorder_that_is_restarted_keeps_the_last_snapshots_of_its_trays_for_
         for each in (snapshot("a", 2 * part), snapshot("a", 2 * part + 1), *([] if part else [snapshot("b", 7)])):
             core.step(each)
         core.close()
+    assert {path.name for path in of_shard.run_folder.glob("*.mcap")} >= {"1-of-2.recording.mcap"}, "one of its own"
     last = {each.key: encode(each.message) for each in (snapshot("a", 3), snapshot("b", 7))}
     assert kept_by(of_shard) == last
     of_b = snapshot("b", 7).key

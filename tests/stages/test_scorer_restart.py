@@ -278,6 +278,8 @@ def test_only_a_replay_of_earlier_samples_makes_a_snapshot_be_discarded(
         assert (scores[0].state == FanState.COMMISSIONING).all()
     else:
         assert not scores or scores[0].t_ns[0] > prediction_of(np.zeros(1), first=99).t_ns[0]
+    successor.step(prediction_of(np.zeros((20, 3)), first=-2 * HOUR, producer="integrator-3"))
+    assert successor.counters().get("snapshots_of_other_times", 0) == is_discarded, "only the first one can tell"
 
 
 @pytest.mark.parametrize("twin", ["twin", "another"])

@@ -189,6 +189,12 @@ def test_health_and_twins_are_a_page_that_is_replaced_when_it_changes() -> None:
     core.tick(LATER_NS + 2 * PAGE_PERIOD_NS)
     assert len(sink.pages) == 2 and sink.lines == []
     assert "f40" not in sink.pages[0] and "f40" in sink.pages[1] and "the port is gone" in sink.pages[1]
+    for tenth in range(60):  # of a second
+        core.step(health(problem=f"problem {tenth}"))
+        core.tick(LATER_NS + 2 * PAGE_PERIOD_NS + tenth * 100_000_000)
+    assert len(sink.pages) == 3, "one that changes often is shown at intervals"
+    core.close()
+    assert len(sink.pages) == 4 and "problem 59" in sink.pages[-1]
 
 
 def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp_path: Path) -> None:
@@ -302,6 +308,11 @@ def test_live_viewers_are_served_on_the_loopback_only_and_a_second_shard_takes_a
     shards = [replace(live, instance=f"{number}-of-2", shard_number=number) for number in (1, 2)]
     taken = f"port {port} on 127.0.0.1 is taken"
     assert [any(taken in problem for problem in check(shard)) for shard in shards] == [True, False]
+    with pytest.raises(
+        StageError, match=rf"^viewer\.grpc_port: {taken} .*; set another one, or viewer\.serve = false$"
+    ):
+        build(context(tmp_path / "other", serve=True, grpc_port=port, web_port=0))
+    assert not (tmp_path / "other").exists(), "no file was begun"
     core.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from pipeline.runtime.stage import Context, StageError
 from pipeline.viewing.fleet import SILENT, Fan, class_names
 from pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
 from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
-from pipeline.viewing.viewer_core import ViewerCore
+from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from schemas.messages import Alarm, Score
 from stages.viewer import ViewerConfig, build, check, topics_read
 from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
@@ -149,6 +150,28 @@ def test_the_lane_of_a_silent_fan_says_so_until_it_is_heard_again() -> None:
     ]
 
 
+@pytest.mark.parametrize("is_fleet", [False, True], ids=["few fans", "fleet"])
+def test_scores_that_do_not_fit_or_decode_are_counted_and_reported_until_they_do(is_fleet: bool) -> None:
+    sink = FakeSink()
+    core = fleet_core(sink) if is_fleet else ViewerCore([TrayConfig(name="tray1", fans=3)], sink)
+
+    def score(tray: str = "tray1", fans: int = 3) -> Any:
+        return sent(made_up_tray(tray=tray, fans=fans, seconds=0.1, faulty_fan=None, gap_fan=None)[0][0])
+
+    damaged = score()
+    damaged.payload += b"\xff"
+    for number, message in enumerate((score("elsewhere"), damaged, score(fans=2)), 1):
+        core.step(message)
+        core.tick(START_NS + number * FLUSH_PERIOD_NS)
+    counts = core.counters()
+    assert [counts[name] for name in ("unknown_tray", "undecodable", "wrong_fan_count")] == [1, 1, 1]
+    assert core.problem() == "scores have 2 fans, [[tray]] tray1 has fans = 3: correct `fans`"
+    assert sink.traces == []
+    core.step(score())
+    core.tick(START_NS + 4 * FLUSH_PERIOD_NS)
+    assert core.problem() == "" and len(sink.overviews if is_fleet else sink.traces) > 0
+
+
 def context(folder: Path, trays: int, fans: int, **config: Any) -> Context:
     return Context(
         site="site",
@@ -173,10 +196,16 @@ def test_a_site_of_more_than_64_fans_is_a_fleet(tmp_path: Path, fans: int, is_fl
     assert ("snapshot" in topics_read(ViewerConfig(), trays)) == (not is_fleet), "wear is not drawn of a fleet"
 
 
+def with_supply(message: Score | Alarm) -> Score | Alarm:
+    if isinstance(message, Alarm):
+        return message
+    return replace(message, supply_voltage_v=np.full(message.score.shape, 12.5, np.float32))
+
+
 def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Path) -> None:
     core = build(context(tmp_path, 3, 3, fleet_above=3, show=("tray1/0",), alarm_plot_hold_s=HOLD_S)).core
     assert isinstance(core, ViewerCore)
-    play(core, messages_of())
+    play(core, [with_supply(each) if each.header.tray == "tray2" else each for each in messages_of()])
     core.close()
     path = tmp_path / "view.rrd"
     rows = rows_of(path)
@@ -186,6 +215,8 @@ def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Pa
     assert styles_of(path, "/shown/plot_2/tray2/fan_2/speed", "Measurements:names")[0] == "tray2/2 measured (rad/s)"
     speed = rows["/shown/plot_2/tray2/fan_2/speed"]
     assert np.isnan(np.array(speed[-1][1]["Measurements:values"], float)).all(), "its lines end"
+    *volts, last_v = [row["Scalars:scalars"][0] for _, row in rows["/shown/supply_voltage_v/plot_2"]]
+    assert set(volts) == {12.5} and np.isnan(last_v), "that of what is measured beside, too"
     states = [row["StateChange:state"][0] for _, row in rows["/shown/state/plot_2"]]
     assert states[0] in ("normal", "suspect") and "alarm" in states and states[-1] == "free"
     cells = {t_ns: row["Points2D:class_ids"] for t_ns, row in rows["/fleet/map/cells"]}

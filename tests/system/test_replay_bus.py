@@ -360,6 +360,10 @@ def test_unreadable_parts_are_reported_in_the_output_and_the_exit_code(tmp_path,
     done = as_typed("replay", truncated, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
     assert done.returncode == 3
     assert "truncated.mcap" in done.stderr
+    assert f"no stage on site 'demo' at {endpoint} reads raw" in done.stderr
     report = json.loads(done.stdout)
     assert report["damage"]
     assert 0 < report["messages"]["raw"] < 2000
+    none = as_typed("replay", whole, "--from", "grid", "--set", f"bus.endpoint={endpoint}")
+    expected = f"fantwin: {whole}: it holds no grid, or none between --start and --end"
+    assert (none.returncode, none.stderr.splitlines()[-1]) == (1, expected)

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pipeline.broker.fan_states import FanStates
 from pipeline.broker.outbox import MOST_ANSWERS, Outbox, Outgoing
 from pipeline.broker.topics import do_overlap
 from pipeline.broker.transition_queue import TransitionQueue
+from pipeline.config.models import TrayConfig
 from pipeline.presenting.alarm_store import AlarmStore
-from tests.stages.test_gateway import alarm
+from pipeline.presenting.site_model import SiteModel
+from schemas.enums import FanState
+from schemas.envelope import Envelope
+from schemas.messages import Score
+from schemas.topics import tray_key
+from tests.stages.test_gateway import alarm, score
+from tests.support.running_core import FANS, SITE, TRAY
 
 
 def texts(outbox: Outbox, most: int = 100) -> list[str]:
@@ -67,6 +77,23 @@ def test_answers_do_not_pile_up():
 )
 def test_whether_patterns_have_a_topic_in_common(first, second, expected):
     assert do_overlap(first, second) == do_overlap(second, first) == expected
+
+
+def test_the_state_of_a_fan_is_published_again_only_when_it_has_changed(tmp_path):
+    trays = (TrayConfig(name=TRAY, fans=FANS),)
+    model = SiteModel(SITE, trays, AlarmStore(tmp_path / "alarms.sqlite"), keeps_curves=False)
+    states = FanStates(model)
+
+    def changed(made: Score, *, is_full: bool = False) -> list[int]:
+        model.add_score(Envelope.of(tray_key(SITE, TRAY, "score"), made, 0))
+        return [fan.number for fan in states.changed(is_full=is_full, with_silent=False)]
+
+    assert changed(score()) == list(range(FANS))
+    assert changed(score(1.0), is_full=True) == []
+    assert changed(score(2.0, state=FanState.SUSPECT)) == [2]
+    faster = replace(score(3.0, state=FanState.SUSPECT), measured_speed_rad_s=np.full((5, FANS), 200.0))
+    assert changed(faster) == [], "a number alone waits for the period"
+    assert len(changed(replace(faster, t_ns=faster.t_ns + 1), is_full=True)) == FANS
 
 
 def filled(folder: Path, count: int) -> AlarmStore:

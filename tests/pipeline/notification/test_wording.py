@@ -34,6 +34,16 @@ def test_no_reason_of_a_failure_shows_a_secret(url, capfd):
     assert "123" not in said.out + said.err
 
 
+def test_a_service_is_told_how_bad_it_is():
+    receiver = HttpReceiver()
+    service = Service(f"json://127.0.0.1:{receiver.port}/")
+    for level in (Level.ALARM, Level.WARNING, Level.GOOD):
+        assert service.deliver(Text("ALARM, fan 2", "Cause: more drag", level)) is None
+    assert [each["type"] for each in receiver.received] == ["failure", "warning", "success"]
+    assert (receiver.received[0]["title"], receiver.received[0]["message"]) == ("ALARM, fan 2", "Cause: more drag")
+    receiver.stop()
+
+
 @pytest.mark.parametrize(
     ("url", "words"),
     [

@@ -36,6 +36,20 @@ def test_every_state_has_a_colour_of_its_own() -> None:
     assert len({*styles.STATE_COLORS.values(), styles.UNKNOWN_COLOR}) == len(names) + 2
 
 
+def luminance(color: tuple[int, int, int]) -> float:
+    """Relative luminance of an sRGB colour (WCAG 2)."""
+    linear = [c / 3294.6 if c <= 10 else ((c / 255 + 0.055) / 1.055) ** 2.4 for c in color]
+    return float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
+
+
+@pytest.mark.parametrize("background", [(13, 16, 17), (255, 255, 255)], ids=["dark", "light"])
+def test_every_line_is_legible_on_the_dark_and_on_the_light_background(background: tuple[int, int, int]) -> None:
+    styles = pytest.importorskip("pipeline.viewing.rerun_styles", exc_type=ModuleNotFoundError)
+    for color in (styles.RED, *styles.FAN_COLORS):
+        lighter, darker = sorted((luminance(color), luminance(background)), reverse=True)
+        assert (lighter + 0.05) / (darker + 0.05) > 3.0, f"contrast of {color}, as WCAG asks of graphics"
+
+
 def test_the_band_is_green_and_red_zones_appear_only_during_an_alarm(tmp_path: Path) -> None:
     scores, _ = made_up_tray(fans=3)
     trace = trace_of("tray1", scores, "rad/s")
