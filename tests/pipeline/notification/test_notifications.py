@@ -287,6 +287,16 @@ def test_the_first_notifier_of_a_site_says_what_is_presented_and_not_what_was():
     assert titles(desk.wait(10)) == ["WARNING, fan 3 of tray1"]
 
 
+def test_a_message_about_many_that_are_over_says_so_first():
+    desk = Desk()
+    desk.hear(*(alarm(fan=fan) for fan in range(5)))
+    assert titles(desk.wait(60)) == ["5 alarms in 1 tray (hall): 5 WARNING"]
+    desk.hear(*(cleared(fan) for fan in range(5)))
+    (over,) = desk.wait(60)
+    assert (over.title, over.level) == ("5 alarms cleared in 1 tray (hall)", Level.GOOD)
+    assert over.body.startswith("5 alarms cleared in 1 tray at hall\ntray1: cleared: 5 fans: 0-4\n")
+
+
 def test_a_clock_that_is_set_back_holds_nothing_up():
     desk = Desk(escalation_after_s=900, repeat_s=1800)
     desk.hear(alarm())
