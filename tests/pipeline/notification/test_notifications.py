@@ -184,6 +184,18 @@ def test_a_power_cut_is_one_message():
     assert lost.title == "200 alarms in 1 tray (hall): 200 ALARM, 200 no longer confirmed by data"
 
 
+def test_causes_that_are_as_likely_are_named_together_in_messages_about_one_fan_and_about_many():
+    tie = tuple(Diagnosis(cause=c, probability=p) for c, p in (("blocked", 0.4), ("no_power", 0.4), ("no_tacho", 0.2)))
+    desk = Desk()
+    desk.hear(alarm(causes=tie))
+    (one,) = desk.wait(10)
+    assert "Cause: blocked or no power, 40 % each, or no signal of the tacho, 20 %" in one.body
+    assert "rotor; or look at its supply" in one.body
+    desk.hear(*(alarm(fan=fan, tray="other", causes=tie) for fan in range(10)))
+    (digest,) = desk.wait(100)
+    assert "Most probable causes: blocked or no power 10" in digest.body.splitlines()
+
+
 def test_while_more_fans_keep_coming_messages_become_rarer():
     desk = Desk()
     times: list[float] = []
