@@ -126,7 +126,7 @@ def test_a_recording_of_few_time_constants_is_said_to_be_too_short_before_anythi
 
 def test_a_slow_fan_is_to_be_recorded_for_longer() -> None:
     run = fan_data.published_run(1, duration_s=5.0)
-    (line,) = short_warnings([run], np.array([0.1, 10.0]))
+    (line,) = short_warnings([run], np.array([0.01, 10.0]))
     assert "of the slowest fan (10 s)" in line
     assert "record 25 min or more" in line
 

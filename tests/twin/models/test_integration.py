@@ -80,15 +80,6 @@ def test_a_diverging_fan_does_not_affect_the_others() -> None:
     np.testing.assert_allclose(speed[:, 0], alone[:, 0], rtol=1e-10)
 
 
-def test_windows_join_without_a_seam(monkeypatch) -> None:
-    """As of a recording that is too long to be solved at once."""
-    command = np.random.default_rng(2).uniform(0.0, 90.0, (300, 1))
-    whole, _ = free_run(right_hand_side(PARAMETERS), np.zeros(1), command, np.full(300, 0.01))
-    monkeypatch.setattr(integration, "MAX_WINDOW", 70)
-    parts, _ = free_run(right_hand_side(PARAMETERS), np.zeros(1), command, np.full(300, 0.01))
-    np.testing.assert_allclose(parts, whole, rtol=1e-12)
-
-
 def test_a_model_that_runs_away_gives_infinities_like_its_steps() -> None:
     runaway = right_hand_side(np.array([[0.15, -1.0, -0.01, 0.0]]))
     command, step_s = np.full((500, 1), 50.0), np.full(500, 0.01)
