@@ -95,6 +95,11 @@ def test_all_readings_of_a_tacho_that_does_not_count_count_alike_whatever_the_fa
     np.testing.assert_allclose(of_both[1], identify([counted], with_lag=False).parameters[0], rtol=1e-2)
 
 
+def test_a_narx_predicts_readings_as_they_are(runs: tuple[Run, Run]) -> None:
+    twin = train_twin([runs[0].rows(0, 500)], [], "narx", name="narx", max_iterations=1)
+    assert twin.card.tacho == INSTANTANEOUS, "no tacho averages them once more"
+
+
 def test_runs_that_are_measured_differently_and_the_published_trainer_are_refused(runs: tuple[Run, Run]) -> None:
     one, other = runs
     with pytest.raises(TwinError, match="measured alike"):

@@ -13,6 +13,7 @@ from simulation.surroundings import Surroundings
 from simulation.tacho import NoisyTacho, TachoSettings
 from simulation.tray import TraySettings
 from twin.build import evaluate, train_twin
+from twin.errors import TwinError
 from twin.evaluation.resampling import resampled
 from twin.fitting.drive_fit import FoundDrive
 from twin.fitting.identification import identify
@@ -75,6 +76,8 @@ def test_only_what_all_runs_know_nearly_throughout_is_used(runs: tuple[Run, Run]
     sparse[::50] = 20.0  # once a second
     found = reference_of([replace(other, auxiliary={"temperature_c": sparse})])
     assert found is not None and found.needed == ("temperature_c",)
+    with pytest.raises(TwinError, match="has no supply_voltage_v, which the twin needs"):
+        at_reference([replace(one, auxiliary={})], ReferenceConditions(supply_voltage_v=12.0))
 
 
 def test_a_column_that_the_fans_do_not_follow_is_left_out(runs: tuple[Run, Run]) -> None:

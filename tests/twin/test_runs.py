@@ -7,7 +7,7 @@ import pytest
 
 from schemas.tacho import Tacho
 from twin.errors import TwinError
-from twin.runs import Run, common_tacho, run_from_samples
+from twin.runs import Run, common_tacho, run_from_samples, starting_speed_rad_s
 
 
 def ramp(times: list[float]) -> Run:
@@ -56,3 +56,8 @@ def test_a_bad_run_is_refused_in_one_line(t_s: list, command: list, speed: list,
     with pytest.raises(TwinError, match=words) as refusal:
         Run("bad", np.array(t_s), np.array(command), np.array(speed))
     assert "\n" not in str(refusal.value)
+
+
+def test_the_starting_speed_skips_missing_samples() -> None:
+    speed = np.array([[np.nan, np.nan], [2.0, np.nan], [4.0, np.nan], [4.0, np.nan], [2.0, 8.0], [3.0, 9.0]])
+    np.testing.assert_array_equal(starting_speed_rad_s(speed), [3.0, 8.5])

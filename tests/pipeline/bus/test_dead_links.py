@@ -11,12 +11,15 @@ import pytest
 
 from pipeline.bus.dead_links import UNACKNOWLEDGED_MS, limit_connections
 from pipeline.bus.link import LEASE_MS
+from pipeline.bus.opening import zenoh_config
 from pipeline.bus.router import open_router
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from tests.support.running_chain import eventually
 
 pytestmark = pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system has no such limit")
+
+BOTH_MODES = BusConfig(mode="client"), BusConfig(mode="peer")
 
 
 def limits_ms(port: int) -> list[int]:
@@ -39,6 +42,12 @@ def test_row_16_each_connection_to_a_router_has_the_limit_for_data_without_ackno
     with open_router(endpoint), Bus(BusConfig(mode="client", endpoint=endpoint), threading.Event()):
         eventually(lambda: limits_ms(port) == [UNACKNOWLEDGED_MS], "it has the limit")
     assert int(LEASE_MS) < UNACKNOWLEDGED_MS, "a cut that is shorter than the lease ends no connection"
+
+
+def test_row_16_a_client_and_its_router_notice_a_dead_connection_after_four_seconds():
+    """Peers after the ten seconds of Zenoh."""
+    leases = [zenoh_config(config, listens=False).get_json("transport/link/tx/lease") for config in BOTH_MODES]
+    assert leases == [LEASE_MS, "10000"] and LEASE_MS == "4000"
 
 
 def test_other_sockets_stay_as_they_are():

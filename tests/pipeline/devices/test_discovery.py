@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,11 @@ def test_each_chip_with_fans_is_a_tray_that_reads_what_is_there(root: Path) -> N
     assert any(note.startswith("measures average over 0.05 s") for note in first.notes)
     assert found[2].missing[0].startswith("fan2 has no pwm2, so its command is not known")
     assert any("not known" in note for note in found[2].notes)
+
+
+def test_files_that_may_not_be_written_are_named(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda path, _mode: not str(path).endswith("pwm1"))
+    assert "this user may not write pwm1" in next(iter(discover_hwmon(root))).missing[-1]
 
 
 def test_a_tree_without_fans_or_no_tree_says_what_is_missing(tmp_path: Path) -> None:

@@ -153,3 +153,13 @@ def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_
         eventually(lambda: len(line.transferred["host"]) == received + 19, "the answer comes, too late")
         assert made.read().supply_voltage_v == pytest.approx((540.25,))
         made.disconnect()
+
+
+def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line() -> None:
+    settings = {"port": "/dev/ttyUSB7", "baud": 9600, "parity": "O", "stop_bits": 2, "fan": (FAN,)}
+    made = ModbusDevice(ModbusConfig.model_validate(settings), SourceContext(1, "rpm", Path()))
+    line = made._made_client().comm_params
+    assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 2)
+    assert made.check()[0].startswith("/dev/ttyUSB7: no such port")
+    with pytest.raises(DeviceError, match=r"^no such port, is it unplugged\?; waiting for it$"):
+        made.connect()

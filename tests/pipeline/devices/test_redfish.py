@@ -118,6 +118,9 @@ def test_credentials_come_from_a_file_or_the_environment_over_a_verified_line_on
             connected(url, **settings)
         assert "others may read it" in device(url, **settings).check()[0]
         file.chmod(0o600)
+        file.write_bytes("root\nGeh\xe4im\n".encode("latin-1"))
+        assert device(url, **settings).check() == [f"{file}: is no text in UTF-8: save it as such"]
+        file.write_text(f"operator\n{SECRET}\n")
         made = connected(url, **settings)
         assert reading(made).speed == (4000.0, 4200.0)
         made.disconnect()

@@ -7,6 +7,7 @@ import pytest
 from pipeline.launch.refused_input import refused, refused_lines, unusable_lines
 from schemas.enums import StageStatus
 from schemas.health import Counter, Health
+from schemas.wire import DEVICE_COUNTERS, FaultKind
 from tests.support import made_messages
 
 LAUNCHED = {("acquisition/bench", 7)}
@@ -48,6 +49,19 @@ def test_a_device_of_which_all_was_refused_is_named_with_the_count_and_the_setti
         "check command_min and command_max of the [[tray]]"
     ]
     assert unusable_lines([health("acquisition/bench", 8, garbage=30, refused_input=30)], LAUNCHED) == [], "of others"
+    (line,) = unusable_lines([health(samples=50, absurd_samples=50, absurd_speed=200)], LAUNCHED)
+    assert line.endswith("50 were refused (absurd_samples 50): check speed_max and speed_unit of the [[tray]]")
+
+
+def test_all_that_a_device_counts_and_every_fault_of_its_line_has_its_words():
+    counters = {f"device_{name}": 2 for name in DEVICE_COUNTERS}
+    assert set(refused([health(**counters)])["acquisition/bench"]) == set(counters) - {
+        "device_frames",
+        "device_glitches",
+    }
+    for kind in set(FaultKind) - {FaultKind.RESYNC, FaultKind.UNKNOWN_TYPE}:  # these are harmless
+        (line,) = unusable_lines([health(refused_input=1, **{kind.value: 1})], LAUNCHED)
+        assert "source of the [[tray]]" not in line, kind
 
 
 @pytest.mark.parametrize(

@@ -65,6 +65,14 @@ def test_row_01_a_stage_that_hangs_is_said_once_and_that_it_works_again(report, 
     ]
 
 
+def test_row_01_a_stage_that_starves_is_said_until_it_works_again_and_one_without_a_process_is_left_to_the_launcher(
+    report, lines
+):
+    for word, detail in ((Word.STARVED, "nothing for 6 s"), (Word.STARVED, "nothing for 7 s"), (Word.OK, "")):
+        report.stages([state("resampler", word, detail), state("scorer", Word.GONE)], {"resampler": IDS["resampler"]})
+    assert lines == ["resampler: starved: nothing for 6 s", "resampler: at work again"]
+
+
 def test_row_18_a_problem_whose_figures_change_is_said_once(report, lines):
     for free in ("12.3", "11.9", "11.5"):
         health = replace(CONSUMER, problem=f"{free} MB are free on the disk, but 100.0 MB are required")

@@ -267,6 +267,18 @@ def test_what_a_full_disk_has_is_kept_and_said_until_samples_are_on_the_disk_aga
     assert history.problem == ""
     history.finish()
     assert kept_s(tmp_path) == [(0, 299), (400, 699)]
+    add(history, 800, 1100)
+    history.flush()
+    with monkeypatch.context() as full:
+        refuse_writes(full)
+        history.finish()
+    assert kept_s(tmp_path)[2:] == [(800, 1099)], "what the disk refused to finish"
+    assert "the history cannot be kept" in history.problem
+    add(history, 1200, 1500)
+    history.flush()
+    assert "the history cannot be kept" in history.problem, "until another one is finished"
+    history.finish()
+    assert history.problem == ""
 
 
 def test_what_could_not_be_kept_near_an_alarm_is_said_until_healthy_running_is_kept(
@@ -312,6 +324,8 @@ def test_where_an_excluded_time_span_ends_a_new_recording_begins(tmp_path: Path)
     history.exclude([(START_S * NS_PER_S, (START_S + 300) * NS_PER_S)])
     add(history, 0, 600)
     assert history.seconds == 289.0
+    history.exclude([((START_S + 500) * NS_PER_S, (START_S + 5000) * NS_PER_S)])
+    assert history.seconds == 309.0, "the open recording does not count either, and the first one does again"
     history.finish()
     assert kept_s(tmp_path) == [(0, 309), (310, 599)]
 

@@ -184,6 +184,18 @@ def test_a_power_cut_is_one_message():
     assert lost.title == "200 alarms in 1 tray (hall): 200 ALARM, 200 no longer confirmed by data"
 
 
+def test_causes_that_are_as_likely_are_named_together_in_messages_about_one_fan_and_about_many():
+    tie = tuple(Diagnosis(cause=c, probability=p) for c, p in (("blocked", 0.4), ("no_power", 0.4), ("no_tacho", 0.2)))
+    desk = Desk()
+    desk.hear(alarm(causes=tie))
+    (one,) = desk.wait(10)
+    assert "Cause: blocked or no power, 40 % each, or no signal of the tacho, 20 %" in one.body
+    assert "rotor; or look at its supply" in one.body
+    desk.hear(*(alarm(fan=fan, tray="other", causes=tie) for fan in range(10)))
+    (digest,) = desk.wait(100)
+    assert "Most probable causes: blocked or no power 10" in digest.body.splitlines()
+
+
 def test_while_more_fans_keep_coming_messages_become_rarer():
     desk = Desk()
     times: list[float] = []
@@ -285,6 +297,16 @@ def test_the_first_notifier_of_a_site_says_what_is_presented_and_not_what_was():
     desk.hear(alarm(fan=3), alarm(fan=4), alarm(Transition.ACKNOWLEDGED, fan=4, acknowledged=True))
     assert desk.wait(FIRST_LOOK_NS / NS_PER_S) == []
     assert titles(desk.wait(10)) == ["WARNING, fan 3 of tray1"]
+
+
+def test_a_message_about_many_that_are_over_says_so_first():
+    desk = Desk()
+    desk.hear(*(alarm(fan=fan) for fan in range(5)))
+    assert titles(desk.wait(60)) == ["5 alarms in 1 tray (hall): 5 WARNING"]
+    desk.hear(*(cleared(fan) for fan in range(5)))
+    (over,) = desk.wait(60)
+    assert (over.title, over.level) == ("5 alarms cleared in 1 tray (hall)", Level.GOOD)
+    assert over.body.startswith("5 alarms cleared in 1 tray at hall\ntray1: cleared: 5 fans: 0-4\n")
 
 
 def test_a_clock_that_is_set_back_holds_nothing_up():

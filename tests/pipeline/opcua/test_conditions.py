@@ -15,7 +15,7 @@ from pipeline.opcua.events import condition_event, system_event
 from pipeline.viewing.fleet import Fan
 from schemas.enums import Severity, Transition
 from schemas.header import Header
-from schemas.messages import Alarm
+from schemas.messages import Alarm, Diagnosis
 from scoring.alarms.current_alarms import current_alarms
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, TRAY, alarm
@@ -52,6 +52,12 @@ def test_a_comment_stays_until_the_next_and_that_of_a_refused_request_does_not_c
     marked = alarm(Transition.MARKED_FALSE, 4, active=False, acknowledged=True, **of_earlier)
     fields = after(alarm(), said, refused, cleared, marked).fields(NOW_NS)
     assert (fields["Comment"], fields["ClientUserId"]) == ("seen", "ann")
+
+
+def test_the_cause_names_all_that_are_as_likely():
+    tie = (Diagnosis(cause="blocked", probability=0.4), Diagnosis(cause="no_power", probability=0.4))
+    fields = after(alarm(causes=tie)).fields(NOW_NS)
+    assert (fields["Cause"], fields["CauseProbability"]) == ("blocked or no power", 0.4)
 
 
 def test_shelving_counts_down():

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from pipeline.recordings.reading import read_recording
+from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.records import RECORD, RecordReader
+from pipeline.recordings.scan import scan
 from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import decode, encode
 from schemas.messages import newest_t_ns
@@ -61,3 +62,17 @@ def test_a_damaged_chunk_costs_only_that_chunk(tmp_path, what):
         assert len(found) == len(whole) - 100
         assert found[-1].received_t_ns == whole[-1].received_t_ns
         assert reading.damage == f"{damaged}: damaged chunks left out: 1"
+
+
+def test_a_recording_that_is_renamed_while_it_is_read_is_one_line(tmp_path, monkeypatch):
+    """As by the recorder that finishes it."""
+    path, read = tmp_path / "one.mcap", RecordReader.__iter__
+    path.write_bytes(GOLDEN.read_bytes())
+
+    def then_renamed(reader):
+        yield from read(reader)
+        path.rename(tmp_path / "other.mcap")
+
+    monkeypatch.setattr(RecordReader, "__iter__", then_renamed)
+    with pytest.raises(RecordingError, match="one.mcap: cannot read the recording: No such file"):
+        scan(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from pipeline.recordings.clips.clip import Clip, clip_lines
 from pipeline.recordings.clips.cutting import cut_clips
 from pipeline.recordings.contents import contents_of
+from pipeline.recordings.disk import DiskError
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.records import active_path
 from pipeline.recordings.writing import RecordingWriter
@@ -144,3 +146,22 @@ def test_a_clip_of_parts_that_are_gone_is_not_written_and_one_of_some_has_the_re
     assert (result.size_bytes, result.may_pass) == (0, False)
     assert "nothing of that time is recorded" in result.problem
     assert not active_path(tmp_path / "clips" / past.name).exists()
+
+
+def test_where_room_runs_out_while_clips_are_written_the_last_one_is_given_up(undisturbed, tmp_path):
+    clip = clip_of(first_raised(undisturbed), before_s=0.5, after_s=2.0)
+    record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
+    folder = tmp_path / "clips"
+    files: list[int] = []
+
+    def rest() -> None:
+        files.append(len(list(folder.iterdir())))
+        if len(files) == 2:
+            raise DiskError("0.1 MB are free")
+
+    clips = [clip, replace(clip, name="last.mcap")]
+    first, last = cut_clips(clips, tmp_path / "recording.mcap", folder, rest=rest)
+    assert first.size_bytes and not first.problem
+    assert (last.size_bytes, last.may_pass, last.problem) == (0, True, "0.1 MB are free")
+    assert files[:3] == [2, 2, 1], "there is room again before the first one goes on"
+    assert [path.name for path in folder.iterdir()] == [clip.name]

@@ -16,12 +16,13 @@ from typing import Any, BinaryIO, NoReturn
 import numpy as np
 import pytest
 
+from pipeline.errors import UserError
 from pipeline.recordings.reading import read_metadata
 from pipeline.replay.offline import healthy_runs
 from pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
 from pipeline.replay.offline.kept_samples import KeptSamples
 from pipeline.runtime.tray_twin import load_tray_twin
-from scoring.calibration.healthy_statistics import HealthyRun, statistics_of_run
+from scoring.calibration.healthy_statistics import HealthyRun, MixedRatesError, statistics_of_run
 from scoring.limits import Limits
 from scoring.samples import Samples
 
@@ -95,6 +96,14 @@ def test_where_room_or_the_disk_is_full_samples_are_computed_again(
     assert len(samples_in(runs)) == len(samples_in(runs)) == whole
     assert opened == [GOLDEN] * 2
     assert sum(file.stat().st_size for file in kept.folder.iterdir()) < 100
+
+
+def test_a_recording_whose_grid_changes_is_a_bad_one(part: HealthyPart) -> None:
+    def found_to_change(run: HealthyRun) -> NoReturn:
+        raise MixedRatesError((run.name, 10_000_000), (run.name, 20_000_000))
+
+    with pytest.raises(UserError, match="golden.mcap: its grid changes between 100 Hz and 50 Hz"):
+        list(HealthyRuns([GOLDEN], part)(found_to_change))
 
 
 def test_a_pass_that_ends_early_is_not_taken_for_a_whole_recording(part: HealthyPart, tmp_path: Path) -> None:

@@ -217,3 +217,13 @@ def test_progress_is_reported_and_an_error_of_its_callback_ends_the_replay():
         play(raws(1000), look=look)
     assert seen[-1].t_ns == pytest.approx(START_NS + 1_000_000_000, abs=1e8)
     assert (seen[-1].rate, seen[-1].paused, seen[-1].round) == (1.0, False, 0)
+
+
+def test_recorded_time_never_overtakes_the_message_that_is_next_and_a_pause_is_counted():
+    """Else stages would give up samples that are still to come."""
+    pace = Pace(1.0)
+    pace.start(START_NS, 7.0)
+    assert pace.position_ns(60.0, START_NS + STEP_NS) == START_NS + STEP_NS
+    pace.change(START_NS + STEP_NS, 60.0, paused=True)
+    pace.change(START_NS + STEP_NS, 1000.0, paused=False)
+    assert pace.paused_s == 940.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from pipeline.replay.live.listeners import Listeners
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from stages.resampler import ResamplerConfig, ResamplerCore
 from tests.support.fantwin_command import error_of, usage_error_of
@@ -40,6 +41,15 @@ def test_a_tray_that_the_configuration_lacks_is_one_line(recording, tmp_path):
     config = tmp_path / "c.toml"
     config.write_text('[[tray]]\nname = "rig"\nfans = 8\n')
     assert error_of("replay", recording, "-c", config) == f"{config}: no tray called 'tray1'; known: rig"
+
+
+def test_beside_another_replay_it_is_refused(recording, tmp_path, endpoint, monkeypatch):
+    monkeypatch.setattr(Listeners, "wait_for_discovery", lambda _listeners, _stop: None)
+    monkeypatch.setattr(Listeners, "is_replaying", lambda _listeners: True)
+    config = tmp_path / "c.toml"
+    config.write_text(f'site = "hall"\nbus = {{ endpoint = "{endpoint}" }}\n[[tray]]\nname = "tray1"\nfans = 8\n')
+    expected = f"a replay is running on site 'hall' at {endpoint}: stop that first"
+    assert error_of("replay", recording, "-c", config) == expected
 
 
 def test_round_after_round_a_resampler_sees_a_device_that_restarts_with_a_short_gap_and_no_loss(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pipeline.runtime.clock import StageClock
+from pipeline.runtime.clock import StageClock, is_of_replay
 from schemas.header import Header
 from schemas.messages import Clock
 
@@ -96,3 +96,9 @@ def test_row_12_a_clock_that_is_not_renewed_expires_and_another_replay_may_follo
     clock.add_replay_health("replay-all-2", has_ended=False)
     assert clock.update(clock_message(3000, 1.0, producer="replay-all-2"))
     assert clock.tick_ns("a") == 3000
+
+
+def test_only_the_sessions_of_a_replay_are_of_one_whatever_a_tray_is_called():
+    """Samples and commands of a replay drive no live fan."""
+    assert is_of_replay("replay-all-12ab")
+    assert not any(map(is_of_replay, ("acquisition-replay-12ab", "replayer-all-12ab")))

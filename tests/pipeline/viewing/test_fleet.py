@@ -107,6 +107,13 @@ def test_what_a_judged_sample_says_counts_more_than_an_old_message() -> None:
     assert fleet.alarms() == []
 
 
+def test_an_alarm_of_a_fan_that_the_tray_does_not_have_changes_no_other() -> None:
+    fleet = fleet_of(a=1, b=1)
+    fleet.add_alarm(alarm("a", 1, START_NS))
+    fleet.update(newest("b", START_NS, GAP))
+    assert fleet.alarms() == []
+
+
 def test_a_cell_shows_the_state_and_how_near_the_score_is_to_the_limit() -> None:
     states = [*((FanState.NORMAL, score) for score in (0.0, 0.5, 0.99, 7.0, np.nan)), (99, 0.0)]
     fleet = fleet_of(a=len(states), b=len(FanState), c=1)

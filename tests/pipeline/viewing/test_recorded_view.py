@@ -18,6 +18,7 @@ from schemas.messages import Alarm, Message, Score
 from schemas.topics import health_key, tray_key
 from stages.viewer import build
 from tests.stages.test_viewer import card, chunks_of, context, health, rows_of, sent
+from tests.stages.test_viewer_fleet import TRAYS, messages_of
 from tests.support.score_data import START_NS, made_up_tray
 from tests.support.wear_data import worn_snapshot
 
@@ -112,3 +113,20 @@ def test_an_existing_view_is_kept_and_a_recording_without_scores_is_one_line(tmp
     with pytest.raises(UserError, match="holds no scores to show"):
         view([writer.path], tmp_path / "new.rrd")
     assert not (tmp_path / "new.rrd").exists()
+
+
+def test_a_recording_of_a_fleet_shows_its_overview_and_has_a_plot_for_the_fan_in_alarm(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trays = {f"fans.{tray}": "3" for tray in TRAYS}
+    with RecordingWriter(tmp_path / "fleet.mcap", {"trays": ",".join(TRAYS), **trays}, {}) as writer:
+        for number, message in enumerate(messages_of()):
+            header = replace(message.header, sequence=number)
+            key = tray_key("site", message.header.tray, TOPICS[type(message).__name__])
+            writer.add_message(key, replace(message, header=header), last_t_ns(message))
+    view([writer.path], tmp_path / "fleet.rrd", fleet_above=3, json_output=True)
+    assert json.loads(capsys.readouterr().out)["fans"] == 9
+    rows = rows_of(tmp_path / "fleet.rrd")
+    in_alarm = [(t_ns - START_NS) / 1e9 for t_ns, row in rows["/fleet/counts/in_alarm"] if row["Scalars:scalars"][0]]
+    assert 8.5 <= in_alarm[0] <= 9.1 and 14.0 <= in_alarm[-1] <= 15.1
+    assert "/shown/plot_1/tray2/fan_2/speed" in rows and "/shown/score/plot_1" in rows

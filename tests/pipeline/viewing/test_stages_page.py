@@ -81,6 +81,17 @@ def test_row_01_a_stage_that_waits_for_its_input_is_named() -> None:
     assert section(page.text(NOW_NS), "What is wrong")[0] == "- **scorer**: waits for grid of tray1"
 
 
+def test_of_many_instances_only_those_that_are_not_well_have_a_row() -> None:
+    page = page_of(*(health("acquisition", f"rack{number}") for number in range(157)))
+    page.add_health(health("acquisition", "rack3", lost=2))
+    page.add_health(health("acquisition", "rack5", status=StageStatus.DEGRADED, problem="no port"))
+    assert [row for row in section(page.text(NOW_NS), "Stages now") if row][2:] == [
+        "| acquisition/rack3 | ok | **2** |",
+        "| acquisition/rack5 | **degraded** | 0 |",
+        "| acquisition: 155 of 157 | ok | 0 |",
+    ]
+
+
 def test_a_fleet_in_trouble_has_a_short_page() -> None:
     awaited = tuple(AwaitedInput(key=f"fantwin/s/rack{number}/grid", since_t_ns=0) for number in range(157))
     page = page_of(replace(health("scorer"), waiting_for=awaited))

@@ -52,3 +52,5 @@ def test_a_fan_that_stands_or_starts_does_not_count() -> None:
     command[300:350] = 0.0
     stopped = replace(run, command=command)
     assert sigma(stopped, STANDSTILL) < 0.2 * sigma(stopped, None)
+    never = replace(run, command=np.zeros_like(run.command))
+    assert sigma(never, STANDSTILL) == WHOLE_SIGMA[0], "that of the whole residual where no sample is left"

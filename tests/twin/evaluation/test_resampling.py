@@ -6,7 +6,7 @@ import pytest
 from tests.support import fan_data
 from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluate_model
-from twin.evaluation.resampling import Grid, on_grid, resampled, thinned
+from twin.evaluation.resampling import Grid, irregular, on_grid, resampled, thinned
 from twin.models.hybrid import UNITS, Hybrid
 from twin.models.model import TwinModel
 from twin.models.network import Scaling, TanhNetwork
@@ -43,6 +43,17 @@ def test_speeds_are_the_measured_ones_wherever_the_grids_meet() -> None:
     same = resampled(run, 100.0)
     np.testing.assert_array_equal(same.speed_rad_s, run.speed_rad_s)
     np.testing.assert_allclose(same.command, run.command, rtol=1e-9)
+
+
+def test_irregular_steps_are_one_to_three_steps_of_the_run_lose_no_impulse_and_depend_on_the_seed_only() -> None:
+    run = fan_data.published_run(4, 10.0)
+    thin = irregular(run, seed=1)
+    steps = np.rint(np.diff(thin.t_s) * fan_data.RATE_HZ)
+    assert [np.mean(steps == k) for k in (1, 2, 3)] == pytest.approx([1 / 3] * 3, abs=0.07)
+    np.testing.assert_array_equal(thin.speed_rad_s[:, 0], run.speed_rad_s[np.isin(run.t_s, thin.t_s), 0])
+    np.testing.assert_array_equal(irregular(run, seed=1).t_s, thin.t_s)
+    for stop_s in thin.t_s[[1, 50, -1]]:
+        assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
 
 
 def test_on_grids_with_few_common_times_speeds_are_interpolated_and_gaps_stay_gaps() -> None:

@@ -100,6 +100,14 @@ def test_a_residual_that_follows_the_command_peaks_at_its_lag_with_its_sign() ->
     assert peak == pytest.approx(gain / np.hypot(1.0, gain), abs=0.05)
 
 
+def test_a_command_that_answers_the_residual_shows_at_a_negative_lag_and_is_no_fault_of_the_model() -> None:
+    rng = np.random.default_rng(6)
+    residual = white(rng)
+    analysis = analysed(residual, 0.5 * np.roll(residual, 10) + rng.normal(size=SAMPLES))
+    assert analysis.cross_lags_s[np.argmax(analysis.cross_correlation)] == pytest.approx(-0.10)
+    assert abs(analysis.cross_over_bound) < 2.0
+
+
 def test_a_model_too_weak_or_too_slow_is_seen_in_its_residual() -> None:
     run = fan_data.published_run(7)
 
@@ -148,6 +156,26 @@ def test_runs_are_not_joined_across_their_ends() -> None:
     pairs = zip(parts, driven, strict=True)
     crossed = np.sum([part[lag:] @ drive[:-lag] for part, drive in pairs]) / (4 * (1000 - lag)) / centred.std()
     assert analysis.cross_correlation[len(analysis.lags_s) + lag] == pytest.approx(crossed, rel=1e-9)
+
+
+def test_a_gap_within_a_run_is_time_in_which_nothing_was_measured() -> None:
+    rng = np.random.default_rng(9)
+    residual = slow(rng)
+    kept = rng.random(SAMPLES) < 0.7
+    run = Run("lossy", times(SAMPLES)[kept], np.zeros(kept.sum()), residual[kept])
+    lossy = analyse_residual(residual[kept, np.newaxis], [run], settling_s=0.0)[0]
+    marked = analysed(np.where(kept, residual, np.nan), np.zeros(SAMPLES))
+    common = slice(0, 400)
+    np.testing.assert_allclose(lossy.autocorrelation[common], marked.autocorrelation[common], atol=1e-3)
+    assert lossy.ljung_box_p == pytest.approx(marked.ljung_box_p)
+
+
+def test_independent_samples_say_how_far_the_mean_scatters() -> None:
+    """Also where half of the samples are missing."""
+    rng = np.random.default_rng(10)
+    drawn = [np.where(rng.random(SAMPLES) < 0.5, np.nan, slow(rng)) for _ in range(200)]
+    claimed = [np.nanstd(one) / np.sqrt(analysed(one, np.zeros(SAMPLES)).independent_samples) for one in drawn]
+    assert np.mean(claimed) == pytest.approx(np.std([np.nanmean(one) for one in drawn]), rel=0.2)
 
 
 def test_the_autocorrelation_time_is_that_of_an_exponential_with_and_without_lost_samples() -> None:

@@ -123,6 +123,15 @@ def test_with_a_tacho_that_counts_least_squares_have_to_explain_more_than_its_er
     assert set(fit_balance([counted(run, coarse)], [], wrong).sources) == {"least-squares"}
 
 
+def test_standard_errors_are_about_the_scatter_from_recording_to_recording(plants) -> None:
+    run, identification = plants
+    fit = fit_balance([run], [], identification)
+    chosen = np.array(fit.sources) == "least-squares"
+    scatter = fit.coefficients[chosen].std(axis=0, ddof=1)
+    ratio = np.sqrt(np.mean(std_errors(fit)[chosen] ** 2, axis=0)) / scatter
+    assert np.all((ratio > 0.6) & (ratio < 2.5)), ratio
+
+
 def test_the_command_a_fan_needs_is_known_better_than_any_one_coefficient(plants) -> None:
     run, identification = plants
     fit = fit_balance([run], [], identification)
@@ -152,6 +161,20 @@ def test_a_fan_that_is_held_or_braked_to_a_stop_teaches_nothing_then(published) 
     stopped, free = (fit_balance([r], [], identification) for r in (replace(run, speed_rad_s=speed), run))
     assert stopped.sources == free.sources
     np.testing.assert_allclose(stopped.sigma_command, free.sigma_command, rtol=0.05)
+
+
+def test_a_few_missing_speeds_are_bridged(published) -> None:
+    run, identification = published
+    speed = run.speed_rad_s.copy()
+    speed[np.random.default_rng(1).random(run.samples) < 0.05] = np.nan
+    fit, whole = (fit_balance([r], [], identification) for r in (replace(run, speed_rad_s=speed), run))
+    np.testing.assert_allclose(fit.sigma_command, whole.sigma_command, rtol=0.05)
+
+
+def test_damping_is_never_negative_where_runs_are_at_few_speeds() -> None:
+    levels = [published_fan.rough_run(seed, 12.0, low=60.0).run for seed in range(5)]
+    fit = fit_balance(levels, [], identify(levels))
+    assert np.all(fit.coefficients[:, :3] >= 0.0)
 
 
 def test_runs_too_short_are_refused_in_one_line(published) -> None:

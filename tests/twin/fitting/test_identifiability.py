@@ -152,6 +152,16 @@ def test_every_loop_at_one_set_point_is_noticed(controller) -> None:
     assert all(feedback_share([run], fan) > 0.0 for fan in range(run.fans))
 
 
+def test_a_loop_is_noticed_through_missing_speeds_and_gaps() -> None:
+    run = controlled(np.full((4000, 2), 120.0), seed=8)
+    speed = run.speed_rad_s.copy()
+    speed[np.random.default_rng(1).random(speed.shape) < 0.05] = np.nan
+    keep = np.flatnonzero((run.t_s < 15.0) | (run.t_s > 18.0))
+    pieces = Run("lossy", run.t_s[keep], run.command[keep], speed[keep]).split_at_gaps()
+    assert len(pieces) == 2
+    assert all(feedback_share(pieces, fan) > 0.2 for fan in range(2))
+
+
 def test_a_loop_at_one_set_point_is_reported_with_biased_and_indistinguishable_parameters() -> None:
     lines = warnings_of(controlled(np.full((4000, 4), 120.0), seed=5))
     for fan in range(4):
@@ -181,6 +191,27 @@ def test_each_parameter_is_judged_by_its_own_interval() -> None:
     assert "low speed" in line
     (line,) = judged(run, J=(0.15, 0.05))
     assert line.startswith("fan 0: J is poorly determined (0.15 ± 0.1)")
+
+
+def test_a_lag_below_the_sampling_step_or_within_its_error_is_reported_as_undetermined() -> None:
+    run = published_run(1)
+    assert judged(run, lag_s=(0.03, 0.002)) == ()
+    (line,) = judged(run, lag_s=(0.006, 0.001))
+    assert line.startswith("fan 0: lag_s (6 ± 2 ms) is not determined by samples every 10 ms")
+    assert has_line_with(judged(run, lag_s=(0.03, 0.02)), "lag_s (30 ± 40 ms) is not determined")
+
+
+def test_a_command_that_hardly_moves_is_little_excitation() -> None:
+    levels = np.random.default_rng(4).choice([50.0, 51.0], 14).repeat(100)[:, None]
+    lines = warnings_of(commanded(levels, seed=4, warm_up_s=4.0))
+    for reason in ("moves by 2.0%", "2 level(s) only", "hardly more than its noise"):
+        assert has_line_with(lines, "little excitation", reason, "three or more levels")
+
+
+def test_a_speed_measured_after_its_command_is_no_feedback() -> None:
+    run = commanded(open_loop_commands(2001, 20)["stairs with dither"], seed=4, noise_rad_s=0.1)
+    late = Run("late", run.t_s[:-1], run.command[:-1], run.speed_rad_s[1:])
+    assert not any(feedback_share([late], fan) > 0.0 for fan in range(run.fans))
 
 
 def rosa(folder: Path, number: int) -> Run:

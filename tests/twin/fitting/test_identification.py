@@ -1,11 +1,15 @@
 """Parameters recovered, in any units, or refused."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from bench.training.published_fan import published_fan
+from bench.training.published_fan import published_fan, rough_run
 from tests.support import fan_data
 from twin.errors import TwinError
+from twin.fitting.free_run_problem import FreeRunProblem
+from twin.fitting.identifiability import short_warnings
 from twin.fitting.identification import Identification, identify
 from twin.runs import Run
 
@@ -118,3 +122,31 @@ def test_a_recording_of_few_time_constants_is_said_to_be_too_short_before_anythi
     assert "takes 75; record 5 min or more" in first
     parts = [fan_data.published_run(seed, duration_s=10.0) for seed in (1, 2)]
     assert not any("too short" in line for line in identify(parts).warnings), "recordings count together"
+
+
+def test_a_slow_fan_is_to_be_recorded_for_longer() -> None:
+    run = fan_data.published_run(1, duration_s=5.0)
+    (line,) = short_warnings([run], np.array([0.01, 10.0]))
+    assert "of the slowest fan (10 s)" in line
+    assert "record 25 min or more" in line
+
+
+def test_fans_that_have_converged_are_left_out_and_all_end_as_if_they_were_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in large trays, for which it pays."""
+    tray, fitted = rough_run(11, 6.0, 5).run, []
+    normal_equations = FreeRunProblem.normal_equations
+
+    def noted(problem: FreeRunProblem, *arguments: Any) -> Any:
+        fitted.append(problem.fans)
+        return normal_equations(problem, *arguments)
+
+    monkeypatch.setattr(FreeRunProblem, "normal_equations", noted)
+    monkeypatch.setattr("twin.fitting.free_run_problem.WIDE_BATCH", 1)
+    found, some_left = identify([tray]), min(fitted)
+    fitted.clear()
+    monkeypatch.setattr(FreeRunProblem, "pays_for_some", lambda *_: False)
+    together = identify([tray])
+    assert (some_left, min(fitted)) == (1, 5)
+    np.testing.assert_allclose(found.parameters, together.parameters, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance, together.covariance, rtol=1e-6)
+    assert found.warnings == together.warnings

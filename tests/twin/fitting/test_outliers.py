@@ -39,3 +39,12 @@ def test_the_steps_of_a_quantised_tacho_are_no_outliers() -> None:
     run = fan_data.published_run(3, 60.0)
     quantised = np.round(run.speed_rad_s / 20.0) * 20.0
     assert np.all(without_outliers(with_speed(run, quantised))[1] < 2e-3)
+
+
+def test_missing_speeds_stay_missing_and_are_not_counted() -> None:
+    run = fan_data.published_run(3, 10.0)
+    speed = run.speed_rad_s.copy()
+    speed[::3] = np.nan
+    cleaned, share = without_outliers(with_speed(run, speed))
+    np.testing.assert_array_equal(cleaned.speed_rad_s, speed)
+    assert share[0] == 0.0

@@ -61,6 +61,24 @@ def test_stops_and_starts_are_found_with_their_times() -> None:
     assert 0.0 <= found.slowing_s < slowed_s + COUNT.held_s, "readings tell it to a count"
 
 
+def test_a_fan_that_keeps_its_speed_for_a_while_is_allowed_to() -> None:
+    """Its drive acts five seconds late, so that the command it is under is known, and its speed stays."""
+    late, run = round(5.0 / PERIOD_S), measured(*STOPS)
+    speed = np.concatenate((np.full((late, 1), run.speed_rad_s[0, 0]), run.speed_rad_s))[:-late]
+    prompt, found = find_standstill([run]), find_standstill([replace(run, speed_rad_s=speed)])
+    assert found is not None
+    assert prompt is not None
+    assert found.slowing_s == pytest.approx(5.0 + (prompt.slowing_s or 0.0), abs=1.0)
+
+
+def test_a_slow_start_is_not_a_command_that_stops_the_fan() -> None:
+    found = find_standstill([measured(*STOPS, start_delay_s=15.0)])
+    assert found is not None
+    assert (found.off_command, found.turning_command) == (10.0, 30.0)
+    assert found.start_s is not None
+    assert 15.0 < found.start_s < 18.5
+
+
 def test_a_fan_that_stood_under_a_rising_command_does_not_stop_under_it() -> None:
     """It starts above 20 only, and once it turns it turns at 15, too."""
     up = [(level, 15.0) for level in (0.0, 5.0, 10.0, 15.0)]

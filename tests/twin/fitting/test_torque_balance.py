@@ -42,3 +42,16 @@ def test_tacho_noise_gives_inertia_times_lambda_times_noise_at_every_rate(rate_h
     settled = balance[round(rate_hz) :]
     implied = COEFFICIENTS[:, 0] * FILTER_RATE_PER_S * noise_rad_s
     np.testing.assert_allclose(settled.std(axis=0), implied, rtol=0.1)
+
+
+def test_after_an_unknown_speed_the_filter_starts_again_and_the_other_fan_continues() -> None:
+    command, speed = wandering(200)
+    whole = torque_balance(command, speed, STEP_S, COEFFICIENTS, LAG_S)
+    broken = speed.copy()
+    broken[80:90, 1] = np.nan
+    balance = torque_balance(command, broken, STEP_S, COEFFICIENTS, LAG_S)
+    np.testing.assert_array_equal(balance[:, 0], whole[:, 0])
+    assert np.isnan(balance[80:91, 1]).all()
+    assert np.isfinite(np.delete(balance[1:, 1], slice(79, 90))).all()
+    from_there = torque_balance(command[90:], speed[90:], STEP_S, COEFFICIENTS, LAG_S)
+    np.testing.assert_allclose(balance[91:, 1], from_there[1:, 1], rtol=1e-9)

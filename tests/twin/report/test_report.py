@@ -5,6 +5,7 @@ import re
 from dataclasses import astuple, replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from twin.models.physics import PARAMETER_NAMES
 from twin.report import figures
 from twin.report.assessment import assess
 from twin.report.content import Content, SpeedUnit, report_content, summary_of
-from twin.report.page import report_page
+from twin.report.page import MOST_FANS_DRAWN, drawn_fans, report_page
 from twin.report.recording_sums import common_extent, extent_of, recording_sums
 from twin.report.steady_states import static_curve
 from twin.report.timeline import broken_at, kept_samples, timeline
@@ -216,6 +217,43 @@ def test_limitations_of_the_figures_are_reported_as_warnings(twin):
     assert any("speeds are missing" in line for line in assess(content_of(twin, with_speed(run, speed))).warnings)
 
 
+def test_the_worst_fan_decides_and_is_named_and_speeds_of_another_unit_are_recognised(twin):
+    healthy = published_run(6, 20.0, fans=3)
+    judged = assess(content_of(twin, with_speed(healthy, healthy.speed_rad_s * np.array([1.0, 0.85, 1.0]))))
+    assert "does not follow fan 1: rmse" in judged.headline
+    assert "A twin of one fan is used for 3: fans differ, and so may their errors." in judged.warnings
+    run = published_run(5, 10.0)
+    (first, *_) = assess(content_of(twin, with_speed(run, run.speed_rad_s * 60.0 / (2.0 * np.pi)))).warnings
+    assert re.fullmatch(r"Speeds up to \d,\d{3} rad/s, the twin knows \d{3}: is the recording's unit right\?", first)
+
+
+def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_reported(twin):
+    run = published_run(5, 30.0)
+    content = content_of(twin, run)
+    wide = replace(content, fans=(replace(content.fans[0], sigma_rad_s=2.0 * content.fans[0].sigma_rad_s),))
+    (line,) = assess(wide).warnings
+    assert line.startswith("This fan: the card's sigma is over 1.5 times the standard deviation of the errors")
+    (line,) = assess(content_of(twin, run.between(0.0, 0.9))).warnings
+    assert re.search(r"\d+ independent errors determine the rmse to 1\d% only", line)
+    healthy = replace(twin.card.healthy, independent_samples=(8.0,))
+    of_few: Any = SimpleNamespace(card=replace(twin.card, healthy=healthy), path=twin.path)
+    (line,) = assess(replace(content, twin=of_few)).warnings
+    assert "equivalent of 8 independent errors: its sigma may be off by 25%" in line
+
+
+def test_a_free_run_that_diverges_is_reported_and_of_many_fans_the_worst_are_drawn(twin):
+    many = published_run(9, 4.0, fans=MOST_FANS_DRAWN + 3)
+    content = content_of(twin, with_speed(many, many.speed_rad_s * np.where(np.arange(many.fans) == 13, 0.7, 1.0)))
+    drawn = drawn_fans(content.fans)
+    assert len(drawn) == MOST_FANS_DRAWN and 13 in [fan.number for fan in drawn]
+    left_out = [fan.rmse_in_sigma for fan in content.fans if fan not in drawn]
+    assert max(left_out) <= min(fan.rmse_in_sigma for fan in drawn)
+    lost = replace(content.fans[0].figures, rmse_rad_s=np.inf, max_error_rad_s=np.inf, r2=-np.inf)
+    judged = assess(replace(content, fans=(replace(content.fans[0], figures=lost),)))
+    assert judged.headline == "The twin does not follow this fan: rmse without limit."
+    assert "This fan: the free run diverges." in judged.warnings
+
+
 @given(spike=st.integers(0, 19_999), columns=st.integers(10, 500), missing=st.integers(0, 10_000))
 def test_a_thinned_line_keeps_every_spike_and_breaks_where_nothing_was_measured(spike, columns, missing):
     t_s = np.arange(20_000) / 100.0
@@ -241,6 +279,13 @@ def test_gaps_stay_open_and_long_ones_are_shortened():
     assert not line.keeps_the_clock
     (drawn,) = broken_at(line.starts, np.arange(run.samples), run.speed_rad_s[:, 0])
     assert np.flatnonzero(np.isnan(drawn)).tolist() == [line.starts[1], line.starts[2] + 1]
+
+
+def test_recordings_follow_one_another_and_one_alone_keeps_its_clock():
+    first, second = published_run(1, 10.0).rows(500, 1000), published_run(2, 10.0)
+    both, alone = timeline([first, second]), timeline([first])
+    assert [name for _, name in both.recordings] == ["published 1", "published 2"]
+    assert (both.t_s[0], alone.t_s[0], alone.keeps_the_clock) == (0.0, 5.0, True)
 
 
 def test_the_static_curve_is_where_torque_and_load_meet():
