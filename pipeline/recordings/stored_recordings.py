@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from pipeline.recordings.rare_messages import last_message_ns
 from pipeline.recordings.reading import RecordingError, read_metadata
-from pipeline.recordings.records import ACTIVE_SUFFIX
+from pipeline.recordings.records import ACTIVE_SUFFIX, whole_number
 from pipeline.recordings.run_recordings import CLIPS, RECORDING_KEY
 
 SUFFIX = ".mcap"
@@ -90,7 +90,7 @@ def _part(path: Path) -> StoredPart | None:
         return None
     first = Path(metadata.get(RECORDING_KEY, ""))
     named = re.fullmatch(rf"{re.escape(first.stem)}(?:-(\d+))?{re.escape(first.suffix)}", path.name)
-    began_ns = metadata.get("started_t_ns", "")
-    if not (first.name and named and "session" in metadata and began_ns.isdecimal()):
+    began_ns = whole_number(metadata.get("started_t_ns", ""))
+    if not (first.name and named and "session" in metadata and began_ns is not None):
         return None
-    return StoredPart(last_message_ns(path) or int(began_ns), int(named[1] or 1), path)
+    return StoredPart(last_message_ns(path) or began_ns, int(named[1] or 1), path)

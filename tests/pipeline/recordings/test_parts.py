@@ -88,6 +88,8 @@ def test_what_other_recorders_wrote_counts_and_what_recorders_did_not_write_is_n
     part(parts_in(tmp_path), [3_000]).finish()
     write(tmp_path / "import.mcap", 3)
     (tmp_path / "r-2.mcap").write_bytes(b"not ours")
+    about = {"recording": "dated.mcap", "session": "s", "started_t_ns": "9" * 5000}
+    RecordingWriter(tmp_path / "dated.mcap", about).finish()
     (tmp_path / "kept-by-me.mcap").write_bytes((tmp_path / "r.mcap").read_bytes())
     (tmp_path / "clips").mkdir()
     (tmp_path / "clips" / "c.mcap").write_bytes(bytes(100))
@@ -95,7 +97,7 @@ def test_what_other_recorders_wrote_counts_and_what_recorders_did_not_write_is_n
     written = sum((tmp_path / name).stat().st_size for name in ("2-of-2.r.mcap", "earlier.mcap", "r.mcap"))
     assert (place.stored().finished_bytes, place.stored().clips_bytes) == (written, 100)
     assert [oldest_deleted(place) for _ in range(4)] == ["earlier.mcap", "r.mcap", "2-of-2.r.mcap", None]
-    assert names(tmp_path) == ["clips", "import.mcap", "kept-by-me.mcap", "r-2.mcap"]
+    assert names(tmp_path) == ["clips", "dated.mcap", "import.mcap", "kept-by-me.mcap", "r-2.mcap"]
 
 
 def test_a_new_recorder_takes_a_number_above_all_existing_ones(tmp_path):
