@@ -87,7 +87,7 @@ class Part:
         self.content: list[Envelope] = []
         self.flushes = self.restored = self.lost = self.absent = 0
         self.closed = ""
-        self.size = 0
+        self.size = disk.attached_bytes
 
     def index(self) -> PartIndex:
         return PartIndex(self.path, {}, ())
@@ -140,7 +140,7 @@ class Disk:
         self.disk = 1 << 44
         self.old: list[StoredPart] = []
         self.deleted: list[Path] = []
-        self.freed_by_each = self.clips_bytes = 0
+        self.freed_by_each = self.clips_bytes = self.attached_bytes = 0
         self.gone = self.unreadable = self.undeletable = self.sizeless = ""
 
     def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> Part:
