@@ -73,6 +73,10 @@ class RecordingError(UserError):
     """A recording cannot be read or written. The message is one line."""
 
 
+class UnreadableError(RecordingError):
+    """The system refuses to read a file. It may allow it later."""
+
+
 def active_path(path: Path) -> Path:
     """The name of a recording while it is being written."""
     return path.with_name(path.name + ACTIVE_SUFFIX)
@@ -131,7 +135,7 @@ class RecordReader:
         except OSError as error:
             active = active_path(self.path)
             advice = f"; it is still being written: name {active}" if active.exists() else ""
-            raise RecordingError(f"{self.path}: cannot read the recording: {error.strerror}{advice}") from error
+            raise UnreadableError(f"{self.path}: cannot read the recording: {error.strerror}{advice}") from error
 
     def _records(self, file: BinaryIO) -> Iterator[Record]:
         while True:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 from mcap.opcode import Opcode
@@ -33,6 +35,10 @@ def part(parts_in: RecordingParts, numbers=(), ledger: SequenceLedger | None = N
 def killed(writer: RecordingWriter) -> None:
     """Close the file as kill -9 does: the unfinished chunk is lost."""
     writer._file.close()
+
+
+def refuse(*_: object) -> NoReturn:
+    raise OSError(errno.EMFILE, "Too many open files")
 
 
 def names(folder: Path) -> list[str]:
@@ -98,6 +104,15 @@ def test_what_other_recorders_wrote_counts_and_what_recorders_did_not_write_is_n
     assert (place.stored().finished_bytes, place.stored().clips_bytes) == (written, 100)
     assert [oldest_deleted(place) for _ in range(4)] == ["earlier.mcap", "r.mcap", "2-of-2.r.mcap", None]
     assert names(tmp_path) == ["clips", "dated.mcap", "import.mcap", "kept-by-me.mcap", "r-2.mcap"]
+
+
+def test_a_part_that_could_not_be_read_for_a_while_counts_again(tmp_path, monkeypatch):
+    part(parts_in(tmp_path), [0]).finish()
+    place = parts_in(tmp_path)
+    with monkeypatch.context() as busy:
+        busy.setattr(Path, "open", refuse)
+        assert place.stored().parts == ()
+    assert [each.path.name for each in place.stored().parts] == ["r.mcap"] and place.stored().finished_bytes > 0
 
 
 def test_a_new_recorder_takes_a_number_above_all_existing_ones(tmp_path):
