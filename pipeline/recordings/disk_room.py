@@ -173,12 +173,12 @@ class DiskRoom:
 
     def _delete(self, oldest: _Oldest, why: str) -> bool:
         """Delete it; False if that is not possible."""
-        if oldest.part is None:
-            assert self._clips
-            deleted = self._clips.delete_oldest_acknowledged()
-            _LOG.warning("clip %s, the oldest whose alarms are acknowledged, was deleted: %s", deleted, why)
-            return True
         try:
+            if oldest.part is None:
+                assert self._clips
+                deleted = self._clips.delete_oldest_acknowledged()
+                _LOG.warning("clip %s, the oldest whose alarms are acknowledged, was deleted: %s", deleted, why)
+                return True
             self._parts.delete(oldest.part)
         except RecordingError as error:
             self._report(error)
