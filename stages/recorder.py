@@ -383,8 +383,10 @@ def build(context: Context) -> BuiltStage:
                 found.messages,
                 found.discarded_bytes,
             )
-        for path in parts.unreadable:
-            _LOG.warning("a recorder was killed; its recording cannot be repaired and was renamed to %s", path)
+        for path, why in parts.unreadable.items():
+            _LOG.warning(
+                "a recorder was killed; its recording cannot be repaired and was renamed to %s: %s", path.name, why
+            )
         for path in parts.unrepaired:
             _LOG.warning(
                 "a recorder was killed; the disk refuses the repair of its recording, which stays %s: make room and "

@@ -666,6 +666,18 @@ def test_a_recording_says_which_topics_were_left_out_on_purpose(tmp_path):
     assert read_metadata(run.run_folder / "recording-2.mcap").left_out == ()
 
 
+def test_what_a_killed_recorder_of_another_version_left_is_kept_and_its_format_is_said(tmp_path, caplog):
+    STAGE.build(context(tmp_path)).core.close()
+    finished = tmp_path / "runs" / "recording.mcap"
+    of_tomorrow = finished.read_bytes().replace(b"format\x01\x00\x00\x001", b"format\x01\x00\x00\x002")
+    finished.rename(finished.with_name("recording.mcap.active")).write_bytes(of_tomorrow)
+    with caplog.at_level(logging.WARNING):
+        STAGE.build(context(tmp_path)).core.close()
+    assert (tmp_path / "runs" / "recording.mcap.original").read_bytes() == of_tomorrow
+    reason = "a recording of format 2; this fantwin reads format 1: update fantwin"
+    assert "cannot be repaired and was renamed to recording.mcap.original: " in caplog.text and reason in caplog.text
+
+
 def test_a_recorder_that_is_restarted_keeps_the_last_snapshots_of_its_trays_for_others(tmp_path):
     trays = tuple(TrayConfig(name=name, fans=2) for name in "abc")
     of_shard = replace(context(tmp_path), trays=trays[:2], instance="1-of-2", shard_number=1)

@@ -172,7 +172,7 @@ def test_an_active_file_whose_only_chunk_is_damaged_is_renamed_and_not_deleted(t
     kill_a_recorder(tmp_path / "r.mcap", flushed=5)
     damage_a_chunk(tmp_path / "r.mcap.active", 0)
     content = (tmp_path / "r.mcap.active").read_bytes()
-    assert parts_in(tmp_path).unreadable == [tmp_path / "r.mcap.original"]
+    assert list(parts_in(tmp_path).unreadable) == [tmp_path / "r.mcap.original"]
     assert (tmp_path / "r.mcap.original").read_bytes() == content
 
 
@@ -183,10 +183,19 @@ def test_a_damaged_active_file_that_a_full_disk_keeps_from_being_repaired_is_con
     damage_a_chunk(tmp_path / "r.mcap.active", 1)
     with disk_of(100):
         place = parts_in(tmp_path, "s2")
-    assert (place.unrepaired, place.unreadable, place.repaired) == ([tmp_path / "r.mcap.active"], [], [])
+    assert (place.unrepaired, place.unreadable, place.repaired) == ([tmp_path / "r.mcap.active"], {}, [])
     assert place.before == {STREAM: 3000}
     part(place, [3000]).finish()
     assert read_metadata(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
+    assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
+
+
+def test_an_active_file_that_cannot_be_read_for_a_while_is_repaired_later(tmp_path, monkeypatch):
+    kill_with_a_part_open(part(parts_in(tmp_path), [0]))
+    with monkeypatch.context() as busy:
+        busy.setattr(Path, "open", refuse)
+        place = parts_in(tmp_path, "s2")
+    assert (place.unrepaired, place.unreadable) == ([tmp_path / "r.mcap.active"], {})
     assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
 
 
@@ -214,8 +223,8 @@ def test_a_recording_that_is_being_written_is_not_touched(tmp_path):
 def test_an_active_file_that_is_not_a_recording_is_renamed(tmp_path, content):
     (tmp_path / "r.mcap.active").write_bytes(content)
     place = parts_in(tmp_path)
-    assert place.unreadable == [tmp_path / "r.mcap.original"]
-    assert place.unreadable[0].read_bytes() == content
+    assert list(place.unreadable) == [tmp_path / "r.mcap.original"]
+    assert (tmp_path / "r.mcap.original").read_bytes() == content
     part(place).finish()
     assert names(tmp_path) == ["r-2.mcap", "r.mcap.original"]
 
