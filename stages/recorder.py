@@ -31,7 +31,14 @@ from pipeline.recordings.open_part import OpenPart, PartsFolder
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import LEFT_OUT_KEY, RecordingError
 from pipeline.recordings.recorded_healths import RecordedHealths
-from pipeline.recordings.recorder_config import CLIPS_SHARE, FLUSH_BYTES, FLUSH_S, RecorderConfig, recorded_topics
+from pipeline.recordings.recorder_config import (
+    CLIPS_SHARE,
+    FLUSH_BYTES,
+    FLUSH_S,
+    LEAST_PART_BYTES,
+    RecorderConfig,
+    recorded_topics,
+)
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from schemas.envelope import Envelope
@@ -88,6 +95,8 @@ class Recorder(Core):
         self._clips = clips
         self._room = DiskRoom(parts, config, clips)
         self._part: OpenPart | None = None
+        self._least_bytes = 0
+        """of the part: the attachments alone may be more than its limit"""
         self._ledger = SequenceLedger(parts.before, left_out)
         self._before = parts.before
         self._cards: dict[str, Envelope] = {}
@@ -239,6 +248,7 @@ class Recorder(Core):
         held_since_ns = self._held.first_received_t_ns
         self._began_ns = self._now_ns if held_since_ns is None else min(held_since_ns, self._now_ns)
         self._part = self._parts.begin(self._began_ns, self._ledger, about)
+        self._least_bytes = self._part.size + LEAST_PART_BYTES
         self._interference.begin_part()
         self._counts["parts"] += 1
         self._problem = ""
@@ -257,8 +267,8 @@ class Recorder(Core):
         )
 
     def _is_full(self, part: OpenPart) -> bool:
-        room = self._room
-        return part.size >= room.part_bytes or self._now_ns - self._began_ns >= room.part_s * NS_PER_S
+        is_large = part.size >= max(self._room.part_bytes, self._least_bytes)
+        return is_large or self._now_ns - self._began_ns >= self._room.part_s * NS_PER_S
 
     def _keep_limits(self, *, has_ended_part: bool = False) -> None:
         self._limited_ns = self._now_ns
@@ -373,8 +383,10 @@ def build(context: Context) -> BuiltStage:
                 found.messages,
                 found.discarded_bytes,
             )
-        for path in parts.unreadable:
-            _LOG.warning("a recorder was killed; its recording cannot be repaired and was renamed to %s", path)
+        for path, why in parts.unreadable.items():
+            _LOG.warning(
+                "a recorder was killed; its recording cannot be repaired and was renamed to %s: %s", path.name, why
+            )
         for path in parts.unrepaired:
             _LOG.warning(
                 "a recorder was killed; the disk refuses the repair of its recording, which stays %s: make room and "

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import queue
-import re
 import threading
 import time
 from collections.abc import Callable
@@ -22,12 +21,6 @@ QUEUE_SIZE = 1000
 _MAX_REMEMBERED = 1000  # lines that may be repeated
 _POLL_S = 0.5
 _CLOSE_LIMIT_S = 1.0
-_FIGURE = re.compile(r"\d[\d,]*\.\d+|\d[\d,]*(?= ?(?:B|kB|MB|GB|ms|s|min|h|%|rpm|rad/s|samples|messages|times)\b)")
-
-
-def without_figures(line: str) -> str:
-    """The line without its measured figures, which change while its meaning stays; numbers of fans are kept."""
-    return _FIGURE.sub("#", line)
 
 
 @dataclass(slots=True)

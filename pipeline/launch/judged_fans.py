@@ -12,9 +12,9 @@ import numpy as np
 from pipeline.bus.session import Bus
 from pipeline.config.models import TrayConfig
 from pipeline.config.registry import STAGES
-from pipeline.launch.event_log import without_figures
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
+from pipeline.runtime.figures import without_figures
 from schemas.codec import CodecError, decode
 from schemas.enums import InvalidReason
 from schemas.fan_numbers import fans_in_words

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.launch.event_log import without_figures
 from pipeline.launch.site_state import OFF_THE_BUS, WHY_SILENT, StageState, Word
 from pipeline.launch.site_watcher import StageView
 from pipeline.launch.stage_notes import note_lines
+from pipeline.runtime.figures import without_figures
 from pipeline.runtime.latencies import LATENCY_WINDOW_S
 from schemas.enums import Severity
 from schemas.health import Health

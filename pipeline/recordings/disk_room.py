@@ -18,7 +18,7 @@ from typing import NamedTuple
 from pipeline.recordings.clips.alarm_clips import AlarmClips
 from pipeline.recordings.disk import Disk, DiskError
 from pipeline.recordings.open_part import PartsFolder
-from pipeline.recordings.recorder_config import CLIPS_SHARE, PARTS_WITHIN_LIMITS, RecorderConfig
+from pipeline.recordings.recorder_config import CLIPS_SHARE, LEAST_PART_S, PARTS_WITHIN_LIMITS, RecorderConfig
 from pipeline.recordings.records import RecordingError
 from pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
 from schemas.units import NS_PER_S
@@ -72,7 +72,7 @@ class DiskRoom:
     def part_s(self) -> float:
         """The time after which a new part begins."""
         kept_s = self._config.keep_days * 86_400 or math.inf
-        return min(self._config.part_s or math.inf, kept_s / PARTS_WITHIN_LIMITS)
+        return max(LEAST_PART_S, min(self._config.part_s or math.inf, kept_s / PARTS_WITHIN_LIMITS))
 
     def keep_limits(self, now_ns: int, *, has_ended_part: bool = False) -> None:
         """Delete what is too old, and the oldest that is too much; room for the part that is written is left. The last
@@ -173,12 +173,12 @@ class DiskRoom:
 
     def _delete(self, oldest: _Oldest, why: str) -> bool:
         """Delete it; False if that is not possible."""
-        if oldest.part is None:
-            assert self._clips
-            deleted = self._clips.delete_oldest_acknowledged()
-            _LOG.warning("clip %s, the oldest whose alarms are acknowledged, was deleted: %s", deleted, why)
-            return True
         try:
+            if oldest.part is None:
+                assert self._clips
+                deleted = self._clips.delete_oldest_acknowledged()
+                _LOG.warning("clip %s, the oldest whose alarms are acknowledged, was deleted: %s", deleted, why)
+                return True
             self._parts.delete(oldest.part)
         except RecordingError as error:
             self._report(error)

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from pipeline.recordings.records import whole_number
 from pipeline.recordings.run_recordings import recorded_files
 
 
@@ -35,8 +36,7 @@ def _sessions_in_order(paths: Iterable[Path]) -> list[Path]:
     sessions: dict[str, list[tuple[int, int, Path]]] = {}
     for path in paths:
         metadata = read_metadata(path).metadata
-        part = metadata.get("part", "")
-        numbered = (int(part) if part.isdecimal() else 0, _start_ns(path), path)
+        numbered = (whole_number(metadata.get("part", "")) or 0, _start_ns(path), path)
         sessions.setdefault(metadata.get("session") or str(path), []).append(numbered)
     ordered = [sorted(parts) for parts in sessions.values()]
     return [path for parts in sorted(ordered, key=lambda parts: parts[0][1]) for _, _, path in parts]

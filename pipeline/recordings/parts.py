@@ -17,7 +17,7 @@ from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
 from pipeline.recordings.rare_messages import last_messages
 from pipeline.recordings.reading import RecordingError, read_metadata
-from pipeline.recordings.records import ACTIVE_SUFFIX
+from pipeline.recordings.records import ACTIVE_SUFFIX, UnreadableError
 from pipeline.recordings.repair import (
     ORIGINAL_SUFFIX,
     Recovery,
@@ -73,8 +73,8 @@ class RecordingParts:
         self._part = 0
         self.repaired: list[Recovery] = []
         """files that killed recorders had left"""
-        self.unreadable: list[Path] = []
-        """such files that cannot be repaired, under their new names"""
+        self.unreadable: dict[Path, str] = {}
+        """such files that cannot be repaired, under their new names, and why"""
         self.unrepaired: list[Path] = []
         """such files whose repair the disk refuses for now; left as they are"""
         try:
@@ -188,12 +188,12 @@ class RecordingParts:
                 raise RecordingError(
                     f"{path}: another recorder is writing it; stop it, or name another file"
                 ) from error
-            except DiskError:
+            except (DiskError, UnreadableError):
                 self.unrepaired.append(path)
                 continue
-            except RecordingError:
+            except RecordingError as error:
                 aside = free_original_name(path.with_name(path.name.removesuffix(ACTIVE_SUFFIX)))
-                self.unreadable.append(path.rename(aside))
+                self.unreadable[path.rename(aside)] = str(error)
                 sync_folder(aside.parent)
                 continue
             if recovery:

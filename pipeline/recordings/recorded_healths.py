@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
+from pipeline.runtime.figures import without_figures
 from schemas.envelope import Envelope
 from schemas.health import Health
 from schemas.units import NS_PER_S
 
 HEALTH_S = 3600
 """longest time without a recorded message of a session"""
-_NUMBERS = re.compile(r"[\d.,]+")
 
 
 @dataclass
@@ -58,7 +57,7 @@ class RecordedHealths:
 
 
 def _said(health: Health) -> object:
-    """The content whose change is worth recording. Numbers in the text of a problem may change each second."""
+    """The content whose change is worth recording. Figures in the text of a problem may change each second."""
     lost = sum(line.missing + line.refused for line in health.inputs)
     awaited = tuple(line.key for line in health.waiting_for)
-    return health.status, _NUMBERS.sub("", health.problem), health.lost, lost, awaited, health.is_last
+    return health.status, without_figures(health.problem), health.lost, lost, awaited, health.is_last

@@ -14,7 +14,9 @@ from schemas.topics import BY_NAME, TOPICS
 FLUSH_S, FLUSH_BYTES = 1.0, 64 << 10
 """messages in memory are flushed after this time if they are more than this, or if one of them is urgent"""
 PARTS_WITHIN_LIMITS = 8
-"""parts within each limit at least, because only whole parts are deleted"""
+"""parts within each limit, because only whole parts are deleted"""
+LEAST_PART_BYTES, LEAST_PART_S = 1_000_000, 1.0
+"""of a part, beyond its metadata and attachments, before the next one begins: whatever the limits are"""
 RECORDED = tuple(topic.name for topic in TOPICS if topic.recorded)
 SAMPLES = tuple(name for name in RECORDED if BY_NAME[name].has_samples)
 """the topics that may be left out"""
@@ -88,15 +90,15 @@ class RecorderConfig(StageConfig):
     @field_validator("part_bytes")
     @classmethod
     def _not_too_small(cls, value: int) -> int:
-        if 0 < value < 1_000_000:
-            raise ValueError("must be 0 (no limit) or at least 1,000,000 bytes")
+        if 0 < value < LEAST_PART_BYTES:
+            raise ValueError(f"must be 0 (no limit) or at least {LEAST_PART_BYTES:,} bytes")
         return value
 
     @field_validator("part_s")
     @classmethod
     def _not_too_short(cls, value: float) -> float:
-        if 0 < value < 1.0:
-            raise ValueError("must be 0 (no limit) or at least 1 s")
+        if 0 < value < LEAST_PART_S:
+            raise ValueError(f"must be 0 (no limit) or at least {LEAST_PART_S:g} s")
         return value
 
 

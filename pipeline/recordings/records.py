@@ -7,6 +7,7 @@ finding the records is done here.
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections import deque
 from collections.abc import Iterator
@@ -45,6 +46,8 @@ MESSAGE = struct.Struct("<HIQQ")
 """before a message's payload: channel, sequence, log time, publish time"""
 CORRUPT_DATA_ERRORS = (McapError, ZstdError, ValueError, struct.error, OverflowError, MemoryError)
 """What parsing damaged bytes raises; the last two where a damaged length asks for too much memory."""
+SHOWN_CHARACTERS = 40
+"""of a text that a file from anywhere puts into an error message"""
 _BEFORE_COMPRESSION = RECORD.size + 28  # of a chunk: start time, end time, size and checksum
 _ZSTD = b"\x04\x00\x00\x00zstd"
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)
@@ -68,6 +71,10 @@ ACTIVE_SUFFIX = ".active"
 
 class RecordingError(UserError):
     """A recording cannot be read or written. The message is one line."""
+
+
+class UnreadableError(RecordingError):
+    """The system refuses to read a file. It may allow it later."""
 
 
 def active_path(path: Path) -> Path:
@@ -128,7 +135,7 @@ class RecordReader:
         except OSError as error:
             active = active_path(self.path)
             advice = f"; it is still being written: name {active}" if active.exists() else ""
-            raise RecordingError(f"{self.path}: cannot read the recording: {error.strerror}{advice}") from error
+            raise UnreadableError(f"{self.path}: cannot read the recording: {error.strerror}{advice}") from error
 
     def _records(self, file: BinaryIO) -> Iterator[Record]:
         while True:
@@ -291,10 +298,15 @@ def _check_format(record: McapRecord | None, path: Path | str) -> None:
     """Refuse the metadata of a recording of an unknown format, by a RecordingError."""
     if isinstance(record, Metadata) and record.name == METADATA_NAME:
         stated = record.metadata.get(FORMAT_KEY)
-        number = int(stated) if stated and stated.isdecimal() else stated
-        if refusal := RECORDING.refusal(number):
-            made_by = record.metadata.get(MADE_BY_KEY, "an unknown program")
-            raise RecordingError(f"{path}: {refusal} (made by {made_by})")
+        number = None if stated is None else whole_number(stated)
+        if refusal := RECORDING.refusal(stated[:SHOWN_CHARACTERS] if stated and number is None else number):
+            made_by = record.metadata.get(MADE_BY_KEY, "an unknown program")[:SHOWN_CHARACTERS]
+            raise RecordingError(f"{path}: {refusal} (made by {''.join(filter(str.isprintable, made_by))})")
+
+
+def whole_number(text: str) -> int | None:
+    """The number that a text of the metadata is; None if it is none that fantwin writes: at most 19 ASCII digits."""
+    return int(text) if re.fullmatch(r"[0-9]{1,19}", text) else None
 
 
 def chunk_at(file: BinaryIO, offset: int, length: int) -> bytes:

@@ -132,12 +132,12 @@ class SequenceLedger:
 
     def as_lost(self) -> SequenceLedger:
         """An empty ledger in place of this one, whose file is lost: what it counted is missing from now on."""
-        ledger = SequenceLedger(left_out=self.left_out)
+        known = self.next
+        ledger = SequenceLedger({stream: self._streams[stream].first_sequence for stream in known}, self.left_out)
         ledger._published = self._published
-        for stream, state in self._streams.items():
-            if state.next_sequence is not None:
-                ledger._streams[stream] = StreamState(state.first_sequence)
-                ledger._published[stream] = max(state.next_sequence, self._published.get(stream, 0))
+        for stream, sequence in known.items():
+            if stream not in self._thinned:
+                ledger._published[stream] = max(sequence, self._published.get(stream, 0))
         return ledger
 
     def before_as_metadata(self) -> dict[str, str]:

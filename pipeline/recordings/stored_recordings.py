@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from pipeline.recordings.rare_messages import last_message_ns
 from pipeline.recordings.reading import RecordingError, read_metadata
-from pipeline.recordings.records import ACTIVE_SUFFIX
+from pipeline.recordings.records import ACTIVE_SUFFIX, UnreadableError, whole_number
 from pipeline.recordings.run_recordings import CLIPS, RECORDING_KEY
 
 SUFFIX = ".mcap"
@@ -45,7 +45,7 @@ class Stored:
 
 
 class StoredRecordings:
-    """The folder of a recording. A file is opened only once; its size and time then show whether it has changed."""
+    """The folder of a recording. A file is read only once; its size and time then show whether it has changed."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -65,8 +65,9 @@ class StoredRecordings:
                 open_bytes += size
             elif path.suffix == SUFFIX:
                 key = path, size, written_ns
-                part = self._known[key] = known[key] if key in known else _part(path)
-                if part:
+                with suppress(UnreadableError):  # too many files are open, say: it is tried again
+                    self._known[key] = known[key] if key in known else _part(path)
+                if part := self._known.get(key):
                     parts.append(part)
                     finished_bytes += size
         with suppress(FileNotFoundError):
@@ -83,14 +84,16 @@ def _files(folder: Path) -> Iterator[tuple[Path, int, int]]:
 
 
 def _part(path: Path) -> StoredPart | None:
-    """The part in a file; None if no recorder wrote it under this name."""
+    """The part in a file; None if no recorder wrote it under this name. Raises UnreadableError."""
     try:
         metadata = read_metadata(path).metadata
+    except UnreadableError:
+        raise
     except RecordingError:
         return None
     first = Path(metadata.get(RECORDING_KEY, ""))
     named = re.fullmatch(rf"{re.escape(first.stem)}(?:-(\d+))?{re.escape(first.suffix)}", path.name)
-    began_ns = metadata.get("started_t_ns", "")
-    if not (first.name and named and "session" in metadata and began_ns.isdecimal()):
+    began_ns = whole_number(metadata.get("started_t_ns", ""))
+    if not (first.name and named and "session" in metadata and began_ns is not None):
         return None
-    return StoredPart(last_message_ns(path) or int(began_ns), int(named[1] or 1), path)
+    return StoredPart(last_message_ns(path) or began_ns, int(named[1] or 1), path)

@@ -88,7 +88,7 @@ class Part:
         self.content: list[Envelope] = []
         self.flushes = self.restored = self.lost = self.absent = 0
         self.closed = ""
-        self.size = 0
+        self.size = disk.attached_bytes
 
     def index(self) -> PartIndex:
         return PartIndex(self.path, {}, ())
@@ -141,7 +141,7 @@ class Disk:
         self.disk = 1 << 44
         self.old: list[StoredPart] = []
         self.deleted: list[Path] = []
-        self.freed_by_each = self.clips_bytes = 0
+        self.freed_by_each = self.clips_bytes = self.attached_bytes = 0
         self.gone = self.unreadable = self.undeletable = self.sizeless = ""
 
     def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> Part:
@@ -588,7 +588,7 @@ def test_of_healths_those_that_report_something_new_are_recorded_and_no_other_is
     core = STAGE.build(run).core
     start_ns = run.started_t_ns
     for second in range(1000):
-        problem = f"no data for {second} s" if 700 <= second < 710 else ""
+        problem = f"tray{1 + second // 705}: no data for {second} s" if 700 <= second < 710 else ""
         status = StageStatus.DEGRADED if problem else StageStatus.OK
         lost = 1 if second >= 900 else 0
         output = Output(key=RAW_KEY, published=0 if second < 999 else 3)
@@ -598,7 +598,7 @@ def test_of_healths_those_that_report_something_new_are_recorded_and_no_other_is
         core.tick(start_ns + second * SECOND_NS)
     core.close()
     path = run.run_folder / "recording.mcap"
-    assert [each.message.header.sequence for each in read_recording(path)] == [0, 700, 710, 900, 999]
+    assert [each.message.header.sequence for each in read_recording(path)] == [0, 700, 705, 710, 900, 999]
     streams = contents_of(path).streams
     assert streams[health_key("plant", "scorer", "all"), "acquisition-1"].missing == 0
     assert streams[RAW_KEY, "acquisition-1"].missing == 3, "the last one says what was published"
@@ -676,6 +676,18 @@ def test_a_recording_says_which_topics_were_left_out_on_purpose(tmp_path):
     assert missing == {RAW_KEY: 3}, "only what should have been recorded is missing"
     STAGE.build(context(tmp_path)).core.close()
     assert read_metadata(run.run_folder / "recording-2.mcap").left_out == ()
+
+
+def test_what_a_killed_recorder_of_another_version_left_is_kept_and_its_format_is_said(tmp_path, caplog):
+    STAGE.build(context(tmp_path)).core.close()
+    finished = tmp_path / "runs" / "recording.mcap"
+    of_tomorrow = finished.read_bytes().replace(b"format\x01\x00\x00\x001", b"format\x01\x00\x00\x002")
+    finished.rename(finished.with_name("recording.mcap.active")).write_bytes(of_tomorrow)
+    with caplog.at_level(logging.WARNING):
+        STAGE.build(context(tmp_path)).core.close()
+    assert (tmp_path / "runs" / "recording.mcap.original").read_bytes() == of_tomorrow
+    reason = "a recording of format 2; this fantwin reads format 1: update fantwin"
+    assert "cannot be repaired and was renamed to recording.mcap.original: " in caplog.text and reason in caplog.text
 
 
 def test_a_recorder_that_is_restarted_keeps_the_last_snapshots_of_its_trays_for_others(tmp_path):

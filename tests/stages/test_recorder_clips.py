@@ -15,7 +15,7 @@ from pipeline.recordings.clips.tracker import ClipTracker, CutResult
 from pipeline.recordings.clips.worker import ClipMaker, ClipWorker
 from pipeline.recordings.index import PartIndex
 from pipeline.recordings.parts import RecordingParts
-from pipeline.recordings.reading import read_recording
+from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.enums import Severity, Transition
 from schemas.header import Header
@@ -42,7 +42,7 @@ class Maker(ClipMaker):
         self.deleted: list[str] = []
         self.saved: list[Clip] = []
         self.waiting: list[CutResult] = []
-        self.refuses = ""
+        self.refuses = self.undeletable = ""
 
     def save(self, clips: Sequence[Clip]) -> None:
         if not self.refuses:
@@ -56,6 +56,8 @@ class Maker(ClipMaker):
         return results
 
     def delete(self, clip: Clip) -> None:
+        if self.undeletable:
+            raise RecordingError(self.undeletable)
         self.deleted.append(clip.name)
 
     def problem(self) -> str:
@@ -157,6 +159,10 @@ def test_the_disk_guard_takes_what_is_oldest_but_no_unacknowledged_clip_and_last
     core.tick(now_ns := now_ns + SECOND_NS)
     assert disk.old_names == ["r-1.mcap"] and maker.deleted == []  # this part is older than any clip
     disk.old = old_parts("r-1.mcap", "r-2.mcap", last_ns=now_ns)
+    maker.undeletable = f"clips/{acknowledged}: cannot be deleted: Operation not permitted; delete or move it"
+    core.tick(now_ns := now_ns + SECOND_NS)
+    assert maker.undeletable in core.problem() and core.counters().get("clips_deleted", 0) == 0
+    maker.undeletable = ""
     core.tick(now_ns := now_ns + SECOND_NS)
     assert disk.old_names == ["r-1.mcap", "r-2.mcap"] and maker.deleted == [acknowledged]
     assert core.problem() == ""
@@ -185,6 +191,23 @@ def test_a_clip_outlives_the_limit_of_days_until_it_is_acknowledged_and_that_is_
     core.step(envelope(raised(0, NOW_NS, acknowledged=True, transition=Transition.ACKNOWLEDGED), "alarm", now_ns))
     core.tick(now_ns + 10 * SECOND_NS)
     assert maker.deleted == maker.asked and len(core.notes()) == 1
+
+
+def test_of_clips_that_cannot_be_deleted_none_is_forgotten_and_the_first_is_named(tmp_path):
+    names = ["1.mcap", "2.mcap"]
+    clips = [Clip(name, "tray1", 0, at, 0, (), is_due=False, size_bytes=100) for at, name in enumerate(names)]
+    tracker = ClipTracker(clips, 1, 1, most_bytes=100)
+    of = AlarmClips(tracker, ClipWorker(tmp_path / "recording.mcap", 0, lambda: FREE))
+    in_the_way = tmp_path / "clips" / names[0]
+    in_the_way.mkdir(parents=True)
+    of.tick(NOW_NS, lambda: None)
+    assert tracker.clips == clips and of.problem().startswith(f"{in_the_way}: cannot be deleted: ")
+    with pytest.raises(RecordingError, match=r"1\.mcap: cannot be deleted"):
+        of.delete_oldest_acknowledged()
+    in_the_way.rmdir()
+    of.tick(NOW_NS, lambda: None)
+    assert tracker.clips == [] and of.problem() == "" and of.counters()["clips_deleted"] == 2
+    of.close(lambda: None)
 
 
 def test_files_that_a_killed_recorder_left_of_a_clip_are_removed_and_what_another_one_is_writing_stays(tmp_path):

@@ -57,6 +57,16 @@ def test_clips_count_as_half_of_the_share_at_most_and_the_last_part_stays():
     assert "nothing may be deleted, the last finished part included" in core.notes()[1]
 
 
+@pytest.mark.parametrize("limits", [{"keep_days": 1e-6}, {"keep_share_of_disk": 1e-6}, {"part_bytes": 1_000_000}])
+def test_limits_that_leave_room_for_no_part_begin_none_at_every_tick(limits):
+    disk = Disk()
+    disk.disk, disk.attached_bytes = 1_000_000_000, 5_000_000
+    core = recorder(disk, **limits)
+    for tick in range(41):
+        core.tick(NOW_NS + tick * SECOND_NS // 20)
+    assert [(part.t_ns - NOW_NS) / SECOND_NS for part in disk.parts] == ([0, 1, 2] if "keep_days" in limits else [0])
+
+
 def test_a_clock_that_is_years_ahead_costs_a_part_an_hour_and_never_the_last():
     disk, hours = Disk(), [0.0]
     disk.old = ten_days_of_parts()

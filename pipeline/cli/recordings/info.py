@@ -190,7 +190,7 @@ def _about(part: Contents) -> list[str]:
         after = f", continues {metadata['continues']}" if "continues" in metadata else ""
         session, site = metadata.get("session", "?"), metadata.get("site", "?")
         lines.append(f"part {metadata['part']} of session {session}{after}, site {site}")
-    with suppress(KeyError, ValueError):  # others may have metadata of these names
+    with suppress(KeyError, ValueError, OverflowError):  # others may have metadata of these names
         gap_s = (int(metadata["resumed_t_ns"]) - int(metadata["paused_t_ns"])) / NS_PER_S
         lost, reason = metadata["lost_in_pause"], metadata["paused_because"]
         lines.append(f"before this part nothing was recorded for {gap_s:,.1f} s; messages lost: {lost}")

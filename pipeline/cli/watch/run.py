@@ -19,8 +19,8 @@ from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.config.shards import Shard, chosen_shard
 from pipeline.errors import UsageError, UserError
-from pipeline.launch.event_log import without_figures
 from pipeline.launch.processes import EXIT_CANNOT_START
+from pipeline.runtime.figures import without_figures
 from pipeline.runtime.notifier import starting
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.signals import set_when_stdin_closes, stop_on_signals

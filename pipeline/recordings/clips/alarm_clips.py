@@ -36,6 +36,7 @@ class AlarmClips:
     def __init__(self, tracker: ClipTracker, maker: ClipMaker) -> None:
         self._tracker, self._maker = tracker, maker
         self._saved, self._saved_ns = tracker.version, 0
+        self._undeletable = ""
 
     def continue_after(self, last_part: Path) -> None:
         """Follow the last alarms that a recorder before this one has recorded: it may have been killed before it had
@@ -57,8 +58,12 @@ class AlarmClips:
         written, asked for only where something is due. unsaved_since_ns: see `ClipTracker.due`."""
         for result in self._maker.results():
             self._tracker.cut(result)
-        for clip in self._tracker.to_delete():
-            self._maker.delete(clip)
+        self._undeletable = ""
+        try:
+            while clip := self._tracker.to_delete():
+                self._delete(clip)
+        except RecordingError as error:
+            self._undeletable = str(error)
         if self._maker.problem() and abs(now_ns - self._saved_ns) >= RETRY_NS:
             self._saved = -1  # the disk has refused it
         self._save(now_ns)  # before it is cut: a clip that is due survives a crash
@@ -75,12 +80,15 @@ class AlarmClips:
         return [clip for clip in self._tracker.clips if clip.until_ns < t_ns and not clip.is_acknowledged]
 
     def delete_oldest_acknowledged(self) -> str | None:
-        """Delete the first clip that may be deleted, and give its name; None if there is none."""
+        """Delete the first clip that may be deleted, and give its name; None if there is none.
+
+        Raises:
+            RecordingError: it cannot be deleted.
+        """
         clip = self._tracker.oldest_acknowledged
         if clip is None:
             return None
-        self._tracker.deleted(clip)
-        self._maker.delete(clip)
+        self._delete(clip)
         return clip.name
 
     def needs(self, last_ns: int) -> bool:
@@ -111,8 +119,12 @@ class AlarmClips:
         return self._tracker.counts
 
     def problem(self) -> str:
-        """Why clips cannot be cut or kept; empty if all is well."""
-        return self._tracker.problem() or self._maker.problem()
+        """Why clips cannot be cut, kept or deleted; empty if all is well."""
+        return self._undeletable or self._tracker.problem() or self._maker.problem()
+
+    def _delete(self, clip: Clip) -> None:
+        self._maker.delete(clip)
+        self._tracker.deleted(clip)  # only now: what is still there takes room, and must not be forgotten
 
     def _save(self, now_ns: int) -> None:
         if self._tracker.version != self._saved:

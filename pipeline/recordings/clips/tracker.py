@@ -141,16 +141,12 @@ class ClipTracker:
             self._drop(clip)
             self._not_kept = f"clip {clip.name} is not kept: {result.problem}"
 
-    def to_delete(self) -> list[Clip]:
-        """The oldest acknowledged clips beyond the limit of bytes, which are then no longer known."""
-        deleted: list[Clip] = []
-        while self._is_full() and (clip := self.oldest_acknowledged):
-            self.deleted(clip)
-            deleted.append(clip)
-        return deleted
+    def to_delete(self) -> Clip | None:
+        """The oldest acknowledged clip, if clips exceed the limit of bytes."""
+        return self.oldest_acknowledged if self._is_full() else None
 
     def deleted(self, clip: Clip) -> None:
-        """A clip is deleted to make room."""
+        """A clip was deleted to make room: it is no longer known."""
         self._remove(clip)
         self.counts["clips_deleted"] += 1
 

@@ -13,7 +13,7 @@ from typing import Protocol
 from pipeline.recordings.clips.clip import Clip, clip_folder, clips_as_text, list_path
 from pipeline.recordings.clips.cutting import cut_clips, remove_unfinished
 from pipeline.recordings.clips.tracker import CutResult
-from pipeline.recordings.disk import DiskError, sync_folder
+from pipeline.recordings.disk import DiskError, refused, sync_folder
 from pipeline.recordings.index import PartIndex
 from pipeline.recordings.records import RecordingError
 
@@ -41,7 +41,7 @@ class ClipMaker(Protocol):
         ...
 
     def delete(self, clip: Clip) -> None:
-        """Delete the file of a clip."""
+        """Delete the file of a clip. Raises RecordingError if that is not possible."""
         ...
 
     def problem(self) -> str:
@@ -95,7 +95,12 @@ class ClipWorker(ClipMaker):
 
     def delete(self, clip: Clip) -> None:
         """See ClipMaker. At once: what waits behind clips that are being cut makes no room, and more is deleted."""
-        self._do(lambda: (self._folder / clip.name).unlink(missing_ok=True))
+        path = self._folder / clip.name
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            advice = "clips and recordings stay until it can be: delete or move it"
+            raise refused(f"{path}: cannot be deleted", error, advice) from error
 
     def problem(self) -> str:
         """See ClipMaker."""

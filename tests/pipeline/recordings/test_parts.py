@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 from mcap.opcode import Opcode
@@ -33,6 +35,10 @@ def part(parts_in: RecordingParts, numbers=(), ledger: SequenceLedger | None = N
 def killed(writer: RecordingWriter) -> None:
     """Close the file as kill -9 does: the unfinished chunk is lost."""
     writer._file.close()
+
+
+def refuse(*_: object) -> NoReturn:
+    raise OSError(errno.EMFILE, "Too many open files")
 
 
 def names(folder: Path) -> list[str]:
@@ -88,6 +94,8 @@ def test_what_other_recorders_wrote_counts_and_what_recorders_did_not_write_is_n
     part(parts_in(tmp_path), [3_000]).finish()
     write(tmp_path / "import.mcap", 3)
     (tmp_path / "r-2.mcap").write_bytes(b"not ours")
+    about = {"recording": "dated.mcap", "session": "s", "started_t_ns": "9" * 5000}
+    RecordingWriter(tmp_path / "dated.mcap", about).finish()
     (tmp_path / "kept-by-me.mcap").write_bytes((tmp_path / "r.mcap").read_bytes())
     (tmp_path / "clips").mkdir()
     (tmp_path / "clips" / "c.mcap").write_bytes(bytes(100))
@@ -95,7 +103,16 @@ def test_what_other_recorders_wrote_counts_and_what_recorders_did_not_write_is_n
     written = sum((tmp_path / name).stat().st_size for name in ("2-of-2.r.mcap", "earlier.mcap", "r.mcap"))
     assert (place.stored().finished_bytes, place.stored().clips_bytes) == (written, 100)
     assert [oldest_deleted(place) for _ in range(4)] == ["earlier.mcap", "r.mcap", "2-of-2.r.mcap", None]
-    assert names(tmp_path) == ["clips", "import.mcap", "kept-by-me.mcap", "r-2.mcap"]
+    assert names(tmp_path) == ["clips", "dated.mcap", "import.mcap", "kept-by-me.mcap", "r-2.mcap"]
+
+
+def test_a_part_that_could_not_be_read_for_a_while_counts_again(tmp_path, monkeypatch):
+    part(parts_in(tmp_path), [0]).finish()
+    place = parts_in(tmp_path)
+    with monkeypatch.context() as busy:
+        busy.setattr(Path, "open", refuse)
+        assert place.stored().parts == ()
+    assert [each.path.name for each in place.stored().parts] == ["r.mcap"] and place.stored().finished_bytes > 0
 
 
 def test_a_new_recorder_takes_a_number_above_all_existing_ones(tmp_path):
@@ -155,7 +172,7 @@ def test_an_active_file_whose_only_chunk_is_damaged_is_renamed_and_not_deleted(t
     kill_a_recorder(tmp_path / "r.mcap", flushed=5)
     damage_a_chunk(tmp_path / "r.mcap.active", 0)
     content = (tmp_path / "r.mcap.active").read_bytes()
-    assert parts_in(tmp_path).unreadable == [tmp_path / "r.mcap.original"]
+    assert list(parts_in(tmp_path).unreadable) == [tmp_path / "r.mcap.original"]
     assert (tmp_path / "r.mcap.original").read_bytes() == content
 
 
@@ -166,10 +183,19 @@ def test_a_damaged_active_file_that_a_full_disk_keeps_from_being_repaired_is_con
     damage_a_chunk(tmp_path / "r.mcap.active", 1)
     with disk_of(100):
         place = parts_in(tmp_path, "s2")
-    assert (place.unrepaired, place.unreadable, place.repaired) == ([tmp_path / "r.mcap.active"], [], [])
+    assert (place.unrepaired, place.unreadable, place.repaired) == ([tmp_path / "r.mcap.active"], {}, [])
     assert place.before == {STREAM: 3000}
     part(place, [3000]).finish()
     assert read_metadata(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
+    assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
+
+
+def test_an_active_file_that_cannot_be_read_for_a_while_is_repaired_later(tmp_path, monkeypatch):
+    kill_with_a_part_open(part(parts_in(tmp_path), [0]))
+    with monkeypatch.context() as busy:
+        busy.setattr(Path, "open", refuse)
+        place = parts_in(tmp_path, "s2")
+    assert (place.unrepaired, place.unreadable) == ([tmp_path / "r.mcap.active"], {})
     assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
 
 
@@ -197,8 +223,8 @@ def test_a_recording_that_is_being_written_is_not_touched(tmp_path):
 def test_an_active_file_that_is_not_a_recording_is_renamed(tmp_path, content):
     (tmp_path / "r.mcap.active").write_bytes(content)
     place = parts_in(tmp_path)
-    assert place.unreadable == [tmp_path / "r.mcap.original"]
-    assert place.unreadable[0].read_bytes() == content
+    assert list(place.unreadable) == [tmp_path / "r.mcap.original"]
+    assert (tmp_path / "r.mcap.original").read_bytes() == content
     part(place).finish()
     assert names(tmp_path) == ["r-2.mcap", "r.mcap.original"]
 

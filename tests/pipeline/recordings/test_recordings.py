@@ -96,6 +96,19 @@ def test_a_recording_without_a_format_number_is_refused_and_a_file_of_another_pr
         read_metadata(tmp_path / "r.mcap")
 
 
+@pytest.mark.parametrize("stated", ["9" * 5000, "x" * 200_000, "\N{ARABIC-INDIC DIGIT ONE}", "1\n"])
+def test_a_format_that_is_no_number_is_refused_in_one_short_line(tmp_path, stated):
+    with (tmp_path / "r.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("fantwin", {"format": stated, "made_by": "another\n" * 100})
+        writer.finish()
+    for read in (read_metadata, last_message_ns):
+        with pytest.raises(RecordingError, match=r"r\.mcap: a recording of format '.*\(made by ano") as refused:
+            read(tmp_path / "r.mcap")
+        assert len(str(refused.value)) < 300 + len(str(tmp_path)) and str(refused.value).isprintable()
+
+
 def test_a_finished_recording_is_never_overwritten_unasked(tmp_path):
     path = tmp_path / "r.mcap"
     assert [write(path, k).name for k in (1, 2, 3)] == ["r.mcap", "r-2.mcap", "r-3.mcap"]

@@ -16,6 +16,7 @@ from pipeline.recordings.sequence_ledger import (
     sum_by_key,
 )
 from schemas.health import Health, Output
+from schemas.topics import health_key
 from tests.support import made_messages
 
 KEY, TWIN_KEY = "fantwin/plant/tray1/raw", "fantwin/plant/tray1/twin"
@@ -116,6 +117,19 @@ def test_topics_that_are_never_recorded_or_were_left_out_on_purpose_are_never_mi
         successor.add_health(health("c", 5, grid))
         successor.finish()
         assert not [key for key, _ in successor.counts if key == grid]
+
+
+def test_after_a_lost_part_its_messages_are_missing_and_healths_that_were_left_out_on_purpose_are_not():
+    ledger, of_health = counted([0, 1]), health_key("plant", "scorer", "all")
+    for sequence in (0, 50):
+        ledger.add(of_health, "a", sequence, 1)
+    ledger = ledger.as_lost()
+    assert ledger.unrecorded() == {(KEY, "a"): 2}
+    for sequence in (100, 200, 300):
+        ledger.add(of_health, "a", sequence, 1)
+    ledger.add(KEY, "a", 2, 1)
+    ledger.finish()
+    assert {key: counts.missing for (key, _), counts in ledger.counts.items()} == {of_health: 0, KEY: 2}
 
 
 def test_messages_recorded_in_a_damaged_file_and_not_found_are_missing():
