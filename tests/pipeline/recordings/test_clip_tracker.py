@@ -188,5 +188,7 @@ def test_that_a_clip_waits_for_the_disk_is_said_no_longer_once_none_waits():
     follow(of, alarm(0, 85.0, transition=Transition.ACKNOWLEDGED, acknowledged=True))
     assert "cannot be cut yet: the disk is full" in of.problem()
     assert of.due(T0 + 100 * S) == [], "it is over the limit now, and is dropped"
-    assert [clip.name for clip in of.to_delete()] == [first]
-    assert of.problem() == ""
+    oldest = of.to_delete()
+    assert oldest and oldest.name == first
+    of.deleted(oldest)
+    assert (of.to_delete(), of.problem()) == (None, "")
