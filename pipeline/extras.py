@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import tomllib
 from importlib.metadata import PackageNotFoundError, distribution
 from importlib.util import find_spec
 from pathlib import Path
@@ -67,7 +68,7 @@ def how_to_install(requirement: str) -> str:
     if (environment / "pipx_metadata.json").exists():
         return f"pipx runpip {environment.name} install {_quoted(requirement)}"
     if (environment / "uv-receipt.toml").exists():
-        return _uv_tool(requirement, origin.get("url", ""))
+        return _uv_tool(requirement, origin)
     return f"{_pip()} {_quoted(requirement)}"
 
 
@@ -101,11 +102,29 @@ def require_torch(what: str) -> None:
         raise UserError(f"{what} needs PyTorch: {how_to_install('torch')}")
 
 
-def _uv_tool(requirement: str, url: str) -> str:
-    """The command for a tool of uv. uv replaces a tool as a whole, so fantwin itself is named again with its origin."""
+def _uv_tool(requirement: str, origin: dict[str, Any]) -> str:
+    """The command for a tool of uv. uv replaces a tool as a whole, so fantwin is named again with its origin, and so is
+    all that was installed with it."""
+    receipt = tomllib.loads((Path(sys.prefix) / "uv-receipt.toml").read_text(encoding="utf-8"))
+    before = receipt.get("tool", {}).get("requirements", [])
+    extras = {extra for each in before if each["name"] == "fantwin" for extra in each.get("extras", ())}
+    beside = [each["name"] for each in before if each["name"] != "fantwin"]
     if requirement.startswith("fantwin"):
-        return f"uv tool install {_quoted(requirement + (f' @ {url}' if url else ''))}"
-    return f"uv tool install {_quoted('fantwin' + (f' @ {url}' if url else ''))} --with {_quoted(requirement)}"
+        extras.add(requirement.removeprefix("fantwin[").removesuffix("]"))
+    else:
+        beside.append(requirement)
+    of_extras = f"[{','.join(sorted(extras))}]" if extras else ""
+    fantwin = _quoted(f"fantwin{of_extras}{_at(origin)}")
+    return " ".join(["uv tool install", fantwin, *(f"--with {_quoted(each)}" for each in beside)])
+
+
+def _at(origin: dict[str, Any]) -> str:
+    """The origin as a requirement has it; empty if fantwin came from a registry."""
+    vcs = origin.get("vcs_info")
+    if vcs is None:
+        return f" @ {origin['url']}" if origin else ""
+    revision = vcs.get("requested_revision")
+    return f" @ {vcs['vcs']}+{origin['url']}{f'@{revision}' if revision else ''}"
 
 
 def _quoted(requirement: str) -> str:

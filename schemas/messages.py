@@ -8,7 +8,7 @@ The header of all messages is in `header.py`, the health of a stage in `health.p
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TypeAlias, get_args
+from typing import TypeAlias
 
 import numpy as np
 
@@ -350,7 +350,6 @@ Message: TypeAlias = (
     | Clock
     | Health
 )
-MESSAGE_TYPES: tuple[type[Message], ...] = get_args(Message)
 
 
 def newest_t_ns(message: Message) -> int:

@@ -79,7 +79,7 @@ class TorqueBalance(ColumnState):
         before, given = np.vstack((self._speed, speed))[:-1], np.vstack((self._command, command))[:-1]
         self._speed, self._command = speed[-1].copy(), command[-1].copy()
         linked = np.isfinite(before) & np.isfinite(speed) & np.isfinite(given)
-        acting = self._acting(period_s, given, linked)
+        acting = self._acting(period_s, given)
         mean = 0.5 * (before + speed)
         drag = (model.viscous + model.drag * np.abs(mean)) * mean
         excess = acting - model.inertia * (speed - before) / period_s - drag - model.friction
@@ -117,7 +117,7 @@ class TorqueBalance(ColumnState):
                 filtered[rows, fan], weight[rows, fan] = made.T
         return filtered, weight
 
-    def _acting(self, period_s: float, given: Array, linked: Array) -> Array:
+    def _acting(self, period_s: float, given: Array) -> Array:
         """The command that acts over the step before each sample, after the electrical lag: lag i' + i = command."""
         lag_s = self._model.lag_s
         if not lag_s.any():

@@ -54,8 +54,8 @@ class Run:
         if not np.all(np.diff(t_s) > 0.0):
             sample = int(np.argmin(np.diff(t_s) > 0.0)) + 1
             raise TwinError(
-                f"run {self.name!r}: time does not increase at sample {sample}; merge repeated times "
-                "with run_from_samples, or split the recording where its clock jumps back"
+                f"run {self.name!r}: time does not increase at sample {sample}; merge samples of one time, "
+                "or split the recording where its clock jumps back"
             )
         if np.any(np.isinf(speed_rad_s)):
             raise TwinError(f"run {self.name!r}: a speed is infinite; mark missing speeds with NaN")
@@ -141,23 +141,6 @@ class Run:
         cuts = [0, *(np.flatnonzero(np.diff(self.t_s) > limit_s) + 1).tolist(), self.samples]
         spans = [(first, last) for first, last in pairwise(cuts) if last - first >= 2]
         return [self.rows(first, last) for first, last in spans]
-
-
-def run_from_samples(name: str, t_s: ArrayLike, command: ArrayLike, speed_rad_s: ArrayLike) -> Run:
-    """A Run from samples whose time may repeat: samples of one time become one, mean speed and last command.
-
-    Shapes as in Run. Raises TwinError when time goes back.
-    """
-    times, commands, speeds = np.asarray(t_s, dtype=np.float64), _columns(command), _columns(speed_rad_s)
-    if times.ndim != 1 or commands.shape != speeds.shape or len(times) != len(commands) or np.all(np.diff(times) > 0):
-        return Run(name, times, commands, speeds)
-    first = np.flatnonzero(np.diff(times, prepend=-np.inf) != 0.0)
-    last = np.append(first[1:], len(times)) - 1
-    measured = np.isfinite(speeds)
-    count = np.add.reduceat(measured, first, axis=0, dtype=np.float64)
-    total = np.add.reduceat(np.where(measured, speeds, 0.0), first, axis=0)
-    mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
-    return Run(name, times[first], commands[last], mean)
 
 
 def common_fans(runs: Sequence[Run]) -> int:

@@ -23,7 +23,7 @@ from bench.training.published_fan import SimulatedRun, random_stairs
 from bench.training.rough_table import DUTY_RANGE, simulated_plant
 from simulation.plant import FanParameters, tray_of_fans
 from twin.build import evaluate, train_twin
-from twin.evaluation.accuracy import Evaluation, evaluate_model
+from twin.evaluation.accuracy import Evaluation, sums_of_model
 from twin.finishing import TrainedTwin
 from twin.fitting.placement import TypeOfFans
 from twin.models.physical import physical_parameters
@@ -144,7 +144,7 @@ def _typical(type_twin: TrainedTwin, run: Run) -> Evaluation:
     of_type = TypeOfFans.of_card(type_twin.card)
     unknowns, top_rad_s = np.tile(of_type.mean, (run.fans, 1)), np.full(run.fans, of_type.top_speed_rad_s)
     sigma = np.full(run.fans, np.median(type_twin.card.sigma_rad_s))
-    return evaluate_model(type_twin.model, physical_parameters(unknowns, top_rad_s), sigma, [run])
+    return sums_of_model(type_twin.model, physical_parameters(unknowns, top_rad_s), sigma, [run]).evaluation()
 
 
 if __name__ == "__main__":

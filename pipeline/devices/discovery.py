@@ -15,7 +15,6 @@ from pipeline.devices.hwmon_config import ROOT
 from pipeline.devices.hwmon_tree import ChipFolder, chip_folders, device_words
 
 HIGHEST_RPM = 20_000
-MOST_IN_TRAY = 64
 _UNKNOWN = "n/a"
 """what pyserial returns for a port of which the system knows no device"""
 

@@ -107,8 +107,10 @@ class Launcher:
         lines to print when all stages have started.
 
         Raises:
-            UserError: no process has its first tray among them.
+            UserError: the configuration has no stage, or no process has its first tray among them.
         """
+        if not config.stages:
+            raise UserError(f"{config.path}: launcher.stages and launcher.without leave no stage to run: correct them")
         self._config = config
         self._path: Path = config.path
         self._overrides = tuple(overrides)

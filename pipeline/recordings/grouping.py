@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.recordings.reading import read_metadata
+from pipeline.config.registry import RECORDER, STAGES
+from pipeline.recordings.reading import RecordingMetadata, read_metadata
 
-OF_A_RUN = ("site", "overrides")
-"""metadata that all parts of a recording have in common, as they have their attachments"""
+_SHOWING = {row.name for row in STAGES.values() if row.writes in ((), ("request",)) and row.name != RECORDER}
+"""stages that present a site and decide nothing"""
+_OF_THE_PLACE = {"bus", "launcher", "run_folder", *_SHOWING}
+"""where keys begin that say where and how a site runs, and not what it decides"""
 
 
 @dataclass(frozen=True)
@@ -21,6 +25,7 @@ class File:
     is_whole: bool
     """it is no part: it was made by import, simulate or an offline replay"""
     run: tuple[str | None, ...]
+    """what all parts have in common"""
     session: str | None
     """of the recorder"""
     recording: str | None
@@ -46,8 +51,17 @@ def describe(path: Path) -> File:
     attached = hashlib.sha256()
     for name, content in sorted(found.attachments.items()):
         attached.update(f"{name} {len(content)}\n".encode() + content)
-    run = (*(about.get(key) for key in OF_A_RUN), attached.hexdigest())
+    run = (about.get("site"), *deciding_overrides(found), attached.hexdigest())
     return File(path, "source" in about, run, about.get("session"), about.get("recording"))
+
+
+def deciding_overrides(metadata: RecordingMetadata) -> list[str]:
+    """The recorded overrides but for those of the place, which differ from host to host and from start to start."""
+    try:
+        overrides = list(map(str, json.loads(metadata.metadata.get("overrides", "[]"))))
+    except (ValueError, TypeError):
+        return [metadata.metadata["overrides"]]  # damaged: reported where they are used
+    return [each for each in overrides if each.partition("=")[0].partition(".")[0].strip() not in _OF_THE_PLACE]
 
 
 def recordings_of(files: Iterable[File]) -> list[tuple[Path, ...]]:

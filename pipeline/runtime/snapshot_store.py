@@ -96,10 +96,7 @@ class SnapshotStore:
         found = [*([own] if own else []), *self._kept]
         last = max(found, key=lambda each: (each.t_ns <= self._now_ns + AHEAD_NS, each.t_ns), default=None)
         if last is not None and last is not own:
-            of_file = (
-                f"the file here is {(last.t_ns - own.t_ns) / NS_PER_S:.0f} s older" if own else "there is none here"
-            )
-            self.note = f"continued from the snapshot that the recorder keeps; {of_file}"
+            self.note = f"continued from the snapshot that the recorder keeps; {_beside(last, own)}"
             _check_format(last, f"{self.path.stem}: the snapshot that the recorder keeps")
         return last
 
@@ -134,6 +131,15 @@ class SnapshotStore:
             self.problem = (
                 f"{self.path}: cannot save baselines and alarms: {error.strerror}; a restart would forget them"
             )
+
+
+def _beside(last: ScorerSnapshot, own: ScorerSnapshot | None) -> str:
+    if own is None:
+        return "there is none here"
+    older_s = (last.t_ns - own.t_ns) / NS_PER_S
+    if older_s < 0:
+        return f"the file here is {-older_s:.0f} s newer, of a clock that was ahead"
+    return f"the file here is {older_s:.0f} s older"
 
 
 def _check_format(snapshot: ScorerSnapshot, where: str) -> None:

@@ -66,8 +66,8 @@ def plot_recording(
     fans: Sequence[int] | None = None,
     speed_unit: SpeedUnit | None = None,
     truth: Path | None = None,
-) -> list[int]:
-    """Plot one tray of a recording and return the fans that were drawn.
+) -> tuple[list[int], list[str]]:
+    """Plot one tray of a recording. Returns the fans that were drawn, and what could not be read, a line each.
 
     Args:
         recordings: a recording, or its parts in any order.
@@ -80,23 +80,26 @@ def plot_recording(
     Raises:
         UserError: no scores, no such tray or fan, or a truth file that cannot be read.
     """
-    trace = read_trace(recordings, tray, speed_unit)
+    damage: list[str] = []
+    trace = read_trace(recordings, tray, speed_unit, damage)
     faults = read_faults(truth) if truth is not None else ()
-    return plot_bands(trace, output, fans=fans, faults=faults)
+    return plot_bands(trace, output, fans=fans, faults=faults), damage
 
 
-def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUnit | None) -> Trace:
-    """The scores of one tray, in order of time.
+def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUnit | None, damage: list[str]) -> Trace:
+    """The scores of one tray, in order of time. damage: given a line for each file that could not be read in full.
 
     Raises:
         UserError: there are no scores, or several trays and none is chosen.
     """
     scores: dict[str, list[Score]] = {}
     for path in recordings:
-        for envelope in read_recording(path, topics=("score",)):
+        reading = read_recording(path, topics=("score",))
+        for envelope in reading:
             assert isinstance(envelope.message, Score)
             if len(envelope.message.t_ns):
                 scores.setdefault(envelope.message.header.tray, []).append(envelope.message)
+        damage += [reading.damage] if reading.damage else []
     where = ", ".join(str(path) for path in recordings)
     if not scores:
         why = left_out_hint(recordings, ("score",)) or "did twin_integrator and scorer run?"

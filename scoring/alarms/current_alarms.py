@@ -48,9 +48,12 @@ class CurrentAlarm:
     def line(self) -> str:
         """The last transition, for a log; a silenced active alarm is marked as such."""
         alarm = self.newest
-        word = alarm.severity.name if alarm.active else alarm.transition.name.lower().replace("_", " ")
-        silenced = " (silenced)" if alarm.active and is_silenced(alarm) else ""
-        return f"{word}{silenced}  {alarm.header.tray}  {alarm.message}"
+        word = self.severity() if alarm.active else alarm.transition.name.lower().replace("_", " ")
+        return f"{word}  {alarm.header.tray}  {alarm.message}"
+
+    def severity(self) -> str:
+        """The severity in a log; that of a silenced alarm is marked as such."""
+        return f"{self.newest.severity.name}{' (silenced)' if is_silenced(self.newest) else ''}"
 
     def states(self) -> list[str]:
         """The states the alarm is in, for people."""

@@ -190,6 +190,12 @@ def test_doctor_prints_what_each_source_and_stage_lacks(capsys, monkeypatch):
 CHECKOUT = {"url": "file:///home/me/fantwin%20one", "dir_info": {"editable": True}}
 THERE = "in /home/me/fantwin one"
 WHEEL = {"url": "file:///tmp/fantwin-1-py3-none-any.whl", "archive_info": {}}
+GIT = {"url": "https://example.org/fantwin.git", "vcs_info": {"vcs": "git", "commit_id": "0123abc"}}
+BRANCH = {**GIT, "vcs_info": {**GIT["vcs_info"], "requested_revision": "main"}}
+RECEIPT = """[tool]
+requirements = [{ name = "fantwin", extras = ["report"] }, { name = "torch", specifier = ">=2" }]
+entrypoints = [{ name = "fantwin", install-path = "/bin/fantwin" }]
+"""
 
 
 @pytest.mark.parametrize(
@@ -211,7 +217,10 @@ WHEEL = {"url": "file:///tmp/fantwin-1-py3-none-any.whl", "archive_info": {}}
         ("PIPX", WHEEL, False, False, "fantwin[view]", "pipx runpip fantwin install 'fantwin[view]'"),
         ("UV", {}, False, False, "fantwin[view]", "uv tool install 'fantwin[view]'"),
         ("UV", WHEEL, False, False, "fantwin[view]", f"uv tool install 'fantwin[view] @ {WHEEL['url']}'"),
+        ("UV", GIT, False, False, "fantwin[view]", f"uv tool install 'fantwin[view] @ git+{GIT['url']}'"),
+        ("UV", BRANCH, False, False, "torch", f"uv tool install 'fantwin @ git+{GIT['url']}@main' --with torch"),
         ("UV", {}, False, False, "torch", "uv tool install fantwin --with torch"),
+        ("UV+", {}, False, False, "fantwin[view]", "uv tool install 'fantwin[report,view]' --with torch"),
     ],
 )
 def test_the_command_fits_the_way_fantwin_was_installed(
@@ -224,11 +233,12 @@ def test_the_command_fits_the_way_fantwin_was_installed(
     requirement: str,
     command: str,
 ) -> None:
-    marker = {"PIPX": "pipx_metadata.json", "UV": "uv-receipt.toml"}.get(environment)
+    receipt = RECEIPT if environment == "UV+" else ""
+    marker = {"PIPX": "pipx_metadata.json", "UV": "uv-receipt.toml", "UV+": "uv-receipt.toml"}.get(environment)
     if marker:
         environment = str(tmp_path / "fantwin")
         (tmp_path / "fantwin").mkdir()
-        (tmp_path / "fantwin" / marker).touch()
+        (tmp_path / "fantwin" / marker).write_text(receipt)
 
     class Installed:
         def read_text(self, name: str) -> str | None:

@@ -21,7 +21,8 @@ from schemas.codec import CodecError, decode, encode, proto_type, type_name
 from schemas.fields import OpenEnum, columns, other_fields
 from schemas.header import Header, InputPosition
 from schemas.health import Counter, Input, Output
-from schemas.messages import MESSAGE_TYPES, Alarm, Command, Diagnosis, Grid, Message, Prediction, Raw, Score
+from schemas.messages import Alarm, Command, Diagnosis, Grid, Message, Prediction, Raw, Score
+from tests.support.made_messages import MESSAGE_TYPES
 from tests.support.message_strategies import any_message, same
 
 ENUMS: list[type[OpenEnum]] = OpenEnum.__subclasses__()

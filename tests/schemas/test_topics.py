@@ -3,7 +3,6 @@
 import pytest
 
 from pipeline.runtime.stage import load_stage
-from schemas.messages import MESSAGE_TYPES
 from schemas.topics import (
     BY_NAME,
     RESERVED_TRAY_NAMES,
@@ -13,6 +12,7 @@ from schemas.topics import (
     topic_of,
     tray_key,
 )
+from tests.support.made_messages import MESSAGE_TYPES
 
 
 def test_every_message_type_has_exactly_one_topic():

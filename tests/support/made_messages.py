@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 from schemas.enums import Severity, StageStatus
 from schemas.header import Header
 from schemas.health import Health
-from schemas.messages import Alarm
+from schemas.messages import Alarm, Message
+
+MESSAGE_TYPES: tuple[type[Message], ...] = get_args(Message)
+"""every type of message"""
 
 
 def health(stage: str, instance: str = "all", producer: str = "", sequence: int = 0, **more: Any) -> Health:

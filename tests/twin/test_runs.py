@@ -7,19 +7,12 @@ import pytest
 
 from schemas.tacho import Tacho
 from twin.errors import TwinError
-from twin.runs import Run, common_tacho, run_from_samples, starting_speed_rad_s
+from twin.runs import Run, common_tacho, starting_speed_rad_s
 
 
 def ramp(times: list[float]) -> Run:
     t_s = np.array(times)
     return Run("ramp", t_s, np.ones_like(t_s), t_s)
-
-
-def test_repeated_times_become_one_sample_with_the_mean_speed_and_the_last_command() -> None:
-    run = run_from_samples("esc", [0.0, 0.1, 0.1, 0.2], [1.0, 2.0, 3.0, 4.0], [10.0, 20.0, 22.0, np.nan])
-    np.testing.assert_array_equal(run.t_s, [0.0, 0.1, 0.2])
-    np.testing.assert_array_equal(run.command[:, 0], [1.0, 3.0, 4.0])
-    np.testing.assert_array_equal(run.speed_rad_s[:, 0], [10.0, 21.0, np.nan])
 
 
 def test_a_run_splits_at_a_long_gap_and_leaves_out_a_lone_sample() -> None:

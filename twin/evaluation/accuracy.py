@@ -112,20 +112,11 @@ class FigureSums:
         )
 
 
-def evaluate_model(
-    model: TwinModel, parameters: Array, sigma_rad_s: Array, runs: Sequence[Run], unseen_std: UnseenStd | None = None
-) -> Evaluation:
-    """Evaluate on runs. parameters: (fans, 4). sigma_rad_s: (fans,) healthy standard deviation of the free run.
-
-    The band has this and the unseen error, as that of a running site.
-    """
-    return sums_of_model(model, parameters, sigma_rad_s, runs, unseen_std).evaluation()
-
-
 def sums_of_model(
     model: TwinModel, parameters: Array, sigma_rad_s: Array, runs: Sequence[Run], unseen_std: UnseenStd | None = None
 ) -> FigureSums:
-    """What the figures are made of. Arguments as of evaluate_model."""
+    """What the figures on runs are made of. parameters: (fans, 4). sigma_rad_s: (fans,) healthy standard deviation of
+    the free run: the band has this and the unseen error, as that of a running site."""
     pieces = evaluation_pieces(runs)
     expected = (free_run_readings(model, parameters, piece) for piece in pieces)
     return sums_of_readings(model, parameters, sigma_rad_s, pieces, expected, unseen_std)
@@ -139,7 +130,7 @@ def sums_of_readings(
     expected: Iterable[Array],
     unseen_std: UnseenStd | None = None,
 ) -> FigureSums:
-    """The sums over pieces. expected: of each piece, as of figure_sums. The others as of evaluate_model."""
+    """The sums over pieces. expected: of each piece, as of figure_sums. The others as of sums_of_model."""
     first, *others = (
         figure_sums(model, parameters, sigma_rad_s, piece, its, unseen_std)
         for piece, its in zip(pieces, expected, strict=True)
@@ -155,7 +146,7 @@ def figure_sums(
     expected: Array,
     unseen_std: UnseenStd | None = None,
 ) -> FigureSums:
-    """The sums over one piece. expected: (n, fans) as free_run_readings gives them. The others as of evaluate_model."""
+    """The sums over one piece. expected: (n, fans) as free_run_readings gives them. The others as of sums_of_model."""
     speed = compared_readings(piece)
     measured = np.isfinite(speed)
     count = measured.sum(axis=0, dtype=np.float64)
@@ -164,7 +155,7 @@ def figure_sums(
         noise = measurement_of(piece).noise_rad_s(expected)
         std = np.hypot(sigma_rad_s, np.nan_to_num(unseen_std(expected, piece.command))) if unseen_std else sigma_rad_s
         squares = sums_by_fan(errors**2)
-    steps = _one_step_residual(model, parameters, piece)
+    steps = one_step_residual(model, parameters, piece)
     is_step = np.isfinite(steps)
     total = sums_by_fan(np.where(measured, speed, 0.0))
     deviation = np.where(measured, speed - total / np.maximum(count, 1.0), 0.0)
@@ -241,14 +232,6 @@ def pooled_rmse_rad_s(residual: Array) -> float:
         return float(np.sqrt(np.nanmean(residual**2)))
 
 
-def one_step_residuals(model: TwinModel, parameters: Array, pieces: Sequence[Run]) -> Array:
-    """(samples, fans) measured minus the prediction from the measured speeds up to the sample before.
-
-    The commands before count as they do in a free run. NaN where the speeds that a prediction needs are not measured.
-    """
-    return np.concatenate([_one_step_residual(model, parameters, piece) for piece in pieces])
-
-
 def _starting_state(model: TwinModel, parameters: Array, piece: Run) -> Array:
     """The state whose free run is nearest, in least squares, to the first five readings of each fan.
 
@@ -278,9 +261,10 @@ def _starting_state(model: TwinModel, parameters: Array, piece: Run) -> Array:
     return model.state_layout.initial_state(start, piece.command[0])
 
 
-def _one_step_residual(model: TwinModel, parameters: Array, piece: Run) -> Array:
-    """one_step_residuals of one piece.
+def one_step_residual(model: TwinModel, parameters: Array, piece: Run) -> Array:
+    """(samples, fans) of one piece: measured minus the prediction from the measured speeds up to the sample before.
 
+    The commands before count as they do in a free run. NaN where the speeds that a prediction needs are not measured.
     What the state holds of the commands does not depend on the speeds: it is carried along, and at each sample the
     measured speeds take the place of the predicted ones. The piece is cut into as many stretches as each has samples;
     their starting states come from running it once, and then all stretches advance side by side, as if they were fans.

@@ -32,6 +32,9 @@ def plot(
 
     Topics that the recorder left out (recorder.topics) are made again first.
 
+    Exits with 3 if the recording could not be read in full, or if something is found to be lost when topics are made
+    again; the plot then shows the rest.
+
     Example: fantwin plot runs/demo/recording.mcap --truth runs/demo/truth.json -o bands.png
     """
     require("a plot", "report", "matplotlib")
@@ -39,9 +42,15 @@ def plot(
 
     if unit not in ("rpm", "rad/s", None):
         raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
-    with Console(stderr=True).status(f"drawing {output}"), with_scores(recordings) as files:
-        drawn = plot_recording(files, output, tray=tray, fans=fan_numbers(fans), speed_unit=unit, truth=truth)
+    chosen = fan_numbers(fans)
+    with Console(stderr=True).status(f"drawing {output}"), with_scores(recordings, output) as scored:
+        drawn, unread = plot_recording(scored.files, output, tray=tray, fans=chosen, speed_unit=unit, truth=truth)
+    damage = [*scored.damage, *unread]
     if json_output:
-        typer.echo(json.dumps({"plot": str(output), "fans": drawn}))
+        typer.echo(json.dumps({"plot": str(output), "fans": drawn, "damage": damage}))
     else:
         typer.echo(f"{output}: fans {', '.join(map(str, drawn))}")
+    for line in (*damage, *scored.remarks):
+        typer.echo(line, err=True)
+    if damage:
+        raise typer.Exit(3)

@@ -32,7 +32,8 @@ def view(
 
     Topics that the recorder left out (recorder.topics) are made again first.
 
-    Exits with 3 if the recording could not be read in full; the view then shows what could be read.
+    Exits with 3 if the recording could not be read in full, or if something is found to be lost when topics are made
+    again; the view then shows the rest.
 
     Example: fantwin view runs/demo/recording.mcap --layout alarms -o alarms.rrd
     """
@@ -44,17 +45,17 @@ def view(
         raise UsageError(f"{output}: name a file that ends in .rrd with -o")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or use --force")
-    with Console(stderr=True).status(f"drawing {output}"), with_scores(recordings) as files:
-        site = recorded_site(files)
+    with Console(stderr=True).status(f"drawing {output}"), with_scores(recordings, output) as scored:
+        site = recorded_site(scored.files)
         output.unlink(missing_ok=True)
         options = ViewOptions(layout=layout.value, window_s=window, fleet_above=fleet_above)
-        damage = write_view(site, output, options)
+        damage = [*scored.damage, *write_view(site, output, options)]
     fans = sum(tray.fans for tray in site.trays)
     if json_output:
         typer.echo(json.dumps({"view": str(output), "fans": fans, "damage": damage}))
     else:
         typer.echo(f"{output}: {fans} fans")
-    for line in damage:
+    for line in (*damage, *scored.remarks):
         typer.echo(line, err=True)
     if damage:
         raise typer.Exit(3)

@@ -28,6 +28,7 @@ from schemas.topics import tray_key
 
 RECORDING_ONLY = (
     *("--set", f"launcher.stages={json.dumps(['acquisition', 'resampler', 'recorder'])}"),
+    *("--set", "launcher.without=[]"),
     *("--set", "launcher.shards={ recorder = 1 }"),
     *("--set", "recorder.keep_days=0"),
     *("--set", "recorder.keep_share_of_disk=1"),

@@ -169,7 +169,9 @@ def _refuse_what_cannot_end_well(settings: Config, works: Sequence[TrayWork]) ->
     """Before anything is recorded."""
     judging = [name for name, row in STAGES.items() if row.needs_twin]
     if missing := [name for name in judging if name not in settings.stages]:
-        raise UserError(f"{settings.path}: launcher.stages leaves out {', '.join(missing)}: remove launcher.stages")
+        switched_off = [name for name in missing if name in settings.launcher.without]
+        key = "launcher.without" if switched_off else "launcher.stages"
+        raise UserError(f"{settings.path}: {key} leaves out {', '.join(switched_off or missing)}: remove {key}")
     text = settings.text
     for work in works:
         text = with_twin(text, work.name, work.twin.name, settings.path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,6 +12,7 @@ from pathlib import Path
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
 from pipeline.recordings.clips.clip import CLIP_SNAPSHOT_KEY
+from pipeline.recordings.grouping import deciding_overrides
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.order import in_order
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
@@ -30,9 +30,6 @@ from pipeline.runtime.consumed import CONSUMED
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
-
-_OF_THE_PLACE = ("bus.", "launcher.", "run_folder")
-"""how the names of keys begin that say where a process runs"""
 
 
 @dataclass
@@ -227,7 +224,7 @@ def _refuse_another_run(first: Path, metadata: RecordingMetadata, path: Path, ot
     """The parts of one recording, and the recordings of the shards of one run, have one site, one configuration and one
     twin for each tray."""
     differ = ["site"] if metadata.metadata.get("site") != other.metadata.get("site") else []
-    if _deciding_overrides(metadata) != _deciding_overrides(other):
+    if deciding_overrides(metadata) != deciding_overrides(other):
         differ.append("keys set on the command line")
     names = {*metadata.attachments, *other.attachments}
     if metadata.trays and other.trays:
@@ -238,15 +235,6 @@ def _refuse_another_run(first: Path, metadata: RecordingMetadata, path: Path, ot
         raise RecordingError(
             f"{first} and {path} belong to two runs: they differ in {differ[0]}; replay them one by one"
         )
-
-
-def _deciding_overrides(metadata: RecordingMetadata) -> list[str]:
-    """The recorded overrides but for those of the place, which differ from host to host."""
-    try:
-        overrides = list(map(str, json.loads(metadata.metadata.get("overrides", "[]"))))
-    except (ValueError, TypeError):
-        return [metadata.metadata["overrides"]]  # damaged: reported where they are used
-    return [override for override in overrides if not override.startswith(_OF_THE_PLACE)]
 
 
 def _recorded_twins(metadata: RecordingMetadata, folder: Path, trays: Iterable[str]) -> dict[str, Path]:

@@ -20,11 +20,9 @@ from schemas.messages import Array
 RELATIVE = 1e-6
 """share of the larger of both numbers: eight units in the last digit of a recorded score"""
 SPEED_RAD_S = 1e-6
-"""absolute, of speeds: a hundred-thousandth of a revolution a minute"""
-COMMAND = 1e-9
-"""absolute, of torque balances, in units of the command"""
-RATIO = 1e-9
-"""absolute, of all other numbers: scores, probabilities, sizes of faults"""
+"""absolute, of speeds and variances of speeds: a hundred-thousandth of a revolution a minute"""
+OTHERS = 1e-9
+"""absolute, of all other numbers: scores, torque balances, probabilities, sizes of faults"""
 FIXED_POINT = 4
 """absolute, of integer sums: a number that lies halfway between two of their units is rounded to either"""
 FIXED_POINT_SUMS = frozenset({"sums", "products", "squares", "scaling_squares", "motions", "speeds"})
@@ -51,7 +49,7 @@ def shares(name: str, one: Array, other: Array) -> Array:
     A share is infinite if only one of both numbers is finite.
     """
     one, other = one.astype(np.float64), other.astype(np.float64)
-    absolute = SPEED_RAD_S if name.endswith(("_rad_s", "variance")) else COMMAND if name.endswith("_command") else RATIO
+    absolute = SPEED_RAD_S if name.endswith(("_rad_s", "variance")) else OTHERS
     with np.errstate(invalid="ignore"):
         share = np.abs(one - other) / (absolute + RELATIVE * np.maximum(np.abs(one), np.abs(other)))
     return np.where(np.isfinite(share), share, math.inf)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.child_commands import Commands, next_recording_file
+from pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, next_recording_file
 from pipeline.config.loading import load_config
 from pipeline.config.models import TrayConfig
 from pipeline.learning.ordinary_operation import OrdinaryOperation
@@ -89,6 +89,14 @@ def test_what_its_doctor_step_finds_in_order_is_on_standard_output(capfd: pytest
     printed = capfd.readouterr()
     assert "ok   Python " in printed.out
     assert printed.err == ""
+
+
+def test_a_site_that_only_records_records_whatever_its_configuration_leaves_out(tmp_path: Path) -> None:
+    configuration = tmp_path / "fantwin.toml"
+    text = '[[tray]]\nname = "tray1"\nfans = 1\nport = "line"\n[launcher]\nwithout = ["recorder", "viewer"]\n'
+    configuration.write_text(text, encoding="utf-8")
+    site = load_config(configuration, RECORDING_ONLY[1::2])
+    assert site.stages == ("acquisition", "resampler", "recorder")
 
 
 def test_no_limit_of_a_later_recorder_deletes_what_twins_are_made_of(tmp_path: Path) -> None:

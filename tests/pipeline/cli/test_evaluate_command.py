@@ -14,7 +14,7 @@ from tests.support.fantwin_command import fantwin
 from tests.support.twin_files import write_twin
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
-from twin.evaluation.accuracy import evaluate_model, free_run_residuals, healthy_sigma_rad_s, one_step_residuals
+from twin.evaluation.accuracy import Figures, free_run_residuals, healthy_sigma_rad_s, one_step_residual, sums_of_model
 from twin.export.onnx_twin import OnnxTwin
 from twin.models.model import TwinModel
 from twin.models.narx import PARAMETER_COUNT, Narx
@@ -38,8 +38,13 @@ def run() -> Run:
     return fan_data.published_run(21, 30.0)
 
 
+def figures_on(run: Run, parameters: Array = PARAMETERS, sigma_rad_s: Array = SIGMA) -> Figures:
+    """Those of the physical model."""
+    return sums_of_model(PhysicalModel(), parameters, sigma_rad_s, [run]).evaluation().pooled
+
+
 def test_the_true_model_leaves_the_noise_and_two_sigma_cover_95_percent(run: Run) -> None:
-    figures = evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [run]).pooled
+    figures = figures_on(run)
     assert figures.rmse_rad_s == pytest.approx(fan_data.NOISE_RAD_S, rel=0.05)
     assert figures.coverage_2_sigma == pytest.approx(0.954, abs=0.02)
     assert figures.r2 > 0.99
@@ -50,7 +55,7 @@ def test_r2_is_zero_for_a_model_as_good_as_the_mean() -> None:
     still = parameters_of(J=1.0, alpha=1e-9)
     speed = np.tile([5.0, 5.0, 5.0, 5.0, 5.0, 4.0, 6.0], 10)
     run = Run("flat", np.arange(70) / 100.0, np.zeros(70), speed)
-    figures = evaluate_model(PhysicalModel(), still, np.ones(1), [run]).pooled
+    figures = figures_on(run, still, np.ones(1))
     assert figures.r2 == pytest.approx(0.0, abs=1e-6)
     assert figures.max_error_rad_s == pytest.approx(1.0)
 
@@ -60,7 +65,7 @@ def test_missing_samples_count_nowhere(run: Run) -> None:
     missing[:10] = False
     speed = run.speed_rad_s.copy()
     speed[missing] = np.nan
-    figures = evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [Run("lossy", run.t_s, run.command, speed)]).pooled
+    figures = figures_on(Run("lossy", run.t_s, run.command, speed))
     whole = free_run_residuals(PhysicalModel(), PARAMETERS, [run])
     assert figures.samples == np.count_nonzero(~missing)
     assert figures.rmse_rad_s == pytest.approx(np.sqrt(np.mean(whole[~missing] ** 2)), rel=1e-12)
@@ -69,7 +74,7 @@ def test_missing_samples_count_nowhere(run: Run) -> None:
 def test_the_free_run_starts_again_after_a_long_gap(run: Run) -> None:
     later = run.t_s + np.where(run.t_s > 15.0, 3600.0, 0.0)
     gapped = Run("gapped", later, run.command, run.speed_rad_s)
-    assert evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [gapped]).pooled.rmse_rad_s < 1.1 * fan_data.NOISE_RAD_S
+    assert figures_on(gapped).rmse_rad_s < 1.1 * fan_data.NOISE_RAD_S
 
 
 @pytest.mark.parametrize("every", [1, 10])
@@ -79,17 +84,17 @@ def test_a_fan_that_gathers_speed_from_the_first_sample_on_is_not_started_too_fa
     speed, _ = PhysicalModel().advance(np.array([[0.0, 60.0]]), fine.command, fine.step_s, PARAMETERS)
     run = Run("start", fine.t_s, fine.command, speed)
     thinned = Run("thinned", run.t_s[::every], run.command[::every], run.speed_rad_s[::every])
-    assert evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [thinned]).pooled.max_error_rad_s < 0.1
+    assert figures_on(thinned).max_error_rad_s < 0.1
     sparse = np.where(np.arange(3000)[:, np.newaxis] % every == 0, run.speed_rad_s, np.nan)
     missing = Run("missing", run.t_s, run.command, sparse)
-    assert evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [missing]).pooled.max_error_rad_s < 0.1
+    assert figures_on(missing).max_error_rad_s < 0.1
 
 
 def test_a_fan_first_measured_when_its_start_is_long_forgotten_is_still_followed(run: Run) -> None:
     speed = run.speed_rad_s.copy()
     speed[:2000] = np.nan
     late = Run("late", run.t_s, run.command, speed)
-    figures = evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [late]).pooled
+    figures = figures_on(late)
     assert figures.rmse_rad_s == pytest.approx(fan_data.NOISE_RAD_S, rel=0.06)
     assert figures.samples == 1000
 
@@ -123,13 +128,13 @@ def test_the_one_step_error_takes_speeds_from_the_fan_and_past_commands_from_the
         if k >= speeds - 1:
             expected[k + 1] = run.speed_rad_s[k + 1] - state[:, 0]
         state[:, :speeds] = 0.0
-    found = one_step_residuals(model, parameters, [run])
+    found = one_step_residual(model, parameters, run)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7)
     assert 0.2 < np.mean(np.isfinite(found)) < 0.9
 
 
 def test_the_one_step_error_of_the_true_model_is_the_noise_of_two_samples(run: Run) -> None:
-    figures = evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [run]).pooled
+    figures = figures_on(run)
     # One noise in the speed it starts from, hardly damped in 10 ms, and one in the speed it is compared with.
     assert figures.one_step_rmse_rad_s == pytest.approx(np.sqrt(2.0) * fan_data.NOISE_RAD_S, rel=0.05)
 
@@ -140,7 +145,7 @@ def test_sigma_is_about_the_twin_so_a_bias_widens_it() -> None:
 
 def test_a_diverging_free_run_is_infinite_not_an_exception(run: Run) -> None:
     runaway = parameters_of(J=0.001, C_D=-1.0)
-    figures = evaluate_model(PhysicalModel(), runaway, SIGMA, [run]).pooled
+    figures = figures_on(run, runaway)
     assert figures.rmse_rad_s == np.inf
     assert figures.r2 == -np.inf
 

@@ -19,10 +19,11 @@ from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import proto_type
 from schemas.enums import FanState, Statistic
 from schemas.health import Health
-from schemas.messages import MESSAGE_TYPES, ModelCard, Raw
+from schemas.messages import ModelCard, Raw
 from tests.pipeline.recordings.test_arrays import alarm, raw, write
 from tests.support.failing_writers import disk_of
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.made_messages import MESSAGE_TYPES
 from tests.support.score_data import START_NS, made_up_tray
 
 READING = Path(__file__).parents[3] / "docs" / "how-to" / "read-recordings.md"

@@ -8,7 +8,9 @@ import re
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 
+from pipeline.recordings.records import RecordReader
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.offline_replay import changed, recorded, recording_of, without_topics
@@ -86,6 +88,31 @@ def test_a_view_makes_the_scores_again(lean, tmp_path):
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["fans"] == 3
     assert (tmp_path / "v.rrd").stat().st_size > 50_000
+
+
+def test_what_a_view_and_a_plot_lack_is_told_as_by_a_replay(lean, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.recordings.writing.CHUNK_BYTES", 4096)
+    damaged = without_topics(lean, tmp_path / "damaged.mcap", *MADE)
+    content = bytearray(damaged.read_bytes())
+    chunks = [record for record in RecordReader(damaged) if record.opcode == Opcode.CHUNK]
+    content[chunks[len(chunks) // 2].end - 5] ^= 0xFF
+    damaged.write_bytes(content)
+    replayed = fantwin("replay", "--offline", "--json", damaged)
+    found = json.loads(replayed.stdout)
+    assert replayed.exit_code == 3 and found["lost"] and found["damage"]
+    for command, output in (("view", tmp_path / "v.rrd"), ("plot", tmp_path / "p.svg")):
+        done = fantwin(command, damaged, "-o", output, "--json")
+        damage = json.loads(done.stdout)["damage"]
+        assert damage == [*found["damage"], f"{damaged}: {found['lost']} samples and messages lost"]
+        assert (done.exit_code, [line for line in damage if line not in done.stderr]) == (3, [])
+        assert output.exists() and not list(tmp_path.glob(".*")), "nothing temporary is left"
+
+
+def test_a_plot_tells_of_damage_where_scores_were_recorded(whole, tmp_path):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:-40_000])
+    done = fantwin("plot", cut, "-o", tmp_path / "p.svg")
+    assert (done.exit_code, str(cut) in done.stderr) == (3, True), done.output
 
 
 def test_an_export_has_raw_samples_and_names_what_is_missing(lean, tmp_path):

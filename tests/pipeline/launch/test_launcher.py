@@ -55,9 +55,13 @@ def no_bus(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     [
         (["tray.0.twin='none.onnx'"], f"{DEMO}/none.onnx: cannot read the twin: No such file or directory; correct "),
         (["tray.0.fans=5"], f"{DEMO}/twin.onnx: a twin of 8 fans, [[tray]] says fans = 5: choose a twin that fits"),
+        (
+            ["launcher.stages=['scorer']", "launcher.without=['scorer']"],
+            f"{DEMO}/demo.toml: launcher.stages and launcher.without leave no stage to run: correct them",
+        ),
     ],
 )
-def test_a_twin_that_cannot_be_used_is_refused_before_anything_starts(no_bus, settings, fault):
+def test_what_cannot_be_used_is_refused_before_anything_starts(no_bus, settings, fault):
     with pytest.raises(UserError, match=re.escape(fault)):
         Launcher(load_config(DEMO / "demo.toml", settings), (), no_bus).run(threading.Event())
 

@@ -160,15 +160,17 @@ def test_an_alarm_that_came_and_went_between_two_looks_is_said_to_have_been_rais
     def cleared(onset_t_ns: int) -> Alarm:
         return alarm(onset_t_ns, Transition.CLEARED, active=False, message="back to normal")
 
-    from_before, seen, missed = (CONSUMER.t_ns + seconds * NS_PER_S for seconds in (-60, 10, 20))
+    from_before, seen, missed, shelved = (CONSUMER.t_ns + seconds * NS_PER_S for seconds in (-60, 10, 20, 30))
     for newest in (
         cleared(from_before),
         alarm(seen, Transition.RAISED, active=True, message="214 rpm below the twin"),
         cleared(seen),
         cleared(missed),
         cleared(missed),
+        replace(cleared(shelved), shelved_until_t_ns=shelved + 3600 * NS_PER_S),
     ):
         report.alarms(current_alarms([newest]))
     over = "cleared  tray1  fan 2: back to normal"
     raised = f"ALARM  tray1  fan 2: raised for what began at {clock(missed)}, and over"
-    assert lines == [over, "ALARM  tray1  fan 2: 214 rpm below the twin", over, raised, over]
+    silenced = f"ALARM (silenced)  tray1  fan 2: raised for what began at {clock(shelved)}, and over"
+    assert lines == [over, "ALARM  tray1  fan 2: 214 rpm below the twin", over, raised, over, silenced, over]

@@ -93,7 +93,7 @@ def test_shards_of_hosts_that_run_at_different_places_are_one_run_and_those_that
     sites, tmp_path
 ):
     here = shard(sites, tmp_path, 1, overrides='["run_folder=\\"/a\\"", "bus.endpoint=\\"x\\""]')
-    there = shard(sites, tmp_path, 2, overrides='["run_folder=\\"/b\\""]')
+    there = shard(sites, tmp_path, 2, overrides='["run_folder=\\"/b\\"", "gateway.port=8081"]')
     with open_replay_input([here, there], None, (), None) as both:
         assert [tray.name for tray in both.trays] == list(TRAYS)
     other = tmp_path / "other"

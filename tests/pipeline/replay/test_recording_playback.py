@@ -19,7 +19,7 @@ from schemas.enums import InvalidReason
 from schemas.envelope import Envelope
 from schemas.fields import columns
 from schemas.header import Header
-from schemas.messages import MESSAGE_TYPES, Alarm, Grid, ModelCard
+from schemas.messages import Alarm, Grid, ModelCard
 from schemas.topics import tray_key
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.support import made_messages
@@ -131,7 +131,7 @@ def test_all_times_of_a_message_are_shifted_and_nothing_else():
 
 
 def test_columns_in_ns_are_times_since_the_epoch_and_named_t_ns():
-    assert {name for kind in MESSAGE_TYPES for name in columns(kind) if name.endswith("_ns")} == {
+    assert {name for kind in made_messages.MESSAGE_TYPES for name in columns(kind) if name.endswith("_ns")} == {
         "host_receive_t_ns",
         "t_ns",
     }

@@ -87,14 +87,14 @@ def test_a_recording_in_two_parts_is_one_trace_in_time_order_in_its_unit_of_spee
     scores, alarms = made_up_tray(seconds=4)
     second = record(tmp_path / "b.mcap", scores[20:], alarms)
     first = record(tmp_path / "a.mcap", scores[:20], [])
-    trace = read_trace([second, first], None, "rpm")
+    trace = read_trace([second, first], None, "rpm", [])
     whole = trace_of("tray1", scores, "rpm")
     assert trace.t_ns.tolist() == whole.t_ns.tolist()
     np.testing.assert_array_equal(trace.measured, whole.measured)
     for metadata in ({"speed_unit": "rpm"}, {"speed_unit.tray1": "rpm"}):
         path = record(tmp_path / "rec.mcap", scores, [], metadata)
-        assert read_trace([path], None, None).speed_unit == "rpm"
-        assert read_trace([path], None, "rad/s").speed_unit == "rad/s"
+        assert read_trace([path], None, None, []).speed_unit == "rpm"
+        assert read_trace([path], None, "rad/s", []).speed_unit == "rad/s"
 
 
 def test_the_command_plots_a_recording_with_its_true_faults(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_the_command_plots_a_recording_with_its_true_faults(tmp_path: Path) -> N
     arguments = ["plot", str(recording), "-o", str(output), "--truth", str(truth), "--json"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
-    drawn = {"plot": str(output), "fans": [0, 2]}
+    drawn = {"plot": str(output), "fans": [0, 2], "damage": []}
     assert json.loads(result.stdout) == drawn, "the fan with an alarm and a healthy one"
     assert coverage(output, band_plot.FAULT) > 0.001
 

@@ -5,7 +5,7 @@ import pytest
 
 from tests.support import fan_data
 from twin.errors import TwinError
-from twin.evaluation.accuracy import evaluate_model
+from twin.evaluation.accuracy import sums_of_model
 from twin.evaluation.resampling import Grid, irregular, on_grid, resampled, thinned
 from twin.models.hybrid import UNITS, Hybrid
 from twin.models.model import TwinModel
@@ -121,7 +121,8 @@ def errors_in_noise(model: TwinModel, parameters: Array, run: Run) -> dict[str, 
     """Free-run error over the noise on the run's own grid and on the others."""
     runs = {"own": [run]} | {str(grid): on_grid([run], grid) for grid in OTHER_GRIDS}
     sigma = np.array([NOISE])
-    return {name: evaluate_model(model, parameters, sigma, on).pooled.rmse_rad_s / NOISE for name, on in runs.items()}
+    figures = {name: sums_of_model(model, parameters, sigma, on).evaluation().pooled for name, on in runs.items()}
+    return {name: each.rmse_rad_s / NOISE for name, each in figures.items()}
 
 
 def random_hybrid() -> Hybrid:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.typing import ArrayLike
 
 from schemas.tacho import Tacho
 from tests.support import fan_data
@@ -13,7 +14,7 @@ from tests.support.fan_data import published_run, rough_run
 from twin.fitting.identifiability import feedback_share, identifiability_warnings
 from twin.fitting.identification import identify
 from twin.models.physics import PARAMETER_NAMES
-from twin.runs import Array, Run, run_from_samples
+from twin.runs import Array, Run
 
 INERTIA, VISCOUS, DRAG = fan_data.PUBLISHED_PARAMETERS[:3]
 STEP_S = 1.0 / fan_data.RATE_HZ
@@ -193,6 +194,13 @@ def test_each_parameter_is_judged_by_its_own_interval() -> None:
     assert line.startswith("fan 0: J is poorly determined (0.15 ± 0.1)")
 
 
+def merged(name: str, t_s: ArrayLike, command: ArrayLike, speed_rad_s: ArrayLike) -> Run:
+    """A run of samples whose time may repeat: those of one time become one, mean speed and last command."""
+    table = pd.DataFrame({"t_s": t_s, "command": command, "speed_rad_s": speed_rad_s})
+    one = table.groupby("t_s", sort=False).agg({"command": "last", "speed_rad_s": "mean"})
+    return Run(name, one.index.to_numpy(float), one["command"].to_numpy(float), one["speed_rad_s"].to_numpy(float))
+
+
 def test_a_lag_below_the_sampling_step_or_within_its_error_is_reported_as_undetermined() -> None:
     run = published_run(1)
     assert judged(run, lag_s=(0.03, 0.002)) == ()
@@ -218,7 +226,7 @@ def rosa(folder: Path, number: int) -> Run:
     table = pd.read_csv(folder / "rosa" / f"healthy_{number}.csv", encoding="utf-8-sig", low_memory=False)
     table.columns = table.columns.str.strip()
     t_s = table["Time"].to_numpy(dtype=float) / 1000.0
-    return run_from_samples("rosa", t_s, table["Shaft Control Effort"], table["Actual Speed"] * RPM)
+    return merged("rosa", t_s, table["Shaft Control Effort"], table["Actual Speed"] * RPM)
 
 
 @pytest.mark.data
@@ -238,9 +246,9 @@ def test_motors_in_open_loop_are_not_reported_as_controlled(measured_data) -> No
     pwm = np.tile(crazyflie["pwm"].to_numpy(dtype=float)[:, None], (1, 4))
     motor = pd.read_csv(measured_data / "undcmotor" / "DCmotor_prbs_open_exp.csv")
     for run in (
-        run_from_samples("esc", seconds, esc["Duty"], esc["RPM"] * RPM),
+        merged("esc", seconds, esc["Duty"], esc["RPM"] * RPM),
         Run("crazyflie", 0.01 * np.arange(float(len(rpm))), pwm, rpm * RPM),
-        run_from_samples("motor", motor["t"], motor["u"], np.deg2rad(motor["y"])),
+        merged("motor", motor["t"], motor["u"], np.deg2rad(motor["y"])),
     ):
         lines = warnings_of(run)
         assert not has_line_with(lines, "closed loop"), run.name
