@@ -31,14 +31,7 @@ from pipeline.recordings.open_part import OpenPart, PartsFolder
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import LEFT_OUT_KEY, RecordingError
 from pipeline.recordings.recorded_healths import RecordedHealths
-from pipeline.recordings.recorder_config import (
-    CLIPS_SHARE,
-    FLUSH_BYTES,
-    FLUSH_S,
-    LEAST_PART_BYTES,
-    RecorderConfig,
-    recorded_topics,
-)
+from pipeline.recordings.recorder_config import CLIPS_SHARE, FLUSH_BYTES, FLUSH_S, RecorderConfig, recorded_topics
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from schemas.envelope import Envelope
@@ -96,7 +89,7 @@ class Recorder(Core):
         self._room = DiskRoom(parts, config, clips)
         self._part: OpenPart | None = None
         self._least_bytes = 0
-        """of the part: the attachments alone may be more than its limit"""
+        """of the part: its messages take as much as its attachments, which alone may be more than its limit"""
         self._ledger = SequenceLedger(parts.before, left_out)
         self._before = parts.before
         self._cards: dict[str, Envelope] = {}
@@ -248,7 +241,7 @@ class Recorder(Core):
         held_since_ns = self._held.first_received_t_ns
         self._began_ns = self._now_ns if held_since_ns is None else min(held_since_ns, self._now_ns)
         self._part = self._parts.begin(self._began_ns, self._ledger, about)
-        self._least_bytes = self._part.size + LEAST_PART_BYTES
+        self._least_bytes = 2 * self._part.size
         self._interference.begin_part()
         self._counts["parts"] += 1
         self._problem = ""

@@ -16,7 +16,7 @@ FLUSH_S, FLUSH_BYTES = 1.0, 64 << 10
 PARTS_WITHIN_LIMITS = 8
 """parts within each limit, because only whole parts are deleted"""
 LEAST_PART_BYTES, LEAST_PART_S = 1_000_000, 1.0
-"""of a part, beyond its metadata and attachments, before the next one begins: whatever the limits are"""
+"""the smallest limits of a part that can be set"""
 RECORDED = tuple(topic.name for topic in TOPICS if topic.recorded)
 SAMPLES = tuple(name for name in RECORDED if BY_NAME[name].has_samples)
 """the topics that may be left out"""

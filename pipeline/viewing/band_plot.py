@@ -280,16 +280,17 @@ def _draw_lanes(axes: Axes, trace: Trace, fan: int, faults: Sequence[Fault], *, 
 def _title(trace: Trace, fan: int, faults: Sequence[Fault]) -> str:
     """The title of a panel: the fan, its faults and its alarms."""
     parts = [f"fan {fan}"]
-    changes_ns, names = state_changes(trace, fan, None)
-    raised = [t for t, name in zip(changes_ns, names, strict=True) if name == "alarm"]
-    if not trace.in_alarm[:, fan].any():
+    in_alarm = trace.in_alarm[:, fan]
+    raised = trace.t_ns[in_alarm & ~np.concatenate(([False], in_alarm[:-1]))]
+    if not len(raised):
         parts.append("no alarm")
     for fault in faults:
         text = f"{fault.kind.replace('_', ' ').replace('-', ' ')} at {_seconds(trace, np.array(fault.start_ns)):.1f} s"
-        first = next((t for t in raised if fault.start_ns <= t <= fault.stop_ns), None)
+        first = next((t for t in raised.tolist() if fault.start_ns <= t <= fault.stop_ns), None)
         parts.append(text + (f", alarm {(first - fault.start_ns) / NS_PER_S:.2f} s later" if first else ", no alarm"))
-    if not faults and raised:
-        parts.append("alarm at " + ", ".join(f"{_seconds(trace, t):.1f} s" for t in raised[:4]))
+    if not faults and len(raised):
+        more = f" and {len(raised) - 4} more" if len(raised) > 4 else ""
+        parts.append("alarm at " + ", ".join(f"{_seconds(trace, t):.1f} s" for t in raised[:4]) + more)
     return "   ".join(parts)
 
 
