@@ -53,6 +53,7 @@ class TorqueBalance(ColumnState):
         self._lagged = np.full(fans, np.nan)
         self._lag_step_s = np.nan
         self._lag_shares = (np.zeros(fans), np.zeros(fans))
+        load_lfilter()
         self._filtered = np.zeros(fans)
         self._weight = np.zeros(fans)
 
@@ -172,12 +173,14 @@ def filter_rows(keep: float, rows: Array, state: Array) -> tuple[Array, Array]:
 
     rows: (n, m). state: (1, m), keep times the y before the first. Returns y (n, m) and the state after.
     """
-    made: Any = _lfilter()([1.0 - keep], [1.0, -keep], rows, axis=0, zi=state)
+    made: Any = load_lfilter()([1.0 - keep], [1.0, -keep], rows, axis=0, zi=state)
     return made[0], made[1]
 
 
-def _lfilter() -> Any:
-    # a live scorer filters its short blocks row by row, and this import takes longer than all its others
+def load_lfilter() -> Any:
+    """The filter of SciPy. Whatever filters loads it when built: with the first long block of a line it would make the
+    first scores a second or two late. A process that only shows alarms does without this large import.
+    """
     from scipy.signal import lfilter  # noqa: PLC0415
 
     return lfilter

@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.column_state import ColumnState
-from scoring.torque_balance import FEW_ROWS, by_rows, filter_rows
+from scoring.torque_balance import FEW_ROWS, by_rows, filter_rows, load_lfilter
 
 MEMORY_TIME_CONSTANTS = 5.0  # after these, less than one percent of an output is left
 
@@ -17,6 +17,7 @@ class LowPass(ColumnState):
     """y[k] = keep y[k-1] + (1 - keep) x[k] with keep = exp(-step / time constant), exact for a held input."""
 
     def __init__(self, columns: int, time_constant_s: float, start: float = 0.0) -> None:
+        load_lfilter()
         self._time_constant_s = time_constant_s
         self.value = np.full(columns, start)
         """(columns,) the last output"""

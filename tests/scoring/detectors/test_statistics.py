@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -115,6 +117,16 @@ def test_cuts_and_invalid_samples_change_no_bit(
         update = make()
         made = np.concatenate([update(x[a:b], valid[a:b]) for a, b in pairwise(edges)])
         np.testing.assert_array_equal(made, whole)
+
+
+def test_a_filter_is_loaded_when_it_is_built_and_not_with_the_first_long_block() -> None:
+    """The import takes a second or two, and the first scores would be late; what only shows wear does without it."""
+    program = (
+        "import sys; import scoring.wear.trend; before = 'scipy.signal' in sys.modules;"
+        "from scoring.detectors.low_pass import LowPass; LowPass(1, 1.0); print(before, 'scipy.signal' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "False True\n"
 
 
 def test_the_cusum_is_its_recursion_up_to_its_cap_and_finds_both_signs() -> None:
