@@ -176,8 +176,8 @@ class LauncherConfig(Section):
     )
     shards: int | dict[str, int] | None = Field(
         default=None,
-        description="as how many processes each stage runs, which share its trays: one number for all stages but "
-        f"{', '.join(name for name, row in STAGES.items() if not row.has_common_shards)}; or a table, as "
+        description="number of processes that share the trays of a stage: one number for all stages but "
+        f"{', '.join(name for name, row in STAGES.items() if not row.has_common_shards)}; or a table, such as "
         "{ scorer = 4, recorder = 2 }; without it, one process for the site, of acquisition one for each tray",
     )
     restart_delay_s: float = Field(default=0.2, gt=0, description="first delay before a dead stage is restarted")

@@ -169,7 +169,7 @@ class RecordingParts:
         try:
             part.path.unlink(missing_ok=True)
         except OSError as error:
-            advice = "older recordings stay until it can be: delete or move it"
+            advice = "other recordings are kept until this file is gone: delete it or move it"
             raise refused(f"{part.path}: cannot be deleted", error, advice) from error
 
     def _is_ours(self, path: Path) -> bool:

@@ -30,8 +30,8 @@ class RecorderConfig(StageConfig):
 
     topics: tuple[str, ...] = Field(
         default=(RAW,),
-        description=f"recorded topics of samples, of {', '.join(SAMPLES)}; all other topics are always recorded. From "
-        f"{RAW} `fantwin view`, `plot` and `replay --offline` make the rest again",
+        description=f"which topics of samples to record, of {', '.join(SAMPLES)}; all others are always recorded. "
+        f"`fantwin view`, `plot` and `replay --offline` make the rest again from {RAW}",
     )
     file: Path = Field(
         default=Path("recording.mcap"),
@@ -41,9 +41,9 @@ class RecorderConfig(StageConfig):
     flush_interval_s: float = Field(
         default=120.0,
         gt=0,
-        description="longest time between flushes to the disk; a crash of the machine loses at most this much. It is "
-        f"{FLUSH_S:g} s if {FLUSH_BYTES >> 10} KiB, an alarm, a request, a twin or a problem wait, and while a clip is "
-        "running",
+        description="longest time between flushes to the disk; a crash of the machine loses at most this much. A "
+        f"flush comes after {FLUSH_S:g} s if {FLUSH_BYTES >> 10} KiB, an alarm, a request, a twin or a problem waits, "
+        "or while a clip is running",
     )
     part_bytes: int = Field(
         default=100_000_000,

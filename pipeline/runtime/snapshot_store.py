@@ -138,7 +138,7 @@ def _beside(last: ScorerSnapshot, own: ScorerSnapshot | None) -> str:
         return "there is none here"
     older_s = (last.t_ns - own.t_ns) / NS_PER_S
     if older_s < 0:
-        return f"the file here is {-older_s:.0f} s newer, of a clock that was ahead"
+        return f"the file here is {-older_s:.0f} s newer, because the clock was ahead when it was written"
     return f"the file here is {older_s:.0f} s older"
 
 

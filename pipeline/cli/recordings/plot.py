@@ -32,8 +32,8 @@ def plot(
 
     Topics that the recorder left out (recorder.topics) are made again first.
 
-    Exits with 3 if the recording could not be read in full, or if something is found to be lost when topics are made
-    again; the plot then shows the rest.
+    Exits with 3 if the recording could not be read in full, or if making the topics again shows that data were lost.
+    The plot then shows the rest.
 
     Example: fantwin plot runs/demo/recording.mcap --truth runs/demo/truth.json -o bands.png
     """

@@ -32,8 +32,8 @@ def view(
 
     Topics that the recorder left out (recorder.topics) are made again first.
 
-    Exits with 3 if the recording could not be read in full, or if something is found to be lost when topics are made
-    again; the view then shows the rest.
+    Exits with 3 if the recording could not be read in full, or if making the topics again shows that data were lost.
+    The view then shows the rest.
 
     Example: fantwin view runs/demo/recording.mcap --layout alarms -o alarms.rrd
     """

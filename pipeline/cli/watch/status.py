@@ -59,10 +59,10 @@ def status(
 ) -> None:
     """Show stages, rates, latency, losses and alarms of a running site.
 
-    Each stage that the configuration asks for has a row; one that needs an extra only if it was heard, or if
-    `launcher.stages` names it. Stays live on a terminal, until Ctrl-C. Into a pipe or a file
-    it prints once and exits. Losses count from the start of a stage (column `up`: how long ago), over all sessions
-    heard while this command runs; `fantwin up` at its end and `fantwin info` count all sessions.
+    Each stage that the configuration asks for has a row. A stage that needs an extra has a row only if it was heard, or
+    if `launcher.stages` names it. Stays live on a terminal, until Ctrl-C. Into a pipe or a file it prints once and
+    exits. Losses count from the start of a stage (column `up`: how long ago), over all sessions heard while this
+    command runs; `fantwin up` at its end and `fantwin info` count all sessions.
 
     Below the table are the counters of what was lost and refused; --json has all counters.
 

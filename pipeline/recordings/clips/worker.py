@@ -99,7 +99,7 @@ class ClipWorker(ClipMaker):
         try:
             path.unlink(missing_ok=True)
         except OSError as error:
-            advice = "clips and recordings stay until it can be: delete or move it"
+            advice = "other clips and recordings are kept until this file is gone: delete it or move it"
             raise refused(f"{path}: cannot be deleted", error, advice) from error
 
     def problem(self) -> str:

@@ -116,7 +116,7 @@ def test_a_snapshot_of_a_clock_that_was_ahead_does_not_hide_the_last_one(tmp_pat
     store = SnapshotStore(tmp_path / "m.snapshot", lambda _is_patient: ([snapshot(AHEAD_NS)], ""), now_ns=AHEAD_NS)
     found = store.load()
     assert found and found.t_ns == AHEAD_NS
-    assert store.note.endswith("; the file here is 2 s newer, of a clock that was ahead")
+    assert store.note.endswith("; the file here is 2 s newer, because the clock was ahead when it was written")
 
 
 @pytest.mark.parametrize(("t_ns", "is_patient"), [(None, True), (1, True), (2 * RECENT_NS, False)])
