@@ -89,7 +89,7 @@ class Recorder(Core):
         self._room = DiskRoom(parts, config, clips)
         self._part: OpenPart | None = None
         self._least_bytes = 0
-        """of the part: its messages take as much as its attachments, which alone may be more than its limit"""
+        """size below which a part does not end: its attachments alone may be more than its limit"""
         self._ledger = SequenceLedger(parts.before, left_out)
         self._before = parts.before
         self._cards: dict[str, Envelope] = {}

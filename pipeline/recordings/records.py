@@ -47,7 +47,7 @@ MESSAGE = struct.Struct("<HIQQ")
 CORRUPT_DATA_ERRORS = (McapError, ZstdError, ValueError, struct.error, OverflowError, MemoryError)
 """What parsing damaged bytes raises; the last two where a damaged length asks for too much memory."""
 SHOWN_CHARACTERS = 40
-"""of a text that a file from anywhere puts into an error message"""
+"""the most that an error message shows of a text from a file"""
 _BEFORE_COMPRESSION = RECORD.size + 28  # of a chunk: start time, end time, size and checksum
 _ZSTD = b"\x04\x00\x00\x00zstd"
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)

@@ -80,19 +80,19 @@ def plot_recording(
     Raises:
         UserError: no scores, no such tray or fan, or a truth file that cannot be read.
     """
-    damage: list[str] = []
-    trace = read_trace(recordings, tray, speed_unit, damage)
+    trace, damage = read_trace(recordings, tray, speed_unit)
     faults = read_faults(truth) if truth is not None else ()
     return plot_bands(trace, output, fans=fans, faults=faults), damage
 
 
-def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUnit | None, damage: list[str]) -> Trace:
-    """The scores of one tray, in order of time. damage: given a line for each file that could not be read in full.
+def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUnit | None) -> tuple[Trace, list[str]]:
+    """The scores of one tray, in order of time, and a line for each file that could not be read in full.
 
     Raises:
         UserError: there are no scores, or several trays and none is chosen.
     """
     scores: dict[str, list[Score]] = {}
+    damage: list[str] = []
     for path in recordings:
         reading = read_recording(path, topics=("score",))
         for envelope in reading:
@@ -113,7 +113,7 @@ def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUn
     chosen = sorted(scores[tray], key=lambda score: int(score.t_ns[0]))
     if len({score.fans for score in chosen}) > 1:
         raise UserError(f"{where}: {tray} changes its number of fans; plot the parts one by one")
-    return trace_of(tray, chosen, speed_unit or _display_unit(recordings[0], tray))
+    return trace_of(tray, chosen, speed_unit or _display_unit(recordings[0], tray)), damage
 
 
 def _display_unit(recording: Path, tray: str) -> SpeedUnit:

@@ -28,13 +28,11 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.linalg import get_lapack_funcs
+
+from scoring.torque_balance import load_lfilter
 
 Array: TypeAlias = NDArray[np.float64]
-
-(dtbtrs,) = get_lapack_funcs(("tbtrs",), dtype=np.float64)
 
 BRIDGE_S = 0.1
 """missing speeds are interpolated up to this; after a longer gap the filter has to settle again"""
@@ -142,7 +140,7 @@ class RegressionWindow:
         terms = np.stack((acting, drag, square, motion[3]))
         terms -= self._shared(terms, residual, middle)[:, np.newaxis] * residual
         changing = np.concatenate((terms, terms * self._seconds[:-1], self._momentum[np.newaxis]))
-        self._changing = _low_passed(changing, self._decay)
+        self._changing = self._filtered(changing)
         self._changing_sums = _summed(self._changing * self._weight)
         self._decay_sums = _summed(self._weight * self._decay ** (np.arange(len(middle)) % self.per_row))
         self.rows = self._fixed.shape[-1]
@@ -183,14 +181,16 @@ class RegressionWindow:
         at steady speed only: while a fan accelerates, both are correlated for physical reasons. Zero where it is not
         significant.
         """
+        from scipy.ndimage import maximum_filter1d, uniform_filter1d  # noqa: PLC0415  see load_lfilter
+
         rows = self._whole(np.vstack((speed_rad_s, terms, residual)))[:, self._enough_before_onset]
         shared = np.zeros(len(terms))
         if rows.shape[1] < MIN_STEADY_ROWS:
             return shared
         span = round(STEADY_S / MEAN_OVER_S)
-        means = _around(rows, span).mean(axis=-1)
+        means = uniform_filter1d(rows, span, axis=1)
         speed, *deviations, noise = rows - means
-        steady = _around(np.abs(speed), span).max(axis=-1) <= STEADY_SHARE * np.abs(means[0])
+        steady = maximum_filter1d(np.abs(speed), span) <= STEADY_SHARE * np.abs(means[0])
         power = float(noise[steady] @ noise[steady])
         if np.count_nonzero(steady) < MIN_STEADY_ROWS or power <= 0.0:
             return shared
@@ -203,7 +203,11 @@ class RegressionWindow:
 
     def _whole(self, terms: Array) -> Array:
         """(terms, rows) filtered terms, as means over rows."""
-        return self._rows(_summed(_low_passed(terms, self._decay) * self._weight), np.zeros(1, int))[0]
+        return self._rows(_summed(self._filtered(terms) * self._weight), np.zeros(1, int))[0]
+
+    def _filtered(self, terms: Array) -> Array:
+        filtered: Any = load_lfilter()([1.0 - self._decay], [1.0, -self._decay], terms, axis=-1)
+        return filtered
 
     def _rows(self, sums: Array, at: Array) -> Array:
         """(courses, terms, rows) means over rows, from samples `at` on. sums: running sums (terms, n)."""
@@ -217,22 +221,6 @@ class RegressionWindow:
         since = np.maximum(self._starts - at[:, np.newaxis], -self.per_row)
         found = self._decay**since * (self._decay_sums[self._ends] - self._decay_sums[begins])
         return found[:, self._enough]
-
-
-def _low_passed(values: Array, decay: float) -> Array:
-    """y[k] = decay y[k-1] + (1 - decay) x[k] from zero on, along the last axis of (n,) or (terms, n).
-
-    Such a recursion is a lower bidiagonal system of equations, which LAPACK solves in one call.
-    """
-    bands = np.vstack((np.ones(values.shape[-1]), np.full(values.shape[-1], -decay)))
-    solved, _ = dtbtrs(bands, (1.0 - decay) * np.atleast_2d(values).T, uplo="L")
-    return np.ascontiguousarray(solved.T).reshape(values.shape)
-
-
-def _around(values: Array, span: int) -> Array:
-    """(..., n, span) the values around each along the last axis, mirrored at the ends."""
-    ends = [(0, 0)] * (values.ndim - 1) + [(span // 2, span - 1 - span // 2)]
-    return sliding_window_view(np.pad(values, ends, mode="symmetric"), span, axis=-1)
 
 
 def _summed(values: Array) -> Array:
@@ -253,7 +241,7 @@ def acting_command(command: Array, period_s: float, lag_s: float) -> Array:
     if lag_s <= 0.0:
         return command
     decay = np.exp(-period_s / lag_s)
-    before = _low_passed(np.concatenate((command[:1], command[:-1])) - command[0], decay) + command[0]
+    before: Any = load_lfilter()([0.0, 1.0 - decay], [1.0, -decay], command - command[0]) + command[0]
     return command + (before - command) * (1.0 - decay) * lag_s / period_s
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,10 +129,12 @@ class WearSeries:
         n = len(t_ns)
         if n < MIN_POINTS:
             return None
+        from scipy.stats import theilslopes  # noqa: PLC0415  what only shows wear does without this large import
+
         origin_ns = int(t_ns[0]) + round(float((t_ns - t_ns[0]).mean()))
         day = (t_ns - origin_ns) / NS_PER_DAY
-        rise, run = value[:, np.newaxis] - value, day[:, np.newaxis] - day
-        slope = float(np.median(rise[run > 0.0] / run[run > 0.0]))
+        fitted: Any = theilslopes(value, day)
+        slope = float(fitted.slope)
         level = float(np.median(value - slope * day))
         residual = value - level - slope * day
         effective = n / _inflation(residual)

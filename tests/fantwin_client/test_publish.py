@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -221,12 +222,12 @@ def test_messages_that_acquisition_missed_are_fetched_by_it(
         tray = client.tray(TRAY)
         tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])
         tray.check()
-        real, dropped = tray._publisher._publisher, []
-        tray._publisher._publisher = type("Dropping", (), {"put": dropped.append})()  # type: ignore[assignment]
-        for number in range(1, 5):
-            tray.publish(T_S + number, [0.5, 0.5], [1.0, 1.0])
-        eventually(lambda: dropped and not tray._outbox.waiting, "they are sent in vain")
-        tray._publisher._publisher = real
+        dropped: list[object] = []
+        with monkeypatch.context() as lossy:
+            lossy.setattr(tray._publisher, "_publisher", SimpleNamespace(put=dropped.append))
+            for number in range(1, 5):
+                tray.publish(T_S + number, [0.5, 0.5], [1.0, 1.0])
+            eventually(lambda: dropped and not tray._outbox.waiting, "they are sent in vain")
         losses = tray.check(10)
         assert (losses.received, losses.any) == (5, False)
         raws.wait_for(5)

@@ -65,7 +65,7 @@ def test_a_damaged_chunk_costs_only_that_chunk(tmp_path, what):
 
 
 def test_a_recording_that_is_renamed_while_it_is_read_is_one_line(tmp_path, monkeypatch):
-    """As by the recorder that finishes it."""
+    """The recorder that finishes it renames it."""
     path, read = tmp_path / "one.mcap", RecordReader.__iter__
     path.write_bytes(GOLDEN.read_bytes())
 

@@ -100,14 +100,14 @@ def test_a_recording_in_two_parts_is_one_trace_in_time_order_in_its_unit_of_spee
     scores, alarms = made_up_tray(seconds=4)
     second = record(tmp_path / "b.mcap", scores[20:], alarms)
     first = record(tmp_path / "a.mcap", scores[:20], [])
-    trace = read_trace([second, first], None, "rpm", [])
+    trace, _ = read_trace([second, first], None, "rpm")
     whole = trace_of("tray1", scores, "rpm")
     assert trace.t_ns.tolist() == whole.t_ns.tolist()
     np.testing.assert_array_equal(trace.measured, whole.measured)
     for metadata in ({"speed_unit": "rpm"}, {"speed_unit.tray1": "rpm"}):
         path = record(tmp_path / "rec.mcap", scores, [], metadata)
-        assert read_trace([path], None, None, []).speed_unit == "rpm"
-        assert read_trace([path], None, "rad/s", []).speed_unit == "rad/s"
+        assert read_trace([path], None, None)[0].speed_unit == "rpm"
+        assert read_trace([path], None, "rad/s")[0].speed_unit == "rad/s"
 
 
 def test_the_command_plots_a_recording_with_its_true_faults(tmp_path: Path) -> None:

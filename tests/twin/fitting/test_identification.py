@@ -132,7 +132,7 @@ def test_a_slow_fan_is_to_be_recorded_for_longer() -> None:
 
 
 def test_fans_that_have_converged_are_left_out_and_all_end_as_if_they_were_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in large trays, for which it pays."""
+    """Leaving them out pays in large trays."""
     tray, fitted = rough_run(11, 6.0, 5).run, []
     normal_equations = FreeRunProblem.normal_equations
 
