@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 import threading
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 from pipeline.devices import broker_client, http_source, polling, serial_port
 from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceContext, SourceEvent
 from pipeline.devices.source_kinds import SOURCE_KINDS, build_source, parse_source
-from pipeline.errors import UserError
 from tests.support.running_chain import eventually
 from tests.support.source_worlds import WORLDS, World, speeds_of
 
@@ -179,20 +176,3 @@ def test_settings_are_frozen_and_an_unknown_one_is_refused_by_name(kind: str, ma
         parse_source({**settings, "no_such_key": 1})
     with pytest.raises(ValueError, match="frozen"):
         config.kind = "other"  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def modules_of(kind: str) -> list[ModuleType]:
-    """Those that ask whether the packages of a kind are installed."""
-    own = importlib.import_module(SOURCE_KINDS[kind].source.partition(":")[0])
-    return [each for each in (own, *([broker_client] if kind == "mqtt" else [])) if hasattr(each, "is_installed")]
-
-
-@pytest.mark.parametrize("kind", [kind for kind in SOURCE_KINDS if modules_of(kind)])
-def test_without_its_package_one_line_says_what_to_install(
-    kind: str, made: Callable[[str], Running], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for module in modules_of(kind):
-        monkeypatch.setattr(module, "is_installed", lambda _module: False)
-    with pytest.raises(UserError, match="pip install") as refused:
-        made(kind)
-    assert "\n" not in str(refused.value)
