@@ -36,6 +36,7 @@ from bench.detection.metrics import (
     rate,
     vus_pr,
 )
+from bench.detection.one_model.method import one_model
 from bench.detection.ours import NAME
 from pipeline.cli.main import main as fantwin
 from pipeline.recordings.reading import read_recording
@@ -183,6 +184,7 @@ def scored_fold(
     learned = [blocks[run.name] for run in training]
     coefficients = fitted_balance(learned)
     methods = [
+        one_model(twin, ALARMS_PER_HOUR, [blocks[run.name] for run in calibrating]),
         Method(REFERENCE, lambda _: FilteredBalance(coefficients)),
         *plain_methods(rate_hz, ALARMS_PER_HOUR),
         *(library_methods(rate_hz, learned, few_fans=False) if libraries else ()),

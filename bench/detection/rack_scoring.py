@@ -19,6 +19,7 @@ from bench.detection.campaigns import calibrate as set_limits
 from bench.detection.competitors import plain_methods
 from bench.detection.methods import Log, Method
 from bench.detection.metrics import RaisedAlarm
+from bench.detection.one_model.method import one_model
 from bench.detection.rack_recordings import RackData
 from pipeline.cli.twins.calibrate import calibrate
 from pipeline.cli.twins.train import train
@@ -83,10 +84,10 @@ def _quietly(log: Path) -> Iterator[None]:
 
 
 def other_methods(data: RackData, rack: int, learning: str, twin: Path) -> list[Method]:
-    """The plain methods, with limits from the recordings that the twin is calibrated on."""
+    """The one model; and the plain methods, with limits from the recordings that the twin is calibrated on."""
     methods = plain_methods(data.rate_hz, DECLARED_PER_DAY / 24.0)
     set_limits(methods, _predictions(data.learning(learning, rack), twin), DECLARED_PER_DAY / 24.0)
-    return methods
+    return [one_model(twin, DECLARED_PER_DAY / 24.0), *methods]
 
 
 def _predictions(paths: Sequence[Path], twin: Path) -> Iterator[tuple[str, Prediction]]:

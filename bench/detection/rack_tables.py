@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -92,8 +92,8 @@ def rack_tables(
 def as_raised(judged: Judged, run: str, method: str) -> list[RaisedAlarm]:
     """The alarms of a method in a run."""
     if method == NAME:
-        return [RaisedAlarm(run, one.fan, one.raised_ns, one.cleared_ns) for one in judged.ours]
-    return [RaisedAlarm(run, one.fan, one.raised_ns, one.cleared_ns) for one in judged.others[method]]
+        return [RaisedAlarm(run, one.fan, one.raised_ns, one.cleared_ns, (one.last_cause,)) for one in judged.ours]
+    return [replace(one, run=run) for one in judged.others[method]]
 
 
 def found_faults(result: RackResult, events: Sequence[Event], facts: Sequence[Facts]) -> list[Found]:
@@ -217,6 +217,8 @@ def method_rows(shown: Campaign, results: Sequence[RackResult]) -> Rows:
             of = [one for one in found if one.event.kind == kind]
             hits = [one.delay_s for one in of if one.is_found]
             row[kind] = f"{len(hits)}/{len(of)}" + (f" {np.median(hits):.2g}" if hits else "")
+        named = [one for one in found if one.cause]
+        row["last cause right"] = f"{sum(one.cause == one.event.cause for one in named)}/{len(found)}" if named else "-"
         rows.append(row)
     return rows
 

@@ -13,7 +13,7 @@ from bench.detection.campaigns import Healthy, Watch, calibrate, everyday, predi
 from bench.detection.competitors import plain_methods
 from bench.detection.faulty import FAULTY_ONE_IN, Campaign, Cell, campaign
 from bench.detection.libraries import library_methods
-from bench.detection.methods import Calibration, Method
+from bench.detection.methods import Calibration, Detector, Method
 from bench.detection.metrics import (
     Outcome,
     RaisedAlarm,
@@ -24,6 +24,8 @@ from bench.detection.metrics import (
     share,
     vus_pr,
 )
+from bench.detection.one_model.method import NAME as ONE_MODEL
+from bench.detection.one_model.method import one_model
 from bench.detection.ours import NAME, HealthySamples, Scorer, calibrated_twins
 from bench.detection.plant import RATE_HZ
 from bench.detection.severities import KINDS
@@ -67,6 +69,8 @@ class Bench:
     limits: Limits
     calibration: Calibration | None
     """of the other methods, if there are any"""
+    per_hour: float
+    """declared false alarms of a fan"""
 
     def watches(self, *, keep_scores: bool) -> dict[str, Watch]:
         """A new watch for each, ours first."""
@@ -75,11 +79,16 @@ class Bench:
             method.name: Watch(lambda _run, fans, m=method: m.detector(fans), keep_scores=keep_scores)
             for method in self.methods
         }
+        if self.methods:
+            others = {ONE_MODEL: Watch(self._one_model, keep_scores=keep_scores), **others}
         return {NAME: ours, **others}
 
     def every(self, name: str) -> int:
         """The method scores one fan in this many."""
         return next((method.every for method in self.methods if method.name == name), 1)
+
+    def _one_model(self, run: str, fans: int) -> Detector:
+        return one_model(self.fleet.twins[tray_number(run)], self.per_hour).detector(fans)
 
     def _scorer(self, run: str, _fans: int) -> Scorer:
         return Scorer(stage("scorer", self.calibrated[tray_number(run)]))
@@ -107,7 +116,7 @@ def prepared(
     progress("limits of the scorer")
     calibrated, limits = calibrated_twins(fleet.twins, kept, 1.0 / sizes.declared_days, extrapolate=extrapolate)
     kept.clear()
-    return Bench(fleet, methods, calibrated, limits, calibration)
+    return Bench(fleet, methods, calibrated, limits, calibration, per_hour)
 
 
 def _fitting(fleet: Fleet, seed: int, progress: Progress) -> list[list[Prediction]]:

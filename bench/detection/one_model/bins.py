@@ -1,0 +1,142 @@
+"""Predictions of one tray, sample by sample, to bins: all that the model sees of them.
+
+A bin is a fixed stretch of time since the epoch, so how samples are cut into messages changes nothing. Within a bin of
+several samples, one that lies far from their median is a wrong reading of the tacho and does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.enums import InvalidReason
+from schemas.messages import Array, Prediction
+from schemas.units import NS_PER_S
+from scoring.samples import BALANCE_COUNTS, NO_SPEED, among, reading_missing_of
+from scoring.unseen_error import UnseenError
+
+SHORTEST_S = 0.1
+WRONG_SHARE = 0.05
+"""of the top speed: a reading is wrong that is farther from the median of its bin"""
+RANKED_FROM = 4
+"""samples of a bin; of fewer none can be said to be wrong"""
+READS = (int(InvalidReason.NONE), int(InvalidReason.WARMING_UP), NO_SPEED)
+"""states in which a tacho should give readings"""
+
+
+@dataclass(frozen=True, eq=False)
+class Bin:
+    """What is known of the fans of a tray within one bin. All (fans,) but t_ns, of its end, and missing."""
+
+    t_ns: int
+    readings: Array
+    """number of readings that can be compared with the free run"""
+    deviation_rad_s: Array
+    """their mean distance from it"""
+    predicted_rad_s: Array
+    measured_rad_s: Array
+    """NaN without a reading"""
+    balances: Array
+    """number of samples with a torque balance"""
+    balance_command: Array
+    """their mean"""
+    half_range_rad_s: Array
+    """half of the range of readings that the tacho may show of the predicted speed"""
+    unseen_rad_s: Array
+    """standard deviation of the twin's error where it was not trained"""
+    command: Array
+    missing: Array
+    """(fans, 4) readings after a reading, and those of them that are missing; after a missing one, and missing"""
+
+
+class Bins:
+    """Collects the samples of one tray."""
+
+    def __init__(self, bin_ns: int, top_rad_s: Array, unseen: UnseenError | None) -> None:
+        """From the beginning. top_rad_s: (fans,)."""
+        self._bin_ns, self._top, self._unseen = bin_ns, top_rad_s, unseen
+        self._parts: list[dict[str, Array]] = []
+        self._number = 0
+        self._before = np.zeros((2, len(top_rad_s)), np.bool_)
+        """(2, fans) of the newest sample: the reading was missing, and there should have been one"""
+
+    def take(self, block: Prediction) -> Iterator[Bin]:
+        """The bins that end with a sample of a block, or before it."""
+        columns, numbers = self._columns(block), block.t_ns // self._bin_ns
+        for rows in np.split(np.arange(len(numbers)), np.flatnonzero(np.diff(numbers)) + 1):
+            number = int(numbers[rows[0]])
+            if self._parts and number != self._number:
+                yield self._close()
+            self._number = number
+            self._parts.append({name: column[rows] for name, column in columns.items()})
+            if int(block.t_ns[rows[-1]]) + block.period_ns >= (number + 1) * self._bin_ns:
+                yield self._close()
+
+    def _columns(self, block: Prediction) -> dict[str, Array]:
+        measured, predicted, reason = block.measured_speed_rad_s, block.predicted_speed_rad_s, block.invalid_reason
+        nothing = np.zeros(measured.shape)
+        missing = reading_missing_of(block) | (reason == NO_SPEED)
+        reads = among(reason, *READS)
+        before = np.concatenate((self._before[:, np.newaxis], np.stack((missing, reads))), axis=1)[:, :-1]
+        self._before = np.stack((missing[-1], reads[-1]))
+        return {
+            "measured": measured,
+            "predicted": predicted,
+            "half_range": block.reading_range_rad_s if len(block.reading_range_rad_s) else nothing,
+            "unseen": np.nan_to_num(self._unseen.of(block)[0]) if self._unseen else nothing,
+            "command": np.nan_to_num(block.command),
+            "balance": np.where(among(reason, *BALANCE_COUNTS), block.torque_balance_command, np.nan),
+            "counts": block.valid & np.isfinite(measured) & np.isfinite(predicted) & ~missing,
+            "missing": missing,
+            "after_missing": before[0],
+            "pair": reads & before[1],
+        }
+
+    def _close(self) -> Bin:
+        rows = {name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]}
+        self._parts = []
+        deviation = np.where(rows["counts"], rows["measured"] - rows["predicted"], np.nan)
+        wrong = self._wrong(deviation, rows["half_range"])
+        counts = rows["counts"] & ~wrong
+        measured, predicted = np.isfinite(rows["measured"]), np.isfinite(rows["predicted"])
+        has_balance = np.isfinite(rows["balance"]) & measured & ~wrong
+        speed = mean(rows["measured"], measured)
+        pair, after, missing = rows["pair"], rows["after_missing"], rows["missing"]
+        transitions = (pair & ~after, pair & ~after & missing, pair & after, pair & after & missing)
+        return Bin(
+            t_ns=(self._number + 1) * self._bin_ns,
+            readings=counts.sum(axis=0),
+            deviation_rad_s=mean(deviation, counts),
+            predicted_rad_s=np.where(predicted.any(axis=0), mean(rows["predicted"], predicted), speed),
+            measured_rad_s=np.where(measured.any(axis=0), speed, np.nan),
+            balances=has_balance.sum(axis=0),
+            balance_command=mean(rows["balance"], has_balance),
+            half_range_rad_s=mean(rows["half_range"], counts),
+            unseen_rad_s=mean(rows["unseen"], counts),
+            command=rows["command"].mean(axis=0),
+            missing=np.stack([each.sum(axis=0) for each in transitions], axis=1),
+        )
+
+    def _wrong(self, deviation: Array, half_range: Array) -> Array:
+        """(n, fans) readings far from the others of a bin, where these are more."""
+        if len(deviation) < RANKED_FROM:
+            return np.zeros(deviation.shape, np.bool_)
+        count = np.isfinite(deviation).sum(axis=0)
+        middle = np.take_along_axis(np.sort(deviation, axis=0), np.maximum(count - 1, 0)[np.newaxis] // 2, axis=0)
+        with np.errstate(invalid="ignore"):
+            wrong = np.abs(deviation - middle) > WRONG_SHARE * self._top + half_range
+        found: Array = wrong & (3 * wrong.sum(axis=0) <= np.maximum(count, 3))
+        return found
+
+
+def mean(values: Array, counts: Array) -> Array:
+    """(fans,) the mean of those values that count, (n, fans); 0 where none does."""
+    total: Array = np.where(counts, values, 0.0).sum(axis=0)
+    return total / np.maximum(counts.sum(axis=0), 1)
+
+
+def bin_ns_of(period_ns: int, held_s: float) -> int:
+    """Length of a bin: SHORTEST_S, or as long as a tacho holds a reading, in whole samples."""
+    return max(1, round(max(SHORTEST_S, held_s) * NS_PER_S / period_ns)) * period_ns

@@ -1,0 +1,100 @@
+"""The one model as a method of the bench: what it needs of a twin, and of healthy runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.detection.methods import AlarmChange, Detector, Method, MethodOutput
+from bench.detection.one_model.alarms import Decision
+from bench.detection.one_model.bins import Bins, bin_ns_of
+from bench.detection.one_model.healthy import Priors
+from bench.detection.one_model.operation import Fans, Operation
+from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
+from schemas.messages import Array, Prediction
+from schemas.units import NS_PER_S
+
+NAME = "one model"
+NOTE = "one model: bench/detection/one_model, a candidate for the scorer; nothing of it is calibrated"
+
+
+@dataclass
+class OneModel(Method):
+    """A method that raises and clears its alarms itself."""
+
+    decides: Callable[[int], Detector] | None = None
+
+    def detector(self, fans: int) -> Detector:
+        """See Method."""
+        assert self.decides is not None
+        return self.decides(fans)
+
+
+def one_model(twin: Path, alarms_per_hour: float, healthy: Iterable[Sequence[Prediction]] = ()) -> OneModel:
+    """The method for the predictions of a twin. alarms_per_hour: declared, of a fan; healthy: runs of one fan each that
+    show how far runs differ."""
+    priors = Priors()
+    means = [mean_share(load_tray_twin(twin), run) for run in healthy]
+    if means:
+        spread = float(np.sqrt(np.mean(np.square(means))))
+        priors = replace(priors, twin_share=max(priors.twin_share, spread))
+
+    def decides(fans: int) -> OneModelDetector:
+        return OneModelDetector(load_tray_twin(twin, fans), 3600.0 / alarms_per_hour, priors)
+
+    return OneModel(NAME, lambda fans: Statistic(decides(fans)), is_fixed=True, decides=decides)
+
+
+class OneModelDetector:
+    """The alarms of one run of a tray. Its score is the log of the statistic over that of the limit."""
+
+    def __init__(self, twin: TrayTwin, declared_s: float, priors: Priors) -> None:
+        """From the beginning of a run. declared_s: between two false alarms of a fan."""
+        self._twin, self._fans = twin, Fans.of_twin(twin)
+        self._declared_s, self._priors = declared_s, priors
+        self._bins: Bins | None = None
+        self._decision: Decision | None = None
+        self._score = np.full(twin.fans, np.nan)
+
+    def take(self, block: Prediction) -> MethodOutput:
+        """See Detector."""
+        if self._bins is None or self._decision is None:
+            bin_ns = bin_ns_of(block.period_ns, float(self._fans.held_s.min()))
+            self._bins = Bins(bin_ns, self._fans.top_rad_s, self._twin.unseen_error)
+            self._decision = Decision(self._fans, bin_ns, block.period_ns / NS_PER_S, self._declared_s, self._priors)
+        score = np.repeat(self._score[np.newaxis], len(block.t_ns), axis=0)
+        changes: list[AlarmChange] = []
+        for one in self._bins.take(block):
+            changes += [
+                AlarmChange(change.fan, one.t_ns, change.raised, (change.cause,) if change.cause else ())
+                for change in self._decision.take(one)
+            ]
+            statistic = self._decision.log_statistic
+            self._score = np.where(np.isfinite(statistic), statistic / self._decision.log_limit, np.nan)
+            score[block.t_ns >= one.t_ns - block.period_ns] = self._score
+        return MethodOutput(score, changes)
+
+
+class Statistic:
+    """Only the score of a detector."""
+
+    def __init__(self, detector: Detector) -> None:
+        """Of a run."""
+        self._detector = detector
+
+    def take(self, block: Prediction) -> Array:
+        """See Scores."""
+        return self._detector.take(block).score
+
+
+def mean_share(twin: TrayTwin, run: Sequence[Prediction]) -> float:
+    """The mean deviation of the first fan in a healthy run, as a share of its speed."""
+    fans = Fans.of_twin(twin)
+    bin_ns = bin_ns_of(run[0].period_ns, float(fans.held_s.min()))
+    bins, operation = Bins(bin_ns, fans.top_rad_s, twin.unseen_error), Operation(fans, bin_ns)
+    inputs = [operation.inputs(one) for block in run for one in bins.take(block)]
+    shares = [now.deviation_rad_s[0] / now.speed_rad_s[0] for now in inputs if now.readings[0] and now.speed_rad_s[0]]
+    return float(np.mean(shares)) if shares else 0.0
