@@ -48,7 +48,7 @@ class Decision:
     """Alarms of the fans of one tray."""
 
     def __init__(self, fans: Fans, bin_ns: int, period_s: float, declared_s: float, priors: Priors) -> None:
-        """From the beginning. period_s: of the samples; declared_s: mean time between two false alarms of a fan."""
+        """Begin without an alarm. period_s: of the samples; declared_s: mean time between two false alarms of a fan."""
         count = len(fans.top_rad_s)
         self._fans, self._bin_s = fans, bin_ns / NS_PER_S
         self._operation = Operation(fans, bin_ns)

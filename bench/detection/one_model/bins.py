@@ -19,7 +19,7 @@ from scoring.unseen_error import UnseenError
 
 SHORTEST_S = 0.1
 WRONG_SHARE = 0.05
-"""of the top speed: a reading is wrong that is farther from the median of its bin"""
+"""share of the top speed: a reading that is farther from the median of its bin is wrong"""
 RANKED_FROM = 4
 """samples of a bin; of fewer none can be said to be wrong"""
 READS = (int(InvalidReason.NONE), int(InvalidReason.WARMING_UP), NO_SPEED)
@@ -55,7 +55,7 @@ class Bins:
     """Collects the samples of one tray."""
 
     def __init__(self, bin_ns: int, top_rad_s: Array, unseen: UnseenError | None) -> None:
-        """From the beginning. top_rad_s: (fans,)."""
+        """Begin without a sample. top_rad_s: (fans,)."""
         self._bin_ns, self._top, self._unseen = bin_ns, top_rad_s, unseen
         self._parts: list[dict[str, Array]] = []
         self._number = 0

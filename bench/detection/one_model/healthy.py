@@ -37,7 +37,7 @@ from bench.detection.one_model.operation import Fans, Inputs
 from schemas.messages import Array
 
 KNOTS = np.array([0.09, 0.14, 0.2, 0.28, 0.38, 0.5, 0.63, 0.77, 0.9, 1.02])
-"""of the top speed"""
+"""shares of the top speed"""
 K = len(KNOTS)
 RISE, FALL, LATE, SAG, AIR, LOCAL, WANDER, ROTOR, SHOWN, BALANCE, COUNT, COUNT_BEFORE = range(K, K + 12)
 STATES = K + 12
@@ -61,7 +61,7 @@ class Priors:
     largest_twin_share: float = 0.1
     ageing_per_sqrt_h: float = 0.002
     lag_s: float = 0.15
-    """of a time constant; as much is new after moving over the whole range"""
+    """error of a time constant; as much is new after moving over the whole range"""
     sag: float = 0.02
     air: float = 0.01
     air_s: float = 3600.0
@@ -72,7 +72,7 @@ class Priors:
     wander: float = 0.0025
     wander_s: float = 2.0
     count: float = 0.7
-    """of the error of a count: counts that follow one another are not independent"""
+    """share of the error of a count: counts that follow one another are not independent"""
     half_range: float = 0.25
     """white error, of half the range of readings that the tacho may show"""
     rate_s: float = 0.1
@@ -105,7 +105,7 @@ class HealthyFans:
     """The filter, all fans as columns of one state: mean (fans, STATES) and covariance (fans, STATES, STATES)."""
 
     def __init__(self, fans: Fans, priors: Priors, bin_s: float, period_s: float) -> None:
-        """Before the first reading. period_s: of the samples."""
+        """Begin with the priors. period_s: of the samples."""
         self._fans, self._priors, self._bin_s = fans, priors, bin_s
         count = len(fans.top_rad_s)
         self._columns = np.arange(count)

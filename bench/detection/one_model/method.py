@@ -52,7 +52,7 @@ class OneModelDetector:
     """The alarms of one run of a tray. Its score is the log of the statistic over that of the limit."""
 
     def __init__(self, twin: TrayTwin, declared_s: float, priors: Priors) -> None:
-        """From the beginning of a run. declared_s: between two false alarms of a fan."""
+        """Begin a run. declared_s: between two false alarms of a fan."""
         self._twin, self._fans = twin, Fans.of_twin(twin)
         self._declared_s, self._priors = declared_s, priors
         self._bins: Bins | None = None
@@ -82,7 +82,7 @@ class Statistic:
     """Only the score of a detector."""
 
     def __init__(self, detector: Detector) -> None:
-        """Of a run."""
+        """Take the score of this detector."""
         self._detector = detector
 
     def take(self, block: Prediction) -> Array:

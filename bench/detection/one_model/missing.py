@@ -7,7 +7,7 @@ import numpy as np
 from schemas.messages import Array
 
 SHARES = np.array([0.03, 0.07, 0.15, 0.35, 0.7, 0.95])
-"""of missing readings of a loose wire, equally probable"""
+"""shares of missing readings of a loose wire, equally probable"""
 PRIOR = np.array([300.0, 0.5, 4.0, 1.0])
 """readings after a reading, missing ones of them, readings after a missing one, and missing ones of them"""
 NOTHING, LARGEST = -30.0, 60.0
@@ -20,7 +20,7 @@ class MissingReadings:
     """Shiryaev-Roberts again: a healthy line loses a share of readings and another of those after a missing one."""
 
     def __init__(self, fans: int, log_limit: float) -> None:
-        """From the beginning."""
+        """Begin without a reading. log_limit: of the statistic."""
         self._log_limit = log_limit
         self._counts = PRIOR.copy()
         self._log_terms = np.full((fans, len(SHARES)), NOTHING)

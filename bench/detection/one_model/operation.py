@@ -12,11 +12,11 @@ from schemas.messages import Array
 from schemas.units import NS_PER_S
 
 BACKLASH = 0.01
-"""of the top speed: a smaller movement may be what a speed loop makes of the noise of its tacho"""
+"""share of the top speed: a smaller movement may be what a speed loop makes of the noise of its tacho"""
 FASTEST = 2.0
-"""of the top speed; a free run that is beyond it has diverged"""
+"""times the top speed: a free run that is beyond it has diverged"""
 COUNT_NOISE_RAD_S = 0.8
-"""of readings that count pulses, beside what a count misses"""
+"""error of a reading that counts pulses, beside what the count misses"""
 BALANCE_BETTER = 1.5
 """the torque balance is used where its noise is smaller than that of the speed by this factor"""
 
@@ -47,9 +47,7 @@ class Fans:
         """Those of a twin's tray."""
         balance, top = twin.balance, twin.card.top_speed_rad_s
         at_once = np.array([tacho.kind == "instantaneous" for tacho in twin.tachos])
-        pulses = [
-            2.0 * np.pi / tacho.pulses / tacho.window_s if tacho.kind == "count" else 0.0 for tacho in twin.tachos
-        ]
+        pulses = [tacho.resolution_rad_s if tacho.kind == "count" else 0.0 for tacho in twin.tachos]
         of_balance = balance.sigma_command / (balance.viscous + balance.drag * top)
         return cls(
             np.full(twin.fans, top),
@@ -75,7 +73,7 @@ class Inputs:
     """What drives the model within a bin, (fans,) each."""
 
     speed_rad_s: Array
-    """of the twin; where the torque balance is used, the measured one"""
+    """speed of the twin; where the torque balance is used, the measured one"""
     measured_rad_s: Array
     rate_rad_s2: Array
     moved_to_rad_s: Array
@@ -91,7 +89,7 @@ class Inputs:
     readings: Array
     """0: nothing new is known"""
     deviation_rad_s: Array
-    """from the free run; or what it would be at a steady speed by the torque balance"""
+    """distance from the free run; or what it would be at a steady speed by the torque balance"""
     is_balance: Array
 
 
@@ -99,7 +97,7 @@ class Operation:
     """Follows the fans of one tray from bin to bin."""
 
     def __init__(self, fans: Fans, bin_ns: int) -> None:
-        """From the beginning."""
+        """Begin with fans that stand."""
         count = len(fans.top_rad_s)
         self._fans, self._bin_ns, self._bin_s = fans, bin_ns, bin_ns / NS_PER_S
         self.bins_held = np.maximum(np.round(fans.held_s / self._bin_s), 1).astype(np.int64)
