@@ -12,7 +12,7 @@ import { ask, Events, learnWhoIAm, me, Refused } from "./server.js";
 const content = document.getElementById("content");
 const alarms = new Map();
 const CLIPS_MS = 20000;
-let site = null, view = null, fleet = null, stages = [], shownHash = null, alarmsDue = 0, lastFan = "";
+let site = null, view = null, fleet = null, stages = [], shownHash = null, alarmsDue = 0, lastFan = "", userShown = "";
 
 const events = new Events({
   connected: (isThere) => showConnection(isThere),
@@ -104,7 +104,11 @@ function showCount() {
 
 const viewerUrl = (tray) => site.trays.find((each) => each.name === tray)?.viewer_url ?? "";
 
+// A button that is drawn again while it is pressed loses the click.
 function showUser() {
+  const now = JSON.stringify([me.name, me.has_login]);
+  if (now === userShown) return;
+  userShown = now;
   const button = (text, onclick) => element("button", { type: "button", onclick }, text);
   const shown = me.name ? [`${me.name} `, me.has_login ? button("Log out", () => logOut(start)) : ""]
     : me.has_login ? [button("Log in", () => showLogin(start))] : [];
