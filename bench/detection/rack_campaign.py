@@ -11,7 +11,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from bench.detection.rack_recordings import FAULTY, HEALTHY, RackData
-from bench.detection.rack_scoring import Judged, calibrated, judged, other_methods, trained
+from bench.detection.rack_scoring import Judged, judged, other_methods, twin_of
 
 _JUDGED = TypeAdapter(Judged)
 
@@ -58,14 +58,8 @@ def one_rack(data: RackData, rack: int, learning: Sequence[str], is_healthy_judg
 
 
 def _of_rack(data: RackData, rack: int, learning: Sequence[str], is_healthy_judged: bool) -> Iterator[RackResult]:
-    folder = data.sweep(rack).parent
-    twin = folder / "twin.onnx"
-    if not twin.exists():
-        trained(data, rack, twin)
     for name in learning:
-        limited = folder / f"twin-{data.kept_name(name)}.onnx"
-        if not limited.exists():
-            calibrated(data, rack, name, twin, limited)
+        limited = twin_of(data, rack, name)
         tests = (FAULTY, HEALTHY) if is_healthy_judged else (FAULTY,)
         made = [_judged(data, rack, name, test, limited) for test in tests]
         yield RackResult(rack, name, made[0], made[1] if is_healthy_judged else None)

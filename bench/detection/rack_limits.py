@@ -96,7 +96,7 @@ def facts_of_rack(healthy: Path, faulty: Path, events: Sequence[Event]) -> list[
     """About each event of a rack. healthy, faulty: recordings of the same test without and with faults."""
     first_ns, last_ns = min(one.start_ns for one in events), max(one.end_ns for one in events)
     kept: list[tuple[Array, Array, Array, Array]] = []
-    for without, shown in zip(_reports(healthy), _reports(faulty), strict=True):
+    for without, shown in zip(reports_of(healthy), reports_of(faulty), strict=True):
         times_ns = shown.host_receive_t_ns
         assert np.array_equal(times_ns, without.host_receive_t_ns)  # the same lines are lost
         if times_ns[-1] >= first_ns and times_ns[0] <= last_ns:
@@ -117,7 +117,8 @@ def _facts(event: Event, t_ns: Array, command: Array, expected: Array, reading: 
     return Facts(limit_s, float(t_s[moved[0]]) if len(moved) else math.nan)
 
 
-def _reports(path: Path) -> Iterator[Raw]:
+def reports_of(path: Path) -> Iterator[Raw]:
+    """The reports in the recording of a rack."""
     for envelope in read_recording(path, ("raw",)):
         assert isinstance(envelope.message, Raw)
         yield envelope.message

@@ -76,6 +76,21 @@ def calibrated(data: RackData, rack: int, learning: str, twin: Path, output: Pat
         calibrate(twin, healthy, DECLARED_PER_DAY, extrapolate=learning != "three nights", output=output, jobs=1)
 
 
+def twin_of(data: RackData, rack: int, learning: str) -> Path:
+    """The twin of a rack with limits from the recordings to learn from; made where it is not kept.
+
+    Raises:
+        UserError: the recordings do not suffice.
+    """
+    twin = data.sweep(rack).parent / "twin.onnx"
+    limited = twin.with_name(f"twin-{data.kept_name(learning)}.onnx")
+    if not twin.exists():
+        trained(data, rack, twin)
+    if not limited.exists():
+        calibrated(data, rack, learning, twin, limited)
+    return limited
+
+
 @contextmanager
 def _quietly(log: Path) -> Iterator[None]:
     """What a command prints goes to a file."""

@@ -1,8 +1,8 @@
 """Wrong readings of healthy racks: how many alarms the product and the one model make of them.
 
-Boards give twice, half or an impossible speed, or 0 rpm, for one reading (users report all four). Racks
-learn as in `bench.detection.run --only rack`, from fifteen minutes without wrong readings; then some of the readings of
-a healthy test are replaced, and the recording is scored. Every alarm is false.
+Boards give twice, half or an impossible speed, or 0 rpm, for one reading (users report all four). Racks learn as in
+`bench.detection.run --only rack`, from fifteen minutes without wrong readings; then some of the readings of a healthy
+test are replaced, and the recording is scored. Every alarm is false.
 
 Example: python -m bench.detection.wrong_readings --keep /tmp/racks --racks 2 --report-hz 10
 """
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,13 +23,13 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from bench.detection.one_model.method import NAME as ONE_MODEL
 from bench.detection.one_model.method import one_model
 from bench.detection.plant import START_NS
+from bench.detection.rack_limits import reports_of
 from bench.detection.rack_recordings import HEALTHY, METADATA, PRODUCER, SITE, TRAY, RackData
-from bench.detection.rack_scoring import DECLARED_PER_DAY, Judged, calibrated, judged, trained
+from bench.detection.rack_scoring import DECLARED_PER_DAY, Judged, judged, twin_of
 from bench.printing import JsonOption, progress, show
-from pipeline.recordings.reading import read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.header import Header
-from schemas.messages import Array, Raw
+from schemas.messages import Array
 from schemas.topics import tray_key
 
 LEARNING, TEST_S = "15 minutes", 6 * 3600.0
@@ -59,15 +58,10 @@ def main(
 def _row(data: RackData, one_in: int, hours: float, folder: Path) -> dict[str, Any]:
     found: list[Judged] = []
     for rack in range(data.count):
-        twin = data.sweep(rack).parent / "twin.onnx"
-        limited = twin.with_name(f"twin-{data.kept_name(LEARNING)}.onnx")
-        if not twin.exists():
-            trained(data, rack, twin)
-        if not limited.exists():
-            calibrated(data, rack, LEARNING, twin, limited)
+        twin = twin_of(data, rack, LEARNING)
         recording = folder / f"{rack}.mcap"
         write_with_wrong(data.test(HEALTHY, rack), recording, one_in, hours, data.seed)
-        found.append(judged(recording, limited, [one_model(twin, DECLARED_PER_DAY / 24.0)]))
+        found.append(judged(recording, twin, [one_model(twin, DECLARED_PER_DAY / 24.0)]))
         progress(f"one reading in {one_in} wrong: {rack + 1} of {data.count} racks")
     return {
         "wrong readings": f"1 in {one_in}",
@@ -81,7 +75,7 @@ def write_with_wrong(recording: Path, output: Path, one_in: int, hours: float, s
     """Write the first hours of a recording of a rack again, with one reading in so many replaced."""
     rng = np.random.default_rng([seed, one_in])
     with RecordingWriter(output, METADATA, t_ns=START_NS, overwrite=True) as writer:
-        for number, raw in enumerate(_raw(recording)):
+        for number, raw in enumerate(reports_of(recording)):
             if raw.host_receive_t_ns[-1] > START_NS + hours * 3.6e12:
                 break
             speed = np.where(
@@ -97,12 +91,6 @@ def wrong(speed_rad_s: Array, rng: np.random.Generator) -> Array:
     chosen = rng.integers(len(kinds), size=speed_rad_s.shape)
     found: Array = np.take_along_axis(kinds, chosen[np.newaxis], axis=0)[0]
     return found
-
-
-def _raw(recording: Path) -> Iterator[Raw]:
-    for envelope in read_recording(recording, ("raw",)):
-        assert isinstance(envelope.message, Raw)
-        yield envelope.message
 
 
 if __name__ == "__main__":

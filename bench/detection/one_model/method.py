@@ -18,18 +18,16 @@ from schemas.messages import Array, Prediction
 from schemas.units import NS_PER_S
 
 NAME = "one model"
-NOTE = "one model: bench/detection/one_model, a candidate for the scorer; nothing of it is calibrated"
 
 
-@dataclass
+@dataclass(kw_only=True)
 class OneModel(Method):
     """A method that raises and clears its alarms itself."""
 
-    decides: Callable[[int], Detector] | None = None
+    decides: Callable[[int], Detector]
 
     def detector(self, fans: int) -> Detector:
         """See Method."""
-        assert self.decides is not None
         return self.decides(fans)
 
 
