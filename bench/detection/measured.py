@@ -36,7 +36,7 @@ from bench.detection.metrics import (
     rate,
     vus_pr,
 )
-from bench.detection.one_model.method import one_model
+from bench.detection.one_model.method import healthy_runs, one_model
 from bench.detection.ours import NAME
 from pipeline.cli.main import main as fantwin
 from pipeline.recordings.reading import read_recording
@@ -183,8 +183,9 @@ def scored_fold(
     rate_hz = 1e9 / blocks[training[0].name][0].period_ns
     learned = [blocks[run.name] for run in training]
     coefficients = fitted_balance(learned)
+    stream = ((run.name, block) for run in calibrating for block in blocks[run.name])
     methods = [
-        one_model(twin, ALARMS_PER_HOUR, [blocks[run.name] for run in calibrating]),
+        one_model(twin, ALARMS_PER_HOUR, healthy_runs(twin, stream)),
         Method(REFERENCE, lambda _: FilteredBalance(coefficients)),
         *plain_methods(rate_hz, ALARMS_PER_HOUR),
         *(library_methods(rate_hz, learned, few_fans=False) if libraries else ()),

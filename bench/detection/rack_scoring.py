@@ -19,7 +19,7 @@ from bench.detection.campaigns import calibrate as set_limits
 from bench.detection.competitors import plain_methods
 from bench.detection.methods import Log, Method
 from bench.detection.metrics import RaisedAlarm
-from bench.detection.one_model.method import one_model
+from bench.detection.one_model.method import healthy_runs, one_model
 from bench.detection.rack_recordings import RackData
 from pipeline.cli.twins.calibrate import calibrate
 from pipeline.cli.twins.train import train
@@ -102,7 +102,13 @@ def other_methods(data: RackData, rack: int, learning: str, twin: Path) -> list[
     """The one model; and the plain methods, with limits from the recordings that the twin is calibrated on."""
     methods = plain_methods(data.rate_hz, DECLARED_PER_DAY / 24.0)
     set_limits(methods, _predictions(data.learning(learning, rack), twin), DECLARED_PER_DAY / 24.0)
-    return [one_model(twin, DECLARED_PER_DAY / 24.0), *methods]
+    return [model_of(data, rack, learning, twin), *methods]
+
+
+def model_of(data: RackData, rack: int, learning: str, twin: Path) -> Method:
+    """The one model, with what it learns of the recordings that the twin is calibrated on."""
+    healthy = healthy_runs(twin, _predictions(data.learning(learning, rack), twin))
+    return one_model(twin, DECLARED_PER_DAY / 24.0, healthy)
 
 
 def _predictions(paths: Sequence[Path], twin: Path) -> Iterator[tuple[str, Prediction]]:

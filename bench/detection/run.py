@@ -140,9 +140,10 @@ def _simulated(
     tables["simulated, healthy running of other days"] = healthy_rows(bench, sizes, progress)
     faulty = scored_faults(bench, sizes, progress)
     tables["simulated faults, by method"] = method_rows(faulty, bench)
-    tables["simulated faults, fantwin, by kind and strength"] = kind_rows(faulty)
-    tables["causes reported first by fantwin, command moving"] = cause_rows(faulty, is_moved=True)
-    tables["causes reported first by fantwin, command held"] = cause_rows(faulty, is_moved=False)
+    for name in bench.that_name_causes:
+        tables[f"simulated faults, {name}, by kind and strength"] = kind_rows(faulty, name)
+        tables[f"causes reported first by {name}, command moving"] = cause_rows(faulty, name, is_moved=True)
+        tables[f"causes reported first by {name}, command held"] = cause_rows(faulty, name, is_moved=False)
     rate = bench.limits.declared_rate
     assert rate
     low, high = (sizes.declared_days * figure for figure in rate.interval_95)

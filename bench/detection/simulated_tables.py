@@ -24,12 +24,14 @@ from bench.detection.metrics import (
     share,
     vus_pr,
 )
+from bench.detection.one_model.learned import HealthyRuns
 from bench.detection.one_model.method import NAME as ONE_MODEL
 from bench.detection.one_model.method import one_model
 from bench.detection.ours import NAME, HealthySamples, Scorer, calibrated_twins
 from bench.detection.plant import RATE_HZ
 from bench.detection.severities import KINDS
 from bench.detection.simulated import Fleet, stage, trained_fleet, tray_number
+from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Prediction
 from scoring.limits import Limits
 
@@ -69,6 +71,8 @@ class Bench:
     limits: Limits
     calibration: Calibration | None
     """of the other methods, if there are any"""
+    healthy: dict[int, HealthyRuns]
+    """of each tray, for the one model"""
     per_hour: float
     """declared false alarms of a fan"""
 
@@ -83,12 +87,18 @@ class Bench:
             others = {ONE_MODEL: Watch(self._one_model, keep_scores=keep_scores), **others}
         return {NAME: ours, **others}
 
+    @property
+    def that_name_causes(self) -> list[str]:
+        """The methods that do."""
+        return [NAME, ONE_MODEL] if self.methods else [NAME]
+
     def every(self, name: str) -> int:
         """The method scores one fan in this many."""
         return next((method.every for method in self.methods if method.name == name), 1)
 
     def _one_model(self, run: str, fans: int) -> Detector:
-        return one_model(self.fleet.twins[tray_number(run)], self.per_hour).detector(fans)
+        tray = tray_number(run)
+        return one_model(self.fleet.twins[tray], self.per_hour, self.healthy[tray]).detector(fans)
 
     def _scorer(self, run: str, _fans: int) -> Scorer:
         return Scorer(stage("scorer", self.calibrated[tray_number(run)]))
@@ -112,11 +122,12 @@ def prepared(
     seconds = sizes.seconds(sizes.calibration_days)
     progress(f"calibration: {sizes.calibration_days:g} fan-days in {sizes.runs} runs of {seconds / 60:.0f} min")
     stream = predictions(fleet, everyday(fleet, sizes.runs, sizes.seed + 2000), seconds, progress)
-    calibration = calibrate(methods, _keeping(kept, stream), per_hour)
+    healthy: dict[int, HealthyRuns] = {}
+    calibration = calibrate(methods, _keeping(fleet, kept, healthy, stream), per_hour)
     progress("limits of the scorer")
     calibrated, limits = calibrated_twins(fleet.twins, kept, 1.0 / sizes.declared_days, extrapolate=extrapolate)
     kept.clear()
-    return Bench(fleet, methods, calibrated, limits, calibration, per_hour)
+    return Bench(fleet, methods, calibrated, limits, calibration, healthy, per_hour)
 
 
 def _fitting(fleet: Fleet, seed: int, progress: Progress) -> list[list[Prediction]]:
@@ -126,9 +137,13 @@ def _fitting(fleet: Fleet, seed: int, progress: Progress) -> list[list[Predictio
     return list(runs.values())
 
 
-def _keeping(kept: HealthySamples, stream: Any) -> Any:
+def _keeping(fleet: Fleet, kept: HealthySamples, healthy: dict[int, HealthyRuns], stream: Any) -> Any:
     for run, block in stream:
         kept.take(run, block)
+        tray = tray_number(run)
+        if tray not in healthy:
+            healthy[tray] = HealthyRuns(load_tray_twin(fleet.twins[tray], block.fans))
+        healthy[tray].take(run, block)
         yield run, block
 
 
@@ -231,9 +246,9 @@ def quartiles(delays_s: Sequence[float]) -> str:
     return f"{middle:.2f} ({low:.2f} .. {high:.2f})"
 
 
-def kind_rows(faulty: Faulty) -> Rows:
-    """The results of fantwin for each kind and strength."""
-    pairs = faulty.outcomes(NAME)
+def kind_rows(faulty: Faulty, name: str) -> Rows:
+    """The results of a method for each kind and strength."""
+    pairs = faulty.outcomes(name)
     rows = []
     for kind in KINDS:
         for strength in sorted({cell.strength for cell, _ in pairs if cell.kind == kind}):
@@ -254,16 +269,16 @@ def kind_rows(faulty: Faulty) -> Rows:
     return rows
 
 
-def cause_rows(faulty: Faulty, *, is_moved: bool) -> Rows:
-    """The confusion matrix of faults above 1 sigma (and of those with sizes of their own) that were found."""
-    pairs = faulty.outcomes(NAME)
+def cause_rows(faulty: Faulty, name: str, *, is_moved: bool) -> Rows:
+    """The confusion matrix of faults above 1 sigma (and of those with sizes of their own) that a method has found."""
+    pairs = faulty.outcomes(name)
     chosen = [one for cell, one in pairs if cell.is_moved == is_moved and (cell.kind.sizes or cell.strength > 1.0)]
     table = confusion(chosen)
     reported = sorted({cause for row in table.values() for cause in row})
     return [
         {
             "true cause": cause,
-            **{name.replace("_", " "): row[name] for name in reported},
+            **{one.replace("_", " "): row[one] for one in reported},
             "right (95 %)": str(share(row[cause], row.total())),
         }
         for cause, row in sorted(table.items())

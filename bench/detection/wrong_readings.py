@@ -21,11 +21,10 @@ import typer
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.detection.one_model.method import NAME as ONE_MODEL
-from bench.detection.one_model.method import one_model
 from bench.detection.plant import START_NS
 from bench.detection.rack_limits import reports_of
 from bench.detection.rack_recordings import HEALTHY, METADATA, PRODUCER, SITE, TRAY, RackData
-from bench.detection.rack_scoring import DECLARED_PER_DAY, Judged, judged, twin_of
+from bench.detection.rack_scoring import DECLARED_PER_DAY, Judged, judged, model_of, twin_of
 from bench.printing import JsonOption, progress, show
 from pipeline.recordings.writing import RecordingWriter
 from schemas.header import Header
@@ -61,7 +60,7 @@ def _row(data: RackData, one_in: int, hours: float, folder: Path) -> dict[str, A
         twin = twin_of(data, rack, LEARNING)
         recording = folder / f"{rack}.mcap"
         write_with_wrong(data.test(HEALTHY, rack), recording, one_in, hours, data.seed)
-        found.append(judged(recording, twin, [one_model(twin, DECLARED_PER_DAY / 24.0)]))
+        found.append(judged(recording, twin, [model_of(data, rack, LEARNING, twin)]))
         progress(f"one reading in {one_in} wrong: {rack + 1} of {data.count} racks")
     return {
         "wrong readings": f"1 in {one_in}",

@@ -37,7 +37,9 @@ class Bin:
     """their mean distance from it"""
     predicted_rad_s: Array
     measured_rad_s: Array
-    """NaN without a reading"""
+    """their mean; NaN without a reading"""
+    newest_rad_s: Array
+    """the newest reading; NaN without one"""
     balances: Array
     """number of samples with a torque balance"""
     balance_command: Array
@@ -111,6 +113,7 @@ class Bins:
             deviation_rad_s=mean(deviation, counts),
             predicted_rad_s=np.where(predicted.any(axis=0), mean(rows["predicted"], predicted), speed),
             measured_rad_s=np.where(measured.any(axis=0), speed, np.nan),
+            newest_rad_s=newest(rows["measured"], measured),
             balances=has_balance.sum(axis=0),
             balance_command=mean(rows["balance"], has_balance),
             half_range_rad_s=mean(rows["half_range"], counts),
@@ -135,6 +138,13 @@ def mean(values: Array, counts: Array) -> Array:
     """(fans,) the mean of those values that count, (n, fans); 0 where none does."""
     total: Array = np.where(counts, values, 0.0).sum(axis=0)
     return total / np.maximum(counts.sum(axis=0), 1)
+
+
+def newest(values: Array, counts: Array) -> Array:
+    """(fans,) the last of those values that count, (n, fans); NaN where none does."""
+    last = len(values) - 1 - counts[::-1].argmax(axis=0)
+    found: Array = np.where(counts.any(axis=0), values[last, np.arange(values.shape[1])], np.nan)
+    return found
 
 
 def bin_ns_of(period_ns: int, held_s: float) -> int:

@@ -2,7 +2,7 @@
 
 With w the speed, w' its rate, both as the twin predicts them, a healthy fan in bin k deviates from its twin by
 
-    s = w (h(w).theta + load sag + c + v + u) - rise w'+ - fall w'-      what it tends to
+    s = w (h(w).theta + load sag + c + v + u + f) - rise w'+ - fall w'-  what it tends to
     x = keep x + (1 - keep) s,   keep = exp(-bin / time constant)        its rotor follows
     y = mean of x - late w' + e_k - e_k-1 + white                        and its tacho shows
 
@@ -13,6 +13,7 @@ With w the speed, w' its rate, both as the twin predicts them, a healthy fan in 
     c           share                what the air does: an Ornstein-Uhlenbeck process over an hour
     v           share                what theta does not resolve: it stays while speed and command stay
     u           share                the wandering of the speed: an Ornstein-Uhlenbeck process over seconds
+    f           share                what a fault takes: 0, and a random walk while there is an alarm
     x, mean     rad/s                deviation of the rotor at the end of the bin, and its mean over the bin
     q           rad/s                s as the torque balance shows it, which passes the filter of the balance
     e           rad/s                part of a pulse that a count misses; the next count has it
@@ -39,8 +40,8 @@ from schemas.messages import Array
 KNOTS = np.array([0.09, 0.14, 0.2, 0.28, 0.38, 0.5, 0.63, 0.77, 0.9, 1.02])
 """shares of the top speed"""
 K = len(KNOTS)
-RISE, FALL, LATE, SAG, AIR, LOCAL, WANDER, ROTOR, SHOWN, BALANCE, COUNT, COUNT_BEFORE = range(K, K + 12)
-STATES = K + 12
+RISE, FALL, LATE, SAG, AIR, LOCAL, WANDER, FAULT, ROTOR, SHOWN, BALANCE, COUNT, COUNT_BEFORE = range(K, K + 13)
+STATES = K + 13
 SLOW = slice(WANDER)
 """the states that stay what they are during a fault"""
 FOLLOWING = slice(ROTOR, BALANCE + 1)
@@ -59,6 +60,9 @@ class Priors:
     """and one that differs over `twin_length`, share of the top speed"""
     twin_length: float = 0.12
     largest_twin_share: float = 0.1
+    plateau: float = 0.05
+    """error, share of the top speed, of a twin that does not know a plateau, at speeds below `plateau_ends`"""
+    plateau_ends: float = 0.17
     ageing_per_sqrt_h: float = 0.002
     lag_s: float = 0.15
     """error of a time constant; as much is new after moving over the whole range"""
@@ -117,15 +121,25 @@ class HealthyFans:
         """rows of ROTOR, SHOWN and BALANCE: these are the rows times the states before"""
         self.follows = np.ones((count, 3))
         """how far they go to what a fan tends to in a bin"""
+        self._has_begun = np.zeros(count, np.bool_)
+        """(fans,) whether there was a reading: at the first one a rotor is where it tends to"""
         self.counted = np.arange(0)
         """the fans with a new reading"""
-        self.follows[:, 2] = 1.0 - np.exp(-bin_s * fans.balance_filter_per_s)
+        self._of_balance = 1.0 - math.exp(-bin_s * fans.balance_filter_per_s)
         self.kept[:, WANDER], self.kept[:, AIR] = np.exp(-bin_s / priors.wander_s), np.exp(-bin_s / priors.air_s)
-        self._noise = np.zeros((count, STATES))
-        self._noise[:, :K] = priors.ageing_per_sqrt_h**2 * bin_s / 3600.0
-        self._noise[:, WANDER] = priors.wander**2 * (1.0 - self.kept[:, WANDER] ** 2)
-        self._noise[:, AIR] = priors.air**2 * (1.0 - self.kept[:, AIR] ** 2)
+        self.noise = np.zeros((count, STATES))
+        """(fans, STATES) variance that a bin adds"""
+        self.noise[:, :K] = priors.ageing_per_sqrt_h**2 * bin_s / 3600.0
+        self.noise[:, WANDER] = priors.wander**2 * (1.0 - self.kept[:, WANDER] ** 2)
+        self.noise[:, AIR] = priors.air**2 * (1.0 - self.kept[:, AIR] ** 2)
         self._missed = np.square(priors.count * fans.pulse_rad_s) / 12.0
+
+    def of(self, fan: int) -> HealthyFans:
+        """A copy for one fan."""
+        copied = HealthyFans(self._fans.of(fan), self._priors, self._bin_s, 0.0)
+        copied.mean, copied.covariance = self.mean[[fan]], self.covariance[[fan]]
+        copied._has_begun = self._has_begun[[fan]]
+        return copied
 
     def predict(self, now: Inputs) -> None:
         """Go on by one bin."""
@@ -143,7 +157,7 @@ class HealthyFans:
         covariance *= self.kept[:, :, np.newaxis]
         covariance *= self.kept[:, np.newaxis, :]
         variance = np.einsum("nii->ni", covariance)  # a view
-        variance += self._noise
+        variance += self.noise
         variance[:, COUNT] += is_new * self._missed
         new = (p.local_rad_s**2 + now.unseen_rad_s**2) / np.square(np.maximum(now.speed_rad_s, SLOWEST_RAD_S))
         variance[:, LOCAL] += new * (1.0 - stays**2)
@@ -166,11 +180,15 @@ class HealthyFans:
         decay = np.maximum(fans.viscous + fans.drag * (now.measured_rad_s + speed), 1e-9) / fans.inertia * self._bin_s
         self.follows[:, 0] = -np.expm1(-decay)
         self.follows[:, 1] = 1.0 - self.follows[:, 0] / decay  # the mean over the bin
+        self.follows[:, 2] = self._of_balance
+        begins = (now.readings > 0) & ~self._has_begun
+        self.follows[begins] = 1.0
+        self._has_begun |= begins
         steady = np.zeros((len(speed), STATES))
         steady[:, :K] = speed[:, np.newaxis] * hats(speed / fans.top_rad_s)
         steady[:, RISE], steady[:, FALL] = -now.moves_rad_s2.clip(0.0), -now.moves_rad_s2.clip(None, 0.0)
         steady[:, SAG] = speed * now.load
-        steady[:, AIR] = steady[:, LOCAL] = steady[:, WANDER] = speed
+        steady[:, AIR] = steady[:, LOCAL] = steady[:, WANDER] = steady[:, FAULT] = speed
         self.tends[:] = self.follows[:, :, np.newaxis] * steady[:, np.newaxis, :]
         self.tends[:, :2, ROTOR] = 1.0 - self.follows[:, :2]
         self.tends[:, 1, LATE] = -now.moves_rad_s2
@@ -212,6 +230,8 @@ def _prior(fans: Fans, p: Priors, period_s: float) -> Array:
     local = np.minimum(p.twin_rad_s / (KNOTS * top[:, np.newaxis]), p.largest_twin_share)
     covariance[:, :K, :K] = p.twin_share**2 + near * local[:, :, np.newaxis] * local[:, np.newaxis, :]
     covariance[:, :K, :K] += 1e-8 * np.eye(K)
+    low = fans.may_have_plateau[:, np.newaxis] * np.where(p.plateau_ends > KNOTS, p.plateau / KNOTS, 0.0)
+    covariance[:, :K, :K] += low[:, :, np.newaxis] * low[:, np.newaxis, :]
     for state, std in ((RISE, p.lag_s), (FALL, p.lag_s), (SAG, p.sag), (AIR, p.air), (WANDER, p.wander)):
         covariance[:, state, state] = std**2
     phase_s = (fans.held_s + period_s) / math.sqrt(6.0)  # of window and sample: two phases, then and now

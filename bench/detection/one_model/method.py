@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,8 @@ from bench.detection.methods import AlarmChange, Detector, Method, MethodOutput
 from bench.detection.one_model.alarms import Decision
 from bench.detection.one_model.bins import Bins, bin_ns_of
 from bench.detection.one_model.healthy import Priors
-from bench.detection.one_model.operation import Fans, Operation
+from bench.detection.one_model.learned import HealthyRuns
+from bench.detection.one_model.operation import Fans
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
 from schemas.messages import Array, Prediction
 from schemas.units import NS_PER_S
@@ -31,19 +32,23 @@ class OneModel(Method):
         return self.decides(fans)
 
 
-def one_model(twin: Path, alarms_per_hour: float, healthy: Iterable[Sequence[Prediction]] = ()) -> OneModel:
-    """The method for the predictions of a twin. alarms_per_hour: declared, of a fan; healthy: runs of one fan each that
-    show how far runs differ."""
-    priors = Priors()
-    means = [mean_share(load_tray_twin(twin), run) for run in healthy]
-    if means:
-        spread = float(np.sqrt(np.mean(np.square(means))))
-        priors = replace(priors, twin_share=max(priors.twin_share, spread))
+def one_model(twin: Path, alarms_per_hour: float, healthy: HealthyRuns | None = None) -> OneModel:
+    """The method for the predictions of a twin. alarms_per_hour: declared, of a fan; healthy: runs of the same fans."""
+    priors = healthy.priors if healthy else Priors()
 
     def decides(fans: int) -> OneModelDetector:
         return OneModelDetector(load_tray_twin(twin, fans), 3600.0 / alarms_per_hour, priors)
 
     return OneModel(NAME, lambda fans: Statistic(decides(fans)), is_fixed=True, decides=decides)
+
+
+def healthy_runs(twin: Path, predictions: Iterable[tuple[str, Prediction]]) -> HealthyRuns:
+    """What healthy runs of a twin's fans tell. predictions: with the name of their run."""
+    runs: HealthyRuns | None = None
+    for run, block in predictions:
+        runs = runs or HealthyRuns(load_tray_twin(twin, block.fans))
+        runs.take(run, block)
+    return runs or HealthyRuns(load_tray_twin(twin))
 
 
 class OneModelDetector:
@@ -86,13 +91,3 @@ class Statistic:
     def take(self, block: Prediction) -> Array:
         """See Scores."""
         return self._detector.take(block).score
-
-
-def mean_share(twin: TrayTwin, run: Sequence[Prediction]) -> float:
-    """The mean deviation of the first fan in a healthy run, as a share of its speed."""
-    fans = Fans.of_twin(twin)
-    bin_ns = bin_ns_of(run[0].period_ns, float(fans.held_s.min()))
-    bins, operation = Bins(bin_ns, fans.top_rad_s, twin.unseen_error), Operation(fans, bin_ns)
-    inputs = [operation.inputs(one) for block in run for one in bins.take(block)]
-    shares = [now.deviation_rad_s[0] / now.speed_rad_s[0] for now in inputs if now.readings[0] and now.speed_rad_s[0]]
-    return float(np.mean(shares)) if shares else 0.0
