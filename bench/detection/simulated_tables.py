@@ -72,7 +72,7 @@ class Bench:
     calibration: Calibration | None
     """of the other methods, if there are any"""
     healthy: dict[int, HealthyRuns]
-    """of each tray, for the one model"""
+    """healthy running of each tray, for the one model"""
     per_hour: float
     """declared false alarms of a fan"""
 

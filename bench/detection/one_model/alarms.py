@@ -29,11 +29,11 @@ NAMED_AFTER_S, FALLING, FALLING_S = 3.0, 0.4, 4.0
 STANDS, FALLS = 0.08, 0.85
 """shares of the expected speed"""
 OF_COAST = 0.7
-"""of a coast is seen at least, between these shares; of a rotor that is held at most the reading in which it stops"""
+"""least share of a coast that is seen between these; a held rotor shows at most the reading in which it stops"""
 WALKS_PER_SQRT_S = 0.1
 """how fast the fault of an alarm may change, of its largest size"""
 OVER_S, OVER_ODDS = 10.0, 100.0
-"""a fault is over when for so long a healthy fan was so much likelier than the fault at its largest"""
+"""time for which a healthy fan is likelier, by these odds, than the fault at its largest, until that is over"""
 STANDSTILL = ("blocked", "no_power")
 SMALLEST = 0.01
 """share of the speed: what a fault takes at least"""

@@ -29,7 +29,7 @@ class Fault:
     std: tuple[float, ...]
     sign: int
     mean: float
-    """of the size of the first"""
+    """prior mean of the size of the first"""
     weight: float
     """prior probability, of a fan whose command is a torque: there the course over the speed tells one from another"""
     of_own_drive: float

@@ -15,7 +15,7 @@ from bench.detection.one_model.onsets import Evidence, Hypotheses
 from bench.detection.one_model.operation import Fans, Inputs
 
 ENDS_S = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0, np.inf)
-"""after its onset a growth ends, equally probable"""
+"""times after its onset at which a growth may end, equally probable"""
 
 
 class FanInAlarm:

@@ -27,7 +27,7 @@ from schemas.units import NS_PER_S
 
 STRETCH_S = 2.0
 NEAR, FAR, FARTHEST = 2, 5, 15
-"""stretches compared are so many stretches apart"""
+"""distances of the stretches that are compared, in stretches"""
 STEADY, SLOWEST = 0.02, 0.1
 """shares of the top speed: largest movement within what is compared, as of the load, and least speed"""
 FEWEST = 30
@@ -37,7 +37,7 @@ POPULATION = 2.0
 DAY = 1.0
 """the same between days, of one fan"""
 LEAST = 0.05
-"""of a prior standard deviation: no smaller one is believed"""
+"""share of a prior standard deviation: no smaller one is believed"""
 
 
 class HealthyRuns:
@@ -50,7 +50,7 @@ class HealthyRuns:
         self._runs: dict[str, tuple[Bins, Operation, list[Inputs]]] = {}
         self._fan_days = 0.0
         self._means: list[Array] = []
-        """of each run, of the fans that were seen"""
+        """mean deviations of the fans that were seen, of each run"""
         self._squares = {apart: np.zeros(2) for apart in (NEAR, FAR, FARTHEST)}
         """number of pairs of stretches, and sum of the squares of their differences"""
 
@@ -84,7 +84,7 @@ class HealthyRuns:
         self._compare(means, speeds.mean(axis=1), loads.mean(axis=1), np.cumsum(turned, axis=0))
 
     def _compare(self, means: Array, speeds: Array, loads: Array, turns: Array) -> None:
-        """All (stretches, fans): means of deviation, speed and load, and how many stretches so far have moved."""
+        """All (stretches, fans): means of deviation, speed and load, and how many have moved until then."""
         for apart in self._squares:
             if len(means) > apart:
                 stays = turns[apart:] == turns[:-apart]

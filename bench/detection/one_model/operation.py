@@ -19,11 +19,11 @@ FASTEST = 2.0
 COUNT_NOISE_RAD_S = 0.8
 """error of a reading that counts pulses, beside what the count misses"""
 COASTS_TO, COAST_POINTS = 0.08, 64
-"""share of the top speed to which a coast is followed, and in so many steps"""
+"""share of the top speed to which a coast is followed, and number of steps"""
 LOWEST_ERROR = 0.01
-"""of the commands: standard deviation of the lowest one that acts"""
+"""standard deviation of the lowest command that acts, share of the commands"""
 STEADY_S = 0.5
-"""where the torque balance is used, the measured speed is averaged over such a time: it tells what a fan tends to at a
+"""time over which the measured speed is averaged where the torque balance is used: that tells what a fan tends to at a
 speed, and not what its speed loop does around it"""
 BALANCE_BETTER = 1.5
 """the torque balance is used where its noise is smaller than that of the speed by this factor"""
