@@ -30,23 +30,18 @@ class FanState(OpenEnum):
     SUSPECT = 2
     ALARM = 3
     RETURNING = 4
-    COMMISSIONING = 5
-    STOPPED = 6
-    STARTING = 7
+    STOPPED = 5
+    STARTING = 6
 
 
 class Statistic(OpenEnum):
     """The statistics that are compared with limits; the values number them across messages and snapshots."""
 
     NONE = 0
-    SPEED_SMOOTHED = 1
-    SPEED_DRIFT = 2
-    SPEED_VARIANCE_GROWTH = 3
-    BALANCE_SMOOTHED = 4
-    BALANCE_DRIFT = 5
-    BALANCE_VARIANCE_GROWTH = 6
-    SENSOR = 7
-    STANDSTILL = 8
+    DEVIATION = 1
+    MISSING_READINGS = 2
+    STANDSTILL = 3
+    WEAR = 4
 
 
 class Transition(OpenEnum):

@@ -29,21 +29,16 @@ class FanState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     FAN_STATE_SUSPECT: _ClassVar[FanState]
     FAN_STATE_ALARM: _ClassVar[FanState]
     FAN_STATE_RETURNING: _ClassVar[FanState]
-    FAN_STATE_COMMISSIONING: _ClassVar[FanState]
     FAN_STATE_STOPPED: _ClassVar[FanState]
     FAN_STATE_STARTING: _ClassVar[FanState]
 
 class Statistic(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     STATISTIC_NONE: _ClassVar[Statistic]
-    STATISTIC_SPEED_SMOOTHED: _ClassVar[Statistic]
-    STATISTIC_SPEED_DRIFT: _ClassVar[Statistic]
-    STATISTIC_SPEED_VARIANCE_GROWTH: _ClassVar[Statistic]
-    STATISTIC_BALANCE_SMOOTHED: _ClassVar[Statistic]
-    STATISTIC_BALANCE_DRIFT: _ClassVar[Statistic]
-    STATISTIC_BALANCE_VARIANCE_GROWTH: _ClassVar[Statistic]
-    STATISTIC_SENSOR: _ClassVar[Statistic]
+    STATISTIC_DEVIATION: _ClassVar[Statistic]
+    STATISTIC_MISSING_READINGS: _ClassVar[Statistic]
     STATISTIC_STANDSTILL: _ClassVar[Statistic]
+    STATISTIC_WEAR: _ClassVar[Statistic]
 
 class Transition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -127,18 +122,13 @@ FAN_STATE_NORMAL: FanState
 FAN_STATE_SUSPECT: FanState
 FAN_STATE_ALARM: FanState
 FAN_STATE_RETURNING: FanState
-FAN_STATE_COMMISSIONING: FanState
 FAN_STATE_STOPPED: FanState
 FAN_STATE_STARTING: FanState
 STATISTIC_NONE: Statistic
-STATISTIC_SPEED_SMOOTHED: Statistic
-STATISTIC_SPEED_DRIFT: Statistic
-STATISTIC_SPEED_VARIANCE_GROWTH: Statistic
-STATISTIC_BALANCE_SMOOTHED: Statistic
-STATISTIC_BALANCE_DRIFT: Statistic
-STATISTIC_BALANCE_VARIANCE_GROWTH: Statistic
-STATISTIC_SENSOR: Statistic
+STATISTIC_DEVIATION: Statistic
+STATISTIC_MISSING_READINGS: Statistic
 STATISTIC_STANDSTILL: Statistic
+STATISTIC_WEAR: Statistic
 TRANSITION_NONE: Transition
 TRANSITION_RAISED: Transition
 TRANSITION_SEVERITY: Transition
@@ -355,7 +345,7 @@ class Prediction(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., air_density_ratio: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Score(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic", "supply_voltage_v", "current_a", "temperature_c")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "state", "valid", "invalid_reason", "torque_balance_command", "expected_residual_rad_s", "expected_balance_command", "score", "statistic", "supply_voltage_v", "current_a", "temperature_c")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -364,13 +354,12 @@ class Score(_message.Message):
     MEASURED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
     PREDICTED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
     BAND_VARIANCE_FIELD_NUMBER: _ClassVar[int]
-    SMOOTHED_RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
     VALID_FIELD_NUMBER: _ClassVar[int]
     INVALID_REASON_FIELD_NUMBER: _ClassVar[int]
     TORQUE_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
-    SPEED_BASELINE_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    BALANCE_BASELINE_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
     SCORE_FIELD_NUMBER: _ClassVar[int]
     STATISTIC_FIELD_NUMBER: _ClassVar[int]
     SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
@@ -384,19 +373,18 @@ class Score(_message.Message):
     measured_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
     predicted_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
     band_variance: _containers.RepeatedScalarFieldContainer[float]
-    smoothed_residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
     state: _containers.RepeatedScalarFieldContainer[FanState]
     valid: _containers.RepeatedScalarFieldContainer[bool]
     invalid_reason: _containers.RepeatedScalarFieldContainer[InvalidReason]
     torque_balance_command: _containers.RepeatedScalarFieldContainer[float]
-    speed_baseline_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    balance_baseline_command: _containers.RepeatedScalarFieldContainer[float]
+    expected_residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    expected_balance_command: _containers.RepeatedScalarFieldContainer[float]
     score: _containers.RepeatedScalarFieldContainer[float]
     statistic: _containers.RepeatedScalarFieldContainer[Statistic]
     supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
     current_a: _containers.RepeatedScalarFieldContainer[float]
     temperature_c: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., expected_residual_rad_s: _Optional[_Iterable[float]] = ..., expected_balance_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Diagnosis(_message.Message):
     __slots__ = ("cause", "probability", "parameter", "change", "unit", "evidence")
@@ -415,7 +403,7 @@ class Diagnosis(_message.Message):
     def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., parameter: _Optional[str] = ..., change: _Optional[float] = ..., unit: _Optional[str] = ..., evidence: _Optional[str] = ...) -> None: ...
 
 class Alarm(_message.Message):
-    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "limit_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_limit_command", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed", "out_of_service", "causes", "request", "operator_name", "comment", "stale", "feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
+    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "residual_std_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_std_command", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed", "out_of_service", "causes", "request", "operator_name", "comment", "stale", "feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FAN_FIELD_NUMBER: _ClassVar[int]
     ACTIVE_FIELD_NUMBER: _ClassVar[int]
@@ -423,13 +411,13 @@ class Alarm(_message.Message):
     T_NS_FIELD_NUMBER: _ClassVar[int]
     ONSET_T_NS_FIELD_NUMBER: _ClassVar[int]
     RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    LIMIT_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_STD_RAD_S_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
     TRANSITION_FIELD_NUMBER: _ClassVar[int]
     STATISTIC_FIELD_NUMBER: _ClassVar[int]
     SCORE_FIELD_NUMBER: _ClassVar[int]
     TORQUE_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
-    TORQUE_BALANCE_LIMIT_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    TORQUE_BALANCE_STD_COMMAND_FIELD_NUMBER: _ClassVar[int]
     ACKNOWLEDGED_FIELD_NUMBER: _ClassVar[int]
     CONFIRMED_FIELD_NUMBER: _ClassVar[int]
     LATCHED_FIELD_NUMBER: _ClassVar[int]
@@ -452,13 +440,13 @@ class Alarm(_message.Message):
     t_ns: int
     onset_t_ns: int
     residual_rad_s: float
-    limit_rad_s: float
+    residual_std_rad_s: float
     message: str
     transition: Transition
     statistic: Statistic
     score: float
     torque_balance_command: float
-    torque_balance_limit_command: float
+    torque_balance_std_command: float
     acknowledged: bool
     confirmed: bool
     latched: bool
@@ -474,7 +462,7 @@ class Alarm(_message.Message):
     feedback_by: str
     feedback_reason: str
     marked_onset_t_ns: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., limit_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_limit_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., confirmed: _Optional[bool] = ..., latched: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., suppressed: _Optional[bool] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., stale: _Optional[bool] = ..., feedback: _Optional[_Union[Feedback, str]] = ..., feedback_by: _Optional[str] = ..., feedback_reason: _Optional[str] = ..., marked_onset_t_ns: _Optional[int] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., residual_std_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_std_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., confirmed: _Optional[bool] = ..., latched: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., suppressed: _Optional[bool] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., stale: _Optional[bool] = ..., feedback: _Optional[_Union[Feedback, str]] = ..., feedback_by: _Optional[str] = ..., feedback_reason: _Optional[str] = ..., marked_onset_t_ns: _Optional[int] = ...) -> None: ...
 
 class Request(_message.Message):
     __slots__ = ("header", "t_ns", "action", "fan", "duration_s", "operator_name", "comment", "onset_t_ns")

@@ -155,13 +155,12 @@ class Score:
     predicted_speed_rad_s: Array = column("samples x fans", np.float32)
     band_variance: Array = column("samples x fans", np.float32)
     """the square of half the width of the band"""
-    smoothed_residual_rad_s: Array = column("samples x fans", np.float32)
     state: Array = column("samples x fans", FanState)
     valid: Array = column("samples x fans", np.bool_)
     invalid_reason: Array = column("samples x fans", InvalidReason)
     torque_balance_command: Array = column("samples x fans", np.float32)
-    speed_baseline_rad_s: Array = column("samples x fans", np.float32)
-    balance_baseline_command: Array = column("samples x fans", np.float32)
+    expected_residual_rad_s: Array = column("samples x fans", np.float32)
+    expected_balance_command: Array = column("samples x fans", np.float32)
     score: Array = column("samples x fans", np.float32)
     statistic: Array = column("samples x fans", Statistic)
     supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
@@ -172,6 +171,11 @@ class Score:
     def residual_rad_s(self) -> Array:
         """Measured minus predicted."""
         return self.measured_speed_rad_s - self.predicted_speed_rad_s
+
+    @derived(np.float32)
+    def deviation_rad_s(self) -> Array:
+        """What the residual has more than is expected of this fan when it is healthy."""
+        return self.residual_rad_s - self.expected_residual_rad_s
 
     @derived(np.float32)
     def lower_bound_rad_s(self) -> Array:
@@ -212,13 +216,13 @@ class Alarm:
     t_ns: int
     onset_t_ns: int
     residual_rad_s: float
-    limit_rad_s: float
+    residual_std_rad_s: float
     message: str
     transition: Transition = Transition.NONE
     statistic: Statistic = Statistic.NONE
     score: float = 0.0
     torque_balance_command: float = 0.0
-    torque_balance_limit_command: float = 0.0
+    torque_balance_std_command: float = 0.0
     acknowledged: bool = False
     confirmed: bool = False
     latched: bool = False

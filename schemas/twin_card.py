@@ -213,9 +213,9 @@ class TwinCard:
     parameter_std_errors, parameter_interval_95: of the physical model alone; a hybrid's parameters in force differ
     where its network has taken a share. sigma_rad_s: per fan, the healthy root mean square free-run error.
     speed_range_rad_s, command_range, rate_hz: of the training data; outside them the twin extrapolates. calibration:
-    of the alarms (scoring.limits), None before calibration. tacho: what the free run must pass before it is compared
-    with readings, and the command before the torque balance; one for all fans, or one for each. standstill: how the
-    fans stop, stand and start; None where the runs do not show at which commands fans turn. drive:
+    of the alarms (scoring.calibration), None before calibration. tacho: what the free run must pass before it is
+    compared with readings, and the command before the torque balance; one for all fans, or one for each. standstill:
+    how the fans stop, stand and start; None where the runs do not show at which commands fans turn. drive:
     of fans that control their own speed; None: the command acts as it is. reading_sigma_rad_s: per fan, root mean
     square of the distance of healthy readings from those that the tachos may show of the free run, of fans that neither
     start nor stand; empty where tachos are instantaneous: it is sigma_rad_s there.

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
 import numpy as np
 
 from schemas.auxiliary import auxiliary_columns
-from schemas.enums import FanState, InvalidReason
+from schemas.enums import FanState, InvalidReason, Statistic
 from schemas.messages import Array, Prediction, Score
-from scoring.scored_block import ScoredBlock
+from scoring.samples import BALANCE_COUNTS, among
 
 BAND_SIGMAS = 2.0
 NONE, WARMING_UP = np.uint8(InvalidReason.NONE), np.uint8(InvalidReason.WARMING_UP)
-COMMISSIONING = np.uint8(FanState.COMMISSIONING)
+UNKNOWN, NORMAL, SUSPECT, ALARM, RETURNING = map(
+    int, (FanState.UNKNOWN, FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING)
+)
 IDLE_STATES = (
     (np.uint8(InvalidReason.STOPPED), np.uint8(FanState.STOPPED)),
     (np.uint8(InvalidReason.STARTING), np.uint8(FanState.STARTING)),
@@ -19,16 +24,57 @@ IDLE_STATES = (
 """of a fan that is not scored because its command stops it, or has just started it"""
 
 
-def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array) -> Score:
-    """The message of a block that was scored. state: (n, fans) of FanState. unseen: (n, fans), see Samples."""
-    valid, sigma = np.isfinite(scored.score), item.sigma_rad_s
-    band = BAND_SIGMAS * sigma * np.hypot(1.0, unseen)
-    if len(item.reading_range_rad_s):
-        band = band + item.reading_range_rad_s
-    of_prediction = item.invalid_reason
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoreColumns:
+    """What was decided on fans: (fans,) each, or (n, fans) for the rows of a block."""
+
+    SUSPECT_FROM: ClassVar[float] = 0.5
+    """score from which a fan is suspect"""
+    score: Array
+    statistic: Array
+    is_active: Array
+    is_returning: Array
+    expected_residual_rad_s: Array
+    expected_balance_command: Array
+
+    @classmethod
+    def empty(cls, *shape: int) -> Self:
+        """Of fans of which nothing is known."""
+        return cls(
+            score=np.zeros(shape),
+            statistic=np.full(shape, int(Statistic.DEVIATION), np.uint8),
+            is_active=np.zeros(shape, np.bool_),
+            is_returning=np.zeros(shape, np.bool_),
+            expected_residual_rad_s=np.zeros(shape),
+            expected_balance_command=np.zeros(shape),
+        )
+
+    @classmethod
+    def of_rows(cls, rows: int, fans: int) -> Self:
+        """To be filled."""
+        return cls.empty(rows, fans)
+
+    def fill(self, rows: slice, of: ScoreColumns) -> None:
+        """Write what holds for some rows."""
+        for name, column in vars(of).items():
+            getattr(self, name)[rows] = column
+
+
+def score_of(item: Prediction, of: ScoreColumns, unseen_rad_s: Array | float = 0.0) -> Score:
+    """The message of a block. of: its rows. unseen_rad_s: (n, fans) standard deviation of the twin's error where it was
+    not trained."""
+    has_balance = among(item.invalid_reason, *BALANCE_COUNTS) & np.isfinite(item.torque_balance_command)
+    has_residual = item.valid & np.isfinite(item.measured_speed_rad_s) & np.isfinite(item.predicted_speed_rad_s)
+    is_standing = of.is_active & (of.statistic == int(Statistic.STANDSTILL))
+    valid = has_residual | has_balance | is_standing
+    band = BAND_SIGMAS * np.hypot(item.sigma_rad_s, unseen_rad_s)
+    half_range = item.reading_range_rad_s if len(item.reading_range_rad_s) else np.zeros(valid.shape)
+    state = np.where(of.score > of.SUSPECT_FROM, SUSPECT, NORMAL)
+    state = np.where(of.is_active, np.where(of.is_returning, RETURNING, ALARM), state)
+    state = np.where(valid, state, UNKNOWN)
     for reason, of_idle in IDLE_STATES:
-        state = np.where((of_prediction == reason) & ~valid, of_idle, state)
-    why = np.where(of_prediction == NONE, WARMING_UP, of_prediction)
+        state = np.where((item.invalid_reason == reason) & ~valid, of_idle, state)
+    why = np.where(item.invalid_reason == NONE, WARMING_UP, item.invalid_reason)
     return Score(
         fans=item.fans,
         period_ns=item.period_ns,
@@ -36,16 +82,15 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array)
         command=item.command,
         measured_speed_rad_s=item.measured_speed_rad_s,
         predicted_speed_rad_s=item.predicted_speed_rad_s,
-        band_variance=band**2,
-        smoothed_residual_rad_s=scored.speed_smoothed * sigma,
-        state=np.where(scored.commissioning & ~valid, COMMISSIONING, state).astype(np.uint8),
+        band_variance=np.square(band + half_range),
+        state=state.astype(np.uint8),
         valid=valid,
         invalid_reason=np.where(valid, NONE, why).astype(np.uint8),
         torque_balance_command=item.torque_balance_command,
-        speed_baseline_rad_s=scored.speed_baseline * sigma,
-        balance_baseline_command=scored.balance_baseline * item.torque_balance_sigma_command,
-        score=scored.score,
-        statistic=scored.statistic,
+        expected_residual_rad_s=of.expected_residual_rad_s,
+        expected_balance_command=of.expected_balance_command,
+        score=np.where(valid, of.score, np.nan),
+        statistic=of.statistic,
         **auxiliary_columns(item),
     )
 
@@ -62,13 +107,12 @@ def unscored(item: Prediction) -> Score:
         measured_speed_rad_s=item.measured_speed_rad_s,
         predicted_speed_rad_s=unknown,
         band_variance=unknown,
-        smoothed_residual_rad_s=unknown,
         state=np.full(unknown.shape, int(FanState.UNKNOWN), np.uint8),
         valid=np.zeros(unknown.shape, np.bool_),
         invalid_reason=why.astype(np.uint8),
         torque_balance_command=unknown,
-        speed_baseline_rad_s=unknown,
-        balance_baseline_command=unknown,
+        expected_residual_rad_s=unknown,
+        expected_balance_command=unknown,
         score=unknown,
         statistic=np.zeros(unknown.shape, np.uint8),
         **auxiliary_columns(item),

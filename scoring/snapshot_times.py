@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 NEVER_NS = 1 << 62  # times from here on, and those up to 0, are marks and no times
-OTHER_TIMES = ("due",)
-"""entries with times whose names do not say so"""
 
 
 def with_times_moved(state: Any, by_ns: int, *, is_time: bool = False) -> Any:
     """A snapshot's state, as JSON values, with all absolute times moved by `by_ns`; durations and values stay."""
     if isinstance(state, dict):
         return {
-            name: with_times_moved(entry, by_ns, is_time=is_time or name.endswith("t_ns") or name in OTHER_TIMES)
+            name: with_times_moved(entry, by_ns, is_time=is_time or name.endswith("t_ns"))
             for name, entry in state.items()
         }
     if isinstance(state, list):

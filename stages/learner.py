@@ -244,7 +244,7 @@ class LearnerCore(Core):
         """The version in force, or while it has to wait, the one that the stages had before.
 
         One that was not chosen by an operator waits while a fan has an alarm, or may have one after a restart: with
-        another twin the alarm would end, and the fault would be part of the new baselines.
+        another twin the alarm would end, and the fault would be part of what the new one expects.
         """
         current = self._listed.current
         if current is None or self._listed.is_chosen or (self._alarms.are_known and not self._alarm_fans):

@@ -2,10 +2,9 @@
 
 Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in command units), `request` (what
 operators request about alarms), and `twin` where twins are learned (pipeline.runtime.learned_scorer).
-Writes: topic `score` (residuals, baselines, the statistic closest to its limit, state), `alarm` (every transition of a
-fan's alarm), `snapshot` (the state to continue from after a restart).
-Timing: one score message for every prediction message, immediately, in a process of many trays at its next tick; of
-messages that wait together, one. Delays count the time of valid samples.
+Writes: topic `score` (residuals, what is expected of the fan, how much speaks for a fault, state), `alarm` (every
+transition of a fan's alarm), `snapshot` (the state to continue from after a restart).
+Timing: one score message for every prediction message, immediately; of messages that wait together, one.
 
 How a block is scored is in pipeline.runtime.tray_scorer. Here is what a stage adds: samples that come again, requests,
 snapshots, and health. See docs/explanation/deciding.md.
@@ -15,14 +14,13 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, healthy_twin
-from pipeline.runtime.joint_tray_scorer import JointTrayScorer
 from pipeline.runtime.judged_share import JudgedShare
 from pipeline.runtime.learned_scorer import LearnedTwinScorer
 from pipeline.runtime.old_samples import OldSamples
@@ -32,13 +30,12 @@ from pipeline.runtime.tray_scorer import TrayScorer
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.blocks import select
 from schemas.enums import Transition
-from schemas.fan_numbers import fans_in_words
 from schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
 from schemas.topics import ALL_TRAYS
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_text import AlarmText
-from scoring.alarms.fan_condition import DATA_LOST_AFTER_NS
 from scoring.alarms.unscored_monitor import UnscoredMonitor
+from scoring.model.decision import FORGETS_S
 from scoring.snapshot_times import with_times_moved
 
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
@@ -47,17 +44,17 @@ MOST_FANS_AT_ONCE = 64  # of a tray whose snapshot is taken with each alarm
 SAVED_OF_PUBLISHED = 3  # of a larger tray: every third is published while nothing happens, for the recording's size
 REST_NS_PER_FAN = 5_000_000  # between snapshots with alarms of a larger tray: each takes a millisecond a fan after days
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
-NEW_START = "baselines, alarms and wear start from the beginning"
+NEW_START = "what was learned of the fans, alarms and wear start from the beginning"
 OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
 ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
 EARLIER_TWIN = (
-    "the snapshot is of the previous twin: baselines and alarms start from the beginning, wear continues; "
-    f"{OPERATORS_KEPT}"
+    "the snapshot is of the previous twin: what was learned of the fans and alarms start from the beginning, wear "
+    f"continues; {OPERATORS_KEPT}"
 )
 READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
 NOT_CALIBRATED = (
-    "the twin is not calibrated: only large errors of the speed, missing readings and standstill raise alarms; "
+    "the twin is not calibrated: its alarms rest on what fans have in common, and their rate is not checked; "
     "see fantwin calibrate"
 )
 RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
@@ -85,7 +82,7 @@ class ScorerCore(Core):
         self._fans = fans
         self._twin = twin
         self._config = config
-        self._text = AlarmText(speed_unit, twin.command_unit)
+        self._text = AlarmText(speed_unit, twin.advice.command_unit)
         self._is_learned = is_learned
         self._is_replayed = is_replayed
         self._unscored = UnscoredMonitor(fans, max(1, round(config.not_judged_s * NS_PER_S)))
@@ -114,6 +111,8 @@ class ScorerCore(Core):
     def _start_new(self) -> None:
         self.tray = TrayScorer(self._fans, self._text, self._config, self._twin)
         self._last_t_ns = self._snapshot_t_ns = np.iinfo(np.int64).min
+        self._shown_until_t_ns = np.iinfo(np.int64).max
+        """until when health says that a snapshot was not used; not known before the first sample"""
         self._input_producer = ""
         """who made the last prediction"""
         self._is_restored = False
@@ -122,9 +121,9 @@ class ScorerCore(Core):
     def restore(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
         """Continue from a snapshot. Returns the messages that report it.
 
-        If it is of another twin, or its baselines or wear cannot be read, as after an update, only what belongs to
-        operators is restored: shelved, suppressed, out of service, and the requests already answered. Of a learned twin
-        the wear is restored as well.
+        If it is of another twin, or what was learned of the fans cannot be read, as after an update, only what
+        belongs to operators is restored: shelved, suppressed, out of service, and the requests already answered. Of a
+        learned twin the wear is restored as well.
         """
         try:
             state = json.loads(snapshot.state_json)
@@ -140,7 +139,7 @@ class ScorerCore(Core):
             self._not_restored = EARLIER_TWIN if self._is_learned and self._restore_wear(state) else ANOTHER_TWIN
         else:
             try:
-                self.tray.restore_baselines(state)
+                self.tray.restore_model(state)
             except RESTORE_ERRORS:
                 self._start_new()
                 self.tray.alarms.restore(state["alarms"])
@@ -206,9 +205,10 @@ class ScorerCore(Core):
                 self._old_samples.add(item.t_ns, item.period_ns, self._last_t_ns)
             return Admitted(before_score)
         self._old_samples.clear()
+        self._shown_until_t_ns = min(self._shown_until_t_ns, int(item.t_ns[new][0]) + SHOWN_NS)
         self._last_t_ns, self._input_producer = int(item.t_ns[new][-1]), item.header.producer
         block = item if new.all() else select(item, new)
-        return Admitted(before_score, block, self.tray.joint_key(block))
+        return Admitted(before_score, block)
 
     def finish(self, block: Prediction, made: tuple[Score, list[Alarm]]) -> list[Score | Alarm | ScorerSnapshot]:
         """See Core. made: the score of the block, and the messages on alarms."""
@@ -225,7 +225,6 @@ class ScorerCore(Core):
         of_alarms = {
             "alarms_raised": self.tray.alarms.raised,
             "alarms_cleared": self.tray.alarms.cleared,
-            "excursions_too_short": self.tray.alarms.too_short,
         }
         return {**self._counts, **of_alarms}
 
@@ -234,14 +233,13 @@ class ScorerCore(Core):
         not; fans that change slowly."""
         of_twin = [] if self._twin.is_calibrated else [NOT_CALIBRATED]
         of_store = [self._snapshot_store.note] if self._snapshot_store and self._snapshot_store.note else []
-        return [*of_twin, *of_store, *self._judged_share.notes, *self.tray.wear.notices(), *self.tray.followed]
+        return [*of_twin, *of_store, *self._judged_share.notes, *self.tray.wear.notices()]
 
     def problem(self) -> str:
-        """What people should look at: input, snapshot, fans without a score, baselines at their limit, wear."""
+        """What people should look at: input, snapshot, fans without a score, wear."""
         if self._wrong_fans:
             return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
-        origin_t_ns = self.tray.fan_scorer.origin_t_ns
-        is_new = origin_t_ns is None or self._last_t_ns < origin_t_ns + SHOWN_NS
+        is_new = self._last_t_ns < self._shown_until_t_ns
         problems = [
             self._not_restored if is_new else "",
             self._set_back if self._last_t_ns < self._set_back_until_t_ns else "",
@@ -249,12 +247,6 @@ class ScorerCore(Core):
             self._old_samples.problem("predictions", "scorer"),
         ]
         problems += [self._snapshot_store.problem] if self._snapshot_store else []
-        held = np.flatnonzero(self.tray.fan_scorer.held_baselines)
-        if len(held):
-            names = fans_in_words(held.tolist())
-            problems.append(
-                f"the baseline of fan {names} is at its adaptation limit: inspect the fan, or commission it again"
-            )
         problems.append(self.tray.wear.problem(self._last_t_ns))
         return "; ".join(filter(None, problems))
 
@@ -276,7 +268,7 @@ class ScorerCore(Core):
     def _set_snapshot_back(self, item: Prediction) -> None:
         """Move the restored snapshot to before the first prediction, if the host clock was set back after it.
 
-        How long nothing was judged is not known: longer than the statistics remember. Only a snapshot that is also
+        How long nothing was judged is not known: longer than the evidence remembers. Only a snapshot that is also
         ahead of the host's time is moved. Otherwise a producer repeats what it has kept, or a recording is played.
         """
         if not self._may_be_set_back or not len(item.t_ns):
@@ -285,7 +277,7 @@ class ScorerCore(Core):
         first_t_ns, ahead_ns = int(item.t_ns[0]), self._last_t_ns - int(item.t_ns[0])
         if item.header.producer == self._input_producer or ahead_ns < 0:
             return
-        t_ns = first_t_ns - item.period_ns - max(self.tray.fan_scorer.longest_memory_ns, DATA_LOST_AFTER_NS)
+        t_ns = first_t_ns - item.period_ns - 2 * round(FORGETS_S * NS_PER_S)
         state = with_times_moved(self._state(), t_ns - self._last_t_ns)
         self._start_new()
         self._at_start = self.restore(ScorerSnapshot(t_ns=t_ns, twin_sha256=self._twin.sha256, state_json=_json(state)))
@@ -294,7 +286,7 @@ class ScorerCore(Core):
         self._set_back_until_t_ns = first_t_ns + SHOWN_NS
         self._set_back = (
             f"the snapshot is {ahead_ns / NS_PER_S:.0f} s ahead of the samples, because the host clock was set back: "
-            "baselines, alarms and wear continue, with their times set back as well"
+            "what was learned of the fans, alarms and wear continue, with their times set back as well"
         )
 
     def _discard_if_replayed(self, item: Prediction) -> list[Alarm]:
@@ -350,19 +342,6 @@ class ScorerCore(Core):
 
     def _state(self) -> dict[str, Any]:
         return {**self.tray.snapshot(), "input_producer": self._input_producer}
-
-
-class JointScorers:
-    """Scores trays of one process, see Joint."""
-
-    def __init__(self) -> None:
-        self._joint = JointTrayScorer()
-
-    def process(
-        self, cores: Sequence[ScorerCore], blocks: Sequence[Prediction]
-    ) -> Sequence[tuple[Score, Sequence[Alarm]]]:
-        """What `finish` of each is given."""
-        return self._joint.score([core.tray for core in cores], blocks)
 
 
 def _json(state: Mapping[str, Any]) -> str:
@@ -424,11 +403,10 @@ def check(context: Context) -> list[str]:
 
 STAGE = Stage(
     name="scorer",
-    about="two residuals, their statistics, and the fans' alarms",
+    about="the evidence for faults, and the fans' alarms",
     reads=("prediction", "request", "twin"),
     writes=("score", "alarm", "snapshot"),
     config=ScorerConfig,
     build=build,
-    joint=JointScorers,
     check=check,
 )

@@ -1,9 +1,9 @@
-"""What each mechanism of `scoring` is worth: small sets of the bench without it, a row each, in one table.
+"""What each part of the scorer's model is worth: small sets of the bench without it, a row each, in one table.
 
-Every set is calibrated and judged without the mechanism (bench.detection.without), on the same predictions; the first
+Every set is calibrated and judged without the part (bench.detection.mechanisms), on the same predictions; the first
 row is the decision as it is. Results are kept: what is there is not made again.
 
-Example: python -m bench.detection.ablation --keep /tmp/ablation --without motion --without ridge
+Example: python -m bench.detection.ablation --keep /tmp/ablation --without wander --without lags
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ def main(
     without_names: Annotated[
         list[str] | None,
         typer.Option(
-            "--without", help="A mechanism to leave out, or `list` for their names; repeatable. Default: all, in turn."
+            "--without", help="A part to leave out, or `list` for their names; repeatable. Default: all, in turn."
         ),
     ] = None,
     only: Annotated[
         list[str] | None, typer.Option(help="simulated, rack or rosa; repeatable. Default: all three.")
     ] = None,
     fans: Annotated[int, typer.Option(help="Simulated fans, in trays of 50.")] = 50,
-    runs: Annotated[int, typer.Option(help="Healthy runs; from 12 on calibration learns offsets of fans.")] = 12,
+    runs: Annotated[int, typer.Option(help="Healthy runs.")] = 12,
     calibration_days: Annotated[float, typer.Option(help="Healthy fan-days to calibrate on, simulated.")] = 0.25,
     declared_days: Annotated[float, typer.Option(help="Declared time between false alarms, simulated.")] = 30.0,
     fault_runs: Annotated[int, typer.Option(help="Faults of every simulated fan, each in a run of its own.")] = 4,
@@ -70,7 +70,7 @@ def main(
     seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
     json_output: JsonOption = False,
 ) -> None:
-    """Print one table: a row for each mechanism that was left out."""
+    """Print one table: a row for each part that was left out."""
     if without_names and LIST in without_names:
         list_mechanisms()
         return
@@ -99,7 +99,7 @@ def main(
 
 
 def one_cell(part: Part, folder: Path, name: str) -> dict[str, Any]:
-    """The figures of a part without a mechanism, kept in the folder; CPU time beside them."""
+    """The figures of a set without a part of the model, kept in the folder; CPU time beside them."""
     kept = folder / f"without-{name}.json"
     if not kept.exists():
         began_s = time.process_time()
@@ -114,7 +114,7 @@ def one_cell(part: Part, folder: Path, name: str) -> dict[str, Any]:
 
 
 def _make(keep: Path, parts: dict[str, Part], names: Sequence[str], workers: int) -> None:
-    """The cells that are not there yet, mechanism by mechanism."""
+    """The cells that are not there yet, row by row."""
     with ProcessPoolExecutor(workers, mp_context=get_context("fork")) as pool:
         jobs = {
             pool.submit(one_cell, part, keep / part.name, name): f"{part_name} without {name}"
@@ -139,7 +139,7 @@ def _tables(keep: Path, parts: dict[str, Part], names: Sequence[str]) -> dict[st
         }
         for name in names
     ]
-    return {"without each mechanism of scoring": overview} | {
+    return {"without each part of the model": overview} | {
         part_name: [{"without": name} | _without(cells[part_name, name], OVERVIEW[part_name]) for name in names]
         for part_name in parts
     }

@@ -1,7 +1,7 @@
-"""The small sets that mechanisms are judged on: what they need once, and the figures of one row.
+"""The small sets that parts of the model are judged on: what they need once, and the figures of one row.
 
-`prepare` writes twins and predictions, which no mechanism of `scoring` changes, into a folder; `figures` calibrates and
-judges them with whatever mechanisms are left at that time.
+`prepare` writes twins and predictions, which no part of the scorer changes, into a folder; `figures` calibrates and
+judges them with what is left of the model at that time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from bench.detection.campaigns import Watch, everyday, predictions, watched
 from bench.detection.faulty import FAULTY_ONE_IN, Campaign, campaign
 from bench.detection.judging import (
-    calibrated_twin,
+    calibrate_twin,
     judged,
     keep_predictions,
     read_predictions,
@@ -37,7 +37,7 @@ from bench.detection.measured import (
     train_twin,
 )
 from bench.detection.metrics import RaisedAlarm, rate
-from bench.detection.ours import NAME, HealthySamples, Scorer, calibrated_twins
+from bench.detection.ours import NAME, HealthyBins, Scorer
 from bench.detection.rack_campaign import RackResult
 from bench.detection.rack_limits import Facts
 from bench.detection.rack_recordings import FAULTY, RackData
@@ -45,7 +45,7 @@ from bench.detection.rack_scoring import DECLARED_PER_DAY, Judged, trained
 from bench.detection.rack_tables import beside, found_faults, hours_in_faults
 from bench.detection.racks import FAULT_KINDS, events, run_of
 from bench.detection.simulated import FANS_SEED, Fleet, stage, trained_fleet, tray_number
-from bench.detection.simulated_tables import Faulty, Sizes, is_large_step
+from bench.detection.simulated_tables import Faulty, Sizes, is_large_step, kept_bins
 from schemas.messages import Prediction
 from simulation.plant import tray_of_fans
 
@@ -97,25 +97,26 @@ class SimulatedPart:
             faulty.setdefault(run, []).append(block)
         for run, blocks in faulty.items():
             write_predictions(blocks, _of_run(folder, run))
-        healthy = HealthySamples(folder, fleet.twins)
+        healthy = kept_bins(folder, fleet)
         seconds = sizes.seconds(sizes.calibration_days)
         progress(f"healthy running: {sizes.calibration_days:g} fan-days in {sizes.runs} runs of {seconds / 60:.0f} min")
         plant = everyday(fleet, sizes.runs, sizes.seed + 2000)
         for run, block in predictions(fleet, plant, seconds, progress):
-            healthy.take(run, block)
+            healthy[tray_number(run)].take(run, block)
+        for of_tray in healthy:
+            of_tray.finish()
         index.write_bytes(pickle.dumps(healthy))
 
     def figures(self, folder: Path) -> dict[str, Any]:
         """See Part."""
         sizes = self.sizes
-        healthy: HealthySamples = pickle.loads((folder / "healthy.pickle").read_bytes())
+        healthy: list[HealthyBins] = pickle.loads((folder / "healthy.pickle").read_bytes())
         fleet = self._fleet(folder)
         shown = self._campaign(fleet)
         with tempfile.TemporaryDirectory() as made:
-            own = [Path(made) / twin.name for twin in fleet.twins]
-            for twin, copy in zip(fleet.twins, own, strict=True):
-                copy.write_bytes(twin.read_bytes())
-            twins, _ = calibrated_twins(own, healthy, 1.0 / sizes.declared_days, extrapolate=True)
+            twins = [Path(made) / twin.name for twin in fleet.twins]
+            for of_tray, twin in zip(healthy, twins, strict=True):
+                of_tray.calibrate(1.0 / sizes.declared_days, twin, extrapolate=True)
             watch = Watch(lambda run, _: Scorer(stage("scorer", twins[tray_number(run)])), keep_scores=True)
             watched({NAME: watch}, self._faulty(folder, shown))
         found = Faulty(shown, {NAME: watch})
@@ -135,7 +136,7 @@ class SimulatedPart:
 
     def _campaign(self, fleet: Fleet) -> Campaign:
         sizes = self.sizes
-        return campaign(fleet, sizes.fault_runs, sizes.commissioned_s, sizes.seed + 4000)
+        return campaign(fleet, sizes.fault_runs, sizes.fault_after_s, sizes.seed + 4000)
 
     @staticmethod
     def _faulty(folder: Path, shown: Campaign) -> Iterator[tuple[str, Prediction]]:
@@ -199,13 +200,12 @@ class RackPart:
         }
 
     def _judged(self, place: Path, rack: int) -> Judged:
-        data, twin, test = self.data, place / "twin.onnx", self.data.test(FAULTY, rack)
-        learned = data.learning(self.learning, rack)
-        kept = [place / f"{path.stem}.pickle" for path in learned]
+        twin, test = place / "twin.onnx", self.data.test(FAULTY, rack)
+        kept = [place / f"{path.stem}.pickle" for path in self.data.learning(self.learning, rack)]
         with tempfile.TemporaryDirectory() as made:
             limited = Path(made) / "twin.onnx"
             extrapolate = self.learning != "three nights"
-            calibrated_twin(twin, limited, learned, kept, DECLARED_PER_DAY, extrapolate=extrapolate)
+            calibrate_twin(twin, limited, kept, DECLARED_PER_DAY, extrapolate=extrapolate)
             found = judged(scorer_of(test, limited), read_predictions(place / f"{test.stem}.pickle"))
         return Judged(fan_hours=found.fan_hours, ours=found.alarms)
 
@@ -270,8 +270,7 @@ class RosaPart:
         with tempfile.TemporaryDirectory() as made:
             limited = Path(made) / "rosa.onnx"
             kept = [place / f"{run.name}.pickle" for run in calibrating]
-            recordings = [run.recording for run in calibrating]
-            calibrated_twin(place / "rosa.onnx", limited, recordings, kept, 24 * ALARMS_PER_HOUR, extrapolate=True)
+            calibrate_twin(place / "rosa.onnx", limited, kept, 24 * ALARMS_PER_HOUR, extrapolate=True)
             for run in judged_runs:
                 found = judged(scorer_of(run.recording, limited), read_predictions(place / f"{run.name}.pickle"))
                 scored.alarms[run.name] = [

@@ -2,7 +2,7 @@
 
 In a run, every fifth fan of a tray has one fault and the others are healthy: what most fans of a tray have in common is
 the air, not a fault. Half of the fans are held at a level, half are moved all the time: only moving fans allow causes
-to be distinguished. Faults begin some minutes after the start of the run, within half a minute after `commissioned_s`,
+to be distinguished. Faults begin some minutes after the start of the run, within half a minute after `fault_after_s`,
 and stay; wear grows until the end.
 """
 
@@ -61,7 +61,7 @@ def cells() -> list[Cell]:
     ]
 
 
-def campaign(fleet: Fleet, runs: int, commissioned_s: float, seed: int) -> Campaign:
+def campaign(fleet: Fleet, runs: int, fault_after_s: float, seed: int) -> Campaign:
     """Every cell about equally often, on random fans; as many faults as `runs` have fans."""
     rng = np.random.default_rng(seed)
     runs *= FAULTY_ONE_IN
@@ -73,7 +73,7 @@ def campaign(fleet: Fleet, runs: int, commissioned_s: float, seed: int) -> Campa
     place[is_faulty] = rng.permutation(np.resize(np.arange(len(every)), np.count_nonzero(is_faulty)))
     shown = [every[one] for one in place.tolist()]
     knobs = Knobs([_knob(cell, rng) for cell in shown], seed + 1)
-    start_s = np.round(commissioned_s + rng.uniform(0.0, ONSET_WITHIN_S, size=columns), 2)
+    start_s = np.round(fault_after_s + rng.uniform(0.0, ONSET_WITHIN_S, size=columns), 2)
     start_s[~is_faulty] = NEVER_S
     faults = Faults(
         kind=np.array([cell.kind.name for cell in shown]),
@@ -96,7 +96,7 @@ def campaign(fleet: Fleet, runs: int, commissioned_s: float, seed: int) -> Campa
     ]
     plant = Plant(fleet.fans, runs, knobs, seed + 2, faults)
     return Campaign(
-        plant, commissioned_s + ONSET_WITHIN_S + LASTS_S + 1.0 / RATE_HZ, [shown[column] for column in faulty], events
+        plant, fault_after_s + ONSET_WITHIN_S + LASTS_S + 1.0 / RATE_HZ, [shown[column] for column in faulty], events
     )
 
 

@@ -1,4 +1,4 @@
-"""Limits and alarms from predictions that are kept: scoring alone, without what comes before it.
+"""Calibration and alarms from predictions that are kept: scoring alone, without what comes before it.
 
 What a twin predicts does not depend on how it is scored. So predictions are made once, and calibrated on and judged as
 often as `scoring` is to be changed. The calls are those of `fantwin calibrate` and `fantwin replay --offline`.
@@ -6,25 +6,20 @@ often as `scoring` is to be changed. The calls are those of `fantwin calibrate` 
 
 from __future__ import annotations
 
-import json
 import pickle
+import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from bench.detection.ours import HealthyBins
 from bench.detection.rack_scoring import Episode, episodes
-from pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
-from pipeline.replay.offline.limits_of_twin import find_limits
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.runtime.stage import Core
-from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Alarm, Array, Prediction, Score
 from schemas.units import NS_PER_S
-from scoring.calibration.healthy_statistics import HealthyRun, one_after_another
-from scoring.samples import samples_of
-from twin.export.card_entries import with_card_entries
 
 
 @dataclass(frozen=True)
@@ -59,25 +54,14 @@ def read_predictions(kept: Path) -> list[Prediction]:
     return found
 
 
-def calibrated_twin(
-    twin: Path,
-    output: Path,
-    recordings: Sequence[Path],
-    kept: Sequence[Path],
-    alarms_per_day: float,
-    *,
-    extrapolate: bool,
-) -> None:
-    """Write a twin with limits from healthy recordings, whose predictions are kept, as `fantwin calibrate` does."""
-    known = load_tray_twin(twin)
-    runs = []
-    for path in kept:
-        blocks = [samples_of(block, known.unseen_error) for block in read_predictions(path)]
-        fans = blocks[0].speed_rad_s.shape[1]
-        runs.append(HealthyRun(path.stem, fans, blocks, range(fans) if known.fans > 1 else None, known.card.tacho))
-    timing = HealthyRuns(recordings, HealthyPart(twin)).timing()
-    limits = find_limits([known], one_after_another(lambda: runs), timing, alarms_per_day, extrapolate=extrapolate)
-    output.write_bytes(with_card_entries(twin.read_bytes(), {"calibration": json.loads(limits.model_dump_json())}))
+def calibrate_twin(twin: Path, output: Path, kept: Sequence[Path], alarms_per_day: float, *, extrapolate: bool) -> None:
+    """Write a twin that is calibrated on healthy recordings whose predictions are kept."""
+    with tempfile.TemporaryDirectory() as folder:
+        healthy = HealthyBins(Path(folder), twin)
+        for path in kept:
+            for block in read_predictions(path):
+                healthy.take(path.stem, block)
+        healthy.calibrate(alarms_per_day, output, extrapolate=extrapolate)
 
 
 def scorer_of(recording: Path, twin: Path) -> Core:

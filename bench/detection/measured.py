@@ -1,8 +1,8 @@
 """Measured data with labelled faults, the rosa rig (docs/how-to/datasets.md), evaluated as by a first-time user.
 
 `fantwin import`, `train`, `calibrate` and `replay --offline --json`, nothing else, and healthy runs alone decide on
-twins and limits. Healthy runs are held out in turn: of the others every second one by speed trains, the rest sets the
-limits. Faulty runs are scored by each of these twins. An event is a stretch of rows that `Binary Macro Health Mode`
+twins and limits. Healthy runs are held out in turn: of the others every second one by speed trains, and the rest
+calibrates. Faulty runs are scored by each of these twins. An event is a stretch of rows that `Binary Macro Health Mode`
 calls anomalous; stretches less than a second apart are one.
 """
 
@@ -36,7 +36,6 @@ from bench.detection.metrics import (
     rate,
     vus_pr,
 )
-from bench.detection.one_model.method import healthy_runs, one_model
 from bench.detection.ours import NAME
 from pipeline.cli.main import main as fantwin
 from pipeline.recordings.reading import read_recording
@@ -103,7 +102,7 @@ def measured_tables(progress: Progress, *, libraries: bool) -> tuple[dict[str, R
         for number, (training, calibrating, held_out) in enumerate(folds(runs)):
             names = ", ".join(run.name for run in held_out)
             progress(
-                f"rosa {number + 1}: held out {names}; trained on {len(training)}, limits by {len(calibrating)} runs"
+                f"rosa {number + 1}: held out {names}; trained on {len(training)}, calibrated on {len(calibrating)}"
             )
             place = Path(folder) / f"fold{number}"
             place.mkdir()
@@ -118,7 +117,7 @@ def measured_tables(progress: Progress, *, libraries: bool) -> tuple[dict[str, R
         "rosa: each event, by twins of how many folds it is found": _event_rows(tallies),
     }, [
         f"rosa: every healthy run was held out once, {minutes:.1f} min scored",
-        "rosa: limits for one false alarm in half an hour, extrapolated from healthy runs of a sixth of that time",
+        "rosa: one false alarm in half an hour is declared; calibrated on healthy runs of a sixth of that time",
         *(f"rosa: fantwin, false alarm: {one.run} at {one.raised_ns / 1e9:.2f} s" for one in tallies[NAME].false),
         "rosa: 'beside' are alarms of faulty runs outside of their events and the 5 s after them",
     ]
@@ -183,9 +182,7 @@ def scored_fold(
     rate_hz = 1e9 / blocks[training[0].name][0].period_ns
     learned = [blocks[run.name] for run in training]
     coefficients = fitted_balance(learned)
-    stream = ((run.name, block) for run in calibrating for block in blocks[run.name])
     methods = [
-        one_model(twin, ALARMS_PER_HOUR, healthy_runs(twin, stream)),
         Method(REFERENCE, lambda _: FilteredBalance(coefficients)),
         *plain_methods(rate_hz, ALARMS_PER_HOUR),
         *(library_methods(rate_hz, learned, few_fans=False) if libraries else ()),

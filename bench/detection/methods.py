@@ -3,7 +3,7 @@
 A *detector* is handed the predictions of one tray's run block by block, as the scorer is, and gives for each
 block a score (n, fans), NaN where it has none, and the alarms it raised and cleared. A method that only has a score
 gets its alarms from `Limited`; the limit is set for all of them by one rule on the same healthy runs (`Calibration`).
-The scorer itself (`ours`) brings its own limits, in the twin's card, and its own alarms.
+The scorer itself (`ours`) decides by the rate declared in the twin's card, and raises its own alarms.
 """
 
 from __future__ import annotations

@@ -1,46 +1,34 @@
-"""The scorer itself as a detector, and its calibration on simulated data that are too long for a recording.
-
-`fantwin calibrate` does the same with recordings. Here the healthy samples of all trays lie in plain files of a
-temporary folder, in single precision, and one set of limits is found for the whole fleet.
-"""
+"""The scorer itself as a detector, and its calibration on predictions instead of recordings."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+import pickle
+from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from bench.detection.methods import AlarmChange, MethodOutput
-from bench.detection.plant import BLOCK, STEP_NS, TRAY_FANS
-from bench.detection.simulated import tray_number
-from pipeline.replay.offline.limits_of_twin import find_limits
+from pipeline.replay.offline.calibration_of_twin import calibrated
+from pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
+from pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
+from pipeline.runtime.modelled_fans import modelled_fans
 from pipeline.runtime.stage import Core
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Alarm, Array, Prediction, Score
-from scoring.calibration.healthy_statistics import HealthyRun, one_after_another
-from scoring.limits import Limits, default_timing
-from scoring.samples import Samples, samples_of
+from scoring.calibration.calibration import Calibration
+from scoring.model.bins import Bin, Bins, bin_ns_of
 from twin.export.card_entries import with_card_entries
 
 NAME = "fantwin"
-COLUMNS = (
-    "speed_rad_s",
-    "speed_residual",
-    "speed_sigma_rad_s",
-    "speed_unseen",
-    "balance",
-    "balance_sigma",
-    "balance_unseen",
-    "command",
-    "predicted_rad_s",
-)
-FLAGS = ("speed_valid", "balance_valid", "missing", "reading_missing", "idle", "alive")
+ROOM_BYTES = 1 << 40
+"""of the bins of a run"""
 
 
 class Scorer:
-    """The stage's core. Its score is the largest ratio of a statistic to its limit."""
+    """The stage's core. Its score is how much speaks for a fault, over what an alarm takes."""
 
     def __init__(self, core: Core) -> None:
         self._core = core
@@ -59,77 +47,59 @@ class Scorer:
         return MethodOutput(np.concatenate(scores), changes)
 
 
-class HealthySamples:
-    """Samples of healthy runs, kept in files, to be gone through several times."""
+class HealthyBins:
+    """Bins of healthy runs of one twin's tray, kept in files as `fantwin calibrate` keeps those of recordings."""
 
-    def __init__(self, folder: Path, twins: Iterable[Path]) -> None:
-        """twins: of the trays."""
-        self._folder = folder
-        self._unseen_errors = [load_tray_twin(twin).unseen_error for twin in twins]
-        self._fans: dict[str, int] = {}
-        self._rows: dict[str, int] = {}
+    def __init__(self, folder: Path, twin: Path) -> None:
+        """folder: of its own, made where it is not there."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder, self.twin = folder, twin
+        self._bins: dict[str, Bins] = {}
+        self._runs: dict[str, TrayRun] = {}
 
     def take(self, run: str, block: Prediction) -> None:
-        """Keep a block of a run."""
-        samples = samples_of(block, self._unseen_errors[tray_number(run)])
-        self._fans[run] = block.fans
-        self._rows[run] = self._rows.get(run, 0) + len(block.t_ns)
-        for name in (*COLUMNS, *FLAGS):
-            column: Array = getattr(samples, name)
-            with self._file(run, name).open("ab") as file:
-                column.astype(np.float32 if name in COLUMNS else np.bool_).tofile(file)
+        """Keep a block of a run, in order of time."""
+        if run not in self._runs:
+            twin = load_tray_twin(self.twin, block.fans)
+            fans = modelled_fans(twin)
+            bin_ns = bin_ns_of(block.period_ns, float(fans.held_s.min()))
+            self._bins[run] = Bins(bin_ns, fans.top_rad_s, twin.unseen_error)
+            tray = RecordedTray(Path(run), run, block.fans, "rad/s")
+            self._runs[run] = TrayRun(tray, bin_ns, block.period_ns, ())
+        with self._file(run).open("ab") as file:
+            pickle.dump(list(self._bins[run].take(block)), file)
 
-    def __call__(self) -> Iterator[HealthyRun]:
-        """All runs from the beginning, as scoring.calibration.calibration expects them."""
-        for run, fans in self._fans.items():
-            yield HealthyRun(run, fans, self._blocks(run, fans), fans_of(tray_number(run)))
+    def finish(self) -> None:
+        """End all runs. Only then can processes calibrate side by side."""
+        for name, run in self._runs.items():
+            if not self._file(name).exists():  # it has ended already
+                continue
+            of_run = TrayRun(run.tray, run.bin_ns, run.period_ns, self._read(name))
+            for each in KeptBins(self.folder, ROOM_BYTES).keep(run.tray.path, [of_run]):
+                deque(each.bins, 0)
+            self._file(name).unlink()
 
-    def clear(self) -> None:
-        """Remove the files."""
-        for run in self._fans:
-            for name in (*COLUMNS, *FLAGS):
-                self._file(run, name).unlink()
-        self._fans.clear()
+    def calibrate(self, per_day: float, output: Path, *, extrapolate: bool) -> Calibration:
+        """Write the twin with what `fantwin calibrate` finds.
 
-    def _blocks(self, run: str, fans: int) -> Iterator[Samples]:
-        shape = (self._rows[run], fans)
-        columns = {
-            name: np.memmap(self._file(run, name), np.float32 if name in COLUMNS else np.bool_, "r", shape=shape)
-            for name in (*COLUMNS, *FLAGS)
-        }
-        for first in range(0, shape[0], BLOCK):
-            rows = slice(first, min(first + BLOCK, shape[0]))
-            yield Samples(
-                t_ns=STEP_NS * np.arange(rows.start, rows.stop),
-                period_ns=STEP_NS,
-                **{name: np.array(column[rows], np.float64) for name, column in columns.items() if name in COLUMNS},
-                **{name: np.array(column[rows]) for name, column in columns.items() if name in FLAGS},
-            )
+        Raises:
+            UserError: the runs are too short to show the rate.
+        """
+        self.finish()
+        kept = KeptBins(self.folder, ROOM_BYTES)
+        runs = HealthyRuns([run.tray.path for run in self._runs.values()], HealthyPart(self.twin), kept=kept)
+        found = calibrated(runs, per_day, extrapolate=extrapolate).calibration
+        entry = {"calibration": json.loads(found.model_dump_json())}
+        output.write_bytes(with_card_entries(self.twin.read_bytes(), entry))
+        return found
 
-    def _file(self, run: str, name: str) -> Path:
-        return self._folder / f"{run.replace('/', '-')}.{name}"
+    def _read(self, run: str) -> Iterator[Bin]:
+        with self._file(run).open("rb") as file:
+            while True:
+                try:
+                    yield from pickle.load(file)
+                except EOFError:
+                    return
 
-
-def calibrated_twins(
-    twins: Iterable[Path], healthy: HealthySamples, alarms_per_day: float, *, extrapolate: bool
-) -> tuple[list[Path], Limits]:
-    """Twins with limits in their cards, beside the ones given; and the limits.
-
-    Raises:
-        TooLittleError: the healthy running cannot support so low a rate.
-    """
-    given = list(twins)
-    known = [load_tray_twin(path) for path in given]
-    timing = default_timing(min(run.fans for run in healthy()))
-    limits = find_limits(known, one_after_another(healthy), timing, alarms_per_day, extrapolate=extrapolate)
-    made = []
-    for number, path in enumerate(given):
-        made.append(path.with_name(f"calibrated-{path.name}"))
-        calibration = json.loads(limits.of(fans_of(number)).model_dump_json())
-        made[-1].write_bytes(with_card_entries(path.read_bytes(), {"calibration": calibration}))
-    return made, limits
-
-
-def fans_of(tray: int) -> range:
-    """The fans of the fleet that a tray has."""
-    return range(TRAY_FANS * tray, TRAY_FANS * (tray + 1))
+    def _file(self, run: str) -> Path:
+        return self.folder / f"{run.replace('/', '-')}.pickle"

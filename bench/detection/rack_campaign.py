@@ -59,9 +59,9 @@ def one_rack(data: RackData, rack: int, learning: Sequence[str], is_healthy_judg
 
 def _of_rack(data: RackData, rack: int, learning: Sequence[str], is_healthy_judged: bool) -> Iterator[RackResult]:
     for name in learning:
-        limited = twin_of(data, rack, name)
+        twin = twin_of(data, rack, name)
         tests = (FAULTY, HEALTHY) if is_healthy_judged else (FAULTY,)
-        made = [_judged(data, rack, name, test, limited) for test in tests]
+        made = [_judged(data, rack, name, test, twin) for test in tests]
         yield RackResult(rack, name, made[0], made[1] if is_healthy_judged else None)
 
 

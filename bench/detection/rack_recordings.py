@@ -41,8 +41,8 @@ SEEDS = {SWEEP: 100, "minutes": 200, "night": 300, "test": 400}
 class RackData:
     """The recordings of so many racks at one rate. test_s: length of the test, once without and once with faults.
 
-    without: mechanisms that the racks are calibrated and judged without (bench.detection.without); what is made of the
-    recordings is kept by their names.
+    without: parts of the model that the racks are calibrated and judged without (bench.detection.without); what is made
+    of the recordings is kept by their names.
     """
 
     folder: Path

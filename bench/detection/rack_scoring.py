@@ -1,11 +1,12 @@
-"""A simulated rack as its user has it: twin by `fantwin train`, limits by `fantwin calibrate`, `replay --offline`.
+"""A simulated rack as its user has it: `fantwin train`, `fantwin calibrate` and `fantwin replay --offline`.
 
 The functions of these commands are called, with their defaults and the options of docs/tutorial/own-fan.md. The other
-methods see the same predictions and get their limits from the same recordings.
+methods see the same predictions, and their limits are set on the same recordings.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -19,7 +20,6 @@ from bench.detection.campaigns import calibrate as set_limits
 from bench.detection.competitors import plain_methods
 from bench.detection.methods import Log, Method
 from bench.detection.metrics import RaisedAlarm
-from bench.detection.one_model.method import healthy_runs, one_model
 from bench.detection.rack_recordings import RackData
 from pipeline.cli.twins.calibrate import calibrate
 from pipeline.cli.twins.train import train
@@ -66,7 +66,7 @@ def trained(data: RackData, rack: int, twin: Path) -> None:
 
 
 def calibrated(data: RackData, rack: int, learning: str, twin: Path, output: Path) -> None:
-    """Write the twin with limits from the recordings to learn from; extrapolated where they cannot support the rate.
+    """Write the twin, calibrated on the recordings to learn from; as a target where they cannot show the rate.
 
     Raises:
         UserError: the recordings do not suffice.
@@ -77,18 +77,18 @@ def calibrated(data: RackData, rack: int, learning: str, twin: Path, output: Pat
 
 
 def twin_of(data: RackData, rack: int, learning: str) -> Path:
-    """The twin of a rack with limits from the recordings to learn from; made where it is not kept.
+    """The twin of a rack, calibrated on the recordings to learn from; made where it is not kept.
 
     Raises:
         UserError: the recordings do not suffice.
     """
     twin = data.sweep(rack).parent / "twin.onnx"
-    limited = twin.with_name(f"twin-{data.kept_name(learning)}.onnx")
+    made = twin.with_name(f"twin-{data.kept_name(learning)}.onnx")
     if not twin.exists():
         trained(data, rack, twin)
-    if not limited.exists():
-        calibrated(data, rack, learning, twin, limited)
-    return limited
+    if not made.exists():
+        calibrated(data, rack, learning, twin, made)
+    return made
 
 
 @contextmanager
@@ -99,16 +99,10 @@ def _quietly(log: Path) -> Iterator[None]:
 
 
 def other_methods(data: RackData, rack: int, learning: str, twin: Path) -> list[Method]:
-    """The one model; and the plain methods, with limits from the recordings that the twin is calibrated on."""
+    """The plain methods, with limits from the recordings that the twin is calibrated on."""
     methods = plain_methods(data.rate_hz, DECLARED_PER_DAY / 24.0)
     set_limits(methods, _predictions(data.learning(learning, rack), twin), DECLARED_PER_DAY / 24.0)
-    return [model_of(data, rack, learning, twin), *methods]
-
-
-def model_of(data: RackData, rack: int, learning: str, twin: Path) -> Method:
-    """The one model, with what it learns of the recordings that the twin is calibrated on."""
-    healthy = healthy_runs(twin, _predictions(data.learning(learning, rack), twin))
-    return one_model(twin, DECLARED_PER_DAY / 24.0, healthy)
+    return methods
 
 
 def _predictions(paths: Sequence[Path], twin: Path) -> Iterator[tuple[str, Prediction]]:
@@ -118,8 +112,11 @@ def _predictions(paths: Sequence[Path], twin: Path) -> Iterator[tuple[str, Predi
                 yield path.stem, block
 
 
-def judged(path: Path, twin: Path, methods: list[Method]) -> Judged:
-    """A recording scored as by `fantwin replay --offline`, and by other methods on the same predictions."""
+def judged(
+    path: Path, twin: Path, methods: Sequence[Method] = (), from_s: float = 0.0, to_s: float = math.inf
+) -> Judged:
+    """A recording, or a part of it by itself, scored as by `fantwin replay --offline`, and by other methods on the same
+    predictions."""
     began_s = time.monotonic()
     found = Judged()
     detectors: dict[str, Any] = {}
@@ -134,7 +131,7 @@ def judged(path: Path, twin: Path, methods: list[Method]) -> Judged:
                 detector = detectors.setdefault(method.name, method.detector(message.fans))
                 logs[method.name].take(path.stem, detector.take(message).changes)
 
-    with open_replay_input([path], None, (), twin) as replay_input:
+    with open_replay_input([path], None, (), twin, from_s, to_s) as replay_input:
         for replayed in replay_input.pipeline(replay_input.trays[0].name, observe=observe).run():
             message = replayed.message
             if isinstance(message, Alarm):

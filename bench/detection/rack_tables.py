@@ -24,16 +24,17 @@ AFTER_S = 1800.0
 ASKED_S = {"blocked": 2.0, "no-power": 2.0, "blade": 5.0, "clog": CLOG_S, "bearing": 3600.0}
 ASKED_BEYOND_LIMIT = ("blocked", "no-power")
 """asked is a time after the tacho can show them, of the others one after they begin"""
+SHOWN = "the tacho shows it after"
 Rows = list[dict[str, Any]]
 Progress = Callable[[str], None]
 RACK_NOTES = (
-    f"declared: {DECLARED_PER_DAY:g} false alarm of a fan a day; extrapolated from 15 minutes",
+    f"declared: {DECLARED_PER_DAY:g} false alarm of a fan a day; with 15 minutes of learning a target",
     "beside faults: alarms of fans without a fault, or over 30 min after the end of theirs; after: those before that",
     "a method that raises alarms all the time finds faults by chance: compare those with the same false alarms",
-    "the tacho's limit: when somebody who knows the fan perfectly could tell (bench/detection/rack_limits.py)",
-    "in time: blocked and no power within 2 s of the tacho's limit, blade 5 s, clog 180 s, bearing an hour",
+    f"{SHOWN}: when somebody who knows the fan perfectly could tell (bench/detection/rack_limits.py)",
+    "in time: blocked and no power within 2 s after that, blade 5 s, clog 180 s, bearing an hour",
     "cause, command moved or held: how often right, the one named first and the one on top at the last diagnosis",
-    "all other limits: as many excursions as declared on the recordings that the twin is calibrated on",
+    "limits of the other methods: as many excursions as declared on the recordings that the twin is calibrated on",
 )
 
 
@@ -185,7 +186,7 @@ def kind_rows(shown: Campaign, results: Sequence[RackResult]) -> Rows:
                 "found": f"{len(hits)} of {len(of)}",
                 "in time": _in_time(kind, hits, len(of)),
                 "delay s (90 %)": _quantiles([one.delay_s for one in hits]),
-                "tacho's limit": _quantiles([one.facts.limit_s for one in of]),
+                SHOWN: _quantiles([one.facts.limit_s for one in of]),
                 "beyond it": _quantiles([one.delay_s - one.facts.limit_s for one in hits]),
                 "alarms": f"{np.mean([one.alarms for one in hits]):.1f}" if hits else "-",
                 "cause: moved": _right([one for one in hits if one.is_moved]),
@@ -204,8 +205,12 @@ def _in_time(kind: str, hits: Sequence[Found], of: int) -> str:
 
 
 def method_rows(shown: Campaign, results: Sequence[RackResult]) -> Rows:
-    """How many faults of each kind each method finds, and the median delay in s."""
-    rows: Rows = []
+    """How many faults of each kind each method finds, and the median delay in s; first when the tacho shows them."""
+    limits_s: dict[str, list[float]] = {kind: [] for kind in FAULT_KINDS}
+    for result in results:
+        for event, fact in zip(shown.events[result.rack], shown.facts[result.rack], strict=True):
+            limits_s[event.kind].append(fact.limit_s)
+    rows: Rows = [{"method": SHOWN, **{kind: _shown(limits_s[kind]) for kind in FAULT_KINDS}, "last cause right": "-"}]
     for method in _methods(results):
         row: dict[str, Any] = {"method": method}
         found = [
@@ -229,6 +234,11 @@ def _quantiles(values: Sequence[float]) -> str:
         return "-"
     beyond = f", {len(values) - len(known)} never" if len(known) < len(values) else ""
     return f"{np.median(known):.3g} ({np.quantile(known, 0.9):.3g}){beyond}"
+
+
+def _shown(limits_s: Sequence[float]) -> str:
+    known = [limit_s for limit_s in limits_s if np.isfinite(limit_s)]
+    return f"{len(known)}/{len(limits_s)}" + (f" {np.median(known):.2g}" if known else "")
 
 
 def _right(found: Sequence[Found]) -> str:

@@ -1,10 +1,10 @@
 """The whole decision beside other ways to decide: false alarms, delays, misses and causes where the truth is known.
 
-Simulated: 200 fans that differ, days that differ, twins learned from data; limits for one false alarm of a fan in 30
-days, all set on the same healthy runs; then other healthy days, and five strengths of each kind of fault, in open loop
-and under a speed loop. Racks: simulated 4-pin fans with counting tachos under a thermostat; each rack is learned and
-judged by the documented commands, beside what its tachos can show at all. Measured: the rosa rig, by the public
-commands, limits and twins from healthy runs alone. Every figure is of runs that nothing was learned from.
+Simulated: 200 fans that differ, days that differ, twins learned from data; one false alarm of a fan in 30 days
+declared, and all methods calibrated on the same healthy runs; then other healthy days, and five strengths of each kind
+of fault, in open loop and under a speed loop. Racks: simulated 4-pin fans with counting tachos under a thermostat; each
+rack is learned and judged by the documented commands, beside what its tachos can show at all. Measured: the rosa rig,
+by the public commands, twins from healthy runs alone. Every figure is of runs that nothing was learned from.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import typer
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.detection.measured import measured_tables
+from bench.detection.ours import NAME
 from bench.detection.rack_recordings import LEARNING, RackData
 from bench.detection.rack_tables import RACK_NOTES, rack_tables
 from bench.detection.racks import RATES_HZ
@@ -35,7 +36,8 @@ from bench.detection.simulated_tables import (
 )
 from bench.detection.without import LIST, UnknownMechanismError, list_mechanisms, mechanism, without
 from bench.printing import JsonOption, progress, show
-from scoring.calibration.calibration import TooLittleError
+from pipeline.errors import UserError
+from scoring.calibration.alarm_rate import daily_interval
 
 
 def main(
@@ -52,10 +54,12 @@ def main(
     fault_runs: Annotated[
         int, typer.Option(help="Faults of every fan, each in a run of its own, in which one fan in five has one.")
     ] = 20,
-    commissioned_s: Annotated[
+    fault_after_s: Annotated[
         float, typer.Option(help="Faults begin this long after the start of a run, or up to half a minute later.")
     ] = 60.0,
-    extrapolate: Annotated[bool, typer.Option(help="Set limits beyond what the healthy fan-days can show.")] = True,
+    extrapolate: Annotated[
+        bool, typer.Option(help="Calibrate also where the healthy fan-days cannot show the rate.")
+    ] = True,
     others: Annotated[
         bool, typer.Option(help="Other methods as well; without, the simulated part is ours alone.")
     ] = True,
@@ -81,7 +85,7 @@ def main(
     without_names: Annotated[
         list[str] | None,
         typer.Option(
-            "--without", help="Leave a mechanism of scoring out of calibration and judging; repeatable; `list`: names."
+            "--without", help="Leave a part of the model out of calibration and judging; repeatable; `list`: names."
         ),
     ] = None,
     json_output: JsonOption = False,
@@ -109,7 +113,7 @@ def main(
                     tables |= rack_tables(data, amounts, judged or racks, healthy_racks, workers, progress)
             notes += RACK_NOTES
         elif only != "measured":
-            sizes = Sizes(fans, declared_days, calibration_days, healthy_days, runs, fault_runs, commissioned_s, seed)
+            sizes = Sizes(fans, declared_days, calibration_days, healthy_days, runs, fault_runs, fault_after_s, seed)
             with tempfile.TemporaryDirectory() as folder:
                 _simulated(Path(folder), sizes, extrapolate, others, others and libraries, tables, notes)
         if only not in ("simulated", "rack"):
@@ -132,25 +136,21 @@ def _simulated(
 ) -> None:
     try:
         bench = prepared(folder, sizes, extrapolate=extrapolate, others=others, libraries=libraries, progress=progress)
-    except TooLittleError as error:
-        raise SystemExit(
-            f"{sizes.calibration_days:g} healthy fan-days cannot support one alarm of a fan in "
-            f"{sizes.declared_days:g} days: give --calibration-days {error.needed_fan_hours / 24:.3g}, or --extrapolate"
-        ) from error
+    except UserError as error:
+        raise SystemExit(f"each twin is calibrated on the running of its tray: {error}") from error
     tables["simulated, healthy running of other days"] = healthy_rows(bench, sizes, progress)
     faulty = scored_faults(bench, sizes, progress)
     tables["simulated faults, by method"] = method_rows(faulty, bench)
-    for name in bench.that_name_causes:
-        tables[f"simulated faults, {name}, by kind and strength"] = kind_rows(faulty, name)
-        tables[f"causes reported first by {name}, command moving"] = cause_rows(faulty, name, is_moved=True)
-        tables[f"causes reported first by {name}, command held"] = cause_rows(faulty, name, is_moved=False)
-    rate = bench.limits.declared_rate
-    assert rate
-    low, high = (sizes.declared_days * figure for figure in rate.interval_95)
+    tables["simulated faults by kind and strength"] = kind_rows(faulty, NAME)
+    tables["causes reported first, command moving"] = cause_rows(faulty, NAME, is_moved=True)
+    tables["causes reported first, command held"] = cause_rows(faulty, NAME, is_moved=False)
+    found, fan_hours = (sum(getattr(one, name) for one in bench.calibrations) for name in ("found", "fan_hours"))
+    low, high = (sizes.declared_days * figure for figure in daily_interval(found, fan_hours))
+    factors = ", ".join(f"{one.limit_factor:.3g}" for one in bench.calibrations)
     notes += [
-        f"declared: one false alarm of a fan in {sizes.declared_days:g} days; by the calibration's own interval "
-        f"{low:.2g} to {high:.2g}, from {rate.fan_hours / 24:.3g} fan-days"
-        + (", extrapolated" if rate.extrapolated else ""),
+        f"declared: one false alarm of a fan in {sizes.declared_days:g} days; in calibration {found}, which is "
+        f"{low:.2g} to {high:.2g} (95 %), in {fan_hours / 24:.3g} fan-days; limits by theory times {factors}"
+        + (", a target" if any(one.is_target for one in bench.calibrations) else ""),
     ]
     if not bench.calibration:
         return

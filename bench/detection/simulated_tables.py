@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from bench.detection.campaigns import Healthy, Watch, calibrate, everyday, predi
 from bench.detection.competitors import plain_methods
 from bench.detection.faulty import FAULTY_ONE_IN, Campaign, Cell, campaign
 from bench.detection.libraries import library_methods
-from bench.detection.methods import Calibration, Detector, Method
+from bench.detection.methods import Calibration, Method
 from bench.detection.metrics import (
     Outcome,
     RaisedAlarm,
@@ -24,16 +24,12 @@ from bench.detection.metrics import (
     share,
     vus_pr,
 )
-from bench.detection.one_model.learned import HealthyRuns
-from bench.detection.one_model.method import NAME as ONE_MODEL
-from bench.detection.one_model.method import one_model
-from bench.detection.ours import NAME, HealthySamples, Scorer, calibrated_twins
+from bench.detection.ours import NAME, HealthyBins, Scorer
 from bench.detection.plant import RATE_HZ
 from bench.detection.severities import KINDS
 from bench.detection.simulated import Fleet, stage, trained_fleet, tray_number
-from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Prediction
-from scoring.limits import Limits
+from scoring.calibration.calibration import Calibration as TwinCalibration
 
 FITTING_S = 300.0
 LONGEST_BUFFER_S = 2.0
@@ -53,7 +49,7 @@ class Sizes:
     healthy_days: float
     runs: int
     fault_runs: int
-    commissioned_s: float
+    fault_after_s: float
     seed: int
 
     def seconds(self, fan_days: float) -> float:
@@ -68,13 +64,10 @@ class Bench:
     fleet: Fleet
     methods: list[Method]
     calibrated: list[Path]
-    limits: Limits
+    calibrations: list[TwinCalibration]
+    """of the twins"""
     calibration: Calibration | None
     """of the other methods, if there are any"""
-    healthy: dict[int, HealthyRuns]
-    """healthy running of each tray, for the one model"""
-    per_hour: float
-    """declared false alarms of a fan"""
 
     def watches(self, *, keep_scores: bool) -> dict[str, Watch]:
         """A new watch for each, ours first."""
@@ -83,22 +76,11 @@ class Bench:
             method.name: Watch(lambda _run, fans, m=method: m.detector(fans), keep_scores=keep_scores)
             for method in self.methods
         }
-        if self.methods:
-            others = {ONE_MODEL: Watch(self._one_model, keep_scores=keep_scores), **others}
         return {NAME: ours, **others}
-
-    @property
-    def that_name_causes(self) -> list[str]:
-        """The methods that do."""
-        return [NAME, ONE_MODEL] if self.methods else [NAME]
 
     def every(self, name: str) -> int:
         """The method scores one fan in this many."""
         return next((method.every for method in self.methods if method.name == name), 1)
-
-    def _one_model(self, run: str, fans: int) -> Detector:
-        tray = tray_number(run)
-        return one_model(self.fleet.twins[tray], self.per_hour, self.healthy[tray]).detector(fans)
 
     def _scorer(self, run: str, _fans: int) -> Scorer:
         return Scorer(stage("scorer", self.calibrated[tray_number(run)]))
@@ -110,7 +92,7 @@ def prepared(
     """Train the twins, fit and calibrate all methods on the same healthy runs.
 
     Raises:
-        TooLittleError: the healthy running is too short for a declared rate this low.
+        UserError: the healthy running is too short for a declared rate this low.
     """
     fleet = trained_fleet(folder, sizes.fans, sizes.seed, progress)
     per_hour = 1.0 / (24.0 * sizes.declared_days)
@@ -118,16 +100,23 @@ def prepared(
     if libraries:
         progress("fitting the libraries")
         methods += library_methods(RATE_HZ, _fitting(fleet, sizes.seed + 1000, progress), few_fans=True)
-    kept = HealthySamples(folder, fleet.twins)
+    kept = kept_bins(folder, fleet)
     seconds = sizes.seconds(sizes.calibration_days)
     progress(f"calibration: {sizes.calibration_days:g} fan-days in {sizes.runs} runs of {seconds / 60:.0f} min")
     stream = predictions(fleet, everyday(fleet, sizes.runs, sizes.seed + 2000), seconds, progress)
-    healthy: dict[int, HealthyRuns] = {}
-    calibration = calibrate(methods, _keeping(fleet, kept, healthy, stream), per_hour)
-    progress("limits of the scorer")
-    calibrated, limits = calibrated_twins(fleet.twins, kept, 1.0 / sizes.declared_days, extrapolate=extrapolate)
-    kept.clear()
-    return Bench(fleet, methods, calibrated, limits, calibration, healthy, per_hour)
+    calibration = calibrate(methods, _keeping(kept, stream), per_hour)
+    progress("calibrating the twins")
+    twins = [folder / f"calibrated-{twin.name}" for twin in fleet.twins]
+    calibrations = [
+        healthy.calibrate(1.0 / sizes.declared_days, twin, extrapolate=extrapolate)
+        for healthy, twin in zip(kept, twins, strict=True)
+    ]
+    return Bench(fleet, methods, twins, calibrations, calibration)
+
+
+def kept_bins(folder: Path, fleet: Fleet) -> list[HealthyBins]:
+    """Where the healthy runs of each tray are kept."""
+    return [HealthyBins(folder / f"healthy-{twin.stem}", twin) for twin in fleet.twins]
 
 
 def _fitting(fleet: Fleet, seed: int, progress: Progress) -> list[list[Prediction]]:
@@ -137,13 +126,9 @@ def _fitting(fleet: Fleet, seed: int, progress: Progress) -> list[list[Predictio
     return list(runs.values())
 
 
-def _keeping(fleet: Fleet, kept: HealthySamples, healthy: dict[int, HealthyRuns], stream: Any) -> Any:
+def _keeping(kept: Sequence[HealthyBins], stream: Iterator[tuple[str, Prediction]]) -> Iterator[tuple[str, Prediction]]:
     for run, block in stream:
-        kept.take(run, block)
-        tray = tray_number(run)
-        if tray not in healthy:
-            healthy[tray] = HealthyRuns(load_tray_twin(fleet.twins[tray], block.fans))
-        healthy[tray].take(run, block)
+        kept[tray_number(run)].take(run, block)
         yield run, block
 
 
@@ -204,7 +189,7 @@ class Faulty:
 
 def scored_faults(bench: Bench, sizes: Sizes, progress: Progress) -> Faulty:
     """Score faulty runs by all methods."""
-    shown = campaign(bench.fleet, sizes.fault_runs, sizes.commissioned_s, sizes.seed + 4000)
+    shown = campaign(bench.fleet, sizes.fault_runs, sizes.fault_after_s, sizes.seed + 4000)
     progress(f"faults: {len(shown.events)} in {FAULTY_ONE_IN * sizes.fault_runs} runs of {shown.seconds:.0f} s")
     stream = predictions(bench.fleet, shown.plant, shown.seconds, progress)
     return Faulty(shown, watched(bench.watches(keep_scores=True), stream))

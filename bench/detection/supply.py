@@ -43,7 +43,7 @@ FANS, RATE_HZ, NOISE_RAD_S = 3, 50.0, 4.0
 EPOCH_NS = 1_700_000_000 * NS_PER_S
 FAULTY = 1
 PER_DAY = 1.0
-"""false alarms of a tray that the limits are calibrated for"""
+"""false alarms of a fan that are declared"""
 MEASURED: tuple[Measured, ...] = ("supply_voltage_v", "current_a", "temperature_c")
 KNOWN: dict[str, tuple[Measured, ...]] = {
     "nothing": (),
@@ -97,7 +97,7 @@ def _with(names: Sequence[str], run: Run) -> Run:
 
 
 def calibrated(twin: Path, healthy: Sequence[Run]) -> Path:
-    """The twin with limits from healthy runs, by `fantwin calibrate`."""
+    """The twin, calibrated on healthy runs by `fantwin calibrate`."""
     recordings = [twin.with_name(f"healthy-{number}.mcap") for number in range(len(healthy))]
     for recording, run in zip(recordings, healthy, strict=True):
         metadata = {"site": "bench", "trays": "tray", "speed_unit": "rad/s"}
@@ -213,7 +213,7 @@ def _print_tables(
     for (wander, label), values in sorted(errors.items()):
         spread = f"({min(values):.2f} to {max(values):.2f})"
         print(f"  supply wanders {100 * wander:.0f} %, {label:11}: {np.mean(values):6.2f}  {spread}")
-    print(f"false alarms in {fan_hours:.2f} fan hours of healthy running, limits for {PER_DAY:g} a day")
+    print(f"false alarms in {fan_hours:.2f} fan hours of healthy running, {PER_DAY:g} a fan and day declared")
     for (wander, label), counts in sorted(false_alarms.items()):
         print(f"  supply wanders {100 * wander:.0f} %, {label:11}: {counts}")
     print("first cause of the faulty fan at its last diagnosis")

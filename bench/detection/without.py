@@ -1,6 +1,6 @@
-"""The decision without one of its mechanisms: what would be lost, if it were deleted.
+"""The decision without a part of the model: what would be lost, if it were deleted.
 
-While `without` is entered, calibration and judging both do without the mechanism, so that the limits fit what is left.
+While `without` is entered, calibration and judging both do without it, so that what is learned fits what is left.
 Product code has no switches for this: names of modules and attributes of classes are replaced in this process, and so
 in the processes that are forked from it. `fantwin` in a process of its own is not changed.
 """

@@ -100,15 +100,14 @@ class FleetScores:
             "measured_speed_rad_s": measured,
             "predicted_speed_rad_s": predicted,
             "band_variance": np.full(measured.shape, (2 * SIGMA_RAD_S) ** 2),
-            "smoothed_residual_rad_s": measured - predicted,
             "state": state,
             "valid": valid,
             "invalid_reason": invalid_reason,
             "torque_balance_command": noise / 100,
-            "speed_baseline_rad_s": np.zeros(measured.shape),
-            "balance_baseline_command": np.zeros(measured.shape),
+            "expected_residual_rad_s": np.zeros(measured.shape),
+            "expected_balance_command": np.zeros(measured.shape),
             "score": np.where(valid, score, np.nan),
-            "statistic": np.where(valid, Statistic.SPEED_SMOOTHED, 0),
+            "statistic": np.where(valid, Statistic.DEVIATION, 0),
         }
         arrays = {name: np.asarray(column, columns(Score)[name].dtype) for name, column in values.items()}
         t_ns = START_NS + np.round(t_s * NS_PER_S).astype(np.int64)
@@ -158,10 +157,10 @@ def _alarm(excursion: Excursion, at_s: float, active: bool) -> Alarm:
         t_ns=START_NS + round(at_s * NS_PER_S),
         onset_t_ns=START_NS + round(excursion.onset_s * NS_PER_S),
         residual_rad_s=-8 * SIGMA_RAD_S if active else 0.0,
-        limit_rad_s=2 * SIGMA_RAD_S,
+        residual_std_rad_s=2 * SIGMA_RAD_S,
         message=f"fan {number}: slower than its twin" if active else f"fan {number}: back in the band",
         transition=Transition.RAISED if active else Transition.CLEARED,
-        statistic=Statistic.SPEED_SMOOTHED,
+        statistic=Statistic.DEVIATION,
         score=2.5 if active else 0.2,
         confirmed=True,
     )

@@ -1,8 +1,8 @@
-"""What a message of a small tray costs integrator and scorer: each tray alone, and all trays in one pass.
+"""What a message of a small tray costs the integrator: each tray alone, and all trays in one pass.
 
 Rough fans at 100 Hz under random stairs, watched by a calibrated twin of one such fan. The messages of all trays are
 made outside of the measured time, and the cores run in this process. Both ways make the same messages, but for rounding
-(tests/stages/test_joint_steps.py).
+(tests/stages/test_joint_steps.py). The scorer takes each tray alone.
 
     python -m bench.fleet.joint_cost
 """
@@ -19,7 +19,7 @@ import typer
 
 from bench.detection.plant import START_NS
 from bench.fleet.hall import Hall
-from bench.fleet.stage_cost import SITE, STAGES, calibrated_twin
+from bench.fleet.stage_cost import SITE, calibrated_twin
 from bench.printing import JsonOption, progress, show
 from bench.stage_context import stage_context
 from bench.training.published_fan import RATE_HZ
@@ -27,10 +27,11 @@ from pipeline.config.loading import parse_config
 from pipeline.runtime.building import build_parts
 from pipeline.runtime.joint_step import step_together
 from pipeline.runtime.stage import Core, load_stage
-from schemas.messages import Grid, Message, Prediction
+from schemas.messages import Grid, Message
 
-BEGINNING_S = 25.0
-"""in which baselines are found; it is not measured"""
+STAGES = ("resampler", "twin_integrator")
+BEGINNING_S = 5.0
+"""in which the free runs begin; it is not measured"""
 BLOCKS_S = (0.05, 0.01)
 
 
@@ -39,7 +40,7 @@ def main(
     seconds: Annotated[float, typer.Option(help="That are measured.")] = 10.0,
     json_output: JsonOption = False,
 ) -> None:
-    """Print microseconds of the processor for each message, by stage, length of the messages, and way."""
+    """Print microseconds of the processor for each message, by length of the messages and way."""
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         progress("training and calibrating the twin")
@@ -53,23 +54,20 @@ def main(
 
 def _row(twin: Path, trays: int, block_s: float, seconds: float, *, together: bool) -> dict[str, Any]:
     hall = Hall(8 * trays, 8, block_s)
-    resampler, integrator, scorer = (_stepper(stage, twin, hall, together=together) for stage in STAGES)
-    messages, spent = hall.messages(START_NS, []), {"twin_integrator": 0.0, "scorer": 0.0}
+    resampler, integrator = (_stepper(stage, twin, hall, together=together) for stage in STAGES)
+    messages, spent_s = hall.messages(START_NS, []), 0.0
     for number in range(round((BEGINNING_S + seconds) * RATE_HZ / hall.block)):
         if number == round(BEGINNING_S * RATE_HZ / hall.block):
-            spent = dict.fromkeys(spent, 0.0)
-        grids = _only(Grid, resampler(next(messages)))
-        if not grids:
+            spent_s = 0.0
+        grids = [each for made in resampler(next(messages)) for each in made if isinstance(each, Grid)]
+        if len(grids) < trays:
             continue
         began_s = time.process_time()
-        predictions = _only(Prediction, integrator(grids))
-        between_s = time.process_time()
-        scorer(predictions)
-        spent["twin_integrator"] += between_s - began_s
-        spent["scorer"] += time.process_time() - between_s
+        integrator(grids)
+        spent_s += time.process_time() - began_s
     count = trays * seconds * RATE_HZ / hall.block
     way = "in one pass" if together else "each tray alone"
-    return {"message, s": block_s, "trays": trays, "way": way} | {name: of / count * 1e6 for name, of in spent.items()}
+    return {"message, s": block_s, "trays": trays, "way": way, "twin_integrator": spent_s / count * 1e6}
 
 
 def _stepper(stage: str, twin: Path, hall: Hall, *, together: bool) -> Callable[[Sequence[Any]], list[list[Message]]]:
@@ -87,12 +85,6 @@ def _stepper(stage: str, twin: Path, hall: Hall, *, together: bool) -> Callable[
         return [list(core.step(item)) for core, item in zip(cores, items, strict=True)]
 
     return step
-
-
-def _only(kind: type[Message], of_trays: list[list[Message]]) -> list[Any]:
-    """The message of this kind of each tray; none while there is none."""
-    found = [message for messages in of_trays for message in messages if isinstance(message, kind)]
-    return found if len(found) == len(of_trays) else []
 
 
 if __name__ == "__main__":

@@ -267,7 +267,7 @@ def _alarm(tray: str, fan: int, sequence: int) -> Alarm:
         t_ns=now_ns,
         onset_t_ns=now_ns,
         residual_rad_s=-16.0,
-        limit_rad_s=4.0,
+        residual_std_rad_s=4.0,
         message=f"fan {fan}: slower than its twin",
         transition=Transition.RAISED,
         confirmed=True,

@@ -1,8 +1,9 @@
-"""What a fan-sample costs in each stage: the time of the processor for the cores of the stages and for the codec.
+"""What a fan-sample costs in each stage, and the memory of a fan in the scorer.
 
-Rough fans at 100 Hz under random stairs, all healthy, watched by a calibrated twin of one such fan. Their samples are
-made beforehand, put into messages of a length, and taken by the cores one after the other, in this process. Bus,
-recorder and viewer are not in it.
+Rough fans at 100 Hz under random stairs, all healthy, watched by a calibrated twin of one such fan: trays of 8, of 64,
+and 20 trays of 500. Messages are made beforehand and taken by the cores one after the other, in this process: time of
+the processor for the cores of the stages and for the codec. Memory is by how much this process grows once there are
+scorers. Bus, recorder and viewer are not in it.
 
     python -m bench.fleet.stage_cost
 """
@@ -10,6 +11,7 @@ recorder and viewer are not in it.
 from __future__ import annotations
 
 import io
+import os
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -22,12 +24,16 @@ import numpy as np
 import typer
 
 from bench.detection.plant import START_NS
+from bench.fleet.hall import Hall
 from bench.printing import JsonOption, progress, show
+from bench.runtime.stage_memory import memory_mb
 from bench.stage_context import stage_context
 from bench.training.published_fan import RATE_HZ, rough_run
 from pipeline.cli.twins.calibrate import calibrate
 from pipeline.config.loading import parse_config
+from pipeline.config.models import Config
 from pipeline.recordings.writing import RecordingWriter
+from pipeline.runtime.building import build_parts
 from pipeline.runtime.stage import Core, load_stage
 from schemas.codec import decode, encode
 from schemas.header import Header
@@ -41,19 +47,22 @@ SITE, TRAY = "fleet", "tray1"
 STAGES = ("resampler", "twin_integrator", "scorer")
 TRAINING_S, HEALTHY_S = 80.0, 150.0
 BLOCKS_S = (0.05, 0.1, 1.0)
-TRAYS = (8, 64)
-"""fans of a tray"""
+TRAYS = {8: 16, 64: 4, 500: 20}
+"""fans of a tray, and number of trays"""
+BEGINNING_S = 10.0
+"""before there are scorers; it is not measured"""
 
 
 @dataclass
 class Cost:
-    """Of the samples of one tray so far."""
+    """Of the samples so far."""
 
     seconds: dict[str, float] = field(default_factory=dict[str, float])
     """of the processor, by stage"""
     bytes: dict[str, int] = field(default_factory=dict[str, int])
     """of the messages, by topic"""
     alarms: int = 0
+    scorer_mb: float = 0.0
 
     def add(self, name: str, seconds: float) -> None:
         """Of a stage or the codec."""
@@ -61,7 +70,10 @@ class Cost:
 
 
 def main(
-    seconds: Annotated[float, typer.Option(help="Of samples, for each row.")] = 60.0,
+    seconds: Annotated[float, typer.Option(help="Of samples, for each row.")] = 30.0,
+    fans_of_tray: Annotated[
+        list[int] | None, typer.Option(help="8, 64 or 500, which makes 10,000 fans; repeatable. Default: all three.")
+    ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Print microseconds for each fan-sample, by stage, length of the messages, and fans of a tray."""
@@ -69,13 +81,11 @@ def main(
     with tempfile.TemporaryDirectory() as folder:
         progress("training and calibrating the twin")
         twin = calibrated_twin(Path(folder))
-        for fans in TRAYS:
-            progress(f"simulating {fans} fans for {seconds:g} s")
-            run = rough_run(3, seconds, fans, fan_variation=0.0).run
+        for fans in fans_of_tray or TRAYS:
             for block_s in BLOCKS_S:
-                progress(f"{fans} fans, messages of {block_s:g} s")
-                cost = cost_of(run, block_s, twin, Path(folder))
-                rows.append(_row(fans, block_s, cost, run.samples * fans))
+                hall = Hall(fans * TRAYS[fans], fans, block_s)
+                progress(f"{hall.trays} trays of {fans} fans, messages of {block_s:g} s")
+                rows.append(_row(hall, block_s, cost_of(hall, seconds, twin), seconds))
     show({"us of the processor for each fan-sample": rows}, ["bytes: of all four messages"], as_json=json_output)
 
 
@@ -108,22 +118,34 @@ def raws(run: Run, block_s: float) -> Iterator[Raw]:
         )
 
 
-def cost_of(run: Run, block_s: float, twin: Path, folder: Path) -> Cost:
-    """What the samples of a run cost, in messages of a length."""
-    text = (
-        f'site = "{SITE}"\nrun_folder = "{folder / "runs"}"\n'
-        f'[[tray]]\nname = "{TRAY}"\nfans = {run.fans}\ntwin = "{twin}"\n'
-    )
-    config = parse_config(text, folder / "fantwin.toml", (), STAGES)
-    cores = [load_stage(stage).build(stage_context(config, stage)).core for stage in STAGES]
-    cost = Cost()
-    for raw in raws(run, block_s):
-        _take(raw, STAGES, cores, cost)
+def cost_of(hall: Hall, seconds: float, twin: Path) -> Cost:
+    """What the samples of a hall cost."""
+    table = f'[[tray]]\nname = "{{}}"\nfans = {hall.fans_of_tray}\ntwin = "{twin}"\n'
+    text = f'site = "{SITE}"\n[resampler]\nrate_hz = {RATE_HZ:g}\n' + "".join(map(table.format, hall.names))
+    config = parse_config(text, twin.parent / "fantwin.toml", (), STAGES)
+    messages, cost = hall.messages(START_NS, []), Cost()
+    before = [_cores(stage, config) for stage in STAGES[:-1]]
+    for _ in range(round(BEGINNING_S * RATE_HZ / hall.block)):
+        for tray, raw in enumerate(next(messages)):
+            _take(raw, STAGES, [of[tray] for of in before], Cost())
+    began_mb = memory_mb(os.getpid())[0]
+    stages = [*before, _cores(STAGES[-1], config)]
+    for _ in range(round(seconds * RATE_HZ / hall.block)):
+        for tray, raw in enumerate(next(messages)):
+            _take(raw, STAGES, [of[tray] for of in stages], cost)
+    cost.scorer_mb = memory_mb(os.getpid())[0] - began_mb
     return cost
 
 
+def _cores(stage: str, config: Config) -> list[Core]:
+    """One for each tray."""
+    return [parts.core for parts in build_parts(load_stage(stage), stage_context(config, stage)).values()]
+
+
 def _take(message: Raw | Grid | Prediction, stages: Sequence[str], cores: Sequence[Core], cost: Cost) -> None:
-    """A message travels to the first of some stages, and what that makes of it to the next."""
+    """A message travels to the first of some stages, and what that makes of it to the next that has a core."""
+    if not cores:
+        return
     arrived = _travelled(message, cost)
     began_s = time.process_time()
     made = cores[0].step(arrived)
@@ -146,17 +168,20 @@ def _travelled(message: Any, cost: Cost) -> Any:
     return arrived
 
 
-def _row(fans: int, block_s: float, cost: Cost, fan_samples: int) -> dict[str, Any]:
+def _row(hall: Hall, block_s: float, cost: Cost, seconds: float) -> dict[str, Any]:
+    fan_samples = hall.fans * seconds * RATE_HZ
     us = {name: seconds / fan_samples * 1e6 for name, seconds in cost.seconds.items()}
     total_us = sum(us.values())
     return {
-        "fans of the tray": fans,
+        "fans": hall.fans,
+        "of a tray": hall.fans_of_tray,
         "message, s": block_s,
         **{name: us[name] for name in (*STAGES, "codec")},
         "sum": total_us,
         "fans at 100 Hz a core": round(1e6 / (total_us * RATE_HZ)),
         "bytes": sum(cost.bytes.values()) / fan_samples,
         "alarms": cost.alarms,
+        "scorer, MB a fan": cost.scorer_mb / hall.fans,
     }
 
 

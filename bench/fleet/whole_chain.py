@@ -45,7 +45,7 @@ from tests.support.running_chain import RunningCommand, eventually
 
 STAGES = ("resampler", "twin_integrator", "scorer", "recorder")
 BEGINNING_S = 30.0
-"""in which baselines are found; it is not measured"""
+"""in which the fans become known; it is not measured"""
 LATE_S = 10.0
 """an alarm may come so long after the end of its fault"""
 DEADLINE_S = 1800.0
@@ -125,7 +125,7 @@ def run(
         finally:
             up.kill()
     fan_samples = hall.fans * seconds * RATE_HZ
-    rows = list(_rows((before, halfway, after), fan_samples))
+    rows = list(_rows((before, halfway, after), fan_samples, hall.fans))
     recorded = sum(path.stat().st_size for path in (twin.parent / "runs").glob("*.mcap"))
     return rows, {
         "fans": hall.fans,
@@ -204,15 +204,15 @@ def _measured(watcher: SiteWatcher) -> dict[str, Measured]:
     return found
 
 
-def _rows(measured: Sequence[dict[str, Measured]], fan_samples: float) -> Iterator[dict[str, Any]]:
+def _rows(measured: Sequence[dict[str, Measured]], fan_samples: float, fans: int) -> Iterator[dict[str, Any]]:
     """measured: at the beginning, halfway and at the end."""
     all_s, moments = 0.0, ("MB before", "halfway", "after")
     for stage in STAGES:
         cpu_s = measured[-1][stage].cpu_s - measured[0][stage].cpu_s
         all_s += cpu_s
         memory = {moment: each[stage].memory_mb for moment, each in zip(moments, measured, strict=True)}
-        yield {"stage": stage, **_cost(cpu_s, fan_samples), **memory}
-    yield {"stage": "all", **_cost(all_s, fan_samples), **dict.fromkeys(moments)}
+        yield {"stage": stage, **_cost(cpu_s, fan_samples), **memory, "MB a fan": memory[moments[-1]] / fans}
+    yield {"stage": "all", **_cost(all_s, fan_samples), **dict.fromkeys((*moments, "MB a fan"))}
 
 
 def _cost(cpu_s: float, fan_samples: float) -> dict[str, Any]:

@@ -145,12 +145,11 @@ def snapshots_with_wear(recorded: Sequence[Envelope], points: int) -> list[Envel
     found: list[Envelope] = []
     for number in range(SNAPSHOTS):
         for fan in state["wear"]["fans"]:
-            for parameter in fan["parameters"].values():
-                series = WearSeries()
-                for point in range(points):
-                    t_ns = START_NS + point * WEAR_EVERY_NS + int(rng.integers(WEAR_EVERY_NS))
-                    series.add(t_ns, rng.normal(0.0, 0.02), rng.uniform(0.005, 0.02))
-                parameter["series"] = {name: column.tolist() for name, column in series.snapshot().items()}
+            series = WearSeries()
+            for point in range(points):
+                t_ns = START_NS + point * WEAR_EVERY_NS + int(rng.integers(WEAR_EVERY_NS))
+                series.add(t_ns, rng.normal(0.0, 0.02), rng.uniform(0.005, 0.02))
+            fan["series"] = series.snapshot()
         message = replace(snapshot, state_json=json.dumps(state))
         found.append(Envelope.of(last.key, message, START_NS + 60 * number * NS_PER_S))
     return found

@@ -34,7 +34,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "acquisition": (*COMMON, "serial", "cobs.cobs"),
     "resampler": COMMON,
     "twin_integrator": (*COMMON, "scipy.signal", "onnxruntime"),
-    "scorer": (*COMMON, "scipy.signal", "scipy.special", "scipy.stats", "scipy.ndimage"),
+    "scorer": (*COMMON, "scipy.special"),
     "recorder": (*COMMON, "mcap.writer", "zstandard"),
     "viewer": (
         *COMMON,

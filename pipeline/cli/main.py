@@ -25,8 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "commission": (
         "watch.commission",
-        "Record healthy fans, train their twins, set alarm limits, add the twins to the configuration, start "
-        "`fantwin up`.",
+        "Record healthy fans, train their twins, calibrate them, add them to the configuration, start `fantwin up`.",
     ),
     "up": ("watch.up", "Start all stages, restart those that die, stop all in order on Ctrl-C."),
     "run": ("watch.run", "Run one stage alone, until Ctrl-C."),
@@ -38,7 +37,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "wear": (
         "watch.wear",
-        "Show how each fan has changed since commissioning, how fast, and when its limit will be reached\n"
+        "Show how the speed of each fan has changed since commissioning, how fast, and when its limit will be reached\n"
         "(docs/explanation/wear.md).",
     ),
     "command": ("watch.command", "Send a command to one fan, and wait until acquisition has sent it to the device."),
@@ -107,7 +106,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "calibrate": (
         "twins.calibrate",
-        "Set the alarm limits of a twin from healthy recordings, and write them into its card.",
+        "Learn from healthy recordings how far a twin's fans may differ from it, and write that into its card.",
     ),
     "evaluate": (
         "twins.evaluate",

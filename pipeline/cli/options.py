@@ -14,7 +14,7 @@ from schemas.auxiliary import AUXILIARY
 ConfigOption: TypeAlias = Annotated[Path, typer.Option("-c", "--config", help="Configuration file (TOML).")]
 SetOption: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override one key, e.g. scorer.on_delay_s=1.0. Repeatable."),
+    typer.Option("--set", metavar="KEY=VALUE", help="Override one key, e.g. scorer.alarm_share=1.0. Repeatable."),
 ]
 JsonOption: TypeAlias = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 

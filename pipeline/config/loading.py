@@ -61,7 +61,7 @@ def load_config(path: Path, overrides: Iterable[str] = (), stages: Iterable[str]
 
     Args:
         path: the file.
-        overrides: keys set on top of it, `key=value`, such as `scorer.on_delay_s=1.0`.
+        overrides: keys set on top of it, `key=value`, such as `scorer.alarm_share=1.0`.
         stages: the stages whose sections are checked, and which are imported for that; None: all enabled stages.
 
     Raises:
@@ -170,7 +170,7 @@ def _override(table: dict[str, Any], override: str) -> None:
         raise ConfigUsageError(f"--set {override[:LONGEST_SHOWN]}...: longer than {LONGEST_OVERRIDE:,} characters")
     dotted, equals, value_text = override.partition("=")
     if not equals:
-        raise ConfigUsageError(f"--set {override}: write KEY=VALUE, for example --set scorer.on_delay_s=1.0")
+        raise ConfigUsageError(f"--set {override}: write KEY=VALUE, for example --set scorer.alarm_share=1.0")
     try:
         value = tomllib.loads(f"value = {value_text}")["value"]
     except tomllib.TOMLDecodeError as error:

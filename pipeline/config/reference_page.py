@@ -30,7 +30,7 @@ _INTRODUCTION = f"""# Configuration
 
 One TOML file of at most {LARGEST_FILE_BYTES >> 20} MiB holds the settings of a site. Only a `[[tray]]` with `name` and
 `fans` is required. Unknown keys are refused, with the nearest known one. Keys that end in `_s` are in seconds. Relative
-paths start at the folder of the file. `--set` changes a key for one command: `--set scorer.on_delay_s=1.0`,
+paths start at the folder of the file. `--set` changes a key for one command: `--set scorer.alarm_share=1.0`,
 `--set tray.0.port=/dev/ttyUSB1`. `fantwin doctor -c FILE` checks a file.
 
 Where the default is empty, the description says what holds; times of the `[scorer]` are then those that the twin was

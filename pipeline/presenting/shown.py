@@ -98,19 +98,10 @@ def fan_in_full(model: SiteModel, fan: Fan) -> dict[str, Any]:
 
 
 def _wear_json(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Change and limit are shares of the healthy value where the unit is `relative`, else commands."""
-    shown = (
-        "parameter",
-        "unit",
-        "command_unit",
-        "change",
-        "per_day",
-        "days",
-        "limit",
-        "reached_t_ns",
-        "unknown_reason",
-    )
-    return _without_nan({**{name: row[name] for name in shown}, "error": row["change_std_error"], "t_ns": row["t_ns"]})
+    """Changes and limit are shares of the speed. t_ns: at which they hold."""
+    shown = ("parameter", "unit", "change", "beside", "per_day", "days", "limit", "reached_t_ns", "unknown_reason")
+    values = {name: row[name] for name in shown}
+    return _without_nan({**values, "error": row["change_std_error"], "t_ns": row["seen_t_ns"]})
 
 
 def _without_nan(value: Any) -> Any:

@@ -206,7 +206,7 @@ class SiteModel:
             return {fan: SHOWN_CLASSES[each].group for fan, each in zip(self._fleet.fans, classes, strict=True)}
 
     def words_now(self, fans: Sequence[Fan]) -> list[str]:
-        """Of each: that it is stopped, starting or back within its limits; empty: none of these."""
+        """Of each: that it is stopped, starting or like a healthy fan again; empty: none of these."""
         with self._lock:
             classes = classes_of(self._fleet)
             return [SHOWN_CLASSES[classes[self._fleet.index(fan)]].now for fan in fans]
@@ -298,7 +298,7 @@ class SiteModel:
                 self._wear[tray] = (snapshot.t_ns, wear_rows(tray, snapshot.t_ns, wear))
 
     def wear(self, fan: Fan) -> Sequence[Mapping[str, Any]]:
-        """The wear of a fan, a row for each parameter, as of the last snapshot of its scorer; empty: none is known."""
+        """The wear of a fan as of the last snapshot of its scorer, one row; empty: none is known."""
         with self._lock:
             _, rows = self._wear.get(fan.tray, (0, ()))
         return [row for row in rows if row["fan"] == fan.number]

@@ -1,48 +1,43 @@
-"""Configuration of the scorer, and what it knows about the twin of its tray: limits, balances, tachos, standstill."""
+"""Configuration of the scorer, and what it knows about the twin of its tray."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from pydantic import Field, ValidationError
 
+from pipeline.runtime.modelled_fans import modelled_fans
 from pipeline.runtime.stage import Context, StageConfig, StageError
 from pipeline.runtime.tray_twin import TrayTwin
 from schemas.standstill import Standstill
-from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from scoring.detectors.running_on import RunningOnSettings
-from scoring.detectors.standstill import StandstillSettings
-from scoring.diagnosis.regression_window import HealthyBalance
-from scoring.limits import Limits, Timing, uncalibrated
+from schemas.tacho import Tacho
+from schemas.units import S_PER_DAY
+from scoring.calibration.calibration import Calibration
+from scoring.diagnosis.advice import Advice
+from scoring.diagnosis.steady_fan import SteadyFan
+from scoring.model.operation import Fans
+from scoring.model.priors import Priors
 from scoring.unseen_error import UnseenError
 
-LEAST_OFF_DELAY_S, OFF_DELAY_COUNTS = 1.0, 10.0
+FALSE_ALARMS_PER_DAY = 0.03
+"""declared, of a fan, where nobody says otherwise: one in a month"""
 
 
 class ScorerConfig(StageConfig):
-    """Section `[scorer]`. Times that are not given are those that the twin was calibrated with."""
+    """Section `[scorer]`."""
 
-    alarm_sigmas: float = Field(
-        default=2.0, gt=0, description="limit on the smoothed speed residual of a twin without calibration, in sigma"
-    )
-    limit_factor: float = Field(
-        default=1.0, gt=0, description="multiplies all limits; above 1: fewer alarms than declared"
-    )
-    smoothing_s: float | None = Field(default=None, ge=0, description="time constant of the low-pass of residuals")
-    baseline_s: float | None = Field(default=None, gt=0, description="length of an interval of commissioning")
-    adaptation_s: float | None = Field(default=None, gt=0, description="time constant of the baseline in the long run")
-    on_delay_s: float | None = Field(default=None, ge=0, description="how long a limit must be exceeded to raise")
-    off_delay_s: float | None = Field(
+    false_alarms_per_day: float | None = Field(
         default=None,
-        ge=0,
-        description="shortest return that clears an alarm; it is longer for statistics with a longer memory; "
-        "default: 1 s, or ten counts of a counting tacho",
+        gt=0,
+        le=8640,
+        description="declared rate of false alarms of a fan; default: that of the twin's calibration, else 0.03, which "
+        "is one a month",
     )
-    deadband: float = Field(default=0.5, ge=0, lt=1, description="a return begins below 1 - deadband times the limit")
-    alarm_ratio: float = Field(default=1.5, ge=1, description="score from which a warning is an alarm")
+    alarm_share: float = Field(
+        default=0.1, gt=0, description="share of the speed that a fault takes, from which a warning is an alarm"
+    )
     latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
     confirming: bool = Field(default=False, description="whether an acknowledged alarm must be confirmed, too")
     wear_every_s: float = Field(default=600.0, gt=0, description="how often the wear of a fan is measured")
@@ -51,7 +46,6 @@ class ScorerConfig(StageConfig):
         gt=0,
         description="health reports a fan without a score for this long; set it above twin_integrator.warm_up_s",
     )
-
     asks_for_snapshots: bool | None = Field(
         default=None,
         description="whether it continues from the snapshot that a recorder keeps, where that is newer than its own "
@@ -59,105 +53,71 @@ class ScorerConfig(StageConfig):
         "it is one of several shards",
     )
 
-    def timing(self, calibrated: Timing) -> Timing:
-        """The times in force."""
-        own = {name: getattr(self, name) for name in Timing.model_fields}
-        return calibrated.model_copy(update={name: value for name, value in own.items() if value is not None})
-
-    def least_off_delay_s(self, tachos: Sequence[Tacho]) -> float:
-        """`off_delay_s`, of these tachos where it is not given."""
-        if self.off_delay_s is not None:
-            return self.off_delay_s
-        return max([LEAST_OFF_DELAY_S, *(OFF_DELAY_COUNTS * tacho.held_s for tacho in tachos)])
-
 
 @dataclass(frozen=True, eq=False)
 class HealthyTwin:
     """What the scorer knows about the twin. sha256: identifies its file."""
 
     sha256: str
-    limits: Limits
-    balances: Sequence[HealthyBalance]
-    command_unit: str = ""
-    tachos: tuple[Tacho, ...] = INSTANTANEOUS
-    """one for all fans, or one for each"""
+    fans: Fans
+    steady_fans: Sequence[SteadyFan]
+    tachos: Sequence[Tacho]
+    """of each fan"""
+    advice: Advice = Advice()
     standstill: Standstill | None = None
-    highest_command: float = math.inf
-    """that it was trained on"""
     unseen_error: UnseenError | None = None
     """where healthy runs do not show it; None: its card says nothing about it"""
-    is_calibrated: bool = True
-    knows_supply: bool = False
+    has_supply: bool = False
     """whether it needs the supply voltage, and so allows for it"""
+    priors: Priors = Priors()
+    limit_factor: float = 1.0
+    declared_per_day: float = FALSE_ALARMS_PER_DAY
+    is_calibrated: bool = False
 
-    def of_trays(self, count: int, fans: int) -> HealthyTwin:
-        """The same for the fans of so many trays with as many fans each; without balances."""
-        rows = [*range(fans)] * count
-        return replace(
-            self,
-            limits=self.limits.of(rows),
-            balances=(),
-            tachos=tacho_of_each_fan(self.tachos, fans) * count,
-            unseen_error=self.unseen_error and self.unseen_error.of_fans(rows),
-        )
-
-
-def limits_in_force(
-    config: ScorerConfig, calibration: Mapping[str, Any] | None, standstill: Standstill | None = None
-) -> Limits:
-    """The limits of a twin's card, or those of a twin without calibration, with the scorer's settings applied.
-
-    standstill: of the card; calibration does not change it.
-
-    Raises:
-        ValidationError: the calibration is not valid.
-    """
-    if calibration is None:
-        limits = uncalibrated(config.alarm_sigmas, config.timing(Timing()))
-        return _with_standstill(limits, standstill).times(config.limit_factor)
-    limits = _with_standstill(Limits.model_validate(calibration), standstill)
-    timing = config.timing(limits.timing)
-    declared_rate = limits.declared_rate if timing == limits.timing else None  # it holds for the calibrated times
-    return limits.model_copy(update={"timing": timing, "declared_rate": declared_rate}).times(config.limit_factor)
-
-
-def _with_standstill(limits: Limits, standstill: Standstill | None) -> Limits:
-    if standstill is None:
-        return limits
-    return limits.with_detectors(
-        standstill=StandstillSettings(healthy=standstill), running_on=RunningOnSettings(healthy=standstill)
-    )
+    @property
+    def declared_s(self) -> float:
+        """The mean time between two false alarms of a fan."""
+        return S_PER_DAY / self.declared_per_day
 
 
 def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
     """What a scorer needs to know about the twin of its tray.
 
     Raises:
-        StageError: the twin's calibration cannot be used for this tray.
+        StageError: the twin's calibration cannot be used.
     """
-    again, name = "calibrate it again: fantwin calibrate", context.tray.twin or twin.card.name
+    name = context.tray.twin or twin.card.name
     try:
-        limits = limits_in_force(context.config, twin.card.calibration, twin.card.standstill)
+        return known_of(twin, context.config.false_alarms_per_day)
     except ValidationError as error:
         first = error.errors()[0]
         why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        again = "calibrate it again: fantwin calibrate"
         raise StageError(f"{name}: its calibration cannot be used: {why}; {again}") from error
-    for residual in (limits.speed, limits.balance):
-        fans = len(residual.fan_offsets.offset_sigmas) if residual.fan_offsets else context.tray.fans
-        if len(residual.low_frequency_std_of_fans) not in (0, twin.card.fans):
-            fans = len(residual.low_frequency_std_of_fans)
-        if fans != context.tray.fans:
-            raise StageError(f"{name}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}")
-    card = twin.card
+
+
+def known_of(twin: TrayTwin, declared_per_day: float | None = None) -> HealthyTwin:
+    """What the card of a twin tells. declared_per_day: instead of the declared rate of its calibration.
+
+    Raises:
+        ValidationError: its calibration is not valid.
+    """
+    card, balance, fans = twin.card, twin.balance, modelled_fans(twin)
+    calibration = Calibration.model_validate(card.calibration) if card.calibration is not None else None
+    declared = calibration.false_alarms_per_day if calibration else FALSE_ALARMS_PER_DAY
+    lowest_command = card.standstill.turning_command if card.standstill else 0.0
+    of_fans = zip(balance.viscous.tolist(), balance.drag.tolist(), balance.friction.tolist(), strict=True)
     return HealthyTwin(
         twin.sha256,
-        limits,
-        twin.healthy_balances(),
-        card.command_unit,
-        card.tacho,
+        fans,
+        [SteadyFan(*each, card.top_speed_rad_s, twin.drive is not None) for each in of_fans],
+        twin.tachos,
+        Advice(card.command_unit, lowest_command, card.command_range[1] if card.command_range else math.inf),
         card.standstill,
-        card.command_range[1],
         twin.unseen_error,
-        card.calibration is not None,
         card.conditions is not None and card.conditions.supply_voltage_v is not None,
+        calibration.priors if calibration else Priors(),
+        calibration.limit_factor if calibration else 1.0,
+        declared_per_day or declared,
+        calibration is not None,
     )

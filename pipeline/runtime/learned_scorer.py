@@ -1,8 +1,9 @@
 """The scorer of a tray whose twin is learned while it runs: a core for each version, one at a time.
 
 Predictions name their twin, and the integrator publishes a twin before its first prediction. So the core changes at the
-same sample in a replay. Where only the limits are new, baselines, alarms and wear go on; with another twin baselines
-and alarms start from the beginning, except for what operators have set, and wear goes on.
+same sample in a replay. Where only the calibration is new, what was learned of the fans, alarms and wear go on;
+with another twin what was learned and alarms start from the beginning, except for what operators have set, and wear
+goes on.
 """
 
 from __future__ import annotations
@@ -167,7 +168,7 @@ class LearnedTwinScorer(Core):
             before = self._core.last_snapshot() if self._core else []
             continues = before[0] if before else None
             if continues and self._has_other_limits_only(card):
-                continues = replace(continues, twin_sha256=twin.sha256)  # baselines, alarms and wear go on
+                continues = replace(continues, twin_sha256=twin.sha256)  # what was learned, alarms and wear go on
             core = self._core_of(twin, continues)
         except StageError as error:
             self._problem = str(error)

@@ -1,212 +1,257 @@
 """How one tray is scored: a block of predictions in, its scores and the messages on alarms out.
 
-Four things are kept apart: the *statistics* on two residuals (scoring.fan_scorer), their *limits* (scoring.limits, from
-the twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.alarms.tray_conditions), and its *diagnosis*
-(scoring.diagnosis.diagnosis). They are built and connected here, with slow wear (scoring.wear) beside them.
+Samples become bins (scoring.model.bins). At the end of each, the model of a healthy fan and the evidence for its faults
+are brought up to date (scoring.model.decision), fans that stand or turn against their command are looked for
+(scoring.standing), and so is slow wear (scoring.wear). Whatever is wrong becomes one alarm of the fan, with a state
+after OPC UA Part 9 (scoring.alarms) and causes (scoring.diagnosis). They are built and connected here.
 See docs/explanation/deciding.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
-from schemas.messages import Alarm, Array, Prediction, Score
-from schemas.side_by_side import present_columns
+from schemas.enums import Severity, Statistic
+from schemas.messages import Alarm, Array, Diagnosis, Prediction, Score
 from schemas.units import NS_PER_S
-from scoring.alarms.alarm_manager import AlarmContext, AlarmManager
+from scoring.alarms.alarm_manager import AlarmManager, Measured
 from scoring.alarms.alarm_text import AlarmText
-from scoring.alarms.fan_condition import ALARM, NORMAL, RETURNING, ConditionSettings
-from scoring.alarms.holding import holding_detectors
-from scoring.alarms.tray_conditions import UNKNOWN, AlarmEvent
-from scoring.diagnosis.advice import Advice
-from scoring.diagnosis.diagnoser import Diagnoser
-from scoring.fan_scorer import FanScorer
-from scoring.interval_scorer import HALF_LIMIT
-from scoring.samples import Samples, among, arrived, samples_of
-from scoring.score_message import score_of
-from scoring.scored_block import ScoredBlock
-from scoring.wear.followed import followed_fans, shared_by_all
-from scoring.wear.reference import healthy_fans
-from scoring.wear.wear_monitor import WearInputs, WearMonitor
+from scoring.alarms.fan_condition import ConditionSettings
+from scoring.alarms.tray_conditions import Decided
+from scoring.diagnosis.advice import SeenSinceOnset
+from scoring.diagnosis.cause_words import CauseWords, PossibleCause
+from scoring.diagnosis.shown_causes import CANNOT_TELL, SENSOR_DROPOUT, SLOW_CHANGE
+from scoring.diagnosis.standstill_causes import Standing, standstill_causes
+from scoring.model.bins import Bin, Bins, bin_ns_of
+from scoring.model.decision import Decision
+from scoring.model.saved import as_json, from_json, part, within
+from scoring.samples import IDLE, among
+from scoring.score_message import ScoreColumns, score_of
+from scoring.standing.against_command import KINDS, AgainstCommand
+from scoring.standing.falls import Falls
+from scoring.wear.wear_monitor import WearMonitor
+
+NAMED_AFTER_S, FALLING_S = 3.0, 4.0
+"""an onset is so old before a cause is named; so long after an alarm a fan that has lost much speed may come to rest"""
+KNOWN_SOON = "cannot tell yet: more is known in a few seconds"
 
 
 class TrayScorer:
-    """The scores, alarms and wear of one tray's fans."""
+    """The scores, alarms and wear of one tray's fans. What it tells of a fan is that of the end of the last bin."""
 
     def __init__(self, fans: int, text: AlarmText, config: ScorerConfig, twin: HealthyTwin) -> None:
-        """From the beginning: no fan is commissioned, and none has an alarm."""
+        """From the beginning: nothing is known of a fan but its twin, and none has an alarm."""
         self.fans, self.twin = fans, twin
-        self._text = text
-        self._sigma_rad_s = np.ones(fans)
-        self.fan_scorer = FanScorer(fans, twin.limits, tachos=twin.tachos)
-        lowest_command = twin.standstill.turning_command if twin.standstill else 0.0
-        self._diagnoser = Diagnoser(
-            twin.balances,
-            Advice(twin.command_unit, lowest_command, twin.highest_command),
-            twin.tachos,
-            twin.standstill,
-            knows_supply=twin.knows_supply,
-        )
-        healthy = healthy_fans(twin.balances, twin.limits.balance)
-        self.wear = WearMonitor(healthy, self._diagnoser, config.wear_every_s, twin.command_unit)
-        off_delay_s = config.least_off_delay_s(twin.tachos)
-        settings = ConditionSettings(
-            on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),
-            return_ratio=1.0 - config.deadband,
-            alarm_ratio=config.alarm_ratio,
-            latching=config.latching,
-            confirming=config.confirming,
-            settling_ns=self.fan_scorer.longest_memory_ns,
-            detectors=holding_detectors(self.fan_scorer.detectors, off_delay_s),
-        )
-        self.alarms = AlarmManager(fans, settings, self._diagnoser, text)
+        self._alarm_share = config.alarm_share
+        self._words = CauseWords(twin.advice, has_supply=twin.has_supply)
+        self.wear = WearMonitor(fans, config.wear_every_s)
+        self._against = AgainstCommand(twin.standstill, twin.tachos) if twin.standstill else None
+        self.alarms = AlarmManager(fans, ConditionSettings(config.latching, config.confirming), text)
+        self._period_ns = 0
+        self._open(NS_PER_S)
+        self._period_ns = 0  # of no sample yet
+        self._stands = np.zeros(fans, np.bool_)
+        """(fans,) against its command"""
+        self._kind = np.zeros(fans, np.int64)
+        """(fans,) what it does against its command, number in KINDS"""
+        self._seen = np.zeros((4, fans))
+        """(4, fans) lowest and highest speed, lowest and highest command since an alarm was raised"""
+        self._now = ScoreColumns.empty(fans)
+
+    def _open(self, period_ns: int) -> None:
+        """Begin with samples of this period; what was learned of the fans goes on."""
+        twin, before = self.twin, self._decision if self._period_ns else None
+        bin_ns = bin_ns_of(period_ns, float(twin.fans.held_s.min()))
+        self._period_ns = period_ns
+        self._bins = Bins(bin_ns, twin.fans.top_rad_s, twin.unseen_error)
+        period_s = period_ns / NS_PER_S
+        self._decision = Decision(twin.fans, bin_ns, period_s, twin.declared_s, twin.priors, twin.limit_factor)
+        self._falls = Falls(twin.fans, self._decision.bin_s)
+        if before is not None:
+            self._decision.go_on_from(before)
 
     def score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
         """The score of a block of new samples, and the messages on alarms."""
-        samples = samples_of(item, self.twin.unseen_error)
-        scored, stretches = self.fan_scorer.stretches(samples, lambda: self.alarms.is_quiet)
-        state, events = self.decide(item, scored, stretches)
-        score = score_of(item, scored, state, samples.speed_unseen)
-        return score, self.finish(item, samples, scored, state, events, score)
-
-    def joint_key(self, item: Prediction) -> Hashable:
-        """Blocks of trays with equal keys can be scored in one pass (pipeline.runtime.joint_tray_scorer). None: this
-        one alone, see FanScorer.is_interval_over; or the tray has one fan, whose column NumPy adds up in another order
-        than columns side by side."""
-        is_over = self.fan_scorer.is_interval_over(item.t_ns)
-        has_steps = bool((np.diff(item.t_ns) == item.period_ns).all())
-        if is_over is None or not has_steps or self.fans == 1:
-            return None
-        return self.twin.sha256, self.fans, item.period_ns, len(item.t_ns), is_over, *present_columns(item)
-
-    def finish(
-        self,
-        item: Prediction,
-        samples: Samples,
-        scored: ScoredBlock,
-        state: Array,
-        events: list[AlarmEvent],
-        score: Score,
-    ) -> list[Alarm]:
-        """The messages on alarms of a block that has been decided."""
-        self._sigma_rad_s = item.sigma_rad_s
-        self._feed_diagnoser(item, scored)
-        self._feed_wear(item, scored, state)
-        sigma_rad_s, sigma_command = item.sigma_rad_s, item.torque_balance_sigma_command
-
-        def limits(row: int, fan: int) -> tuple[float, float]:
-            of_speed, of_balance = self._limits_at(item, samples, scored, row, int(scored.statistic[row, fan]))
-            return float((of_speed * sigma_rad_s)[fan]), float((of_balance * sigma_command)[fan])
-
-        context = AlarmContext(balance_command=scored.balance_smoothed * sigma_command, limits=limits)
-        return self.alarms.emit(events, score, context)
-
-    @property
-    def followed(self) -> list[str]:
-        """A line for what most fans share, if it is much, and for each fan whose baseline has followed it far."""
-        healthy, residual = self.twin.limits.speed, self.fan_scorer.residuals["speed"]
-        limit, units = healthy.baseline.adaptation_limit_sigmas, self._text.units
-        of_each = followed_fans(residual.baseline, limit, self._sigma_rad_s, units)
-        return [*shared_by_all(residual.shared_offset, healthy.shared_limit), *of_each]
+        if item.period_ns != self._period_ns:
+            self._open(item.period_ns)
+        if self._against:
+            self._against.take(item)
+        columns = ScoreColumns.of_rows(len(item.t_ns), self.fans)
+        alarms: list[Alarm] = []
+        begin = 0
+        for one in self._bins.take(item):
+            columns.fill(slice(begin, one.row), self._now)
+            begin = one.row
+            alarms += self._decide(one, item)
+        columns.fill(slice(begin, len(item.t_ns)), self._now)
+        return score_of(item, columns, self._bins.unseen_rad_s), alarms
 
     def recommission(self, fans: Array, t_ns: int) -> None:
-        """Commission some fans again, (fans,) of bool, after the sample at t_ns."""
-        self.fan_scorer.recommission(fans)
-        self.wear.forget(fans, t_ns)
+        """Forget what was learned of some fans, (fans,) of bool, after the sample at t_ns."""
+        if fans.any():
+            self._decision.begin_again(fans)
+            self.wear.forget(fans, t_ns)
+            if self._against:
+                self._against.forget(fans)
+
+    def measured(self, fan: int) -> Measured:
+        """See FanFacts."""
+        decision = self._decision
+        residual, std = float(decision.deviation_rad_s[fan]), float(decision.deviation_std_rad_s[fan])
+        statistic = Statistic(int(self._now.statistic[fan]))
+        speed = float(decision.now.speed_rad_s[fan]) if decision.now else 0.0
+        slow = self.wear.of(fan)
+        if statistic == Statistic.WEAR and slow:
+            residual, std = slow.change * speed, slow.std_error * speed
+        torque = float(self.twin.fans.slope(np.full(self.fans, speed))[fan]) if decision.in_balance[fan] else 0.0
+        as_speed = 0.0 if decision.in_balance[fan] else 1.0
+        return Measured(
+            residual_rad_s=as_speed * residual,
+            residual_std_rad_s=as_speed * std,
+            torque_balance_command=-torque * residual,
+            torque_balance_std_command=torque * std,
+            statistic=statistic,
+            score=float(np.nan_to_num(self._now.score[fan])),
+        )
+
+    def causes(self, fan: int) -> tuple[Diagnosis, ...]:
+        """See FanFacts."""
+        decision, falls, command = self._decision, self._falls, float(self._seen[3, fan])
+        kind = KINDS[self._kind[fan]]
+        if self._stands[fan] and kind is not None:
+            fall = falls.of(fan) if kind == Standing.CAME_TO_REST and falls.stands[fan] else None
+            return standstill_causes(kind, fall, command)
+        if decision.active[fan]:
+            return self._causes_of_deviation(fan, command)
+        words, seen, fan_of_twin = self._words, self._seen_since(fan, 0.0), self.twin.steady_fans[fan]
+        if decision.missing.is_active[fan]:
+            dropout = PossibleCause(SENSOR_DROPOUT, 1.0, float(decision.missing.share[fan]), np.nan)
+            return words.of([dropout], seen, fan_of_twin)
+        slow = self.wear.of(fan)
+        if slow and self.wear.is_over[fan]:
+            return words.of([PossibleCause(SLOW_CHANGE, 1.0, slow.change, slow.std_error)], seen, fan_of_twin)
+        return ()
+
+    @property
+    def stands_against_command(self) -> Array:
+        """See FanFacts."""
+        return self._stands | (self._decision.active & self._falls.stands)
+
+    def _causes_of_deviation(self, fan: int, command: float) -> tuple[Diagnosis, ...]:
+        decision, falls = self._decision, self._falls
+        if falls.stands[fan]:
+            return standstill_causes(Standing.CAME_TO_REST, falls.of(fan), command)
+        alarm = decision.alarms.get(fan)
+        if alarm is None:  # it is of before a gap
+            return ()
+        is_new = decision.raised_s(fan) < FALLING_S
+        if alarm.age_s < NAMED_AFTER_S or (is_new and falls.is_falling[fan]):
+            return (Diagnosis(cause=CANNOT_TELL, probability=1.0, evidence=KNOWN_SOON),)
+        return self._words.of(alarm.causes(), self._seen_since(fan, alarm.age_s), self.twin.steady_fans[fan])
+
+    def _seen_since(self, fan: int, age_s: float) -> SeenSinceOnset:
+        slowest, fastest, lowest, highest = self._seen[:, fan].tolist()
+        return SeenSinceOnset(age_s, slowest, fastest, lowest, highest, bool(self._falls.stands[fan]))
+
+    def _decide(self, one: Bin, item: Prediction) -> list[Alarm]:
+        """Bring all up to date with the end of a bin; returns the messages on alarms."""
+        decision, against, row = self._decision, self._against, one.row
+        decision.take(one)
+        assert decision.now is not None
+        self._falls.take(decision.now)
+        nothing = np.zeros(self.fans, np.bool_)
+        self._stands = against.active[row] if against else nothing
+        if against:
+            self._kind = np.where(against.kind[row] > 0, against.kind[row], self._kind)
+        score = decision.score
+        is_steady = one.judged & ~self.alarms.active & ~decision.has_alarm & (score < ScoreColumns.SUSPECT_FROM)
+        self.wear.update(one.t_ns, is_steady, lambda: decision.model.age)
+        is_worn = self.wear.is_over
+        active = decision.has_alarm | self._stands | is_worn
+        idle = among(item.invalid_reason[row], *IDLE)
+        judged = one.judged | idle | decision.missing.is_active | self._stands
+        self._see(one, self.alarms.active)
+        self._now = self._columns(score, active, is_worn, against.score[row] if against else np.zeros(self.fans))
+        is_large = self._stands | (np.abs(decision.fault[0]) >= self._alarm_share)
+        began_ns = np.where(decision.active, decision.number - decision.onset + 1, 1)
+        decided = Decided(
+            one.t_ns,
+            judged,
+            active,
+            np.where(is_large, int(Severity.ALARM), int(Severity.WARNING)),
+            one.t_ns - began_ns * round(decision.bin_s * NS_PER_S),
+        )
+        return self.alarms.update(decided, self)
+
+    def _columns(self, score: Array, active: Array, is_worn: Array, against: Array) -> ScoreColumns:
+        """What the score message says of the fans until the end of the next bin."""
+        decision = self._decision
+        assert decision.now is not None
+        expected = decision.model.expected_rad_s
+        missing = decision.missing.score
+        statistic = np.where(missing > np.where(decision.active, score, decision.deviation_score), 2, 1)
+        statistic = np.where(is_worn & ~decision.has_alarm, int(Statistic.WEAR), statistic)
+        statistic = np.where(self._stands, int(Statistic.STANDSTILL), statistic)
+        return ScoreColumns(
+            score=np.maximum(score, np.where(self._stands, against.clip(1.0), 0.0)),
+            statistic=statistic.astype(np.uint8),
+            is_active=active,
+            is_returning=active & ~self._stands & ~is_worn & ~decision.missing.is_active & decision.is_returning,
+            expected_residual_rad_s=expected,
+            expected_balance_command=-expected * self.twin.fans.slope(decision.now.speed_rad_s),
+        )
+
+    def _see(self, one: Bin, was_active: Array) -> None:
+        """Keep what speeds and commands there were since an alarm; before one, those of now."""
+        speed = np.where(np.isfinite(one.measured_rad_s), np.abs(one.measured_rad_s), np.abs(one.predicted_rad_s))
+        now = np.stack((speed, speed, one.command, one.command))
+        lowest, highest = np.fmin(self._seen[::2], now[::2]), np.fmax(self._seen[1::2], now[1::2])
+        self._seen[::2] = np.where(was_active, lowest, now[::2])
+        self._seen[1::2] = np.where(was_active, highest, now[1::2])
 
     def snapshot(self) -> dict[str, Any]:
         """The state to continue from, as JSON values."""
+        times, arrays = self._decision.snapshot()
+        open_t_ns, of_bins = self._bins.snapshot()
+        arrays |= {
+            **within("bins", of_bins),
+            **within("falls", self._falls.arrays()),
+            **within("now", vars(self._now)),
+            "seen": self._seen,
+            "kind": self._kind,
+        }
+        if self._against:
+            arrays |= within("against", self._against.kept())
         return {
-            "scorer": self.fan_scorer.snapshot(),
+            "model": {
+                "period_ns": self._period_ns,
+                "open_t_ns": open_t_ns,
+                **times,
+                "arrays": as_json(arrays),
+            },
             "alarms": self.alarms.snapshot(),
             "wear": self.wear.snapshot(),
         }
 
-    def restore_baselines(self, state: Mapping[str, Any]) -> None:
-        """Restore what was learned, of a snapshot of the same twin: all but the alarms.
+    def restore_model(self, state: Mapping[str, Any]) -> None:
+        """Restore what was learned, of a snapshot of the same twin: all but the alarms' conditions.
 
         Raises:
             ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError: it cannot be read. Then
                 a part may have been restored.
         """
         self.wear.restore(state["wear"])
-        self.fan_scorer.restore(state["scorer"])
-
-    def _limits_at(
-        self, item: Prediction, samples: Samples, scored: ScoredBlock, row: int, statistic: int
-    ) -> tuple[Array, Array]:
-        """Limits of both residuals from their baselines, by the alarm's statistic: (fans,) each, in sigma."""
-        period_s = item.period_ns / NS_PER_S
-        limits, limit_at = self.fan_scorer.limits, self.fan_scorer.limit_at
-        speed = samples.operating_speed_rad_s(is_predicted=limits.over_predicted_speed)[row]
-        of_speed, of_balance = scored.speed_learned_scale[row], scored.balance_learned_scale[row]
-        return (
-            limit_at("speed", speed, statistic, period_s, of_speed, samples.speed_unseen[row]),
-            limit_at("balance", speed, statistic, period_s, of_balance, samples.balance_unseen[row]),
-        )
-
-    def decide(
-        self, item: Prediction, scored: ScoredBlock, stretches: Iterable[slice]
-    ) -> tuple[Array, list[AlarmEvent]]:
-        """The states (n, fans) and the alarms' events. While an alarm is active, baselines stay.
-
-        stretches: the rows that are scored, one stretch after the other.
-        """
-        speed = np.where(np.isfinite(item.predicted_speed_rad_s), item.predicted_speed_rad_s, item.measured_speed_rad_s)
-        events: list[AlarmEvent] = []
-        state = np.empty(scored.score.shape, np.uint8)
-        for rows in stretches:
-            was_active = self.alarms.active
-            score, judged = scored.score[rows], scored.judged[rows]
-            ratio = np.where(judged & np.isnan(score), 0.0, score)
-            state[rows], happened = self.alarms.update(
-                item.t_ns[rows], item.period_ns, ratio, judged, scored.ratios[rows], speed[rows]
-            )
-            in_alarm = among(state[rows], ALARM, RETURNING).any(axis=0)
-            self.fan_scorer.learn_nothing(was_active | self.alarms.active | in_alarm)
-            events += [replace(event, row=event.row + rows.start) for event in happened]
-        return state, events
-
-    def _feed_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
-        command = item.averaged_command if len(item.averaged_command) else item.command
-        is_known = arrived(item.invalid_reason)
-        is_converted = self.twin.knows_supply or len(item.air_density_ratio) > 0
-        expected = np.where(np.isfinite(item.measured_speed_rad_s), scored.balance_expected, np.nan)
-        density = item.air_density_ratio if len(item.air_density_ratio) else 1.0
-        self._diagnoser.take(
-            item.t_ns,
-            item.period_ns,
-            np.where(is_known, command, np.nan),
-            item.measured_speed_rad_s * density,  # at the twin's reference, as the command and the balance are
-            scored.balance_baseline * item.torque_balance_sigma_command,
-            scored.balance_baseline_s,
-            expected * item.torque_balance_sigma_command,
-            item.predicted_speed_rad_s * density,
-            item.reading_missing,
-            item.supply_voltage_v,
-            item.current_a,
-            np.where(is_known, item.command, np.nan) if is_converted else np.zeros(0),
-        )
-
-    def _feed_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:
-        assert self.fan_scorer.origin_t_ns is not None
-        normal = state == NORMAL
-
-        def inputs() -> WearInputs:
-            sigma_command = item.torque_balance_sigma_command
-            limit_sigmas = self.fan_scorer.persistent_limit_sigmas("balance", item.period_ns / NS_PER_S)
-            return WearInputs(
-                eligible=(scored.score < HALF_LIMIT) & normal & np.isfinite(item.torque_balance_command),
-                commissioned_command=scored.balance_commissioned * sigma_command,
-                shared_command=scored.balance_shared * sigma_command,
-                held=scored.balance_at_limit,
-                limit_command=limit_sigmas * sigma_command,
-            )
-
-        disturbed = (scored.score >= HALF_LIMIT) | ~(normal | (state == UNKNOWN))
-        self.wear.update(item.t_ns, self.fan_scorer.origin_t_ns, disturbed, inputs)
+        of_model = state["model"]
+        stored = from_json(of_model["arrays"])
+        self._open(int(of_model["period_ns"]) or NS_PER_S)
+        self._decision.restore(stored, int(of_model["t_ns"]))
+        self._bins.restore(int(of_model["open_t_ns"]), part("bins", stored))
+        self._falls.restore(part("falls", stored))
+        if self._against:
+            self._against.restore(part("against", stored))
+        self._now = ScoreColumns(**part("now", stored))
+        self._seen, self._kind = stored["seen"], stored["kind"]

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +17,6 @@ from schemas.messages import Array
 from schemas.tacho import Tacho, tacho_of_each_fan
 from schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, DriveCard, TwinCard
 from scoring.unseen_error import UnseenError
-
-if TYPE_CHECKING:
-    from scoring.diagnosis.regression_window import HealthyBalance
 
 LARGEST_TWIN_BYTES = 64 << 20
 """of a twin's file; the demo's has 28 kB"""
@@ -33,17 +30,15 @@ DEAD_ZONE = 0.25
 class Balance:
     """The torque balance of each fan: schemas.twin_card.BalanceCard as arrays.
 
-    covariance: (fans, 4, 4). filter_rate_per_s: one number. All others: (fans,).
+    filter_rate_per_s: one number. All others: (fans,).
     """
 
     inertia: Array
     viscous: Array
     drag: Array
     friction: Array
-    covariance: Array
     lag_s: Array
     sigma_command: Array
-    autocorrelation_time_s: Array
     lowest_speed_rad_s: Array
     filter_rate_per_s: float
 
@@ -55,7 +50,8 @@ class Balance:
     @classmethod
     def from_card(cls, card: BalanceCard, fans: int) -> Balance:
         """The balance of a card for a tray of so many fans."""
-        arrays = {name: for_fans(values, fans) for name, values in card.per_fan.items() if name != "source"}
+        used = {name for name in cls.__dataclass_fields__ if name != "filter_rate_per_s"}
+        arrays = {name: for_fans(values, fans) for name, values in card.per_fan.items() if name in used}
         return cls(**arrays, filter_rate_per_s=card.filter_rate_per_s)
 
 
@@ -99,28 +95,6 @@ class TrayTwin:
         return low - margin, high + margin
 
     @property
-    def bend_rad_s(self) -> float | None:
-        """The speed at which viscous friction and drag contribute equally to the slope of the needed command.
-
-        The median over the fans; None where a fan lacks either.
-        """
-        viscous, drag = self.balance.viscous, self.balance.drag
-        if not np.all((viscous > 0.0) & (drag > 0.0)):
-            return None
-        return float(np.median(viscous / (2.0 * drag)))
-
-    @property
-    def full_speed_rad_s(self) -> Array:
-        """(fans,) the speed at which the highest command of training holds each fan, by its torque balance; where that
-        gives none, the top speed of training.
-        """
-        viscous, drag = self.balance.viscous, self.balance.drag
-        left = self.card.command_range[1] - self.balance.friction
-        with np.errstate(all="ignore"):
-            speed = 2.0 * left / (viscous + np.sqrt(np.square(viscous) + 4.0 * drag * left))
-        return np.where(np.isfinite(speed) & (speed > 0.0), speed, self.card.top_speed_rad_s)
-
-    @property
     def unseen_error(self) -> UnseenError | None:
         """How far it may be wrong where healthy runs do not show it; None where the card says nothing about it."""
         card, table = self.card, self.card.model_uncertainty
@@ -130,28 +104,6 @@ class TrayTwin:
             return None
         low, high = card.command_range
         return UnseenError(table, card.drive, self.balance.viscous, self.balance.drag, high - low)
-
-    def healthy_balances(self) -> list[HealthyBalance]:
-        """The balance of each fan, for diagnosis."""
-        # Imported here: it loads scipy, which a process that only runs the twin does not need.
-        from scoring.diagnosis.regression_window import HealthyBalance  # noqa: PLC0415
-
-        balance = self.balance
-        return [
-            HealthyBalance(
-                inertia=float(balance.inertia[fan]),
-                viscous=float(balance.viscous[fan]),
-                drag=float(balance.drag[fan]),
-                friction=float(balance.friction[fan]),
-                lag_s=float(balance.lag_s[fan]),
-                covariance=balance.covariance[fan],
-                filter_rate_per_s=balance.filter_rate_per_s,
-                sigma_command=float(balance.sigma_command[fan]),
-                autocorrelation_time_s=float(balance.autocorrelation_time_s[fan]),
-                lowest_speed_rad_s=float(balance.lowest_speed_rad_s[fan]),
-            )
-            for fan in range(self.fans)
-        ]
 
 
 def for_fans(values: tuple[Any, ...], fans: int) -> Array:

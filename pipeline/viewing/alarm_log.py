@@ -9,12 +9,15 @@ from schemas.enums import Severity, Statistic, Transition
 from schemas.messages import Alarm
 from scoring.alarms.alarm_text import TRANSITIONS
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
-from scoring.detectors.table import row_of
 from scoring.diagnosis.shown_causes import CANNOT_TELL, with_share
 
 LINE_LENGTH = 64
 """a longer line is cut"""
-_SOURCES = {"speed": "speed", "balance": "torque balance", "tacho": "tacho"}
+_EXCEEDED = {
+    Statistic.STANDSTILL: "does not turn as commanded",
+    Statistic.MISSING_READINGS: "the tacho loses readings",
+    Statistic.WEAR: "a slow change has reached its limit",
+}
 
 
 class LogLine(NamedTuple):
@@ -62,9 +65,8 @@ def _what_happened(alarm: Alarm) -> str:
 
 
 def exceeded(alarm: Alarm) -> str:
-    """What is beyond its limit, and how far: `torque balance 1.7 x its limit`."""
-    if alarm.statistic == Statistic.STANDSTILL:
-        return "does not turn as commanded"
-    row = row_of(alarm.statistic)
-    name = _SOURCES[row.source] if row else "score"
-    return f"{name} {alarm.score:.2g} x its limit"
+    """What raised the alarm: `torque balance off, 1.7 x the limit of the evidence`."""
+    if alarm.statistic in _EXCEEDED:
+        return _EXCEEDED[alarm.statistic]
+    residual = "torque balance" if alarm.torque_balance_command and not alarm.residual_rad_s else "speed"
+    return f"{residual} off, evidence {alarm.score:.2g} x its limit"

@@ -41,7 +41,6 @@ STATE_COLORS = {
     "suspect": "#f2b400",
     "alarm": "#d62020",
     "returning": "#ee8a4a",
-    "commissioning": "#7aa7d8",
     "stopped": "#5d6b7c",
     "starting": "#3fb0b8",
 }

@@ -123,7 +123,7 @@ class Fleet:
     def in_alarm(self) -> Array:
         """Whether each fan is in alarm, (fans,). If its newest sample does not say it, its last alarm message does."""
         state = self._states()
-        says_it = (state > FanState.UNKNOWN) & (state < FanState.COMMISSIONING) & (not self._has_all_alarms)
+        says_it = (state > FanState.UNKNOWN) & (state < FanState.STOPPED) & (not self._has_all_alarms)
         is_active = (state == FanState.ALARM) | (state == FanState.RETURNING)
         return is_active | (~says_it & (self._onset_t_ns != _NEVER_NS))
 

@@ -1,7 +1,7 @@
 """The layout of a view in Rerun. Live views, view files and pictures have the same: it comes from here alone.
 
 `all`: for each tray a tab with plots, state lanes, alarms and log, and a tab for the stages; of a fleet, see
-`rerun_fleet`. `alarms`: the fans that are in alarm or were, and nothing else. `wear`: how each fan's parameters have
+`rerun_fleet`. `alarms`: the fans that are in alarm or were, and nothing else. `wear`: how the speed of each fan has
 changed, on a timeline of days. All plots of a layout share one time axis. Only the modules whose names begin with
 `rerun_` import rerun. Measured with Rerun 0.41; see docs/how-to/viewing.md.
 """
@@ -47,7 +47,6 @@ from pipeline.viewing.rerun_styles import (
     speed_style,
 )
 from pipeline.viewing.trace import state_names
-from pipeline.viewing.wear_points import PARAMETERS
 from schemas.auxiliary import AuxiliaryColumn
 from schemas.units import SpeedUnit
 
@@ -168,16 +167,13 @@ def wear_blueprint(trays: Sequence[str], *, for_picture: bool = False) -> rrb.Bl
 
 
 def _wear_tab(tray: str) -> rrb.Container:
-    views = [
-        rrb.TimeSeriesView(
-            origin=f"/{wear_path(name, tray)}",
-            name=f"{tray} / {words.title} since commissioning ({words.unit})",
-            axis_x=LINKED,
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
-        )
-        for name, words in PARAMETERS.items()
-    ]
-    return rrb.Grid(*views, grid_columns=2, name=tray)
+    view = rrb.TimeSeriesView(
+        origin=f"/{wear_path(tray)}",
+        name=f"{tray} / speed since commissioning (%)",
+        axis_x=LINKED,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+    )
+    return rrb.Grid(view, name=tray)
 
 
 def columns_of(plots: int) -> int:

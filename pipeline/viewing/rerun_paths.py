@@ -52,9 +52,9 @@ def log_path(tray: str) -> str:
     return f"{tray}/log"
 
 
-def wear_path(parameter: str, tray: str, fan: int | None = None) -> str:
-    """Entity of the wear of a fan's parameter; without a fan, that of all fans of the tray."""
-    return f"{WEAR}/{parameter}/{tray}" if fan is None else f"{WEAR}/{parameter}/{tray}/fan_{fan}"
+def wear_path(tray: str, fan: int | None = None) -> str:
+    """Entity of the wear of a fan; without a fan, that of all fans of the tray."""
+    return f"{WEAR}/{tray}" if fan is None else f"{WEAR}/{tray}/fan_{fan}"
 
 
 def place_root(place: int, tray: str) -> str:

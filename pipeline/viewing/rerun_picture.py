@@ -178,7 +178,7 @@ def _read(rrd: Path) -> _Rrd:
         elif path.endswith("/deviation"):
             alarmed[_fan_of(path)] = None
         elif path.startswith(f"{WEAR}/"):
-            worn[path.split("/")[2]] = None
+            worn[path.split("/")[1]] = None
             last_day_ns = max(last_day_ns, int(_times_ns(batch, DAYS).max()))
         elif path.count("/") == 2:
             tray, column, _ = path.split("/")
@@ -241,7 +241,7 @@ def _blueprint(
     if layout == "wear":
         if not contents.worn or (tray is not None and tray not in contents.worn):
             of = f" of {tray}" if tray else ""
-            raise PictureError(f"{rrd}: no wear{of}: a fan has its first point some time after it was commissioned")
+            raise PictureError(f"{rrd}: no wear{of}: a fan has its first point about an hour after it was commissioned")
         return wear_blueprint([tray] if tray else contents.worn, for_picture=True)
     if contents.map_places is not None and tray is None and fans is None:
         count = max(

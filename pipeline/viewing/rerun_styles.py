@@ -31,7 +31,6 @@ STATE_COLORS = {
     "suspect": (250, 178, 0),
     "alarm": (224, 36, 36),
     "returning": (232, 120, 60),
-    "commissioning": (90, 140, 200),
     "stopped": (70, 82, 104),
     "starting": (40, 160, 170),
     SILENT: (70, 70, 70),

@@ -31,7 +31,7 @@ TRACE_COLUMNS = (
     "state",
     "invalid_reason",
     "torque_balance_command",
-    "balance_baseline_command",
+    "expected_balance_command",
     "score",
 )
 """the columns of a score that a trace is made of, its times apart"""
@@ -111,7 +111,7 @@ def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit, fans: Se
         valid=valid,
         in_alarm=np.isin(state, IN_ALARM) & valid,
         balance=np.where(valid, _known_or_nan("torque_balance_command", scores)[:, chosen], np.nan),
-        expected_balance=np.where(valid, _known_or_nan("balance_baseline_command", scores)[:, chosen], np.nan),
+        expected_balance=np.where(valid, _known_or_nan("expected_balance_command", scores)[:, chosen], np.nan),
         score=np.where(valid, column("score"), np.nan),
         state=state,
         invalid_reason=column("invalid_reason"),

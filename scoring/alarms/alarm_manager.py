@@ -1,156 +1,120 @@
-"""The alarms of a tray as messages: each transition with its residuals and, if known, the causes."""
+"""The alarms of a tray as messages: each transition with what the fault takes and, if known, the causes."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from schemas.enums import FanState, Feedback, Severity, Statistic, Transition
+from schemas.enums import Feedback, Severity, Statistic, Transition
 from schemas.header import Header
-from schemas.messages import Alarm, Array, Diagnosis, Request, Score
+from schemas.messages import Alarm, Array, Diagnosis, Request
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed
 from scoring.alarms.alarm_text import AlarmText
 from scoring.alarms.fan_condition import AlarmState, ConditionSettings
-from scoring.alarms.tray_conditions import AlarmEvent, TrayConditions
-from scoring.detectors.table import row_of
-from scoring.diagnosis.diagnoser import Diagnoser
+from scoring.alarms.tray_conditions import Decided, TrayConditions
+from scoring.diagnosis.cause_words import says_more
 from scoring.diagnosis.shown_causes import is_of_standstill
 
-PERSISTING_SHARE = (
-    0.5  # a fault persists while the torque balance is at least this share of its value in the last message
-)
-STANDSTILL = int(Statistic.STANDSTILL)
+AGAIN_AFTER_S = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
+"""times after an alarm was raised at which its causes are looked at again"""
 _OF_FEEDBACK = ("feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
 MAX_REQUESTERS = 64  # the latest whose requests are remembered; docs/reference/alarms.md gives the consequences
 
 
-@dataclass(frozen=True, eq=False)
-class AlarmContext:
-    """How far fans are from their twins, and how far they may be."""
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """The fields of an alarm that describe its fan at a time."""
 
-    balance_command: Array
-    """(n, fans) less baseline"""
-    limits: Callable[[int, int], tuple[float, float]]
-    """at a row, of a fan: of the speed, rad/s, and of the torque balance, command; infinite for none"""
+    residual_rad_s: float
+    residual_std_rad_s: float
+    torque_balance_command: float
+    torque_balance_std_command: float
+    statistic: Statistic
+    score: float
+
+
+class FanFacts(Protocol):
+    """What is known of the fans of a tray at the end of a bin."""
+
+    def measured(self, fan: int) -> Measured:
+        """Of a fan with an alarm."""
+        ...
+
+    def causes(self, fan: int) -> tuple[Diagnosis, ...]:
+        """Of its alarm, most probable first."""
+        ...
+
+    @property
+    def stands_against_command(self) -> Array:
+        """(fans,) whether each stands or turns against its command."""
+        ...
 
 
 class AlarmManager:
-    """Keeps the alarms of a tray and their diagnoses. The messages do not depend on how samples are cut into blocks."""
+    """Keeps the alarms of a tray."""
 
-    def __init__(self, fans: int, settings: ConditionSettings, diagnoser: Diagnoser, alarm_text: AlarmText) -> None:
+    def __init__(self, fans: int, settings: ConditionSettings, alarm_text: AlarmText) -> None:
         self._fans = fans
         self._conditions = TrayConditions(fans, settings)
-        self._diagnoser = diagnoser
         self._alarm_text = alarm_text
         self._last_emitted: dict[int, Alarm] = {}
         """the last message about each fan"""
-        self._against_command = np.zeros(fans, np.bool_)
-        """(fans,) whether the statistic of the last sample was that of standstill"""
+        self._stood = np.zeros(fans, np.bool_)
+        """(fans,) whether each stood or turned against its command when last looked at"""
+        self._due_t_ns: dict[int, list[int]] = {}
+        """when the causes of each alarm are looked at again"""
         self._answered: dict[str, int] = {}
         """for each producer of requests, the sequence of the first one that is not answered"""
-        self.raised = self.cleared = self.too_short = 0
+        self.raised = self.cleared = 0
 
     @property
     def active(self) -> Array:
         """(fans,) whether each fan's alarm is active."""
         return self._conditions.active
 
-    @property
-    def is_quiet(self) -> bool:
-        """Whether no fan has an alarm or is about to have one."""
-        return self._conditions.is_quiet
-
-    def update(
-        self,
-        t_ns: Array,
-        period_ns: int,
-        score: Array,
-        valid: Array,
-        ratios: Array,
-        speed_rad_s: Array,
-    ) -> tuple[Array, list[AlarmEvent]]:
-        """Process a block; see TrayConditions.update. Returns the states (n, fans) and the events."""
-        result = self._conditions.update(t_ns, period_ns, score, valid, ratios, speed_rad_s)
-        self.too_short += result.too_short
-        return result.state, result.events
-
-    def emit(self, events: list[AlarmEvent], score: Score, context: AlarmContext) -> list[Alarm]:
-        """The messages for a block's events and diagnoses, in the order of its rows.
-
-        The diagnoser must already have stored the block.
-        """
+    def update(self, now: Decided, facts: FanFacts) -> list[Alarm]:
+        """Process what was decided at the end of a bin; returns the messages."""
         alarms: list[Alarm] = []
-
-        def emit(row: int, fan: int, transition: Transition, **changed: Any) -> None:
-            lost = transition == Transition.DATA_LOST
-            measured = {"t_ns": int(score.t_ns[row])} if lost else _measured(row, fan, score, context)
-            alarms.append(self._emit(replace(self._next_message(fan), **measured, transition=transition, **changed)))
-
-        def causes_at(row: int, fan: int) -> tuple[Diagnosis, ...]:
-            t_ns, against_command = int(score.t_ns[row]), score.statistic[row, fan] == STANDSTILL
-            return (self._diagnoser.of_standstill if against_command else self._diagnoser.diagnose)(fan, t_ns)
-
-        begins = self._standstill_begins(score)
-
-        def diagnose_due(t_ns: Array) -> None:
-            due = set(self._diagnoser.due(t_ns)) if len(t_ns) else set()
-            while begins and begins[0][0] < len(t_ns):
-                row, fan = begins.popleft()
-                if self._is_standstill_news(fan):
-                    due.add((row, fan))
-            for row, fan in sorted(due):
-                if self._persists(row, fan, score, context):
-                    causes = causes_at(row, fan)
-                    if self._diagnoser.says_more(causes, self._next_message(fan).causes):
-                        emit(row, fan, Transition.DIAGNOSED, causes=causes)
-
-        for event in events:
-            diagnose_due(score.t_ns[: event.row])
+        for event in self._conditions.update(now):
             fan, changed = event.fan, _state_fields(event.alarm_state)
             if event.transition == Transition.RAISED:
                 self.raised += 1
-                t_ns = int(score.t_ns[event.row])
-                self._diagnoser.raised(fan, t_ns, event.alarm_state.onset_t_ns)
-                changed["causes"] = causes_at(event.row, fan)
-            elif event.transition == Transition.SEVERITY and score.statistic[event.row, fan] == STANDSTILL:
-                changed["causes"] = causes_at(event.row, fan)
+                self._due_t_ns[fan] = [now.t_ns + after_s * NS_PER_S for after_s in AGAIN_AFTER_S]
+                changed["causes"] = facts.causes(fan)
             elif event.transition == Transition.CLEARED:
                 self.cleared += 1
-                self._diagnoser.cleared(fan)
-            elif event.transition == Transition.DATA_LOST:
-                self._diagnoser.cleared(fan)  # samples from after a gap may be of another state
-            emit(event.row, fan, event.transition, **changed)
-        diagnose_due(score.t_ns)
+                self._due_t_ns.pop(fan, None)
+            if event.transition != Transition.DATA_LOST:
+                changed |= vars(facts.measured(fan))
+            if event.transition == Transition.CLEARED:
+                changed["statistic"] = self._next_message(fan).statistic  # nothing speaks for a fault any more
+            alarms.append(
+                self._emit(replace(self._next_message(fan), t_ns=now.t_ns, transition=event.transition, **changed))
+            )
+        return [*alarms, *self._diagnosed(now, facts)]
+
+    def _diagnosed(self, now: Decided, facts: FanFacts) -> list[Alarm]:
+        """The messages on causes that are news."""
+        stands = facts.stands_against_command
+        begins = np.flatnonzero(stands & ~self._stood & now.active).tolist()
+        self._stood = stands.copy()
+        due = {fan for fan, times in self._due_t_ns.items() if times[0] <= now.t_ns}
+        for fan in due:
+            left = [t_ns for t_ns in self._due_t_ns.pop(fan) if t_ns > now.t_ns]
+            if left:
+                self._due_t_ns[fan] = left
+        alarms: list[Alarm] = []
+        for fan in sorted(due.union(begins)):
+            before, causes = self._next_message(fan), facts.causes(fan)
+            if before.active and not before.stale and now.judged[fan] and _is_news(causes, before.causes):
+                measured = vars(facts.measured(fan))
+                changed = {"t_ns": now.t_ns, "transition": Transition.DIAGNOSED, "causes": causes}
+                alarms.append(self._emit(replace(before, **measured, **changed)))
         return alarms
-
-    def _standstill_begins(self, score: Score) -> deque[tuple[int, int]]:
-        """Rows and fans at which the statistic becomes that of standstill."""
-        now = score.statistic == STANDSTILL
-        before = np.vstack((self._against_command, now))[:-1]
-        self._against_command = now[-1].copy()
-        return deque((row, fan) for row, fan in np.argwhere(now & ~before).tolist())
-
-    def _is_standstill_news(self, fan: int) -> bool:
-        """Whether standstill is news about a fan: its alarm is active, and no cause of standstill is named yet.
-
-        Later starts of a fan that does not turn say less about the cause than the moment at which it came to rest.
-        """
-        last = self._next_message(fan)
-        return last.active and not any(is_of_standstill(each) for each in last.causes)
-
-    def _persists(self, row: int, fan: int, score: Score, context: AlarmContext) -> bool:
-        """Whether the fault of the last message persists; otherwise a diagnosis would include its end."""
-        if score.state[row, fan] in (FanState.STOPPED, FanState.STARTING):
-            return False
-        now, before = abs(context.balance_command[row, fan]), abs(self._next_message(fan).torque_balance_command)
-        detector = row_of(int(score.statistic[row, fan]))
-        of_tacho = detector is not None and detector.source == "tacho"
-        return bool(of_tacho or not np.isfinite(now) or now >= PERSISTING_SHARE * before)
 
     def answer(self, request: Request, last_t_ns: int) -> list[Alarm]:
         """One answer for each fan that a request concerns; none if it was answered before.
@@ -199,7 +163,7 @@ class AlarmManager:
         self._last_emitted = {}
         alarms: list[Alarm] = []
         for fan in fans:
-            self._diagnoser.cleared(fan)
+            self._due_t_ns.pop(fan, None)
             fields = _state_fields(self._conditions.alarm_state(fan))
             self._last_emitted[fan] = replace(self._next_message(fan), t_ns=t_ns, **fields)
             alarms.append(self._republished(fan))
@@ -218,7 +182,8 @@ class AlarmManager:
         """The whole state, as JSON values."""
         return {
             "conditions": self._conditions.snapshot(),
-            "diagnoser": self._diagnoser.snapshot(),
+            "due_t_ns": {str(fan): times for fan, times in self._due_t_ns.items()},
+            "stood": self._stood.tolist(),
             "last_emitted": {str(fan): _to_json(alarm) for fan, alarm in self._last_emitted.items()},
             "answered": self._answered,
         }
@@ -230,7 +195,12 @@ class AlarmManager:
             ValueError, KeyError, TypeError, AttributeError: it is not such a snapshot.
         """
         self._conditions.restore(stored["conditions"])
-        self._diagnoser.restore(stored["diagnoser"])
+        self._due_t_ns = {int(fan): [int(t_ns) for t_ns in times] for fan, times in stored["due_t_ns"].items()}
+        if not all(0 <= fan < self._fans and times for fan, times in self._due_t_ns.items()):
+            raise ValueError("an alarm of a fan that does not exist")
+        self._stood = np.array(stored["stood"], np.bool_)
+        if self._stood.shape != (self._fans,):
+            raise ValueError(f"a snapshot of alarms, but not of {self._fans} fans")
         self._last_emitted = {int(fan): _from_json(alarm) for fan, alarm in stored["last_emitted"].items()}
         if not all(0 <= fan < self._fans and alarm.fan == fan for fan, alarm in self._last_emitted.items()):
             raise ValueError("an alarm of a fan that does not exist")
@@ -255,7 +225,7 @@ class AlarmManager:
             t_ns=0,
             onset_t_ns=0,
             residual_rad_s=0.0,
-            limit_rad_s=0.0,
+            residual_std_rad_s=0.0,
             message="",
             acknowledged=True,
             confirmed=True,
@@ -268,22 +238,10 @@ class AlarmManager:
         return alarm
 
 
-def _measured(row: int, fan: int, score: Score, context: AlarmContext) -> dict[str, Any]:
-    """The fields of an alarm that describe its sample; 0 where nothing is known."""
-    limit_rad_s, balance_limit_command = context.limits(row, fan)
-    return {
-        "t_ns": int(score.t_ns[row]),
-        "residual_rad_s": float(np.nan_to_num(score.smoothed_residual_rad_s[row, fan])),
-        "limit_rad_s": _finite_or_0(limit_rad_s),
-        "torque_balance_command": float(np.nan_to_num(context.balance_command[row, fan])),
-        "torque_balance_limit_command": _finite_or_0(balance_limit_command),
-        "statistic": Statistic(int(score.statistic[row, fan])),
-        "score": float(np.nan_to_num(score.score[row, fan])),
-    }
-
-
-def _finite_or_0(limit: float) -> float:
-    return float(limit) if np.isfinite(limit) else 0.0
+def _is_news(causes: tuple[Diagnosis, ...], than: tuple[Diagnosis, ...]) -> bool:
+    """Whether causes are worth a message. What a fan does after it stood says less of why it came to rest."""
+    stood = bool(than) and is_of_standstill(than[0])
+    return bool(causes) and not (stood and not is_of_standstill(causes[0])) and says_more(causes, than)
 
 
 def _state_fields(state: AlarmState) -> dict[str, Any]:

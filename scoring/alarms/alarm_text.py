@@ -9,8 +9,7 @@ from __future__ import annotations
 from schemas.enums import Severity, Statistic, Transition
 from schemas.messages import Alarm
 from schemas.units import SpeedUnit
-from scoring.detectors.alarm_units import AlarmUnits
-from scoring.detectors.table import row_of
+from scoring.alarms.alarm_units import AlarmUnits
 from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, STANDSTILL_CAUSES
 
 TRANSITIONS = {
@@ -24,7 +23,7 @@ TRANSITIONS = {
     Transition.UNSUPPRESSED: "no longer suppressed",
     Transition.OUT_OF_SERVICE: "out of service",
     Transition.IN_SERVICE: "in service",
-    Transition.COMMISSIONING: "a new baseline is being taken",
+    Transition.COMMISSIONING: "what was learned of it is forgotten",
     Transition.DATA_LOST: "not confirmed by data: there are no samples to judge",
     Transition.DATA_RESTORED: "judged again, on new samples",
     Transition.MARKED_TRUE: "marked as a true alarm",
@@ -57,10 +56,12 @@ class AlarmText:
         return f"{fan}: {TRANSITIONS[alarm.transition]}"
 
     def _deviation(self, alarm: Alarm) -> str:
-        row = row_of(alarm.statistic)
-        if row is None:
-            return f"a statistic of a newer version is {alarm.score:.1f} times its limit"
-        return row.detector.text(alarm, row.source, self.units)
+        if alarm.statistic == Statistic.STANDSTILL:
+            return (alarm.causes[0].evidence if alarm.causes else "") or "does not turn or stop as commanded"
+        if alarm.statistic == Statistic.MISSING_READINGS:
+            return "the tacho loses readings"
+        deviation = self.units.deviation(alarm)
+        return f"slowly, {deviation}" if alarm.statistic == Statistic.WEAR else deviation
 
     def _cause_if_known(self, alarm: Alarm) -> str:
         if alarm.statistic == Statistic.STANDSTILL and _is_against_command(alarm):

@@ -1,10 +1,10 @@
 """The alarm condition of one fan: the state of its alarm, including the actions of operators.
 
-Names and rules are those of OPC UA Part 9 (OPC 10000-9, release 1.05.03): ActiveState with OnDelay and OffDelay
-(5.8.2), AckedState and ConfirmedState of one occurrence (4.3, 5.7; the rows of table B.1 are a test), LatchedState and
-Reset (4.8, 5.8.5), timed and one-shot shelving (5.8.17), suppressed (5.8.8), out of service (5.8.12). Only the present
-occurrence is kept; there are no branches of earlier ones (as in B.1.2). What operators say of an alarm, that it was
-true or false, is not of Part 9. See docs/reference/alarms.md.
+Names and rules are those of OPC UA Part 9 (OPC 10000-9, release 1.05.03): ActiveState (5.8.2), AckedState and
+ConfirmedState of one occurrence (4.3, 5.7; the rows of table B.1 are a test), LatchedState and Reset (4.8, 5.8.5),
+timed and one-shot shelving (5.8.17), suppressed (5.8.8), out of service (5.8.12). Only the present occurrence is kept;
+there are no branches of earlier ones (as in B.1.2). What operators say of an alarm, that it was true or false, is not
+of Part 9. See docs/reference/alarms.md.
 """
 
 from __future__ import annotations
@@ -15,11 +15,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from schemas.enums import Action, FanState, Feedback, Severity, Transition
+from schemas.enums import Action, Feedback, Severity, Transition
 from schemas.units import NS_PER_S
-from scoring.alarms.return_rule import AlarmReturn, HoldingDetector, ReturnEvidence
 
-NORMAL, SUSPECT, ALARM, RETURNING = map(int, (FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING))
 UNTIL_IT_CLEARS_T_NS = 2**63 - 1
 """`shelved_until_t_ns` of a one-shot shelving: until the alarm clears or is unshelved."""
 ONSET_TOLERANCE_NS = NS_PER_S
@@ -36,23 +34,14 @@ EARLIER_ALARMS = 32
 
 @dataclass(frozen=True)
 class ConditionSettings:
-    """When an alarm is raised and cleared, and what operators must do with it. Ratios are multiples of the limit."""
+    """What operators must do with an alarm, and for how long it is confirmed by data."""
 
-    on_delay_ns: int
-    detectors: tuple[HoldingDetector, ...]
-    """all detectors; those that exceeded their limit decide on the return, see scoring.alarms.return_rule"""
-    return_ratio: float = 0.75
-    """an active alarm begins to return below this"""
-    alarm_ratio: float = 1.5
-    """from here on the severity is ALARM instead of WARNING"""
     latching: bool = False
     """a cleared alarm stays until it is reset"""
     confirming: bool = False
     """an acknowledged alarm must also be confirmed"""
     data_lost_after_ns: int = DATA_LOST_AFTER_NS
-    """an active alarm is stale after a longer time without a valid sample"""
-    settling_ns: int = 0
-    """time of valid samples after a gap, from which on low ratios count: statistics have started again"""
+    """an active alarm is stale after a longer time in which nothing was judged"""
     earlier_alarms: int = EARLIER_ALARMS
     """number of earlier alarms of each fan whose onsets are kept for feedback"""
 
@@ -65,7 +54,7 @@ class AlarmState:
     severity: Severity = Severity.NONE
     """highest since the alarm was raised; NONE if it never was"""
     onset_t_ns: int = 0
-    """first sample of the excursion that raised the alarm; identifies the occurrence"""
+    """when the fault of the alarm probably began; identifies the occurrence"""
     acknowledged: bool = True
     confirmed: bool = True
     """False between an acknowledgement and its confirmation, where confirming is required"""
@@ -86,46 +75,39 @@ class AlarmState:
 
 
 class FanCondition:
-    """One fan's alarm. `fan_state`: NORMAL, SUSPECT (on-delay runs), ALARM, RETURNING (off-delay runs)."""
+    """One fan's alarm."""
 
     def __init__(self, settings: ConditionSettings) -> None:
         self._settings = settings
-        self.fan_state = NORMAL
         self.alarm_state = AlarmState()
-        self._excursion_t_ns = 0  # first sample of the excursion; meaningless when NORMAL
-        self._held_ns = 0  # time since SUSPECT began
-        self._settled_ns = 0  # time of valid samples since the gap, while the alarm is stale
-        self._return = AlarmReturn(settings.detectors, settings.return_ratio)
         self._earlier_onsets_t_ns: tuple[int, ...] = ()
         """of the alarms before this one, oldest first"""
 
-    def update(
-        self, t_ns: int, period_ns: int, ratio: float, evidence: ReturnEvidence
-    ) -> Sequence[tuple[Transition, AlarmState]]:
-        """Process one valid sample and return the transitions, in order.
+    def update(self, *, active: bool, severity: Severity, onset_t_ns: int) -> Sequence[tuple[Transition, AlarmState]]:
+        """Process what was decided, on data; returns the transitions, in order.
 
-        ratio: the statistic closest to its limit, as a multiple of that limit. evidence: of each detector.
+        active, severity: as they are now. onset_t_ns: of the fault that raises an alarm.
         """
-        if self.alarm_state.active:
-            return self._update_active(period_ns, ratio, evidence)
-        if not ratio > 1:
-            self.fan_state = NORMAL
-            return ()
-        if self.fan_state == NORMAL:
-            self._excursion_t_ns = t_ns
-        self._held_ns = 0 if self.fan_state == NORMAL else self._held_ns + period_ns
-        if self._held_ns < self._settings.on_delay_ns:
-            self.fan_state = SUSPECT
-            return ()
-        self.fan_state = ALARM
+        if not self.alarm_state.active:
+            return self._raised(severity, onset_t_ns) if active else ()
+        found: list[tuple[Transition, AlarmState]] = []
+        if self.alarm_state.stale:
+            self.alarm_state = replace(self.alarm_state, stale=False)
+            found.append((Transition.DATA_RESTORED, self.alarm_state))
+        if not active:
+            return (*found, *self._cleared())
+        if severity > self.alarm_state.severity:
+            self.alarm_state = replace(self.alarm_state, severity=severity)
+            found.append((Transition.SEVERITY, self.alarm_state))
+        return found
+
+    def _raised(self, severity: Severity, onset_t_ns: int) -> Sequence[tuple[Transition, AlarmState]]:
         self._keep_onset()
-        self._return.begin()
-        self._return.update(period_ns, evidence)
         self.alarm_state = replace(
             self.alarm_state,
             active=True,
-            severity=self._severity(ratio),
-            onset_t_ns=self._excursion_t_ns,
+            severity=severity,
+            onset_t_ns=onset_t_ns,
             acknowledged=False,
             confirmed=True,  # nothing to confirm before it is acknowledged, see table B.1
             latched=self._settings.latching,
@@ -137,15 +119,16 @@ class FanCondition:
         )
         return ((Transition.RAISED, self.alarm_state),)
 
+    def _cleared(self) -> Sequence[tuple[Transition, AlarmState]]:
+        self.alarm_state = replace(self.alarm_state, active=False)
+        cleared = (Transition.CLEARED, self.alarm_state)
+        if self.alarm_state.shelved_until_t_ns != UNTIL_IT_CLEARS_T_NS:
+            return (cleared,)
+        return cleared, self.unshelve()
+
     def lose_data(self) -> Sequence[tuple[Transition, AlarmState]]:
-        """The time without valid samples has become too long: delays end, and an active alarm becomes stale."""
-        self._held_ns = self._settled_ns = 0
-        self._return.begin_delays_again()
-        if not self.alarm_state.active:
-            self.fan_state = NORMAL
-            return ()
-        self.fan_state = ALARM
-        if self.alarm_state.stale:
+        """Nothing has been judged for too long: an active alarm becomes stale."""
+        if not self.alarm_state.active or self.alarm_state.stale:
             return ()
         self.alarm_state = replace(self.alarm_state, stale=True)
         return ((Transition.DATA_LOST, self.alarm_state),)
@@ -156,7 +139,7 @@ class FanCondition:
         self._keep_onset()
         if not keep_silenced:
             self._earlier_onsets_t_ns = ()
-        before, self.fan_state, self.alarm_state = self.alarm_state, NORMAL, AlarmState()
+        before, self.alarm_state = self.alarm_state, AlarmState()
         if keep_silenced:
             self.alarm_state = AlarmState(
                 shelved_until_t_ns=before.shelved_until_t_ns,
@@ -216,29 +199,18 @@ class FanCondition:
             Action.COMMISSION: (Transition.COMMISSIONING, {}),
         }
         transition, changed = granted[action]
-        if action == Action.COMMISSION:
-            self._return.forget_sizes()
         self.alarm_state = replace(self.alarm_state, **changed, comment=comment or self.alarm_state.comment)
         return transition, ""
 
     def snapshot(self) -> dict[str, Any]:
         """The whole state, as JSON values."""
         alarm = asdict(self.alarm_state)
-        del alarm["active"]  # follows from the fan state
         alarm["severity"] = int(self.alarm_state.severity)
         alarm["feedback"] = int(self.alarm_state.feedback)
         if not alarm["feedback"]:  # most alarms have none: it would be a third of the state of a healthy fan
             del alarm["feedback"], alarm["feedback_by"], alarm["feedback_reason"]
         earlier = {"earlier_onsets_t_ns": list(self._earlier_onsets_t_ns)} if self._earlier_onsets_t_ns else {}
-        return {
-            "state": self.fan_state,
-            "excursion_t_ns": self._excursion_t_ns,
-            "held_ns": self._held_ns,
-            "settled_ns": self._settled_ns,
-            "holds": self._return.snapshot(),
-            **earlier,
-            **alarm,
-        }
+        return {**earlier, **alarm}
 
     @classmethod
     def restore(cls, settings: ConditionSettings, stored: Mapping[str, Any]) -> Self:
@@ -248,16 +220,9 @@ class FanCondition:
             KeyError, TypeError, ValueError, OverflowError: it is not a snapshot of a condition.
         """
         condition = cls(settings)
-        condition.fan_state = int(FanState.known(stored["state"]))
-        if condition.fan_state not in (NORMAL, SUSPECT, ALARM, RETURNING):
-            raise ValueError(stored["state"])
-        condition._excursion_t_ns = _time(stored["excursion_t_ns"])
-        condition._held_ns = _time(stored["held_ns"])
-        condition._settled_ns = _time(stored["settled_ns"])
         condition._earlier_onsets_t_ns = tuple(map(_time, stored.get("earlier_onsets_t_ns", ())))
-        condition._return = AlarmReturn.restore(settings.detectors, settings.return_ratio, stored["holds"])
         condition.alarm_state = AlarmState(
-            active=condition.fan_state in (ALARM, RETURNING),
+            active=bool(stored["active"]),
             severity=Severity.known(stored["severity"]),
             onset_t_ns=_time(stored["onset_t_ns"]),
             shelved_until_t_ns=_time(stored["shelved_until_t_ns"]),
@@ -300,42 +265,6 @@ class FanCondition:
                 self.alarm_state, feedback=feedback, feedback_by=operator_name, feedback_reason=reason
             )
         return transition, ""
-
-    def _update_active(
-        self, period_ns: int, ratio: float, evidence: ReturnEvidence
-    ) -> Sequence[tuple[Transition, AlarmState]]:
-        if not self.alarm_state.stale:
-            return self._update_judged(period_ns, ratio, evidence)
-        self._settled_ns += period_ns
-        if ratio < self._settings.return_ratio and self._settled_ns < self._settings.settling_ns:
-            return ()
-        self.alarm_state = replace(self.alarm_state, stale=False)
-        restored = (Transition.DATA_RESTORED, self.alarm_state)
-        return (restored, *self._update_judged(period_ns, ratio, evidence))
-
-    def _update_judged(
-        self, period_ns: int, ratio: float, evidence: ReturnEvidence
-    ) -> Sequence[tuple[Transition, AlarmState]]:
-        is_below, is_over = self._return.update(period_ns, evidence)
-        if not is_below:
-            self.fan_state = ALARM
-            severity = self._severity(ratio)
-            if severity <= self.alarm_state.severity:
-                return ()
-            self.alarm_state = replace(self.alarm_state, severity=severity)
-            return ((Transition.SEVERITY, self.alarm_state),)
-        if not is_over:
-            self.fan_state = RETURNING
-            return ()
-        self.fan_state = NORMAL
-        self.alarm_state = replace(self.alarm_state, active=False)
-        cleared = (Transition.CLEARED, self.alarm_state)
-        if self.alarm_state.shelved_until_t_ns != UNTIL_IT_CLEARS_T_NS:
-            return (cleared,)
-        return cleared, self.unshelve()
-
-    def _severity(self, ratio: float) -> Severity:
-        return Severity.ALARM if ratio >= self._settings.alarm_ratio else Severity.WARNING
 
     def _refusal(self, action: Action, now_t_ns: int, duration_ns: float) -> str:
         """Why the request must be refused; empty if it is granted."""

@@ -1,8 +1,7 @@
-"""The alarm conditions of a tray's fans, updated with blocks of samples.
+"""The alarm conditions of a tray's fans, updated with what was decided at the end of each bin.
 
-The result does not depend on how samples are cut into blocks: delays count the time of valid samples, and every event
-carries the alarm's state at its own row. An invalid sample changes no state and no timer; only shelving times run on,
-and after some time without a valid sample the delays end and an active alarm becomes stale.
+Where nothing was judged no state changes; only shelving times run on, and after some time an active alarm becomes
+stale.
 """
 
 from __future__ import annotations
@@ -13,42 +12,34 @@ from typing import Any
 
 import numpy as np
 
-from schemas.enums import Action, FanState, Transition
+from schemas.enums import Action, Severity, Transition
 from schemas.messages import Array
-from scoring.alarms.fan_condition import (
-    NORMAL,
-    SUSPECT,
-    UNTIL_IT_CLEARS_T_NS,
-    AlarmState,
-    ConditionSettings,
-    FanCondition,
-)
-from scoring.alarms.return_rule import ReturnEvidence
+from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, AlarmState, ConditionSettings, FanCondition
 
-UNKNOWN = int(FanState.UNKNOWN)
 NEVER_NS = -(1 << 62)
-_DATA_LOST, _UNSHELVE, _SAMPLE = range(3)  # what may happen at a row, in this order
 
 
 @dataclass(frozen=True)
 class AlarmEvent:
-    """A transition of a fan's alarm at a row of a block, and the alarm's state after it."""
+    """A transition of a fan's alarm, and the alarm's state after it."""
 
-    row: int
     fan: int
     transition: Transition
     alarm_state: AlarmState
 
 
-@dataclass(frozen=True)
-class BlockResult:
-    """The result of a block. state: (n, fans) uint8, the FanState after each sample, UNKNOWN where it is invalid."""
+@dataclass(frozen=True, eq=False)
+class Decided:
+    """What was decided at a time, (fans,) each."""
 
-    state: Array
-    events: list[AlarmEvent]
-    """sorted by row, then fan"""
-    too_short: int
-    """number of excursions that ended before their on-delay"""
+    t_ns: int
+    judged: Array
+    """whether something was: else the rest says nothing"""
+    active: Array
+    severity: Array
+    """of schemas.enums.Severity, of an active alarm"""
+    onset_t_ns: Array
+    """of an active alarm"""
 
 
 class TrayConditions:
@@ -57,64 +48,30 @@ class TrayConditions:
     def __init__(self, fans: int, settings: ConditionSettings) -> None:
         self._settings = settings
         self._conditions = [FanCondition(settings) for _ in range(fans)]
-        self._last_valid_t_ns = np.full(fans, NEVER_NS, np.int64)
+        self._judged_t_ns = np.full(fans, NEVER_NS, np.int64)
+        """(fans,) when each was judged last"""
         self._refresh_all()
 
-    def update(
-        self,
-        t_ns: Array,
-        period_ns: int,
-        ratio: Array,
-        valid: Array,
-        ratios: Array,
-        speed_rad_s: Array,
-    ) -> BlockResult:
-        """Process a block. t_ns: (n,), rising; ratio, valid: (n, fans), see `Condition.update`.
-
-        ratios (n, detectors, fans) and speed_rad_s (n, fans): see ReturnEvidence.
-        """
-        state = np.where(valid, np.uint8(NORMAL), np.uint8(UNKNOWN))
+    def update(self, now: Decided) -> list[AlarmEvent]:
+        """Process a decision; returns the events, sorted by fan."""
+        judged, since_ns = now.judged, now.t_ns - self._judged_t_ns
+        lost = self._active & (self._judged_t_ns != NEVER_NS) & (since_ns > self._settings.data_lost_after_ns)
+        unshelved = self._shelved_until_t_ns <= now.t_ns
         events: list[AlarmEvent] = []
-        too_short = 0
-        busy = self._not_normal | ((ratio > 1) & valid).any(axis=0)
-        unshelved = self._shelved_until_t_ns <= t_ns[-1]
-        for fan in np.flatnonzero(busy | unshelved).tolist():
+        for fan in np.flatnonzero(lost | unshelved | (judged & (self._active | now.active))).tolist():
             condition = self._conditions[fan]
-            rows = np.flatnonzero(valid[:, fan]) if busy[fan] else np.zeros(0, np.intp)
-            samples = zip(ratios[rows, :, fan].tolist(), speed_rad_s[rows, fan].tolist(), strict=True)
-            evidence = dict(zip(rows.tolist(), (ReturnEvidence(*sample) for sample in samples), strict=True))
-            steps = [(row, _SAMPLE) for row in rows.tolist()]
-            if busy[fan]:
-                steps += [(row, _DATA_LOST) for row in self._data_lost_rows(fan, t_ns, rows)]
+            transitions = list(condition.lose_data()) if lost[fan] else []
             if unshelved[fan]:
-                steps.append((int(np.searchsorted(t_ns, self._shelved_until_t_ns[fan])), _UNSHELVE))
-            for row, step in sorted(steps):
-                before = condition.fan_state
-                if step == _DATA_LOST:
-                    transitions = condition.lose_data()
-                elif step == _UNSHELVE:
-                    transitions = (condition.unshelve(),)
-                else:
-                    transitions = condition.update(int(t_ns[row]), period_ns, float(ratio[row, fan]), evidence[row])
-                    state[row, fan] = condition.fan_state
-                events += [AlarmEvent(row, fan, *transition) for transition in transitions]
-                too_short += before == SUSPECT and condition.fan_state == NORMAL
+                transitions.append(condition.unshelve())
+            if judged[fan]:
+                severity = Severity(int(now.severity[fan]))
+                transitions += condition.update(
+                    active=bool(now.active[fan]), severity=severity, onset_t_ns=int(now.onset_t_ns[fan])
+                )
+            events += [AlarmEvent(fan, *transition) for transition in transitions]
             self._refresh(fan)
-        last_valid_t_ns = np.where(valid, t_ns[:, np.newaxis], NEVER_NS).max(axis=0)
-        self._last_valid_t_ns = np.maximum(last_valid_t_ns, self._last_valid_t_ns)
-        events.sort(key=lambda event: (event.row, event.fan))
-        return BlockResult(state, events, too_short)
-
-    def _data_lost_rows(self, fan: int, t_ns: Array, rows: Array) -> list[int]:
-        """At which rows a fan has been without a valid sample for too long; rows: those with one."""
-        limit_ns = self._settings.data_lost_after_ns
-        if self._last_valid_t_ns[fan] == NEVER_NS:
-            return []
-        if t_ns[-1] - self._last_valid_t_ns[fan] <= limit_ns:
-            return []
-        since_t_ns = np.concatenate((self._last_valid_t_ns[fan : fan + 1], t_ns[rows]))
-        lost = np.searchsorted(t_ns, since_t_ns + limit_ns, side="right")
-        return lost[lost <= np.append(rows, len(t_ns) - 1)].tolist()
+        self._judged_t_ns = np.where(judged, now.t_ns, self._judged_t_ns)
+        return events
 
     def request(
         self,
@@ -150,11 +107,6 @@ class TrayConditions:
         """(fans,) whether each fan's alarm is active."""
         return self._active.copy()
 
-    @property
-    def is_quiet(self) -> bool:
-        """Whether the state of each fan is normal, and no alarm is active."""
-        return not (self._not_normal.any() or self._active.any())
-
     def alarm_state(self, fan: int) -> AlarmState:
         """The present state of a fan's alarm."""
         return self._conditions[fan].alarm_state
@@ -169,7 +121,7 @@ class TrayConditions:
         """The whole state, as JSON values."""
         return {
             "fans": [condition.snapshot() for condition in self._conditions],
-            "last_valid_t_ns": self._last_valid_t_ns.tolist(),
+            "judged_t_ns": self._judged_t_ns.tolist(),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -180,24 +132,22 @@ class TrayConditions:
         """
         try:
             conditions = [FanCondition.restore(self._settings, each) for each in snapshot["fans"]]
-            last_valid_t_ns = np.array(snapshot["last_valid_t_ns"], np.int64)
+            judged_t_ns = np.array(snapshot["judged_t_ns"], np.int64)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise ValueError(f"not a snapshot of alarm conditions: {error!r}") from error
-        if not len(conditions) == len(last_valid_t_ns) == len(self._conditions):
+        if not len(conditions) == len(judged_t_ns) == len(self._conditions):
             raise ValueError(f"a snapshot of {len(conditions)} fans, here are {len(self._conditions)}")
-        self._conditions, self._last_valid_t_ns = conditions, last_valid_t_ns
+        self._conditions, self._judged_t_ns = conditions, judged_t_ns
         self._refresh_all()
 
     def _refresh_all(self) -> None:
-        self._not_normal = np.zeros(len(self._conditions), np.bool_)
         self._active = np.zeros(len(self._conditions), np.bool_)
         self._shelved_until_t_ns = np.full(len(self._conditions), UNTIL_IT_CLEARS_T_NS, np.int64)
         for fan in range(len(self._conditions)):
             self._refresh(fan)
 
     def _refresh(self, fan: int) -> None:
-        """Keep the columns by which `update` finds the fans to process sample by sample; it skips the others."""
+        """Keep the columns by which `update` finds the fans to process; it skips the others."""
         condition = self._conditions[fan]
         self._active[fan] = condition.alarm_state.active
-        self._not_normal[fan] = condition.fan_state != NORMAL
         self._shelved_until_t_ns[fan] = condition.alarm_state.shelved_until_t_ns or UNTIL_IT_CLEARS_T_NS

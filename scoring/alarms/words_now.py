@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from schemas.enums import FanState, InvalidReason
 
-RETURNING = "within its limits (the alarm clears once it stays there, for most faults near the speeds of the alarm)"
+RETURNING = "like a healthy fan again (the alarm clears once it stays so for ten seconds)"
 STOPPED, STARTING = "stopped by its command", "starting"
 
 
 def words_now(state: int, invalid_reason: int = InvalidReason.NONE) -> str:
-    """After "now": that the fan is stopped, starting or back within its limits; empty: none of these.
+    """After "now": that the fan is stopped, starting or like a healthy fan again; empty: none of these.
 
     state and invalid_reason: `FanState` and `InvalidReason` of the newest sample.
     """

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from schemas.twin_card import CardError, TwinCard
-from scoring.limits import Limits
 
 HOURS_PER_DAY = 24.0
 
@@ -39,10 +38,9 @@ class ObservedRate:
 
     def interval_95(self, alarms: int) -> tuple[float, float]:
         """The exact 95 % interval of the rate of independent alarms (Garwood), per fan and day."""
-        from scoring.calibration.alarm_rate import poisson_interval  # noqa: PLC0415  scipy takes long to import
+        from scoring.calibration.alarm_rate import daily_interval  # noqa: PLC0415  scipy takes long to import
 
-        low, high = poisson_interval(alarms)
-        return low / self.fan_hours * HOURS_PER_DAY, high / self.fan_hours * HOURS_PER_DAY
+        return daily_interval(alarms, self.fan_hours)
 
     @property
     def text(self) -> str:
@@ -88,12 +86,13 @@ def _number(value: float) -> str:
 
 def declared_per_day(card_json: str) -> float | None:
     """The rate that a twin's card declares, false alarms per fan and day; None: it declares none, or cannot be read."""
+    from scoring.calibration.calibration import Calibration  # noqa: PLC0415  scipy, again
+
     try:
         calibration = TwinCard.from_json(card_json).calibration
-        declared = Limits.model_validate(calibration).declared_rate if calibration else None
+        return Calibration.model_validate(calibration).false_alarms_per_day if calibration else None
     except (CardError, ValueError):
         return None
-    return declared.false_alarms_per_day if declared else None
 
 
 def together(rates: Sequence[ObservedRate]) -> ObservedRate:

@@ -1,1 +1,1 @@
-"""Which fault explains an alarm, with probabilities."""
+"""Causes of alarms, in words: what the model found, how large it is, and what would tell where it is unclear."""

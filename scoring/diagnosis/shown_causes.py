@@ -1,8 +1,13 @@
-"""Which causes of an alarm are shown, and their names for people. Commands read this without scipy."""
+"""Causes of alarms in words: names, what to do, and which of them are shown. Commands read this without scipy.
+
+A new cause is one row of `ROWS`, and a row of scoring.model.faults that says how it shows.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 from typing import Protocol, TypeVar
 
 from schemas.messages import Diagnosis
@@ -11,47 +16,73 @@ MIN_PROBABILITY = 0.15
 """less probable causes are not listed, except the first"""
 CLOSE = 0.1
 """causes whose probability is at most this much below that of the first are as likely as the first"""
+CANNOT_TELL = "cannot_tell"
+GAIN_DOWN = "gain_down"
+SENSOR_DROPOUT, UNSTEADY, SLOW_CHANGE = "sensor_dropout", "unsteady", "slow_change"
 BLOCKED, NO_POWER, NO_TACHO = "blocked", "no_power", "no_tacho"
 STILL_DRIVEN, WINDMILLING = "still_driven", "windmilling"
-STANDSTILL_CAUSES = {
-    BLOCKED: "blocked",
-    NO_POWER: "no power",
-    NO_TACHO: "no signal of the tacho",
-    STILL_DRIVEN: "still driven",
-    WINDMILLING: "turned by the air",
-}
-CANNOT_TELL = "cannot_tell"
-CAUSES = {
-    "drag_up": "more drag (airflow blocked, filter clogged)",
-    "drag_down": "less drag (blade lost, airflow freer than before)",
-    "friction_up": "more friction (bearing)",
-    "gain_down": "less drive (supply, driver)",
-    "external_torque": "an external torque (something touches the rotor)",
-    "sensor_stuck": "a stuck tacho",
-    "sensor_dropout": "a tacho that drops out",
-    "sensor_scaling": "a tacho that counts wrongly",
-    **STANDSTILL_CAUSES,
-    CANNOT_TELL: "cannot tell yet",
-}
+
+
+class Size(StrEnum):
+    """How large a fault is said to be: `parameter` of a diagnosis."""
+
+    SPEED = "speed"
+    DRAG = "drag"
+    FRICTION = "friction"
+    TORQUE = "torque against the rotation"
+    GAIN = "gain"
+    READING = "speed reading"
+    STUCK = "repeated readings"
+    MISSING = "missing readings"
+    SPREAD = "spread of the speed"
+
+
+@dataclass(frozen=True)
+class CauseRow:
+    """One cause in words. name: for people, with what the fault may be in brackets."""
+
+    cause: str
+    name: str
+    to_do: str = ""
+    size: Size = Size.SPEED
+
+
+_FREE = "see whether the airflow is free and the filter is clean"
+_LOST = "see whether a blade is missing, or a filter or cover was taken out"
+_CABLE = "look at the tacho and its cable"
+_CLEAN = "clean the fan and its filter; if that changes nothing, listen to the bearing"
+ROWS = (
+    CauseRow("drag_up", "more drag (airflow blocked, filter clogged)", _FREE, Size.DRAG),
+    CauseRow("drag_down", "less drag (blade lost, airflow freer than before)", _LOST, Size.DRAG),
+    CauseRow(
+        "friction_up", "more friction (bearing)", "listen to the bearing, and plan to replace the fan", Size.FRICTION
+    ),
+    CauseRow(GAIN_DOWN, "less drive (supply, driver)", "measure the supply, and look at the driver", Size.GAIN),
+    CauseRow(
+        "external_torque", "an external torque (something touches the rotor)", "see what touches the rotor", Size.TORQUE
+    ),
+    CauseRow("sensor_stuck", "a stuck tacho", _CABLE, Size.STUCK),
+    CauseRow(SENSOR_DROPOUT, "a tacho that drops out", _CABLE, Size.MISSING),
+    CauseRow(
+        "sensor_scaling", "a tacho that counts wrongly", "compare the speed with another tachometer", Size.READING
+    ),
+    CauseRow(
+        UNSTEADY, "an unsteady speed (loose part or plug, gusts)", "see whether a part or a plug is loose", Size.SPREAD
+    ),
+    CauseRow(SLOW_CHANGE, "a slow change (dirt, a filter that clogs, a bearing that wears)", _CLEAN),
+    CauseRow(BLOCKED, "blocked", "switch it off, then see what blocks the rotor"),
+    CauseRow(NO_POWER, "no power", "look at its supply, fuse and plug"),
+    CauseRow(NO_TACHO, "no signal of the tacho", f"see whether it turns; if it does, {_CABLE}"),
+    CauseRow(STILL_DRIVEN, "still driven", "see what still commands it, and look at the driver"),
+    CauseRow(WINDMILLING, "turned by the air", "it is off: see what blows air through it"),
+    CauseRow(CANNOT_TELL, "cannot tell yet"),
+)
+CAUSES = {row.cause: row.name for row in ROWS}
 """names for people, with what the fault may be"""
-WHAT_TO_DO = {
-    "drag_up": "see whether the airflow is free and the filter is clean",
-    "drag_down": "see whether a blade is missing, or a filter or cover was taken out",
-    "friction_up": "listen to the bearing, and plan to replace the fan",
-    "gain_down": "measure the supply, and look at the driver",
-    "external_torque": "see what touches the rotor",
-    "sensor_stuck": "look at the tacho and its cable",
-    "sensor_dropout": "look at the tacho and its cable",
-    "sensor_scaling": "compare the speed with another tachometer",
-    "blocked": "switch it off, then see what blocks the rotor",
-    "no_power": "look at its supply, fuse and plug",
-    "no_tacho": "see whether it turns; if it does, look at the tacho and its cable",
-    "still_driven": "see what still commands it, and look at the driver",
-    "windmilling": "it is off: see what blows air through it",
-}
+WHAT_TO_DO = {row.cause: row.to_do for row in ROWS if row.to_do}
 """by cause; what is to be done where the cause is unclear is part of the evidence"""
-FALLING = "falling speed"
-"""parameter of these causes while the fan still turns"""
+STANDSTILL_CAUSES = {cause: CAUSES[cause] for cause in (BLOCKED, NO_POWER, NO_TACHO, STILL_DRIVEN, WINDMILLING)}
+"""of a fan that does not turn or stop as commanded"""
 
 
 class RatedCause(Protocol):
@@ -136,5 +167,5 @@ def most_probable(causes: Sequence[Diagnosis]) -> list[str]:
 
 
 def is_of_standstill(cause: Diagnosis) -> bool:
-    """Whether it was named of a fan that did not turn or stop as commanded, and not while it slowed down."""
-    return cause.cause in STANDSTILL_CAUSES and cause.parameter != FALLING
+    """Whether it is of a fan that does not turn or stop as commanded."""
+    return cause.cause in STANDSTILL_CAUSES

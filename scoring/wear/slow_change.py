@@ -1,33 +1,38 @@
-"""Slow change of a fan against the fans beside it: a notice, long before it is wear that reaches a limit.
-
-The change of a fan is that of its trend line over the time observed (scoring.wear.trend). The weather, the supply and
-the room act on all fans of a tray, so the median change of those that were first measured with it is subtracted. A
-change is noticed where it and this difference are at least `MIN_CHANGE` and at least twice the half-width of the 95 %
-interval. The limit is wide because every fan is tested again with every point, and a healthy fan must not be named.
-"""
+"""Slow change of one fan, and what is said of it in words long before it is wear that reaches a limit."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from schemas.units import NS_PER_S
 
 if TYPE_CHECKING:  # it loads scipy, which a command that shows alarms does not need
-    from scoring.wear.trend import Trend
+    from scoring.wear.trend import LimitForecast, Trend
 
+LIMIT_SHARE = 0.1
+"""of the speed; an alarm is raised where a change has surely reached it"""
 WEAR_HINT = "see fantwin wear"
-"""each notice ends with it"""
+"""each notice about one fan ends with it"""
 MOST_FANS = "most fans turn"
-"""the line on a change that the fans of a tray share begins with it (scoring.wear.followed)"""
-MIN_CHANGE = 0.03
-"""relative; smaller changes are those of any healthy fan"""
-MIN_INTERVALS = 2.0
-BESIDE_NS = 1800 * NS_PER_S
-"""fans are compared whose first points are at most so far apart"""
-HOURS_PER_DAY = 24.0
+"""a notice about what the fans of a tray share begins with it"""
+
+
+@dataclass(frozen=True)
+class SlowChange:
+    """Change of a fan's speed since commissioning, at its newest point.
+
+    change, std_error: shares of the speed. beside: the median change of the other fans since then; None without any.
+    trend: of the points. forecast: of a change by LIMIT_SHARE.
+    """
+
+    t_ns: int
+    change: float
+    std_error: float
+    beside: float | None
+    trend: Trend | None
+    forecast: LimitForecast
 
 
 def is_of_slow_change(note: str) -> bool:
@@ -35,40 +40,34 @@ def is_of_slow_change(note: str) -> bool:
     return note.endswith(WEAR_HINT) or note.startswith(MOST_FANS)
 
 
-def slow_changes(parameter: str, trends: Sequence[Trend | None]) -> list[str]:
-    """A line for each fan that has changed slowly, as its relative parameter shows. trends: of each fan."""
-    known = {fan: trend for fan, trend in enumerate(trends) if trend is not None}
-    lines = []
-    for fan, trend in known.items():
-        beside = [each for other, each in known.items() if other != fan and _begin_together(each, trend)]
-        change, half_interval = _of_line(trend)
-        others, others_half = np.median([_of_line(each) for each in beside], axis=0) if beside else (0.0, 0.0)
-        least = max(MIN_CHANGE, MIN_INTERVALS * float(np.hypot(half_interval, others_half)))
-        if min(abs(change), abs(change - others)) < least:
-            continue
-        compared = f", the fans beside it {_percent(others)}" if beside else ""
-        lines.append(f"fan {fan}: {parameter} {_over_time(change, trend.days)}{compared}: {WEAR_HINT}")
-    return lines
+def own_change(fan: int, change: float, age_ns: int, beside: float | None) -> str:
+    """The notice about a fan that has changed against the fans beside it. Changes are shares of the speed."""
+    hours = age_ns / (3600.0 * NS_PER_S)
+    age = f"{hours:.0f} h" if hours < 48.0 else f"{hours / 24.0:.0f} days"
+    compared = f", the fans beside it {100 * beside:+.1f} %" if beside is not None else ""
+    return f"fan {fan}: speed {100 * change:+.1f} % in {age}{compared}: {WEAR_HINT}"
 
 
-def _begin_together(one: Trend, other: Trend) -> bool:
-    return abs(one.first_ns - other.first_ns) <= BESIDE_NS
+def shared_change(share: float) -> str:
+    """The notice about a change that most fans of a tray share, as a share of the speed."""
+    direction = "slower" if share < 0.0 else "faster"
+    return (
+        f"{MOST_FANS} {100 * abs(share):.0f} % {direction} than when they were commissioned: the air, the supply, or a "
+        "filter in front of them all"
+    )
 
 
-def _of_line(trend: Trend) -> tuple[float, float]:
-    """The change of the line over the time observed, and half its 95 % interval."""
-    return trend.slope_per_day * trend.days, trend.t_quantile * trend.slope_error * trend.days
+def limit_ahead(fan: int, others: Sequence[int], change: float, days: Sequence[float]) -> str:
+    """The line about the fan that reaches its limit first, and the others that will.
 
-
-def _over_time(change: float, days: float) -> str:
-    unit, each, times = ("days", "a day", days) if days >= 2.0 else ("h", "an hour", days * HOURS_PER_DAY)
-    return f"{_percent(change)} in {times:.{_places(times)}f} {unit}, {_percent(change / times)} {each}"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:+.{_places(100 * share)}f} %"
-
-
-def _places(value: float) -> int:
-    """For two digits at least."""
-    return 2 if abs(value) < 1.0 else 1 if abs(value) < 10.0 else 0
+    change: so far. days: until the limit is likely reached, at the earliest and at the latest; zeros: it may have been.
+    """
+    likely, earliest, latest = days
+    limit = f"{100 * LIMIT_SHARE:.0f} %"
+    reached = f"it will have lost {limit} of its speed" if change < 0.0 else f"it will turn {limit} faster"
+    unit = "day" if round(likely) == 1 else "days"
+    when = f"in about {likely:.0f} {unit} ({earliest:.0f} to {latest:.0f})" if likely > 0.5 else "within a day"
+    if not latest:
+        reached, when = "it has lost" if change < 0.0 else "it turns faster by", f"about {limit} of its speed"
+    more = f", and fan {', '.join(map(str, others))}" if others else ""
+    return f"fan {fan} is wearing: {reached} {when}; inspect it{more}"

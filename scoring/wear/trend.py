@@ -1,13 +1,13 @@
-"""Slow wear: the trend of a parameter per day with its confidence interval, and when it will reach a limit.
+"""Trend of a slow change per day with its confidence interval, and when it will reach a limit.
 
 Points are (time, value, standard error). Memory is bounded: when the series is full, neighbours are merged in pairs,
 and from then on a stored point is the mean of twice as many. A complete point is kept to the second, its value to a
 hundredth of its standard error: all digits would be most of a snapshot, and say nothing.
 
 Slope: the median of the slopes between all pairs of points (Theil 1950; Sen, JASA 63 (1968) 1379), which tolerates a
-third of outliers. Interval: residuals of a fan are correlated over hours (temperature, day and night), so that
-successive points count for less. The means of at least BATCHES stretches show how much less (batch means, as for the
-output of simulations: Law, Simulation Modeling and Analysis, 2015, section 9.5.3). Stretches that are still correlated
+third of outliers. Interval: the errors of a fan are correlated over hours (temperature, day and night), so that
+successive points count for less. The means of at least BATCHES intervals show how much less (batch means, as for the
+output of simulations: Law, Simulation Modeling and Analysis, 2015, section 9.5.3). Means that are still correlated
 count as (1 - rho) / (1 + rho) each, where rho is their lag-one correlation, corrected for the bias of a short series
 (Marriott and Pope, Biometrika 41 (1954) 390; the effective number as in Yue and Wang, Water Resources Management 18
 (2004) 201). The interval is that of a regression line by Student's t with this effective number; the scatter is
@@ -18,28 +18,28 @@ A limit is reached between the earliest and the latest time at which the line wi
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from schemas.messages import Array
 from schemas.units import NS_PER_S
-
-Array = NDArray[np.float64]
 
 NS_PER_DAY = 86_400 * NS_PER_S
 CAPACITY = 128
 MIN_POINTS = 10
 MAX_ERROR_RATIO = 3.0
-"""to the median error of the points; those with larger errors say nothing, and are left out of a trend"""
+"""to the median error of the points; a trend leaves out those with larger errors"""
 MIN_EFFECTIVE_POINTS = 5.0
 BATCHES = 24
 MAX_HORIZON_RATIO = 10.0
 """no forecast of a limit farther ahead than this many times the observed time"""
+REACHED = "the limit is already reached"
 THEIL_SEN_EFFICIENCY = 3.0 / np.pi
 SCATTER_PER_MEDIAN = 1.4826
 
@@ -48,12 +48,11 @@ SCATTER_PER_MEDIAN = 1.4826
 class Trend:
     """A line through the points, at days since `origin_ns`, the mean of their times.
 
-    first_ns: of the first point. slope_per_day with its 95 % interval (low, high). level, level_error: the line at the
-    origin. t_quantile: half the 95 % interval in standard errors. days: observed time.
+    slope_per_day with its 95 % interval (low, high). level, level_error: the line at the origin. t_quantile: half the
+    95 % interval in standard errors. days: observed time.
     """
 
     origin_ns: int
-    first_ns: int
     slope_per_day: float
     low: float
     high: float
@@ -61,7 +60,6 @@ class Trend:
     level: float
     level_error: float
     t_quantile: float
-    points: int
     days: float
 
     @property
@@ -80,57 +78,63 @@ class LimitForecast:
     unknown_reason: str = ""
 
 
+class Point(NamedTuple):
+    """One value of a series, or the mean of several."""
+
+    t_ns: int
+    value: float
+    std_error: float
+
+
 class WearSeries:
-    """The points of one parameter of one fan."""
+    """The points of one fan, at most CAPACITY."""
 
     def __init__(self) -> None:
-        self._t_ns: list[int] = []
-        self._value: list[float] = []
-        self._std_error: list[float] = []
+        self._points: list[Point] = []
         self._points_per_stored = 1
-        self._points_in_last = 0  # the last stored point may still be incomplete
+        self._points_in_last = 0
+        """points in the last stored one, which may be incomplete"""
 
     def __len__(self) -> int:
-        return len(self._t_ns)
+        return len(self._points)
 
-    @property
-    def last(self) -> float:
-        """The last value; 0 if there is none."""
-        return self._value[-1] if self._value else 0.0
-
-    def add(self, t_ns: int, value: float, std_error: float) -> None:
-        """Add a point. It is ignored if not finite, not newer than the last, or without a positive std_error."""
-        if not (np.isfinite(value) and np.isfinite(std_error) and std_error > 0.0):
-            return
-        if self._t_ns and t_ns <= self._t_ns[-1]:
-            return
+    def add(self, t_ns: int, value: float, std_error: float) -> bool:
+        """Add a point. False, and nothing is added: it is not finite, not newer than the last, or without an error."""
+        is_newer = not self._points or t_ns > self._points[-1].t_ns
+        if not (is_newer and math.isfinite(value) and math.isfinite(std_error) and std_error > 0.0):
+            return False
+        point = Point(t_ns, value, std_error)
         if 0 < self._points_in_last < self._points_per_stored:
+            self._points[-1] = mean_of([self._points[-1], point], [self._points_in_last, 1])
             self._points_in_last += 1
-            self._t_ns[-1], self._value[-1], self._std_error[-1] = _merged(
-                (self._t_ns[-1], self._value[-1], self._std_error[-1]), (t_ns, value, std_error)
-            )
         else:
-            if len(self._t_ns) == CAPACITY:
-                self._halve()
-            self._t_ns.append(t_ns)
-            self._value.append(value)
-            self._std_error.append(std_error)
+            if len(self._points) == CAPACITY:
+                pairs = zip(self._points[::2], self._points[1::2], strict=True)
+                self._points = [_rounded(mean_of(pair)) for pair in pairs]
+                self._points_per_stored *= 2
+            self._points.append(point)
             self._points_in_last = 1
         if self._points_in_last == self._points_per_stored:
-            self._t_ns[-1], self._value[-1], self._std_error[-1] = _rounded(
-                (self._t_ns[-1], self._value[-1], self._std_error[-1])
-            )
+            self._points[-1] = _rounded(self._points[-1])
+        return True
+
+    def mean_from(self, from_ns: int, days: float) -> Point:
+        """The mean of the points of some days, or the next point if there is none. The series must not be empty."""
+        later = [point for point in self._points if point.t_ns >= from_ns] or self._points[-1:]
+        until_ns = max(from_ns + round(days * NS_PER_DAY), later[0].t_ns)
+        return mean_of([point for point in later if point.t_ns <= until_ns])
 
     def trend(self) -> Trend | None:
         """The line through the points; None while there are too few independent points."""
-        std_error = np.array(self._std_error)
-        is_known = std_error <= MAX_ERROR_RATIO * np.median(std_error) if len(std_error) else np.zeros(0, bool)
-        t_ns, value = np.array(self._t_ns, np.int64)[is_known], np.array(self._value)[is_known]
-        n = len(t_ns)
+        std_error = np.array([point.std_error for point in self._points])
+        largest = MAX_ERROR_RATIO * np.median(std_error) if len(std_error) else 0.0
+        known = [point for point in self._points if point.std_error <= largest]
+        n = len(known)
         if n < MIN_POINTS:
             return None
         from scipy.stats import theilslopes  # noqa: PLC0415  what only shows wear does without this large import
 
+        t_ns, value = np.array([point.t_ns for point in known]), np.array([point.value for point in known])
         origin_ns = int(t_ns[0]) + round(float((t_ns - t_ns[0]).mean()))
         day = (t_ns - origin_ns) / NS_PER_DAY
         fitted: Any = theilslopes(value, day)
@@ -140,14 +144,13 @@ class WearSeries:
         effective = n / _inflation(residual)
         if effective < MIN_EFFECTIVE_POINTS:
             return None
-        scatter = SCATTER_PER_MEDIAN * float(np.median(np.abs(residual))) * np.sqrt(n / (n - 2.0))
-        scatter = max(scatter, float(np.median(std_error[is_known])))
-        level_error = scatter / np.sqrt(effective * THEIL_SEN_EFFICIENCY)
+        scatter = SCATTER_PER_MEDIAN * float(np.median(np.abs(residual))) * math.sqrt(n / (n - 2.0))
+        scatter = max(scatter, float(np.median(std_error[std_error <= largest])))
+        level_error = scatter / math.sqrt(effective * THEIL_SEN_EFFICIENCY)
         slope_error = level_error / float(day.std())
         t_quantile = float(stdtrit(min(effective, n // max(1, n // BATCHES)) - 2.0, 0.975))
         return Trend(
             origin_ns=origin_ns,
-            first_ns=self._t_ns[0],
             slope_per_day=slope,
             low=slope - t_quantile * slope_error,
             high=slope + t_quantile * slope_error,
@@ -155,55 +158,38 @@ class WearSeries:
             level=level,
             level_error=level_error,
             t_quantile=t_quantile,
-            points=n,
             days=float(day[-1] - day[0]),
         )
 
-    def snapshot(self) -> dict[str, NDArray[np.int64] | Array]:
-        """The whole state as arrays: t_ns, value, std_error (points,), and count (2,)."""
-        return {
-            "t_ns": np.array(self._t_ns, np.int64),
-            "value": np.array(self._value, np.float64),
-            "std_error": np.array(self._std_error, np.float64),
-            "count": np.array((self._points_per_stored, self._points_in_last), np.int64),
-        }
+    def snapshot(self) -> dict[str, list[Any]]:
+        """The whole state as JSON values: a list for each column of the points, and two counts."""
+        columns = {name: [getattr(point, name) for point in self._points] for name in Point._fields}
+        return {**columns, "count": [self._points_per_stored, self._points_in_last]}
 
     @classmethod
-    def restore(cls, snapshot: Mapping[str, NDArray]) -> WearSeries:
+    def restore(cls, snapshot: Mapping[str, Any]) -> WearSeries:
         """The series of a snapshot.
 
         Raises:
             ValueError, KeyError, TypeError: it is not a snapshot of a series.
         """
         series = cls()
-        series._t_ns = [int(t_ns) for t_ns in snapshot["t_ns"]]
-        series._value = [float(value) for value in snapshot["value"]]
-        series._std_error = [float(error) for error in snapshot["std_error"]]
-        if not len(series._t_ns) == len(series._value) == len(series._std_error) <= CAPACITY:
-            raise ValueError("columns of a series must be of one length")
+        columns = zip(*(snapshot[name] for name in Point._fields), strict=True)
+        series._points = [Point(int(t_ns), float(value), float(error)) for t_ns, value, error in columns]
         series._points_per_stored, series._points_in_last = (int(count) for count in snapshot["count"])
+        if len(series._points) > CAPACITY:
+            raise ValueError(f"a series has at most {CAPACITY} points")
         return series
-
-    def _halve(self) -> None:
-        points = list(zip(self._t_ns, self._value, self._std_error, strict=True))
-        pairs = [_rounded(_merged(first, second)) for first, second in zip(points[::2], points[1::2], strict=True)]
-        self._t_ns, self._value, self._std_error = (list(column) for column in zip(*pairs, strict=True))
-        self._points_per_stored *= 2
 
 
 def forecast_limit(trend: Trend, limit: float, now_ns: int) -> LimitForecast:
-    """When the parameter will reach `limit`, from either side, if the trend continues."""
+    """When the value will reach `limit`, which lies ahead in the direction of the trend, if the trend continues."""
     now = (now_ns - trend.origin_ns) / NS_PER_DAY
-    level_now = trend.level + trend.slope_per_day * now
-    distance = limit - level_now
+    distance = limit - (trend.level + trend.slope_per_day * now)
     if not trend.significant:
         return LimitForecast(unknown_reason="no significant trend")
     if distance * trend.slope_per_day <= 0.0:
-        first_distance = limit - (trend.level + trend.slope_per_day * (now - trend.days))
-        passed = first_distance * trend.slope_per_day > 0.0
-        return LimitForecast(
-            unknown_reason="the limit is already reached" if passed else "it moves away from the limit"
-        )
+        return LimitForecast(unknown_reason=REACHED)
     likely = (limit - trend.level) / trend.slope_per_day
     if likely - now > MAX_HORIZON_RATIO * trend.days:
         return LimitForecast(
@@ -226,7 +212,7 @@ def _crossings(trend: Trend, limit: float) -> tuple[float, float]:
     a = trend.slope_per_day**2 - (trend.t_quantile * trend.slope_error) ** 2
     b = -2.0 * distance * trend.slope_per_day
     c = distance**2 - (trend.t_quantile * trend.level_error) ** 2
-    root = np.sqrt(max(b * b - 4.0 * a * c, 0.0))
+    root = math.sqrt(max(b * b - 4.0 * a * c, 0.0))
     return (-b - root) / (2.0 * a), (-b + root) / (2.0 * a)
 
 
@@ -239,22 +225,27 @@ def _inflation(residual: Array) -> float:
     batches = batches - batches.mean()
     power = float(batches @ batches)
     found = float(batches[:-1] @ batches[1:]) / power if power > 0.0 else 0.0
-    # Fitting a line lowers the measured correlation by about that of two stretches.
+    # Fitting a line lowers the measured correlation by about that of two means.
     rho = np.clip(found + 2.0 * (1.0 + 3.0 * max(found, 0.0)) / n, 0.0, 1.0 - 1.0 / n)
     within = size * (power / (n - 2.0)) / float(bounded.var()) if power > 0.0 else 1.0
     return float(max(within, 1.0) * (1.0 + rho) / (1.0 - rho))
 
 
-def _merged(first: tuple[int, float, float], second: tuple[int, float, float]) -> tuple[int, float, float]:
-    """The mean of two points, weighted by their inverse variances."""
-    weights = np.array((first[2] ** -2, second[2] ** -2))
-    share = float(weights[1] / weights.sum())
-    t_ns = first[0] + round(share * (second[0] - first[0]))
-    return t_ns, first[1] + share * (second[1] - first[1]), float(weights.sum() ** -0.5)
+def mean_of(points: Sequence[Point], counts: Iterable[int] = itertools.repeat(1)) -> Point:
+    """The mean of points, each itself the mean of `counts`, weighted by their inverse variances.
+
+    Points of a filter err alike, so a mean is as uncertain as what it is made of.
+    """
+    first_ns, total, value, later_ns, of_counts = points[0].t_ns, 0.0, 0.0, 0.0, 0
+    for point, count in zip(points, counts, strict=False):
+        weight = count / point.std_error**2
+        total, of_counts = total + weight, of_counts + count
+        value, later_ns = value + weight * point.value, later_ns + weight * (point.t_ns - first_ns)
+    return Point(first_ns + round(later_ns / total), value / total, math.sqrt(of_counts / total))
 
 
-def _rounded(point: tuple[int, float, float]) -> tuple[int, float, float]:
+def _rounded(point: Point) -> Point:
     """A point to the second, its value to a hundredth of its standard error or finer, and that to three digits."""
-    t_ns, value, std_error = point
-    digits = 2 - math.floor(math.log10(std_error))
-    return t_ns // NS_PER_S * NS_PER_S, round(value, digits), round(std_error, digits)
+    digits = 2 - math.floor(math.log10(point.std_error))
+    t_ns = point.t_ns // NS_PER_S * NS_PER_S
+    return Point(t_ns, round(point.value, digits), round(point.std_error, digits))

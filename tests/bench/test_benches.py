@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from schemas.messages import Raw
+from schemas.units import NS_PER_S
+from scoring.model.bins import Bins, bin_ns_of
+from scoring.model.decision import Decision
+from scoring.model.priors import Priors
+from tests.support.healthy_running import TOP_RAD_S, made_fans, running
 
 ROOT = Path(__file__).parents[2]
 OURS = ("bench", "fantwin_client", "pipeline", "schemas", "scoring", "simulation", "stages", "tests", "twin")
@@ -30,3 +39,34 @@ def test_what_the_ablation_leaves_out_exists_and_an_unknown_name_is_refused() ->
             assert attribute in vars(owner), place
     with pytest.raises(without.UnknownMechanismError, match="--without list"), without.without("no-such"):
         pass
+
+
+@pytest.mark.parametrize("name", [one.name for one in importlib.import_module("bench.detection.mechanisms").MECHANISMS])
+def test_without_any_one_part_a_fan_that_loses_a_fifth_of_its_speed_has_an_alarm(name: str) -> None:
+    block = running(2, 60.0, seed=1)
+    slower = np.where(np.arange(600)[:, np.newaxis] < 300, 1.0, [0.8, 1.0]) * block.measured_speed_rad_s
+    fans, bin_ns = made_fans(2), bin_ns_of(block.period_ns, 0.0)
+    with importlib.import_module("bench.detection.without").without(name):
+        decision = Decision(fans, bin_ns, block.period_ns / NS_PER_S, 86_400.0, Priors())
+        for one in Bins(bin_ns, np.full(2, TOP_RAD_S), None).take(replace(block, measured_speed_rad_s=slower)):
+            decision.take(one)
+    assert decision.active.tolist() == [True, False]
+
+
+def test_wrong_readings_are_where_they_are_said_to_be() -> None:
+    bench = importlib.import_module("bench.detection.wrong_readings")
+    speed = np.full((1000, 4), 100.0)
+    command = np.where(np.arange(1000) < 500, 0.2, 0.8)[:, np.newaxis] * np.ones(4)
+    raw = Raw(fans=4, host_receive_t_ns=np.arange(1000) * (NS_PER_S // 10), command=command, speed_rad_s=speed)
+
+    def wrong(case: str, *, is_start: bool = False) -> np.ndarray:
+        found = bench.Wrong(case, 20.0, 10.0).replaced(raw, np.random.default_rng(1), is_start=is_start)
+        return found != speed
+
+    assert 0.04 < wrong("half").mean() < 0.06
+    in_a_row = wrong(bench.IN_A_ROW)
+    assert (in_a_row[1:-1] <= (in_a_row[:-2] | in_a_row[2:])).all()
+    changing = np.flatnonzero(wrong(bench.CHANGING).any(axis=1))
+    assert len(changing) and changing.min() >= 500 and changing.max() < 520
+    assert np.flatnonzero(wrong(bench.FIRST, is_start=True).any(axis=1)).tolist() == [0]
+    assert not wrong(bench.FIRST).any()

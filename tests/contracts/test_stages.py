@@ -49,7 +49,7 @@ from stages.resampler import ResamplerConfig, ResamplerCore
 from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from tests.stages.test_viewer import FakeSink
 from tests.support.message_strategies import any_message
-from tests.support.scored_blocks import CALIBRATION, core_of, prediction_of
+from tests.support.scored_blocks import core_of, prediction_of
 from tests.support.twin_files import write_twin
 
 FANS = 2
@@ -95,31 +95,15 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> TwinFile:
     return TwinFile.load(write_twin(folder / "twin.onnx", fans=FANS), FANS)
 
 
-LOW_LIMITS = CALIBRATION | {
-    "speed": {
-        "residual_std": [1.0, 2.0],
-        "speeds_rad_s": [0.0, 100.0],
-        "expected_residual_sigmas": [0.0, 1.0],
-        "baseline": {"commissioning_limit_sigmas": 0.0},
-    },
-    "balance": {"baseline": {"commissioning_limit_sigmas": 0.0}},
-    "detectors": {
-        "speed_smoothed": {"limit": 0.1},
-        "speed_drift": {"limit": 0.1, "period_s": 0.01},
-        "speed_variance_growth": {"limit": 0.1},
-        "balance_smoothed": {"limit": 0.1},
-        "sensor": {"stuck_s": 2.0, "missing_share": 0.5},
-    },
-    "timing": {"baseline_s": 0.01, "on_delay_s": 0.0},
-}
-
+OFTEN: dict[str, Any] = {"declared_per_day": 8640.0}
+"""a false alarm in ten seconds: so low a limit that any message may raise one"""
 
 LOOSE = TwinIntegratorConfig(start_samples=1, warm_up_s=0.0)
 CORES: dict[str, Callable[[TwinFile], Core]] = {
     "resampler": lambda _twin: ResamplerCore(FANS, ResamplerConfig()),
     "twin_integrator": lambda twin: TwinIntegratorCore(twin, LOOSE, 0),
-    "scorer": lambda _twin: core_of(FANS, "rpm", calibration=CALIBRATION, off_delay_s=0.0),
-    "scorer of low limits": lambda _twin: core_of(FANS, "rpm", calibration=LOW_LIMITS, off_delay_s=0.0),
+    "scorer": lambda _twin: core_of(FANS, "rpm"),
+    "scorer of low limits": lambda _twin: core_of(FANS, "rpm", **OFTEN),
     "viewer": lambda _twin: ViewerCore(TRAYS, FakeSink()),
     "viewer of a fleet": lambda _twin: ViewerCore(TRAYS, FakeSink(), fleet()),
 }
@@ -159,7 +143,7 @@ def test_a_core_survives_any_message_of_its_topics_and_makes_the_same_of_the_sam
     st.integers(1, 40),
 )
 def test_a_fan_of_any_speed_and_command_is_diagnosed(period_ns: int, values: list, repeats: int) -> None:
-    core = core_of(1, calibration=LOW_LIMITS, off_delay_s=0.0)
+    core = core_of(1, **OFTEN)
     samples = np.repeat(np.array(values), repeats, axis=0)
     prediction = prediction_of(np.zeros(len(samples)), period_ns=period_ns)
     arbitrary = replace(

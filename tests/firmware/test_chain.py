@@ -70,7 +70,7 @@ def board(tmp_path: Path) -> Iterator[SimulatedBoard]:
 @pytest.fixture
 def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
     settings = (f"site='{SITE}'", f"tray.0.twin='{BOARD_TWIN}'")
-    quick = ("scorer.baseline_s=2", "twin_integrator.warm_up_s=2")
+    quick = ("twin_integrator.warm_up_s=2",)
     chain = Chain(tmp_path, endpoint, *settings, *quick, viewer=False, configuration=FIRMWARE / "fantwin.toml")
     try:
         yield chain

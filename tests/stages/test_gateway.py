@@ -22,6 +22,7 @@ from schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, T
 from schemas.header import Header
 from schemas.messages import Alarm, Diagnosis, ModelCard, Request, Score, ScorerSnapshot
 from schemas.units import RAD_S_PER_UNIT
+from scoring.wear.recorded_wear import shown
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_gateway import Client, RunningGateway
@@ -50,13 +51,12 @@ def score(seconds: float = 0.0, *, state: FanState = FanState.NORMAL, samples: i
         measured_speed_rad_s=np.full(shape, 1000 * rpm, np.float32),
         predicted_speed_rad_s=np.full(shape, 1010 * rpm, np.float32),
         band_variance=np.full(shape, (20 * rpm) ** 2, np.float32),
-        smoothed_residual_rad_s=np.zeros(shape, np.float32),
         state=states,
         valid=valid,
         invalid_reason=np.where(valid, 0, InvalidReason.GAP).astype(np.uint8),
         torque_balance_command=np.full(shape, 0.01, np.float32),
-        speed_baseline_rad_s=np.zeros(shape, np.float32),
-        balance_baseline_command=np.zeros(shape, np.float32),
+        expected_residual_rad_s=np.zeros(shape, np.float32),
+        expected_balance_command=np.zeros(shape, np.float32),
         score=np.full(shape, 0.5, np.float32),
         statistic=np.zeros(shape, np.uint8),
     )
@@ -70,7 +70,7 @@ def alarm(transition: Transition = Transition.RAISED, sequence: int = 0, **more:
         "t_ns": NOW_NS,
         "onset_t_ns": NOW_NS,
         "residual_rad_s": 9.0,
-        "limit_rad_s": 5.0,
+        "residual_std_rad_s": 5.0,
         "message": "fan 2: 90 rpm below the twin (limit 50)",
         "transition": transition,
         "causes": (Diagnosis(cause="drag", probability=0.8, evidence="drag +20 %"),),
@@ -308,17 +308,17 @@ def test_the_history_begins_with_the_first_start_and_survives_a_restart(tmp_path
 
 def test_a_fan_shows_its_wear_its_advice_and_where_rerun_is(opened, tmp_path):
     gateway = opened(tmp_path, configuration=CONFIGURATION)
-    values = {"unit": "relative", "change": 0.2, "per_day": None, "days": None, "limit": math.nan, "reached_t_ns": None}
-    parameter = {**values, "unknown_reason": "too few points so far", "series": {"std_error": [0.01]}}
-    fans = [{"t_ns": NOW_NS, "parameters": {"drag": parameter if fan == 2 else {}}} for fan in range(FANS)]
-    state = json.dumps({"wear": {"command_unit": "", "fans": fans}})
+    known = {"seen_t_ns": NOW_NS - 5, "change": -0.2, "change_std_error": 0.01, "days": math.nan}
+    fans = [{**shown(None), **(known if fan == 2 else {})} for fan in range(FANS)]
+    state = json.dumps({"wear": {"fans": fans}})
     snapshot = ScorerSnapshot(header=Header("scorer-all-1", 0, TRAY), t_ns=NOW_NS, twin_sha256="", state_json=state)
     gateway.feed(score(), alarm(causes=(Diagnosis(cause="drag_up", probability=0.8, evidence="drag +20 %"),)), snapshot)
     gateway.feed(replace(snapshot, state_json="{"), replace(snapshot, t_ns=NOW_NS - 1, state_json='{"wear": {}}'))
     client = Client(gateway)
     worn = client.ask("GET", f"/api/v1/fans/{TRAY}/2")[1]
     (row,) = worn["wear"]
-    assert (row["parameter"], row["change"], row["error"], row["limit"]) == ("drag", 0.2, 0.01, None)
+    assert (row["parameter"], row["change"], row["error"], row["limit"]) == ("speed", -0.2, 0.01, 0.1)
+    assert (row["t_ns"], row["days"]) == (NOW_NS - 5, None)
     assert "filter" in worn["alarm"]["advice"]
     assert client.ask("GET", f"/api/v1/fans/{TRAY}/1")[1]["wear"] == []
     (tray,) = client.ask("GET", "/api/v1/site")[1]["trays"]

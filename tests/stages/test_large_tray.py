@@ -28,7 +28,8 @@ from schemas.header import Header
 from schemas.messages import Alarm, Grid, Message, Prediction, Raw, Score
 from schemas.topics import BY_NAME, TOPICS, most_samples
 from schemas.units import NS_PER_S
-from tests.support.twin_files import small_hybrid, write_twin
+from tests.support.twin_files import write_twin
+from twin.models.physical import PhysicalModel
 
 FANS, FAULTY, SAMPLES, RATE_HZ = 1024, 1000, 500, 100
 CHAIN = ("acquisition", "resampler", "twin_integrator", "scorer")
@@ -45,10 +46,6 @@ block_s = 1.0
 rate_hz = {RATE_HZ}
 [twin_integrator]
 warm_up_s = 0.5
-[scorer]
-baseline_s = 0.2
-alarm_sigmas = 5.0
-on_delay_s = 0.1
 """
 TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 
@@ -57,7 +54,7 @@ TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 def hall(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[ReadingBatch]]:
     """A folder with a twin of one fan, and the readings of a hall of such fans, one of which becomes slow."""
     folder = tmp_path_factory.mktemp("hall")
-    write_twin(folder / "twin.onnx", small_hybrid(), fans=1)
+    write_twin(folder / "twin.onnx", PhysicalModel(), fans=1)
     twin = TwinFile.load(folder / "twin.onnx", FANS)
     rng = np.random.default_rng(1)
     times_s = np.arange(SAMPLES) / RATE_HZ

@@ -231,10 +231,10 @@ def test_every_topic_it_is_given_is_recorded_with_its_bytes(tmp_path_factory, me
 def test_configuration_twin_and_keys_of_the_command_line_are_in_the_recording(tmp_path, caplog):
     (tmp_path / "twin.onnx").write_bytes(b"the twin")
     tray = TrayConfig(name="tray1", fans=2, speed_unit="rpm", twin=Path("twin.onnx"))
-    run = replace(context(tmp_path, tray, file=Path("today") / "a.mcap"), overrides=("scorer.on_delay_s=1",))
+    run = replace(context(tmp_path, tray, file=Path("today") / "a.mcap"), overrides=("scorer.alarm_share=1",))
     STAGE.build(run).core.close()
     head = read_metadata(tmp_path / "runs" / "today" / "a.mcap")
-    assert json.loads(head.metadata["overrides"]) == ["scorer.on_delay_s=1"]
+    assert json.loads(head.metadata["overrides"]) == ["scorer.alarm_share=1"]
     assert head.attachments == {"configuration.toml": b"site = 'plant'\n", "tray1.onnx": b"the twin"}
     assert head.speed_unit("tray1") == "rpm"
     expected = {
@@ -681,12 +681,12 @@ def test_a_recording_says_which_topics_were_left_out_on_purpose(tmp_path):
 def test_what_a_killed_recorder_of_another_version_left_is_kept_and_its_format_is_said(tmp_path, caplog):
     STAGE.build(context(tmp_path)).core.close()
     finished = tmp_path / "runs" / "recording.mcap"
-    of_tomorrow = finished.read_bytes().replace(b"format\x01\x00\x00\x001", b"format\x01\x00\x00\x002")
+    of_tomorrow = finished.read_bytes().replace(b"format\x01\x00\x00\x002", b"format\x01\x00\x00\x003")
     finished.rename(finished.with_name("recording.mcap.active")).write_bytes(of_tomorrow)
     with caplog.at_level(logging.WARNING):
         STAGE.build(context(tmp_path)).core.close()
     assert (tmp_path / "runs" / "recording.mcap.original").read_bytes() == of_tomorrow
-    reason = "a recording of format 2; this fantwin reads format 1: update fantwin"
+    reason = "a recording of format 3; this fantwin reads format 2: update fantwin"
     assert "cannot be repaired and was renamed to recording.mcap.original: " in caplog.text and reason in caplog.text
 
 

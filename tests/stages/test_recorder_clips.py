@@ -74,7 +74,7 @@ def clips_of(recording: Path, free: int = FREE, after_s: float = 1.0) -> AlarmCl
 
 def raised(fan: int, t_ns: int, **more: Any) -> Alarm:
     fields: dict[str, Any] = {"transition": Transition.RAISED, "active": True, "severity": Severity.ALARM} | more
-    about: dict[str, Any] = {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "", "confirmed": True}
+    about: dict[str, Any] = {"residual_rad_s": 0.0, "residual_std_rad_s": 0.0, "message": "", "confirmed": True}
     return Alarm(header=Header("scorer-1", fan, "tray1"), fan=fan, t_ns=t_ns, onset_t_ns=t_ns, **about, **fields)
 
 

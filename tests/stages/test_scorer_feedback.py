@@ -1,4 +1,4 @@
-"""stages.scorer: what operators say of an alarm, whether it was true, while it stands and after it."""
+"""Scorer: what operators say of an alarm, whether it was true, while it stands and after it."""
 
 from __future__ import annotations
 
@@ -9,26 +9,33 @@ import numpy as np
 import pytest
 
 from schemas.enums import Action, Feedback, Transition
-from schemas.messages import Alarm
+from schemas.messages import Alarm, Prediction
 from schemas.units import NS_PER_S
 from scoring.alarms.fan_condition import EARLIER_ALARMS
 from stages.scorer import ScorerCore
-from tests.support.scored_blocks import commissioned, core_of, feed, prediction_of, request_of, snapshot_of
+from tests.support.scored_blocks import core_of, feed, prediction_of, request_of, snapshot_of
 
-EXCURSION = [0.0] * 20 + [9.0] * 20 + [0.0] * 90
-"""of 1.3 s: raises one alarm, and clears it"""
+PERIOD_NS = NS_PER_S
+EXCURSION = [0.0] * 5 + [-90.0] * 6 + [0.0] * 19
+"""of 30 s: raises one alarm, and clears it"""
 SEQUENCES = count()
 
 
-def scorer(**more: Any) -> ScorerCore:
-    return commissioned(core_of(smoothing_s=0.0, on_delay_s=0.05, off_delay_s=0.1, **more))
+def residuals(residual: list[float], first: int) -> Prediction:
+    return prediction_of(np.array(residual), first=first, period_ns=PERIOD_NS)
+
+
+def scorer() -> ScorerCore:
+    core = core_of()
+    feed(core, [residuals([0.0] * 30, first=-30)])
+    return core
 
 
 def excursions(core: ScorerCore, count: int, first: int = 0) -> list[int]:
     """Onsets of so many alarms."""
     alarms: list[Alarm] = []
     for number in range(first, first + count):
-        alarms += feed(core, [prediction_of(np.array(EXCURSION), first=number * len(EXCURSION))])[1]
+        alarms += feed(core, [residuals(EXCURSION, first=number * len(EXCURSION))])[1]
     return [alarm.onset_t_ns for alarm in alarms if alarm.transition == Transition.RAISED]
 
 
@@ -43,17 +50,18 @@ def of(alarm: Alarm) -> tuple[Feedback, str, str]:
 
 def test_feedback_on_an_alarm_that_stands_is_in_every_message_about_it_and_not_in_those_about_the_next() -> None:
     core = scorer()
-    _, (raised,) = feed(core, [prediction_of(np.array([9.0] * 20))])
+    _, (raised, *_) = feed(core, [residuals([-90.0] * 6, first=0)])
     answer = asked(core, Action.FALSE_ALARM, "a door was open")
     assert (answer.transition, answer.marked_onset_t_ns) == (Transition.MARKED_FALSE, raised.onset_t_ns)
     assert (answer.message, answer.comment) == ("fan 0: marked as a false alarm", "a door was open")
     assert (answer.active, answer.acknowledged, answer.severity) == (True, False, raised.severity), (
         "nothing else changes"
     )
-    _, (cleared,) = feed(core, [prediction_of(np.zeros(30), first=20)])
+    _, (*_, cleared) = feed(core, [residuals([0.0] * 20, first=6)])
+    assert cleared.transition == Transition.CLEARED
     assert of(cleared) == of(answer) == (Feedback.FALSE_ALARM, answer.operator_name, "a door was open")
     assert cleared.marked_onset_t_ns == 0
-    _, (raised_again, *_) = feed(core, [prediction_of(np.array([9.0] * 20), first=60)])
+    _, (raised_again, *_) = feed(core, [residuals([-90.0] * 6, first=26)])
     assert of(raised_again) == (Feedback.NONE, "", "")
 
 

@@ -20,7 +20,6 @@ from schemas.header import Header
 from schemas.messages import Grid, ModelCard, Prediction
 from schemas.model_uncertainty import ModelUncertainty
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from scoring.samples import speed_residual_rad_s
 from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
 from tests.support.twin_files import PARAMETERS, SIGMA_RAD_S, made_up_card, small_hybrid, still_balance, write_twin
 from twin.models import physics
@@ -444,7 +443,9 @@ def test_a_healthy_fan_is_within_the_readings_of_a_counting_tacho_through_steps_
 
     def residual_of(twin: TwinFile, size: int) -> Floats:
         prediction = feed(core_of(twin, warm_up_s=20.0), split(grid, size))
-        return np.where(prediction.valid, np.abs(speed_residual_rad_s(prediction)), 0.0)
+        distance = np.abs(prediction.measured_speed_rad_s - prediction.predicted_speed_rad_s)
+        allowed = prediction.reading_range_rad_s if len(prediction.reading_range_rad_s) else 0.0
+        return np.where(prediction.valid, np.maximum(distance - allowed, 0.0), 0.0)
 
     known, unknown = physical_twin(fans, tacho=(COUNTING,)), physical_twin(fans)
     residual = residual_of(known, 600)

@@ -25,5 +25,5 @@ def alarm(
 ) -> Alarm:
     """An active alarm; its onset is its own time."""
     fields: dict[str, Any] = {"active": True, "severity": Severity.ALARM, "t_ns": t_ns, "onset_t_ns": t_ns}
-    fields |= {"residual_rad_s": 0.0, "limit_rad_s": 1.0, "message": "", **more}
+    fields |= {"residual_rad_s": 0.0, "residual_std_rad_s": 1.0, "message": "", **more}
     return Alarm(header=Header(producer, sequence, tray), fan=fan, **fields)

@@ -42,9 +42,7 @@ rate_hz = 50
 [twin_integrator]
 warm_up_s = 1.0
 [scorer]
-on_delay_s = 0.3
-off_delay_s = 0.5
-adaptation_s = 10.0
+alarm_share = 0.2
 """
 
 
@@ -85,13 +83,13 @@ def make_golden_restart(path: Path) -> None:
     """Kill a scorer while its operators have set something for each fan."""
     with tempfile.TemporaryDirectory() as name:
         site = Site(Path(name), seed=1, scorer_settings="wear_every_s = 1.0\nlatching = true\n")
-        site.run(180)
+        site.run(200)
         site.ask(Action.ACKNOWLEDGE, fan=0)
         site.ask(Action.SHELVE, fan=1, duration_s=60.0)
         site.ask(Action.OUT_OF_SERVICE, fan=2)
         site.run(10)
         site.kill("scorer")
-        site.run(110)
+        site.run(100)
         path.write_bytes(site.finished().read_bytes())
 
 

@@ -41,7 +41,7 @@ def alarm(
         "t_ns": START_NS,
         "onset_t_ns": START_NS + round(onset_s * NS_PER_S),
         "residual_rad_s": 9.0,
-        "limit_rad_s": 5.0,
+        "residual_std_rad_s": 5.0,
         "message": f"fan {fan}: 90 rpm below the twin (limit 50); more drag, 80 %: drag +20 %",
         "transition": transition,
         "causes": CAUSES,

@@ -129,7 +129,7 @@ def raw(second: int, *, moves: bool) -> Raw:
 
 def score(second: int, state: FanState) -> Score:
     one = np.zeros((1, 1))
-    arrays = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s")
+    arrays = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance")
     return Score(
         fans=1,
         period_ns=NS_PER_S,

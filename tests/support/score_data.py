@@ -54,15 +54,14 @@ def made_up_tray(
         "measured_speed_rad_s": measured,
         "predicted_speed_rad_s": predicted,
         "band_variance": np.full(predicted.shape, (2 * SIGMA) ** 2),
-        "smoothed_residual_rad_s": residual,
         "state": state,
         "valid": valid,
         "invalid_reason": invalid_reason,
         "torque_balance_command": np.where(np.isfinite(measured), -residual / 100, np.nan),
-        "speed_baseline_rad_s": np.zeros(predicted.shape),
-        "balance_baseline_command": np.zeros(predicted.shape),
+        "expected_residual_rad_s": np.zeros(predicted.shape),
+        "expected_balance_command": np.zeros(predicted.shape),
         "score": np.abs(residual) / (2 * SIGMA),
-        "statistic": np.where(valid, Statistic.SPEED_SMOOTHED, Statistic.NONE).astype(np.uint8),
+        "statistic": np.where(valid, Statistic.DEVIATION, Statistic.NONE).astype(np.uint8),
     }
     columns = {name: values.astype(columns_of(Score)[name].dtype) for name, values in columns.items()}
     t_ns = START_NS + np.arange(len(t_s)) * STEP_NS
@@ -88,10 +87,10 @@ def _alarm(tray: str, fan: int, at_s: float, onset_s: float, active: bool) -> Al
         t_ns=START_NS + round(at_s * 1e9),
         onset_t_ns=START_NS + round(onset_s * 1e9),
         residual_rad_s=-30.0 if active else -1.0,
-        limit_rad_s=2 * SIGMA,
+        residual_std_rad_s=2 * SIGMA,
         message="slower than its twin" if active else "back in the band",
         transition=Transition.RAISED if active else Transition.CLEARED,
-        statistic=Statistic.SPEED_SMOOTHED,
+        statistic=Statistic.DEVIATION,
         score=3.75 if active else 0.1,
         torque_balance_command=0.3 if active else 0.01,
         confirmed=True,
@@ -103,8 +102,8 @@ def one_sample(fans: int, *reasons: InvalidReason) -> Score:
     invalid = np.array([[*reasons, *[InvalidReason.NONE] * (fans - len(reasons))]], np.uint8)
     valid, column = invalid == InvalidReason.NONE, np.zeros(invalid.shape)
     measured = ("command", "measured_speed_rad_s", "predicted_speed_rad_s")
-    derived = ("band_variance", "smoothed_residual_rad_s", "torque_balance_command", "score")
-    baselines = ("speed_baseline_rad_s", "balance_baseline_command")
+    derived = ("band_variance", "torque_balance_command", "score")
+    expected = ("expected_residual_rad_s", "expected_balance_command")
     return Score(
         fans=fans,
         period_ns=STEP_NS,
@@ -113,5 +112,5 @@ def one_sample(fans: int, *reasons: InvalidReason) -> Score:
         statistic=invalid * 0,
         valid=valid,
         invalid_reason=invalid,
-        **dict.fromkeys((*measured, *derived, *baselines), column),
+        **dict.fromkeys((*measured, *derived, *expected), column),
     )

@@ -2,88 +2,104 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
+from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
 from pipeline.runtime.snapshot_store import SnapshotStore
 from schemas.enums import Action, InvalidReason
 from schemas.header import Header
 from schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot
-from schemas.tacho import INSTANTANEOUS, Tacho
+from schemas.standstill import Standstill
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import SpeedUnit
-from scoring.diagnosis.regression_window import HealthyBalance
+from scoring.diagnosis.advice import Advice
+from scoring.diagnosis.steady_fan import SteadyFan
+from scoring.model.operation import Fans
 from stages.scorer import ScorerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
 SIGMA = 4.0
 SIGMA_COMMAND = 0.5
-TWIN_SPEED = 300.0
+TWIN_SPEED, TOP_SPEED = 300.0, 400.0
 NEEDED = 50.0
 """command at which the synthetic fan runs at TWIN_SPEED"""
-CALIBRATION: dict[str, Any] = {
-    "speed": {},
-    "balance": {},
-    "detectors": {
-        "speed_smoothed": {"limit": 4.0},
-        "speed_drift": {"limit": 6.0, "period_s": 0.01},
-        "speed_variance_growth": {"limit": 3.0},
-        "balance_smoothed": {"limit": 4.0},
-        "balance_drift": {"limit": 6.0, "period_s": 0.01},
-        "balance_variance_growth": {"limit": 3.0},
-        "sensor": {"stuck_s": 2.0, "missing_share": 0.5},
-    },
-    "timing": {"smoothing_s": 0.1, "baseline_s": 0.5, "adaptation_s": 30.0, "on_delay_s": 0.05},
-}
-NO_BASELINES = {
-    name: {"baseline": {"commissioning_limit_sigmas": 0.0, "adaptation_limit_sigmas": 0.0}}
-    for name in ("speed", "balance")
-}
-LIVELY = CALIBRATION | NO_BASELINES
-"""limits with which no part of a test's residual becomes a baseline"""
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
-def balance_of_a_fan() -> HealthyBalance:
-    """A fan that needs NEEDED for TWIN_SPEED."""
-    return HealthyBalance(
-        inertia=0.1,
-        viscous=0.05,
-        drag=(NEEDED - 5.0 - 0.05 * TWIN_SPEED) / TWIN_SPEED**2,
-        friction=5.0,
-        lag_s=0.0,
-        covariance=np.diag(np.square([0.001, 0.001, 1e-6, 0.1])),
-        filter_rate_per_s=3.0,
-        sigma_command=SIGMA_COMMAND,
-        autocorrelation_time_s=0.02,
-        lowest_speed_rad_s=20.0,
+FRICTION, VISCOUS = 5.0, 0.05
+DRAG = (NEEDED - FRICTION - VISCOUS * TWIN_SPEED) / TWIN_SPEED**2
+
+
+def twin_of(
+    fans: int = 1,
+    *,
+    sha256: str = "twin",
+    tachos: Sequence[Tacho] = INSTANTANEOUS,
+    standstill: Standstill | None = None,
+    **more: Any,
+) -> HealthyTwin:
+    """Fans that need NEEDED for TWIN_SPEED, with a time constant of 0.6 s."""
+    of_each = tacho_of_each_fan(tachos, fans)
+
+    def each(value: float) -> Floats:
+        return np.full(fans, value)
+
+    of_model = Fans(
+        top_rad_s=each(TOP_SPEED),
+        inertia=each(0.1),
+        viscous=each(VISCOUS),
+        drag=each(DRAG),
+        friction=each(FRICTION),
+        noise_rad_s=each(SIGMA),
+        pulse_rad_s=np.array([tacho.resolution_rad_s if tacho.kind == "count" else 0.0 for tacho in of_each]),
+        held_s=np.array([tacho.held_s for tacho in of_each]),
+        timing_s=each(0.02),
+        coasts_s=each(2.0),
+        balance_noise=each(SIGMA_COMMAND),
+        balance_filter_per_s=3.0,
+        lowest_command=each(np.nan),
+        commands=100.0,
+        has_own_drive=np.zeros(fans, np.bool_),
+        may_have_plateau=np.zeros(fans, np.bool_),
+        prefers_balance=np.zeros(fans, np.bool_),
     )
+    steady = [SteadyFan(VISCOUS, DRAG, FRICTION, TOP_SPEED)] * fans
+    advice = Advice("%", 10.0, 100.0)
+    return HealthyTwin(sha256, of_model, steady, of_each, advice, standstill, is_calibrated=True, **more)
 
 
 def core_of(
     fans: int = 1,
     unit: SpeedUnit = "rad/s",
     *,
-    calibration: Mapping[str, Any] | None = None,
-    sha256: str = "twin",
     snapshot_store: SnapshotStore | None = None,
-    tachos: tuple[Tacho, ...] = INSTANTANEOUS,
     is_replayed: bool = False,
     started_t_ns: int | None = None,
-    **config: Any,
+    config: Mapping[str, Any] | None = None,
+    **twin: Any,
 ) -> ScorerCore:
-    """Without a calibration: limits on the speed residual alone, 2 SIGMA."""
-    settings = ScorerConfig.model_validate(config)
-    limits = limits_in_force(settings, calibration)
-    twin = HealthyTwin(sha256, limits, [balance_of_a_fan()] * fans, "%", tachos=tachos)
+    """A scorer of `twin_of` these."""
+    settings = ScorerConfig.model_validate(config or {})
     return ScorerCore(
-        fans, unit, settings, twin, snapshot_store, started_t_ns=started_t_ns, is_replayed=lambda: is_replayed
+        fans,
+        unit,
+        settings,
+        twin_of(fans, **twin),
+        snapshot_store,
+        started_t_ns=started_t_ns,
+        is_replayed=lambda: is_replayed,
     )
+
+
+def noise_of(samples: int, fans: int = 1, seed: int = 1) -> Floats:
+    """(samples, fans) healthy residuals."""
+    return np.random.default_rng(seed).normal(0.0, SIGMA, (samples, fans))
 
 
 def prediction_of(
@@ -118,11 +134,10 @@ def prediction_of(
     )
 
 
-def commissioned(core: ScorerCore, fans: int = 1, seconds: float = 11.0) -> ScorerCore:
-    """A core whose fans were healthy up to EPOCH_NS, longer than commissioning needs."""
-    samples = round(seconds * 100) + 1
-    wobble = 1e-9 * (np.arange(samples) % 7 - 3.0)[:, np.newaxis]  # a tacho that repeats itself is stuck
-    core.step(prediction_of(np.tile(wobble, (1, fans)).astype(np.float64), first=-samples))
+def learned(core: ScorerCore, fans: int = 1, seconds: float = 30.0, seed: int = 9) -> ScorerCore:
+    """A core whose fans were healthy up to EPOCH_NS."""
+    samples = round(seconds * 100)
+    core.step(prediction_of(noise_of(samples, fans, seed), first=-samples))
     return core
 
 

@@ -14,7 +14,7 @@ from pipeline.config.loading import load_config
 from pipeline.learning import ordinary_operation
 from pipeline.recordings.reading import read_recording
 from pipeline.runtime.tray_twin import load_tray_twin
-from scoring.limits import Limits
+from scoring.calibration.calibration import Calibration
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import RunningCommand
 
@@ -60,10 +60,8 @@ def test_a_tray_that_its_plant_moves_gets_a_calibrated_twin(
     assert [tray.twin for tray in load_config(configuration).trays] == [Path("tray1.onnx")]
     (its,) = found["trays"]
     twin = load_tray_twin(configuration.with_name(its["entry"]), FANS)
-    declared = Limits.model_validate(twin.card.calibration).declared_rate
-    assert declared
-    assert declared.extrapolated
-    assert its["extrapolated"]
+    assert Calibration.model_validate(twin.card.calibration).is_target
+    assert its["is_target"]
     assert its["false_alarms_per_day"] == 1.0
     assert its["fan_hours"] == pytest.approx(FANS * 2 * 0.7 / 60, rel=0.25)
     assert twin.card.training.data[0].name == "commissioned-1.mcap"

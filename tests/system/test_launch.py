@@ -189,7 +189,9 @@ def test_a_stage_that_cannot_start_ends_all_with_one_line(tmp_path, endpoint):
         up.kill()
         assert f"recorded until then: {tmp_path}/recording.mcap" in up.lines
         errors = [line for line in up.lines if line.startswith("fantwin:")]
-        assert errors and errors[0].startswith(f"fantwin: {twin}: its calibration cannot be used: speed")
+        assert errors and errors[0].startswith(
+            f"fantwin: {twin}: its calibration cannot be used: false_alarms_per_day: "
+        )
         assert len(errors) == 1
         assert "Traceback" not in "\n".join(up.lines)
         started = chain.process_ids()

@@ -15,7 +15,7 @@ import pytest
 
 from pipeline.recordings.reading import read_recording
 from schemas.enums import InvalidReason
-from schemas.messages import Message, ModelCard, Raw, Score
+from schemas.messages import Message, ModelCard, Prediction, Raw, Score
 from tests.support.fantwin_command import fantwin
 from tests.support.running_chain import DEADLINE_S, RunningCommand
 
@@ -57,7 +57,7 @@ endpoint = "{endpoint}"
 [resampler]
 watermark_s = 5  # a host that runs other tests may stall for more than the default, and late samples would be lost
 [recorder]
-topics = ["raw", "score"]
+topics = ["raw", "prediction", "score"]
 [launcher]
 stages = ["acquisition", "resampler", "twin_integrator", "scorer", "recorder"]
 """
@@ -93,20 +93,24 @@ def play(rig: Rig, measured_data: Path, folder: Path) -> RunningCommand:
 def check(rig: Rig, folder: Path, messages: list[Message]) -> None:
     """All samples sent are there, the twin is believed only where it was trained, and its residual is small."""
     raws = [message for message in messages if isinstance(message, Raw)]
+    predictions = [message for message in messages if isinstance(message, Prediction)]
     scores = [message for message in messages if isinstance(message, Score)]
     truth = json.loads((folder / f"{rig.tray}.json").read_text())
     assert truth["bytes_unread"] == 0
     assert sum(len(raw.host_receive_t_ns) for raw in raws) == truth["samples_sent"] > 0
-    valid, invalid_reason, command, measured, residual = (
-        np.concatenate([getattr(score, column) for score in scores])
-        for column in ("valid", "invalid_reason", "command", "measured_speed_rad_s", "residual_rad_s")
+    valid, invalid_reason, command, measured, predicted = (
+        np.concatenate([getattr(prediction, column) for prediction in predictions])
+        for column in ("valid", "invalid_reason", "command", "measured_speed_rad_s", "predicted_speed_rad_s")
     )
+    residual = measured - predicted
+    judged = np.concatenate([score.valid for score in scores])
     card = next(json.loads(message.card_json) for message in messages if isinstance(message, ModelCard))
     low, high = card["command_range"]
     beyond = (command < low - 0.05 * (high - low)) | (command > high + 0.05 * (high - low))
     assert not valid[beyond].any(), "a twin is not valid beyond its training commands"
     stands = invalid_reason == InvalidReason.STOPPED
     assert (valid | stands).mean() > 0.25
+    assert judged[valid].all() and not judged[stands].any()
     assert np.isfinite(residual[valid]).all()
     assert np.sqrt(np.mean(residual[valid] ** 2)) < 0.1 * np.nanmax(measured)
 
@@ -129,6 +133,6 @@ def test_the_rest_of_measured_files_comes_through_whole_and_the_residuals_are_sm
     assert status == 0, "\n".join((str(outcome), *up.lines))
     assert not any(outcome["lost"].values())
     assert outcome["restarts"] == {}
-    entries = list(read_recording(tmp_path / "recording.mcap", topics=("raw", "score", "twin")))
+    entries = list(read_recording(tmp_path / "recording.mcap", topics=("raw", "prediction", "score", "alarm", "twin")))
     for rig in RIGS:
         check(rig, tmp_path, [entry.message for entry in entries if entry.message.header.tray == rig.tray])

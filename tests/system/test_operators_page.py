@@ -36,7 +36,7 @@ STAGES = ["acquisition", "resampler", "twin_integrator", "scorer", "recorder", "
 def chain(tmp_path: Path, endpoint: str) -> Iterator[tuple[Chain, str]]:
     make_users(tmp_path / "users.toml")
     port = free_port()
-    settings = (f"gateway.port={port}", f"gateway.users='{tmp_path / 'users.toml'}'", "scorer.baseline_s=2")
+    settings = (f"gateway.port={port}", f"gateway.users='{tmp_path / 'users.toml'}'")
     running = Chain(tmp_path, endpoint, *settings, f"launcher.stages={json.dumps(STAGES)}", viewer=False)
     try:
         yield running, f"http://127.0.0.1:{port}/"

@@ -253,7 +253,7 @@ def test_a_stopped_fan_stays_in_alarm_filters_are_kept_and_all_alarms_of_a_tray_
     expect(card).to_contain_text("blocked or no power, 40 % each")
     expect(card).to_contain_text("now stopped by its command")
     gateway.feed(score(3.0, state=FanState.RETURNING))
-    expect(card).to_contain_text("now within its limits")
+    expect(card).to_contain_text("now like a healthy fan again")
     page.get_by_role("button", name=f"Acknowledge all 2 of {TRAY}").click()
     page.get_by_role("dialog").get_by_role("button", name="Acknowledge all").click()
     expect(page.get_by_role("dialog")).to_be_hidden()

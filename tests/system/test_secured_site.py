@@ -28,7 +28,7 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
     secured = endpoint.replace("tcp/", "tls/")
     files = {"ca": "ca.pem", "certificate": "{role}.pem", "key": "{role}.key"}
     security = [f"bus.security.{name}='{tmp_path}/certs/{file}'" for name, file in files.items()]
-    settings = ["bus.mode=client", *security, "scorer.baseline_s=2", "twin_integrator.warm_up_s=2"]
+    settings = ["bus.mode=client", *security, "twin_integrator.warm_up_s=2"]
     chain = Chain(tmp_path, secured, *settings, viewer=False)
     try:
         yield chain

@@ -35,7 +35,7 @@ OF_THE_OCCURRENCE = (
 
 @pytest.fixture
 def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
-    chain = Chain(tmp_path, endpoint, "scorer.baseline_s=2", "twin_integrator.warm_up_s=2")
+    chain = Chain(tmp_path, endpoint, "twin_integrator.warm_up_s=2")
     try:
         yield chain
     finally:

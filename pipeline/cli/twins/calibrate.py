@@ -1,10 +1,11 @@
-"""`fantwin calibrate`: alarm limits from healthy recordings, for a declared false-alarm rate."""
+"""`fantwin calibrate`: what healthy recordings say of a twin's fans, and a declared false-alarm rate."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,7 +13,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from pipeline.cli.options import JsonOption, SetOption
 from pipeline.cli.progress import interruptible, show_part
@@ -20,23 +20,33 @@ from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel
 from pipeline.cli.twins.calibration_check import Check, check_declared_rate
 from pipeline.cli.twins.drops_found import drop_lines, drops_found
 from pipeline.cli.twins.marked_running import marked_running
-from pipeline.cli.twins.outlier_run_check import outlier_warning
+from pipeline.cli.twins.outlier_run_check import outlier_warnings
 from pipeline.cli.twins.training_data import FromOption, ToOption, twin_errors
 from pipeline.errors import UsageError, UserError
 from pipeline.recordings.remote import matching, recording_path
+from pipeline.replay.offline.calibration_of_twin import (
+    LARGEST_PER_DAY,
+    CalibratedTwin,
+    calibrated,
+    number_text,
+    rate_text,
+)
 from pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
-from pipeline.replay.offline.kept_samples import KeptSamples
-from pipeline.replay.offline.limits_of_twin import find_limits
+from pipeline.replay.offline.kept_bins import KeptBins
 from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
-from scoring.calibration.calibration import MIN_S_OF_A_FAN, FragmentedError, TooLittleError, supports, too_little
-from scoring.calibration.healthy_statistics import MixedRatesError
-from scoring.detectors.table import calibrated_rows
-from scoring.limits import Limits, Timing
+from schemas.units import RAD_S_PER_UNIT
+from scoring.calibration.calibration import Calibration, changed_priors, expected_alarms, needed_fan_hours
+from scoring.model.priors import Priors
 
 EXIT_BROKEN = 3
-MAX_KEPT_SAMPLES = 10_000_000
-"""of fans, about 85 bytes each: so many are kept on the disk between passes, as many of each recording"""
+MOST_KEPT_BYTES = 1 << 30
+"""of bins, kept on the disk between passes, as many of each recording: about 120 of each fan and 30 of its samples"""
+MEANING = {
+    "twin_share": "how far fans and runs differ from the twin in the mean, share of the speed",
+    "air": "what the air does within an hour, share of the speed",
+    "wander": "wandering of the speed over seconds, share of the speed",
+}
+"""of the priors that are learned"""
 
 
 def calibrate(
@@ -51,7 +61,8 @@ def calibrate(
         ),
     ] = None,
     false_alarms_per_day: Annotated[
-        float | None, typer.Option(help="The rate to declare: false alarms per fan and day.", min=1e-6, max=8640)
+        float | None,
+        typer.Option(help="The rate to declare: false alarms per fan and day.", min=1e-6, max=LARGEST_PER_DAY),
     ] = None,
     from_s: FromOption = 0.0,
     to_s: ToOption = math.inf,
@@ -83,7 +94,7 @@ def calibrate(
         bool,
         typer.Option(
             "--extrapolate",
-            help="Set limits by extrapolation if there are too few data for the rate, which is then only a target.",
+            help="Also with too few data to show the rate, which is then only a target.",
         ),
     ] = False,
     alarms_left_out: Annotated[
@@ -91,24 +102,24 @@ def calibrate(
         typer.Option(
             min=0,
             help="So many alarms, perhaps false ones, were raised while these were recorded, and the time around them "
-            "is not in the recordings.",
+            "is not in the recordings: they count as found.",
         ),
     ] = 0,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="OUT.onnx", help="Write to this file, not into TWIN.onnx.")
     ] = None,
     overrides: SetOption = None,
-    seed: Annotated[int, typer.Option(help="Seed of the bootstrap.")] = 0,
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
     skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Set the alarm limits of a twin from healthy recordings, and write them into its card.
+    """Learn from healthy recordings how far a twin's fans may differ from it, and write that into its card.
 
-    Every recording is scored like a live fan, with commissioning at its start. Limits are set so that false alarms are
-    as frequent as declared. If the data cannot support the rate, the command refuses and says how much is needed.
-    Without calibration only large errors of the speed, missing readings and standstill raise alarms.
+    The limit of an alarm follows from the declared rate. It is checked on the recordings: every one is scored like a
+    live fan, and where there are more false alarms than chance explains, the limit is raised. If the recordings are too
+    few to show the rate, the command refuses and says how much is needed. A twin without calibration has the
+    uncertainty of a population of fans, and one false alarm per fan and month.
 
     The time of an alarm that an operator has marked as true is left out, with the ten minutes before it.
 
@@ -137,24 +148,26 @@ def calibrate(
             for line in marked.lines:
                 typer.echo(line, err=True)
             part = HealthyPart(twin, tuple(overrides or ()), from_s, to_s, tray, marked.left_out)
-            limits, warning, speed_unit = _calibrated(
-                healthy, part, false_alarms_per_day, pool, extrapolate, alarms_left_out, seed
+            found = _calibrated(
+                healthy, part, false_alarms_per_day, pool, extrapolate=extrapolate, alarms_left_out=alarms_left_out
             )
+            calibration, speed_unit = found.calibration, found.learned[0].tray.speed_unit
             output = output or twin
-            _write(twin, output, limits)
-            drops = drops_found(output, RAD_S_PER_UNIT[speed_unit])
+            _write(twin, output, calibration)
+            drops, warnings = drops_found(output, RAD_S_PER_UNIT[speed_unit]), outlier_warnings(found)
             result = {
                 "twin": str(output),
                 "alarms": marked.as_json(),
-                "calibration": json.loads(limits.model_dump_json()),
-                "warnings": [warning] if warning else [],
+                "calibration": json.loads(calibration.model_dump_json()),
+                "is_target": calibration.is_target,
+                "warnings": warnings,
                 "speed_unit": speed_unit,
                 "drops_found": [drop.as_json() for drop in drops],
             }
-            if warning:
+            for warning in warnings:
                 typer.echo(warning, err=True)
             if not json_output:
-                _print(output, limits, drop_lines(drops, speed_unit))
+                _print(output, calibration, drop_lines(drops, speed_unit))
         if verify:
             true_ones = marked_running(verify, feedback or [], tray, pool).left_out
             check = check_declared_rate(output or twin, verify, overrides or [], pool, tray, true_ones)
@@ -171,43 +184,19 @@ def _calibrated(
     part: HealthyPart,
     per_day: float,
     pool: RecordingsInParallel,
+    *,
     extrapolate: bool,
     alarms_left_out: int,
-    seed: int,
-) -> tuple[Limits, str, SpeedUnit]:
-    """The limits, a warning about the recordings, empty if there is none, and the unit of speeds in the first."""
-    known = load_tray_twin(part.twin)
-    top_speed_rad_s = known.card.top_speed_rad_s
-    if top_speed_rad_s <= 0.0:
+) -> CalibratedTwin:
+    if load_tray_twin(part.twin).card.top_speed_rad_s <= 0.0:
         raise UserError(f"{part.twin}: its training data have no speed above zero (speed_range_rad_s): train it again")
     with TemporaryDirectory(prefix="fantwin-calibrate-") as folder:
-        kept = KeptSamples(Path(folder), MAX_KEPT_SAMPLES // len(healthy))
+        kept = KeptBins(Path(folder), MOST_KEPT_BYTES // len(healthy))
         runs = HealthyRuns(healthy, part, pool.map, kept, show_part)
-        timing = runs.timing()
-        try:
-            longest_fan_s = runs.longest_fan_s()  # however much of it can be scored
-            if not extrapolate and not supports(longest_fan_s, per_day):
-                raise too_little(longest_fan_s, per_day)
-            limits = find_limits(
-                [known], runs, timing, per_day, seed=seed, extrapolate=extrapolate, alarms_left_out=alarms_left_out
-            )
-        except TooLittleError as error:
-            raise UserError(_too_little(error, per_day, extrapolate=extrapolate)) from error
-        except MixedRatesError as error:
-            raise UserError(_mixed_rates(error)) from error
-        except FragmentedError as error:
-            raise UserError(_fragmented(error)) from error
-        warning = outlier_warning(runs, limits, top_speed_rad_s)
-    assert limits.declared_rate
-    declared_rate = limits.declared_rate.model_copy(
-        update={
-            "data": tuple(
-                {"name": path.name, "sha256": sha256, **_part(part)} for path, sha256 in runs.sha256().items()
-            ),
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        }
-    )
-    return limits.model_copy(update={"declared_rate": declared_rate}), warning, runs.speed_unit
+        found = calibrated(runs, per_day, extrapolate=extrapolate, alarms_left_out=alarms_left_out)
+        data = tuple({"name": path.name, "sha256": sha256, **_part(part)} for path, sha256 in runs.sha256().items())
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    return replace(found, calibration=found.calibration.model_copy(update={"data": data, "created": created}))
 
 
 def _part(part: HealthyPart) -> dict[str, float | str]:
@@ -228,10 +217,8 @@ def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path],
         raise UsageError(f"{path}: --verify takes recordings, and all arguments after it: name TWIN.onnx before it")
     _named_once([*healthy, *verify])
     for key in (override.partition("=")[0].strip() for override in overrides if healthy):
-        if key.startswith("scorer.") and key.removeprefix("scorer.") not in Timing.model_fields:
-            raise UsageError(
-                f"--set {key}: does not affect calibration; of [scorer] these do: {', '.join(Timing.model_fields)}"
-            )
+        if key.startswith("scorer."):
+            raise UsageError(f"--set {key}: [scorer] does not affect calibration: leave it out, or use --verify alone")
 
 
 def _refuse_without_healthy(names: list[str]) -> None:
@@ -252,58 +239,11 @@ def _named_once(recordings: list[Path]) -> None:
         seen.add(path.resolve())
 
 
-def _too_little(error: TooLittleError, per_day: float, *, extrapolate: bool) -> str:
-    if error.fan_hours < error.needed_fan_hours and not extrapolate:
-        return (
-            f"{error.fan_hours:.2g} fan-hours of healthy running cannot support {_rate(per_day)}: that takes "
-            f"{error.needed_fan_hours:.3g}; record more, declare {_round_up(error.least_per_day):g} or more, or set "
-            "limits beyond what was recorded, which declare no rate: add --extrapolate"
-        )
-    scored = f"{error.fan_hours * 3600:.0f} s of healthy running could be scored, all fans together"
-    return (
-        f"{scored}: too little for any limit; that takes {MIN_S_OF_A_FAN:.0f} s of each fan: "
-        "record two minutes or more, better ten"
-    )
-
-
-def _mixed_rates(error: MixedRatesError) -> str:
-    (first, first_ns), (other, other_ns) = error.first, error.other
-    rates = f"{NS_PER_S / first_ns:g} Hz and {NS_PER_S / other_ns:g} Hz"
-    if first == other:
-        return f"{first}: its trays have grids of different rates, {rates}, and limits hold for one: choose with --tray"
-    return (
-        f"{first} and {other} have grids of different rates, {rates}, and limits hold for one: calibrate on recordings "
-        "of one rate, or choose one with --set resampler.rate_hz=..."
-    )
-
-
-def _fragmented(error: FragmentedError) -> str:
-    what = "speed" if error.source == "speed" else "torque balance"
-    return (
-        f"the {what} was scored for {error.scored_s:.0f} s, but never for a whole second: each lacks samples, "
-        "so no limit can be set; `fantwin info` shows what is missing, `fantwin doctor` what does not fit the line"
-    )
-
-
-def _rate(per_day: float) -> str:
-    return f"{per_day:g} false alarm{'s' * (per_day != 1)} per fan and day"
-
-
-def _runs(count: int) -> str:
-    return f"{count} run{'s' * (count != 1)}"
-
-
-def _round_up(rate: float) -> float:
-    """Rounded up to two digits, so that the printed rate is sufficient."""
-    unit = 10.0 ** (math.floor(math.log10(rate)) - 1)
-    return math.ceil(rate / unit) * unit
-
-
-def _write(twin: Path, output: Path, limits: Limits) -> None:
+def _write(twin: Path, output: Path, calibration: Calibration) -> None:
     with twin_errors():
         from twin.export.card_entries import with_card_entries  # noqa: PLC0415  the command line loads twin only when needed
 
-        content = with_card_entries(twin.read_bytes(), {"calibration": json.loads(limits.model_dump_json())})
+        content = with_card_entries(twin.read_bytes(), {"calibration": json.loads(calibration.model_dump_json())})
     beside = output.with_name(output.name + ".new")
     try:
         beside.write_bytes(content)
@@ -312,24 +252,33 @@ def _write(twin: Path, output: Path, limits: Limits) -> None:
         raise UserError(f"{output}: cannot write the twin: {error.strerror}") from error
 
 
-def _print(output: Path, limits: Limits, drops: Sequence[str]) -> None:
-    rate = limits.declared_rate
-    assert rate
+def _print(output: Path, calibration: Calibration, drops: Sequence[str]) -> None:
     console = Console(highlight=False, soft_wrap=True)
-    console.print(f"{output}: alarms calibrated on {rate.fan_hours:.3g} fan-hours in {_runs(rate.runs)}", markup=False)
-    table = Table("detector", "settings", box=None, pad_edge=False)
-    for row in calibrated_rows():
-        settings = limits.detectors.get(row.name)
-        in_use = [(name, value) for name, value in settings or () if value is not None]
-        shown = ", ".join(f"{name} {value:.3g}" for name, value in in_use) or "not used"
-        table.add_row(row.name, shown)
-    console.print(table)
-    declared = _rate(rate.false_alarms_per_day)
-    if rate.extrapolated:
-        console.print(f"[yellow]target: {declared}; the data are too few to show whether these limits keep it[/yellow]")
-    else:
-        low, high = rate.interval_95
-        console.print(f"declared: {declared} (95 % interval from these data: {low:.3g} to {high:.3g})")
-    for line in drops:
+    runs = f"{calibration.runs} run{'s' * (calibration.runs != 1)}"
+    console.print(f"{output}: calibrated on {calibration.fan_hours:.3g} fan-hours in {runs}", markup=False)
+    of_population = asdict(Priors())
+    for name, value in changed_priors(calibration.priors).items():
+        console.print(f"learned: {MEANING.get(name, name)}: {of_population[name]:.2g} -> {value:.2g}", markup=False)
+    if calibration.priors == Priors():
+        console.print("learned: nothing; the priors are those of a population of fans")
+    for line in (*_rate_lines(calibration), *drops):
         console.print(line, markup=False)
     console.print("test it on other healthy recordings: fantwin calibrate TWIN.onnx --verify OTHER.mcap")
+
+
+def _rate_lines(calibration: Calibration) -> list[str]:
+    """The false alarms that were found, what was done about them, and what may be promised."""
+    per_day, fan_hours, (low, high) = calibration.false_alarms_per_day, calibration.fan_hours, calibration.interval_95
+    lines = [
+        f"false alarms: {calibration.found} found, {number_text(expected_alarms(fan_hours, per_day))} declared "
+        f"({number_text(low)} to {number_text(high)} per fan and day with 95 %)",
+        f"limit: the logarithm of that by theory times {calibration.limit_factor:.3g}: without this there were more"
+        if calibration.limit_factor > 1.0
+        else "limit: by theory",
+    ]
+    if not calibration.is_target:
+        return [*lines, f"declared: {rate_text(per_day)}"]
+    why = f"{needed_fan_hours(per_day):.3g} fan-hours are needed to show it"
+    if calibration.is_exceeded:
+        why = "these recordings have more, of faults or of what a twin cannot know: see the warnings"
+    return [*lines, f"target: {rate_text(per_day)}; {why}"]

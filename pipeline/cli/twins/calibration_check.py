@@ -13,12 +13,13 @@ from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.errors import UserError
 from pipeline.recordings.checksum import sha256_of
 from pipeline.replay.offline.alarm_episodes import episodes
+from pipeline.replay.offline.calibration_of_twin import calibration_in, number_text
 from pipeline.replay.offline.healthy_runs import HealthyPart
 from pipeline.replay.offline.marked_alarms import LeftOut, concerning
 from pipeline.replay.offline.rescoring import rescore
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
-from scoring.calibration.alarm_rate import poisson_interval
-from scoring.limits import DeclaredRate, Limits
+from scoring.calibration.alarm_rate import daily_interval
+from scoring.calibration.calibration import Calibration, expected_alarms, is_exceeded
 
 NS_PER_HOUR = 3.6e12
 
@@ -34,19 +35,17 @@ class Check:
     @property
     def expected(self) -> float:
         """Number of alarms by the declared rate."""
-        return self.declared_per_day * self.fan_hours / 24
+        return expected_alarms(self.fan_hours, self.declared_per_day)
 
     @property
     def interval_95(self) -> tuple[float, float]:
         """95 % confidence interval of the rate per fan and day."""
-        days = self.fan_hours / 24
-        low, high = poisson_interval(self.alarms)
-        return low / days, high / days
+        return daily_interval(self.alarms, self.fan_hours)
 
     @property
     def is_broken(self) -> bool:
         """Whether there were more alarms than chance explains: the whole interval is above the declared rate."""
-        return self.interval_95[0] > self.declared_per_day
+        return is_exceeded(self.alarms, self.fan_hours, self.declared_per_day)
 
     @property
     def text(self) -> str:
@@ -54,7 +53,8 @@ class Check:
         low, high = self.interval_95
         found = (
             f"{self.alarms} alarm{'s' * (self.alarms != 1)} in {self.fan_hours:.3g} fan-hours: "
-            f"{self.alarms / self.fan_hours * 24:.2g} per fan and day (95 %: {low:.2g} to {high:.2g}); "
+            f"{number_text(self.alarms / self.fan_hours * 24)} per fan and day "
+            f"(95 %: {number_text(low)} to {number_text(high)}); "
             f"declared {self.declared_per_day:g}"
         )
         if self.is_broken:
@@ -88,19 +88,20 @@ def check_declared_rate(
     tray: the only one that is used; without it all are. left_out: times of fans in which an alarm is no false one.
 
     Raises:
-        UserError: the twin declares no rate or was made from one of the recordings, a recording cannot be used, or none
-            of its samples could be scored.
+        UserError: the twin is not calibrated, or was made from one of the recordings; a recording cannot be used, or
+            none of its samples could be scored.
     """
     loaded = load_tray_twin(twin)
-    calibration = loaded.card.calibration
-    declared = Limits.model_validate(calibration).declared_rate if calibration else None
-    if declared is None:
+    calibration = calibration_in(twin, loaded)
+    if calibration is None:
         raise UserError(f"{twin}: its alarms were never calibrated: give healthy recordings and --false-alarms-per-day")
-    made_from = _made_from(twin, loaded, declared)
+    made_from = _made_from(twin, loaded, calibration)
     list(pool.map(partial(_refuse_its_own, made_from=made_from), recordings, "looking for its own recordings"))
     count = partial(_count_alarms, twin=twin, overrides=tuple(overrides), tray=tray, left_out=tuple(left_out))
     counts = list(pool.map(count, recordings, "scoring other healthy recordings"))
-    return Check(sum(alarms for alarms, _ in counts), sum(hours for _, hours in counts), declared.false_alarms_per_day)
+    return Check(
+        sum(alarms for alarms, _ in counts), sum(hours for _, hours in counts), calibration.false_alarms_per_day
+    )
 
 
 def _count_alarms(
@@ -120,10 +121,10 @@ def _count_alarms(
     return alarms, fan_hours
 
 
-def _made_from(path: Path, twin: TrayTwin, declared: DeclaredRate) -> dict[str, str]:
+def _made_from(path: Path, twin: TrayTwin, calibration: Calibration) -> dict[str, str]:
     """By the hash of each recording that a twin was made from: how, in words."""
     training = json.loads(twin.card_json).get("training", {})
-    used = (("trained", training.get("data", ())), ("calibrated", declared.data))
+    used = (("trained", training.get("data", ())), ("calibrated", calibration.data))
     return {entry["sha256"]: f"{path} was {verb} on it" for verb, data in used for entry in data}
 
 

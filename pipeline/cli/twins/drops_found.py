@@ -1,53 +1,121 @@
-"""What a calibrated twin finds, for people: the drops of speed that raise an alarm, in the unit of the tray."""
+"""What a twin finds, for people: the drops of a steady speed that raise an alarm within a time.
+
+The scorer itself is asked, without noise: fans run steadily, then each drops by another share of its speed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.runtime.tray_twin import load_tray_twin
-from scoring.calibration.detectable import SHARES, detectable_drops
-from scoring.limits import Limits
+from pipeline.replay.offline.calibration_of_twin import calibration_in
+from pipeline.replay.offline.healthy_runs import FreeLimit
+from pipeline.runtime.modelled_fans import modelled_fans
+from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
+from schemas.enums import InvalidReason
+from schemas.messages import Array, Prediction
+from schemas.units import NS_PER_S
+from scoring.calibration.calibration import Calibration
+from scoring.model.bins import Bins, bin_ns_of
+from scoring.model.operation import Fans
+
+SPEEDS = (0.25, 0.5, 0.75, 1.0)
+"""shares of the top speed of training"""
+DROPS = np.geomspace(0.002, 1.0, 11)
+"""shares of the speed"""
+WITHIN_S = (1.0, 10.0, 60.0)
+STEADY_S = 60.0
+"""before the drop; a fan that has run for longer is known better"""
 
 
 @dataclass(frozen=True)
 class Drop:
-    """Of the fan with the widest limits, in the unit of speeds; infinite where not even standstill raises an alarm."""
+    """The smallest drops found at a speed, in its unit; None: not even standstill is found in that time."""
 
     speed: float
-    at_once: float
-    within_a_minute: float
+    within_1_s: float | None
+    within_10_s: float | None
+    within_60_s: float | None
 
     def as_json(self) -> dict[str, float | None]:
-        """The same for --json, null where not even standstill raises an alarm."""
-        return {name: value if np.isfinite(value) else None for name, value in vars(self).items()}
+        """The same for --json."""
+        return dict(vars(self))
 
 
 def drops_found(path: Path, rad_s_per_unit: float) -> list[Drop]:
-    """The drops at some speeds up to the top speed of training; none without a calibration.
+    """The drops at some speeds up to the top speed of training, of the fan whose readings vary most; none without a
+    calibration.
 
     Raises:
-        StageError: the twin cannot be read.
+        UserError: the twin or its calibration cannot be read.
     """
     twin = load_tray_twin(path)
-    if twin.card.calibration is None:
+    calibration = calibration_in(path, twin)
+    if calibration is None:
         return []
-    limits, rad_s = Limits.model_validate(twin.card.calibration), rad_s_per_unit
-    speeds = [share * twin.card.top_speed_rad_s for share in SHARES]
-    of_fans = [
-        detectable_drops(limits.of(range(fan, fan + 1)), float(twin.sigma_rad_s[fan]), balance, speeds)
-        for fan, balance in enumerate(twin.healthy_balances())
-    ]
-    widest = [
-        (speed, max(drop.at_once_rad_s for drop in drops), max(drop.within_a_minute_rad_s for drop in drops))
-        for speed, drops in zip(speeds, zip(*of_fans, strict=True), strict=True)
-    ]
+    speeds = [share * twin.card.top_speed_rad_s / rad_s_per_unit for share in SPEEDS]
     return [
-        Drop(speed / rad_s, *(drop / rad_s if drop <= speed else np.inf for drop in drops)) for speed, *drops in widest
+        Drop(speed, *(share * speed if np.isfinite(share) else None for share in shares))
+        for speed, shares in zip(speeds, smallest_drops(twin, calibration).tolist(), strict=True)
     ]
+
+
+def smallest_drops(twin: TrayTwin, calibration: Calibration) -> Array:
+    """(SPEEDS, WITHIN_S) shares of the speed; infinite where not even standstill is found in that time."""
+    each = modelled_fans(twin)
+    fan = int(np.argmax(np.hypot(each.noise_rad_s, each.pulse_rad_s)))
+    count = len(SPEEDS) * len(DROPS)
+    arrays = {name: values for name, values in vars(each.of(fan)).items() if isinstance(values, np.ndarray)}
+    fans = replace(each, **{name: np.repeat(values, count) for name, values in arrays.items()})
+    period_ns = round(NS_PER_S / twin.card.rate_hz)
+    bin_ns = bin_ns_of(period_ns, float(fans.held_s.min()))
+    limit = FreeLimit(calibration.priors, 86400.0 / calibration.false_alarms_per_day)
+    decision = limit.decision(fans, bin_ns, period_ns)
+    bins = Bins(bin_ns, fans.top_rad_s, None)
+    speed_rad_s, drop = np.repeat(SPEEDS, len(DROPS)) * fans.top_rad_s, np.tile(DROPS, len(SPEEDS))
+    scores: list[Array] = []
+    for one in bins.take(dropping(twin, fans, speed_rad_s, drop)):
+        decision.take(one)
+        if one.t_ns > STEADY_S * NS_PER_S:
+            scores.append(decision.score * limit.factor / calibration.limit_factor)
+    ends = [max(1, round(seconds * NS_PER_S / bin_ns)) for seconds in WITHIN_S]
+    highest = np.stack([np.max(scores[:end], axis=0).reshape(len(SPEEDS), -1) for end in ends], axis=1)
+    return np.array([[_crossing(at_speed) for at_speed in within] for within in highest])
+
+
+def _crossing(score: Array) -> float:
+    """The drop whose score is 1. score: of each of DROPS."""
+    above = np.flatnonzero(score >= 1.0)
+    if not len(above):
+        return np.inf
+    to = max(int(above[0]), 1)
+    share = np.interp(1.0, score[to - 1 : to + 1], (0.0, 1.0))
+    return float(DROPS[to - 1] * (DROPS[to] / DROPS[to - 1]) ** share)
+
+
+def dropping(twin: TrayTwin, fans: Fans, speed_rad_s: Array, drop: Array) -> Prediction:
+    """Fans whose readings are exact, and which drop by these shares of their speed after STEADY_S."""
+    t_s = np.arange(round((STEADY_S + WITHIN_S[-1]) * twin.card.rate_hz)) / twin.card.rate_hz
+    low, high = twin.card.command_range
+    shape = len(t_s), len(speed_rad_s)
+    after = (t_s >= STEADY_S)[:, np.newaxis]
+    return Prediction(
+        fans=shape[1],
+        period_ns=round(NS_PER_S / twin.card.rate_hz),
+        t_ns=np.round(t_s * NS_PER_S).astype(np.int64),
+        command=np.broadcast_to(low + (high - low) * speed_rad_s / fans.top_rad_s, shape),
+        measured_speed_rad_s=speed_rad_s * (1.0 - drop * after),
+        predicted_speed_rad_s=np.broadcast_to(speed_rad_s, shape),
+        sigma_rad_s=fans.noise_rad_s,
+        valid=np.ones(shape, np.bool_),
+        invalid_reason=np.full(shape, InvalidReason.NONE, np.uint8),
+        torque_balance_command=np.full(shape, np.nan),
+        torque_balance_sigma_command=fans.balance_noise,
+        reading_range_rad_s=np.broadcast_to(0.5 * fans.pulse_rad_s, shape),
+    )
 
 
 def drop_lines(drops: Sequence[Drop], unit: str) -> list[str]:
@@ -56,14 +124,9 @@ def drop_lines(drops: Sequence[Drop], unit: str) -> list[str]:
 
 
 def _found(drop: Drop, unit: str) -> str:
-    if not np.isfinite(drop.within_a_minute):
-        return "no drop, not even standstill"
-    at_once = f"a drop of {_of(drop.at_once)} {unit} at once"
-    if not np.isfinite(drop.at_once):
-        return f"a drop of {_of(drop.within_a_minute)} {unit} within a minute"
-    if drop.within_a_minute > 0.95 * drop.at_once:
-        return at_once
-    return f"{at_once}, {_of(drop.within_a_minute)} {unit} within a minute"
+    found = ((drop.within_1_s, "1 s"), (drop.within_10_s, "10 s"), (drop.within_60_s, "60 s"))
+    parts = [f"{_of(value)} {unit} within {time}" for value, time in found if value is not None]
+    return f"a drop of {', '.join(parts)}" if parts else "no drop, not even standstill"
 
 
 def _of(value: float) -> str:

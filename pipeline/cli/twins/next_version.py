@@ -4,13 +4,12 @@ First the speeds of the fans over the newest healthy hours are checked against t
 than those of healthy fans do, the new version is trained on what came after, and is offered to the operator. Whether
 most fans have changed alike is checked near alarms as well: it is no fault of a fan, and may raise one alarm after the
 other. Otherwise a new twin is compared with the one in force on what neither has seen. Unless it is clearly better, the
-new version is the twin in force with new limits.
+new version is the twin in force with a new calibration.
 """
 
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 import shutil
 import tempfile
@@ -43,15 +42,16 @@ from pipeline.learning.healthy_history import healthy_recordings, recordings_nea
 from pipeline.learning.history_recordings import HistoryRecording
 from pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList, overlap
 from pipeline.recordings.excerpts import ExcerptReader
+from pipeline.replay.offline.calibration_of_twin import calibration_in
 from pipeline.runtime.tray_twin import load_tray_twin
-from scoring.calibration.calibration import too_little
-from scoring.limits import Limits
+from scoring.calibration.calibration import Calibration, needed_fan_hours
 
 if TYPE_CHECKING:
     from schemas.messages import Array
 
-WANTED_S = 24 * 3600.0
-"""of healthy running that limits are set from, unless the declared rate needs more; an hour takes about five seconds"""
+WANTED_S, MOST_S = 12 * 3600.0, 48 * 3600.0
+"""of healthy running that a version is calibrated on, and that is used if the declared rate needs more; an hour takes
+about 40 seconds"""
 MARGIN = 1.3
 """times the healthy running that the rate needs, because not all of it can be scored"""
 BETTER = 0.98
@@ -159,8 +159,8 @@ class _Work:
         self._near_alarms = set(near_alarms)
         self._recordings = recordings = sorted([*healthy, *near_alarms], key=lambda each: each.span)
         self._rate_hz, self._fans = _rate_and_fan_count((healthy or near_alarms)[-1])
-        needed_s = 3600.0 * too_little(0.0, per_day).needed_fan_hours / self._fans
-        self._calibration_recordings = newest_recordings(recordings, max(WANTED_S, MARGIN * needed_s))
+        needed_s = MARGIN * 3600.0 * needed_fan_hours(per_day) / self._fans
+        self._calibration_recordings = newest_recordings(recordings, min(max(WANTED_S, needed_s), MOST_S))
         since_t_ns = max(listed.commissioned_t_ns, listed.waiting.made_t_ns if listed.waiting else 0)
         self._newest = newest_recordings([each for each in recordings if each.span[0] >= since_t_ns], CHECKED_S)
 
@@ -258,7 +258,7 @@ class _Work:
         return self._newest[first]
 
     def taken(self) -> tuple[Version, bytes]:
-        """A version that takes over: a newly trained twin if it is better than the one in force, or new limits."""
+        """A version that takes over: a newly trained twin if it is better than the one in force, or that one."""
         parts, before = split(self._recordings, self._rate_hz, self._fans), self._before
         trained, test = self._trained(parts), read_excerpts(parts.comparison)
         if before is None:
@@ -289,15 +289,14 @@ class _Work:
         learned: Sequence[HistoryRecording] | None = None,
         since_t_ns: int | None = None,
     ) -> tuple[Version, bytes]:
-        """The version of a twin, with limits. reference: None: itself. learned, since_t_ns: None: all recordings, and
+        """The version of a twin, calibrated. reference: None: itself. learned, since_t_ns: None: all recordings, and
         as the version in force."""
         before = self._before
         spans = {each.span for each in learned or self._recordings}
         if before and how == "new limits":
             spans |= set(before.learned_spans)  # of its weights
         newest_parts = spread_parts(self._newest or self._recordings[-1:], CHECKED_S)
-        limited = self._with_limits(twin, test)
-        assert limited.limits.declared_rate
+        calibrated = self._calibrated(twin, test)
         of_reference = self._file_of(reference.name) if reference else twin
         return Version(
             name=self._name,
@@ -311,24 +310,24 @@ class _Work:
             error_before=_error(self._file_of(before.name), test) if before else None,
             change=changes_to_list(mean_changes(of_reference, newest_parts)),
             reference=reference.name if reference else self._name,
-            drops=limited.drops,
+            drops=calibrated.drops,
             declared_per_day=self._per_day,
-            is_target=limited.limits.declared_rate.extrapolated,
+            is_target=calibrated.calibration.is_target,
             outcome=outcome,
             why=why,
-            sha256=hashlib.sha256(limited.file).hexdigest(),
-        ), limited.file
+            sha256=hashlib.sha256(calibrated.file).hexdigest(),
+        ), calibrated.file
 
     def _alarms_since(self, t_ns: int) -> int:
-        """Alarms that began since then outside of what is marked as faulty, if the time around them is left out: limits
-        would fall with each version."""
+        """Alarms that began since then outside of what is marked as faulty, if the time around them is left out: they
+        may have been false."""
         if self._near_alarms:
             return 0
         began = (each for each in self._listed.alarms_t_ns if each >= t_ns)
         return sum(not overlap([(each, each)], self._listed.faulty) for each in began)
 
     def _trained(self, parts: Split) -> Path:
-        """A newly trained twin, without limits."""
+        """A newly trained twin, not calibrated."""
         twin = self._place / f"{self._name}.onnx"
         self._say(f"{self._name}: training")
         training, validation = read_excerpts(parts.training), read_excerpts(parts.validation)
@@ -344,42 +343,33 @@ class _Work:
             fit_twin(training, validation, self._name).save(twin)
         return twin
 
-    def _with_limits(self, twin: Path, test: TrainingData) -> _WithLimits:
+    def _calibrated(self, twin: Path, test: TrainingData) -> _CalibratedFile:
         of = self._calibration_recordings
-        named, done = self._place / "named.onnx", self._place / "limits.onnx"
+        named, done = self._place / "named.onnx", self._place / "calibrated.onnx"
         with twin_errors():
             # The command line loads twin only when it is needed.
             from twin.export.card_entries import with_card_entries  # noqa: PLC0415
 
             named.write_bytes(with_card_entries(twin.read_bytes(), {"name": self._name}))
-        self._say(f"{self._name}: limits from {_hours(sum(each.seconds for each in of))} of healthy running")
+        self._say(f"{self._name}: calibrating on {_hours(sum(each.seconds for each in of))} of healthy running")
         with _quietly():
-            calibrate(
-                named,
-                [each.path for each in of],
-                self._per_day,
-                extrapolate=True,
-                alarms_left_out=self._alarms_since(of[0].span[0]),
-                output=done,
-                jobs=1,
-            )
-        calibration = load_tray_twin(done).card.calibration
-        drops = tuple(
-            Drop(speed=drop.speed, at_once=_finite(drop.at_once), within_a_minute=_finite(drop.within_a_minute))
+            left_out = self._alarms_since(of[0].span[0])
+            paths = [each.path for each in of]
+            calibrate(named, paths, self._per_day, extrapolate=True, alarms_left_out=left_out, output=done, jobs=1)
+        calibration = calibration_in(done, load_tray_twin(done))
+        assert calibration
+        drops = (
+            Drop(speed=drop.speed, at_once=drop.within_1_s, within_a_minute=drop.within_60_s)
             for drop in drops_found(done, test.rad_s_per_unit)
         )
-        return _WithLimits(done.read_bytes(), Limits.model_validate(calibration), drops)
+        return _CalibratedFile(done.read_bytes(), calibration, tuple(drops))
 
 
 @dataclass(frozen=True)
-class _WithLimits:
+class _CalibratedFile:
     file: bytes
-    limits: Limits
+    calibration: Calibration
     drops: tuple[Drop, ...]
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _rate_and_fan_count(recording: HistoryRecording) -> tuple[float, int]:

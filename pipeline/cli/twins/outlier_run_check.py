@@ -1,68 +1,58 @@
-"""Whether a recording used for calibration was probably not healthy: its scores are far above the others."""
+"""Fans of recordings that were probably not healthy: they differ from the others, or have most of the alarms."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.replay.offline.healthy_runs import HealthyRuns
-from schemas.messages import Array
-from scoring.calibration.calibration import DAY_S, VARIATION_FAN_S
-from scoring.calibration.healthy_statistics import healthy_statistics, truncate_runs
-from scoring.limits import Limits
+from pipeline.replay.offline.calibration_of_twin import CalibratedTwin
+from pipeline.replay.offline.healthy_runs import DecidedRun, LearnedRun
+from scoring.model.priors import Priors
 
-MIN_FANS = 4  # fans, counted over all runs: with fewer the median says little
-OUTLIER_RATIO = 3.0  # times the median: healthy fans that ran alike came to 1.7, faulty ones to 3.5 and more
-
-
-class Outlier(NamedTuple):
-    """The fan of a run with the highest score."""
-
-    run: int
-    """number of the run"""
-    fan: int
-    score: float
-    median_score: float
-    """of the highest scores of all fans of runs"""
+LEAST_FANS = 4
+"""fans, counted over all runs: with fewer the median says little"""
+OUTLIER_RATIO = 5.0
+"""times the median: one healthy fan in a thousand differs from its twin by so much more than the others"""
+SO_LEAVE_IT_OUT = "if something was wrong there, calibrate without this recording"
 
 
-def outlier_warning(runs: HealthyRuns, limits: Limits, top_speed_rad_s: float) -> str:
-    """A warning about the fan of a recording whose score is far above the others; empty if there is none.
+def outlier_warnings(found: CalibratedTwin) -> list[str]:
+    """A line for the fan whose mean speed differs most, and one for the fan with most alarms, where that is much."""
+    warnings = [_of_mean(found.learned)]
+    if found.calibration.limit_factor > 1.0 or found.calibration.is_exceeded:
+        warnings.append(_of_alarms(found.by_theory))
+    return [warning for warning in warnings if warning]
 
-    limits: those that were found on these runs. Of more than five fan-days only the first part of each run is scored.
 
-    Raises:
-        UserError: a recording cannot be used.
-    """
-    assert limits.declared_rate
-    is_long = limits.declared_rate.fan_hours > 24 * VARIATION_FAN_S / DAY_S
-    part = truncate_runs(runs, limits.declared_rate.runs, VARIATION_FAN_S) if is_long else runs
-    found = outlier([run.score for run in healthy_statistics(part, limits, top_speed_rad_s).maxima])
-    if found is None:
+def _of_mean(runs: Sequence[LearnedRun]) -> str:
+    shares = [
+        (abs(float(share)), float(share), run, fan)
+        for run in runs
+        for fan, share in enumerate(run.sums.mean_share)
+        if math.isfinite(share)
+    ]
+    if len(shares) < LEAST_FANS:
         return ""
-    tray = runs.trays[found.run]
+    median = float(np.median([size for size, *_ in shares]))
+    size, share, run, fan = max(shares, key=lambda each: each[0])
+    if size <= max(OUTLIER_RATIO * median, Priors().twin_share):
+        return ""
+    than = "faster" if share > 0.0 else "slower"
     return (
-        f"{tray.path}: {tray.tray} fan {found.fan} goes to {found.score:.2g} times the limits that were found, the "
-        f"others mostly to {found.median_score:.2g}: if something was wrong there, calibrate without this recording"
+        f"{run.tray.path}: {run.tray.tray} fan {fan} is {100 * size:.2g} % {than} than its twin in the "
+        f"mean, half of all differ by {100 * median:.2g} % or less: {SO_LEAVE_IT_OUT}"
     )
 
 
-def outlier(scores: Sequence[Array]) -> Outlier | None:
-    """The fan of a run with the highest score, if that is far above the others.
-
-    scores: of each run (windows, fans), NaN where a fan was not scored.
-    """
-    highest = {
-        (number, fan): float(np.nanmax(run[:, fan]))
-        for number, run in enumerate(scores)
-        for fan in range(run.shape[1])
-        if np.isfinite(run[:, fan]).any()
-    }
-    if len(highest) < MIN_FANS:
-        return None
-    median = float(np.median(list(highest.values())))
-    run, fan = max(highest, key=lambda key: highest[key])
-    score = highest[run, fan]
-    return Outlier(run, fan, score, median) if score > OUTLIER_RATIO * median else None
+def _of_alarms(runs: Sequence[DecidedRun]) -> str:
+    alarms = [(count, run, fan) for run in runs for fan, count in enumerate(run.alarms)]
+    total = sum(count for count, *_ in alarms)
+    most, run, fan = max(alarms, key=lambda each: each[0])
+    if 2 * most <= total or len(alarms) == 1:
+        return ""
+    return (
+        f"{run.tray.path}: {run.tray.tray} fan {fan} has {most} of the {total} alarms that the limit by theory "
+        f"raises: {SO_LEAVE_IT_OUT}"
+    )

@@ -16,7 +16,7 @@ from pipeline.errors import UsageError
 from pipeline.learning.versions import TimeSpan, TwinVersions, learning_folder
 from schemas.units import NS_PER_S
 
-CONSEQUENCE = "alarms are discarded and baselines start again, unless only the limits differ"
+CONSEQUENCE = "alarms are discarded and the fans are learned anew, unless only the calibration differs"
 
 
 def twins(

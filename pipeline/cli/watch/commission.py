@@ -27,10 +27,10 @@ from pipeline.config.models import Config, TrayConfig
 from pipeline.config.registry import RECORDER, STAGES
 from pipeline.config.twin_entry import with_twin
 from pipeline.errors import UsageError, UserError
+from pipeline.replay.offline.calibration_of_twin import calibration_in
 from pipeline.runtime.signals import stop_on_signals
 from pipeline.runtime.tray_twin import load_tray_twin
 from pipeline.selftest.scratch_site import FANTWIN
-from scoring.limits import Limits
 
 EXIT_LOST = 3
 
@@ -74,13 +74,13 @@ def commission(
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Record healthy fans, train their twins, set alarm limits, add the twins to the configuration, start `fantwin up`.
+    """Record healthy fans, train their twins, calibrate them, add them to the configuration, start `fantwin up`.
 
     Each tray that names no twin gets one; the others stay as they are. The steps are commands of
     docs/tutorial/own-fan.md; each is shown before it runs, except the `up` that records. The fans must be healthy. With
     --sweep, the trays are swept one after another. Without --sweep, no command is sent: the first recording lasts until
-    the plant has moved the command of every fan enough, and what is missing is shown. The limits come from little data:
-    calibrate again after a few days.
+    the plant has moved the command of every fan enough, and what is missing is shown. The calibration is from
+    little data: calibrate again after a few days.
 
     A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends `commission`
     without further twins. Recordings stay, in folders `commissioned-N` of their own, which the limits of `[recorder]`
@@ -114,8 +114,8 @@ def commission(
     for work in commissioning.left:
         for fan in work.held:
             say(
-                f"tray {work.name}, {fan} while the data for its limits were recorded: its limits are uncertain at "
-                "other commands; calibrate again later"
+                f"tray {work.name}, {fan} while it was calibrated: what it does at other commands is uncertain; "
+                "calibrate again later"
             )
     if json_output:
         typer.echo(json.dumps(_as_json(settings, commissioning, works)))
@@ -226,14 +226,14 @@ def _as_json(settings: Config, commissioning: Commissioning, works: Sequence[Tra
 
 
 def _tray_as_json(work: TrayWork) -> dict[str, Any]:
-    rate = Limits.model_validate(load_tray_twin(work.twin).card.calibration).declared_rate
-    assert rate
+    calibration = calibration_in(work.twin, load_tray_twin(work.twin))
+    assert calibration
     return {
         "tray": work.name,
         "twin": str(work.twin),
         "entry": work.entry,
         "held": work.held,
-        "false_alarms_per_day": rate.false_alarms_per_day,
-        "extrapolated": rate.extrapolated,
-        "fan_hours": rate.fan_hours,
+        "false_alarms_per_day": calibration.false_alarms_per_day,
+        "is_target": calibration.is_target,
+        "fan_hours": calibration.fan_hours,
     }

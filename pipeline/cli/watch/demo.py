@@ -36,7 +36,7 @@ from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import short_name
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
-DURATION_S = 34.0
+DURATION_S = 36.0
 FAULTS = (
     ("inlet", "fan=2,start=8,stop=14,size=1.8"),
     ("rotor", "fan=5,start=18,stop=24,size=0.8"),

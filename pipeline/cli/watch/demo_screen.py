@@ -91,7 +91,7 @@ class DemoScreen:
                 f"{score.command[-1, fan]:.2f}",
                 f"{score.measured_speed_rad_s[-1, fan] * scale:.0f}",
                 f"{score.predicted_speed_rad_s[-1, fan] * scale:.0f}",
-                f"{score.smoothed_residual_rad_s[-1, fan] * scale:+.0f}",
+                f"{score.deviation_rad_s[-1, fan] * scale:+.0f}",
                 Text(state.name.lower() + why, style=_STYLES.get(state, "bold red")),
             )
         return table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 from collections.abc import Iterable
 from datetime import datetime
@@ -31,9 +32,10 @@ from schemas.messages import ScorerSnapshot
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 from scoring.wear.recorded_wear import wear_in, wear_rows
-from scoring.wear.trend import NS_PER_DAY
+from scoring.wear.slow_change import LIMIT_SHARE
 
-_NEEDED = "a fan has its first point some time after commissioning (score below 0.5, no alarm, not too slow)"
+NS_PER_DAY = 86_400 * NS_PER_S
+_NEEDED = "a fan has its first point about an hour after commissioning, while it turns without an alarm"
 
 
 def wear(
@@ -44,12 +46,12 @@ def wear(
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Show how each fan has changed since commissioning, how fast, and when its limit will be reached
+    """Show how the speed of each fan has changed since commissioning, how fast, and when its limit will be reached
     (docs/explanation/wear.md).
 
-    The values are those of the last snapshot that the scorer has sent, which is at most a minute or 3,000 samples old,
-    of a tray of more than 64 fans three times as old. Exit code 0: shown; 1: nothing is known; 3: a recording could not
-    be read in full.
+    Each value holds at the time beside it. They come from the last snapshot that the scorer has sent, which is at most
+    a minute or 3,000 samples old, of a tray of more than 64 fans three times as old. Exit code 0: shown; 1: nothing is
+    known; 3: a recording could not be read in full.
 
     Example: fantwin wear
 
@@ -125,55 +127,55 @@ def _decoded(payload: bytes) -> list[ScorerSnapshot]:
 
 
 def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
-    unit = escape(state["command_unit"])
-    date = f"{datetime.fromtimestamp(t_ns / NS_PER_S):%Y-%m-%d %H:%M}"
-    without = [str(number) for number, fan in enumerate(state["fans"]) if not fan["t_ns"]]
-    caption = [
-        f"balance, friction: command{f' in {unit}' if unit else ''}; drag, gain: % of healthy",
-        "± 95 %: of the last point, while there is no trend",
-    ]
-    caption += [f"no data yet for fan {', '.join(without)}: {_NEEDED}"] if without else []
+    rows = wear_rows(tray, t_ns, state)
+    without = sorted(set(range(len(state["fans"]))) - {row["fan"] for row in rows})
+    limit = f"{100 * LIMIT_SHARE:.0f} %"
+    caption = ["% of the speed, ± 95 %, since commissioning; beside: the change of the fans beside it"]
+    caption += [f"no data yet for fan {', '.join(map(str, without))}: {_NEEDED}"] if without else []
     table = Table(
         "fan",
-        "parameter",
-        title=f"wear of {escape(tray)} up to {date if has_date(t_ns) else format_local(t_ns)}",
+        title=f"wear of {escape(tray)} up to {_minute(t_ns)}",
         title_justify="left",
         caption="\n".join(caption),
         caption_justify="left",
         box=SIMPLE_HEAD,
+        padding=(0, 0, 0, 1),
     )
-    for column in ("change", "per day, 95 %"):
+    table.add_column("at", no_wrap=True)
+    for column in ("change", "beside", "per day"):
         table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("limit reached")
-    before = None
-    for row in wear_rows(tray, t_ns, state):
-        name, before = "" if row["fan"] == before else str(row["fan"]), row["fan"]
-        per_day = row["per_day"]
+    table.add_column(f"{limit} reached")
+    for row in rows:
+        per_day, beside = row["per_day"], row["beside"]
         significant = per_day and not per_day["low"] <= 0.0 <= per_day["high"]
-        change = _number(row, row["change"])
-        if row["change_std_error"] is not None:  # of the last point; a trend has an interval of its own
-            change += f" ± {_number(row, 2.0 * row['change_std_error'], digits=2)[1:]}"
-        table.add_row(name, row["parameter"], change, _per_day(row), _forecast(row), style="" if significant else "dim")
+        table.add_row(
+            str(row["fan"]),
+            _minute(row["seen_t_ns"], "%m-%d %H:%M"),
+            _percent(row["change"], 1.96 * row["change_std_error"]),
+            "" if beside is None else f"{100 * beside:+.1f}",
+            _percent(per_day["value"], (per_day["high"] - per_day["low"]) / 2) if per_day else "no trend yet",
+            _forecast(row),
+            style="" if significant else "dim",
+        )
     return table
 
 
-def _number(row: dict[str, Any], value: float, digits: int = 3) -> str:
-    return f"{100 * value if row['unit'] == 'relative' else value:+.{digits}g}"
+def _minute(t_ns: int, form: str = "%Y-%m-%d %H:%M") -> str:
+    return datetime.fromtimestamp(t_ns / NS_PER_S).strftime(form) if has_date(t_ns) else format_local(t_ns)
 
 
-def _per_day(row: dict[str, Any]) -> str:
-    per_day = row["per_day"]
-    if per_day is None:
-        return "no trend yet"
-    half = (per_day["high"] - per_day["low"]) / 2
-    return f"{_number(row, per_day['value'])} ± {_number(row, half, digits=2)[1:]}"
+def _percent(share: float, half_interval: float) -> str:
+    """Both with the digits that say something."""
+    places = max(0, 1 - math.floor(math.log10(100 * max(half_interval, 1e-6))))
+    return f"{100 * share:+.{places}f} ± {100 * half_interval:.{places}f}"
 
 
 def _forecast(row: dict[str, Any]) -> str:
+    """When the limit is reached, from the time at which the values hold."""
     reached = row["reached_t_ns"]
     if reached is None:
-        return str(row["unknown_reason"]) if row["parameter"] == "balance" else ""
+        return str(row["unknown_reason"])
     earliest, likely, latest = (
-        max(reached[name] - row["t_ns"], 0) / NS_PER_DAY for name in ("earliest", "likely", "latest")
+        max(reached[name] - row["seen_t_ns"], 0) / NS_PER_DAY for name in ("earliest", "likely", "latest")
     )
-    return f"in {likely:.1f} days ({earliest:.1f} to {latest:.1f})"
+    return f"in {likely:.0f} days ({earliest:.0f} to {latest:.0f})"

@@ -15,7 +15,7 @@ export const ACTIONS = {
   reset: { title: "Reset", about: "Release the latched alarm." },
   true_alarm: { title: "True alarm", about: "Something was wrong with the fan." },
   false_alarm: { title: "False alarm", about: "Nothing was wrong with the fan. Calibration may learn from it.", needsReason: true },
-  commission: { title: "Commission", about: "The fan was replaced or repaired: learn its offset again." },
+  commission: { title: "Commission", about: "The fan was replaced or repaired: forget what was learned of it, and end its alarm." },
 };
 const SHELVED_FOR = [["30 minutes", 1800], ["2 hours", 7200], ["8 hours", 28800], ["1 day", 86400], ["7 days", 604800], ["until it clears", 0]];
 

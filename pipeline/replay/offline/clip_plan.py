@@ -2,7 +2,8 @@
 
 Such a clip lacks what the stages before the scorer had in memory. A replay runs them over the clip's raw samples, which
 begin early enough for them to settle; the scorer continues from the snapshot. The same alarms are raised, perhaps a few
-samples earlier or later. To verify them, the scorer gets the recorded predictions.
+samples earlier or later. To verify them, the scorer gets the recorded predictions
+(pipeline.replay.offline.clip_tolerance).
 """
 
 from __future__ import annotations
@@ -13,8 +14,6 @@ from pipeline.replay.offline.plan import BEGINNING, Span, TrayPlan, undisturbed_
 from pipeline.replay.stage_chain import StageChain
 from schemas.messages import ModelCard, Request, ScorerSnapshot
 from schemas.streams import continues
-from schemas.units import NS_PER_S
-from scoring.diagnosis.diagnoser import WINDOW_S
 
 NO_PREDICTIONS = (
     "an alarm clip without predictions cannot be compared: replay it without --verify to raise its alarms again"
@@ -43,8 +42,9 @@ def plan_with_recorded_inputs(plan: TrayPlan, snapshot: ScorerSnapshot) -> TrayP
     scorer = plan.last[0]
     if scorer.snapshot is None:
         scorer.snapshot = snapshot
-        scorer.causes_from_t_ns = snapshot.t_ns + round(WINDOW_S * NS_PER_S)
+        scorer.lacks_evidence = True
         scorer.requests = [(t_ns, request) for t_ns, request in scorer.requests if t_ns >= snapshot.t_ns]
+        scorer.snapshots_t_ns = [t_ns for t_ns in scorer.snapshots_t_ns if t_ns > snapshot.t_ns]
         known, first = snapshot.header.input_position, scorer.first_position
         follows = known is not None and first is not None and continues(known, first)
         if not follows or first is None or known is None or first.consumed_count != known.consumed_count + 1:

@@ -1,5 +1,5 @@
 """Comparing replayed snapshots of a scorer with the recorded ones: where scores are not recorded, they show that every
-statistic, baseline and alarm was the same.
+statistic and alarm was the same, and all that was learned of the fans.
 
 A scorer takes snapshots at the end of a block of samples. A replay has other blocks, so it takes its own at the samples
 of the recorded ones.
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 from pipeline.recordings.dates import format_utc
 from pipeline.replay.offline.comparison import Comparison
@@ -17,6 +18,7 @@ from pipeline.replay.offline.tolerance import Apart, differences
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.messages import ScorerSnapshot
+from scoring.model.saved import from_json
 
 
 class SnapshotVerifier:
@@ -97,10 +99,17 @@ def first_difference(
     if made.state_json == recorded.state_json:
         return ""
     try:
-        one, other = json.loads(made.state_json), json.loads(recorded.state_json)
-    except ValueError:
+        one, other = (_state(snapshot) for snapshot in (made, recorded))
+    except (ValueError, LookupError, TypeError, AttributeError):
         return "state_json"
     return next(differences(one, other, note), "")
+
+
+def _state(snapshot: ScorerSnapshot) -> dict[str, Any]:
+    """What a snapshot holds, with its arrays as such."""
+    state = json.loads(snapshot.state_json)
+    model = state["model"]
+    return state | {"model": model | {"arrays": from_json(model["arrays"])}}
 
 
 def _saved(envelopes: Iterable[Envelope], producer: str) -> Iterator[ScorerSnapshot]:

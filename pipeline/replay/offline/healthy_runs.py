@@ -1,4 +1,4 @@
-"""Healthy recordings as the scorer would receive them: what `fantwin calibrate` calibrates on."""
+"""Healthy recordings as the scorer would receive them: what `fantwin calibrate` learns from and counts alarms in."""
 
 from __future__ import annotations
 
@@ -6,30 +6,34 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 from pipeline.config.models import TrayConfig
 from pipeline.errors import UserError
 from pipeline.recordings.checksum import sha256_of
-from pipeline.recordings.length import longest_s
-from pipeline.replay.offline.kept_samples import KeptSamples, RecordedTray, TrayRuns
+from pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
 from pipeline.replay.offline.marked_alarms import LeftOut, concerning, without
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
+from pipeline.runtime.modelled_fans import modelled_fans
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
-from schemas.units import NS_PER_S, SpeedUnit
-from scoring.baseline.shared_offset import LEAST_FANS
-from scoring.calibration.healthy_statistics import HealthyRun, HealthyStatistics, MixedRatesError, RunWork
-from scoring.limits import Timing, default_timing
-from scoring.samples import Samples, samples_of
+from schemas.messages import Prediction
+from schemas.units import NS_PER_S
+from scoring.calibration.calibration import Excursions
+from scoring.model.bins import Bin, Bins, bin_ns_of
+from scoring.model.decision import Decision
+from scoring.model.learned import HealthyRun, RunSums
+from scoring.model.operation import Fans
+from scoring.model.priors import Priors
 
 REPORTED_EVERY_S = 5.0
 """of the time that the work takes"""
-CLOCK_MARGIN = 1.01
-"""by which the clock of a device may be faster than that of the host"""
+NEVER = 1e6
+"""factor of a limit that no statistic reaches"""
 
 Result = TypeVar("Result")
 
@@ -76,29 +80,58 @@ class HealthyPart:
             yield replay_input
 
 
-def _require_that_all_fit(twin: Path, path: Path, trays: Sequence[TrayConfig]) -> None:
-    """Refuse trays of which the twin fits some only: its limits are those of one kind of tray."""
-    if len(trays) < 2:
-        return
-    fans = load_tray_twin(twin).fans
-    if fans > 1 and len({tray.fans == fans for tray in trays}) > 1:
-        found = ", ".join(f"{tray.name} of {_fans(tray.fans)}" for tray in trays)
-        raise UserError(f"{path}: several trays, {found}, and a twin of {_fans(fans)}: choose one with --tray")
+@dataclass(frozen=True)
+class LearnedRun:
+    """What a run of a tray tells of the priors."""
 
+    tray: RecordedTray
+    sums: RunSums
 
-def _fans(count: int) -> str:
-    return f"{count} fan{'s' * (count != 1)}"
+    @property
+    def fan_hours(self) -> float:
+        """Time in which fans were compared with the twin."""
+        return math.fsum(self.sums.judged_s) / 3600.0
 
 
 @dataclass(frozen=True)
-class _Facts:
-    """What is known of a recording without scoring it."""
+class DecidedRun:
+    """Alarms in a run of a tray."""
 
-    path: Path
-    trays: tuple[RecordedTray, ...]
-    timing: Timing
-    longest_fan_s: float
-    speed_unit: SpeedUnit
+    tray: RecordedTray
+    alarms: tuple[int, ...]
+    """of each fan"""
+    peaks: tuple[float, ...]
+    """of the score, one for each time that it exceeds the limit by theory; with alarms only up to them"""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What a run is decided with. declared_s: mean time between two false alarms of a fan."""
+
+    priors: Priors
+    declared_s: float
+    factor: float = 1.0
+
+    def decision(self, fans: Fans, bin_ns: int, period_ns: int) -> Decision:
+        """A new decision on fans."""
+        return Decision(fans, bin_ns, period_ns / NS_PER_S, self.declared_s, self.priors, self.factor)
+
+
+@dataclass(frozen=True)
+class FreeLimit:
+    """The limit by theory, for statistics that go on beyond it: no alarm is raised."""
+
+    priors: Priors
+    declared_s: float
+    factor: float = NEVER
+    """the score of a decision times this is relative to the limit by theory"""
+
+    def decision(self, fans: Fans, bin_ns: int, period_ns: int) -> Decision:
+        """A new decision on fans. Which readings of a tacho are wrong is decided as by theory."""
+        by_theory = Limit(self.priors, self.declared_s).decision(fans, bin_ns, period_ns)
+        never = Limit(self.priors, self.declared_s, self.factor).decision(fans, bin_ns, period_ns)
+        by_theory.log_limit, by_theory.missing = never.log_limit, never.missing
+        return by_theory
 
 
 class HealthyRuns:
@@ -109,152 +142,131 @@ class HealthyRuns:
         paths: Sequence[Path],
         part: HealthyPart,
         each: MapRecordings = in_this_process,
-        kept: KeptSamples | None = None,
+        kept: KeptBins | None = None,
         progress: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """each: does the work. kept: where samples are kept between passes. progress: takes how far a recording is."""
+        """each: does the work. kept: where bins are kept between passes. progress: takes how far a recording is."""
         self._paths = paths
-        self._part = part
         self._each = each
-        self._kept = kept
-        self._progress = progress
-        self._pass = 0
-        self.trays: list[RecordedTray] = []
-        """of each run of the last pass"""
+        self._source = _Source(part, kept, progress)
 
-    def __call__(self, work: RunWork) -> Iterator[HealthyStatistics]:
-        """What the work returns for each run. Of one recording in each process, a block is in memory at a time.
+    def learned(self) -> list[LearnedRun]:
+        """What each run tells of the priors.
 
         Raises:
-            UserError: a recording cannot be used.
+            UserError: a recording cannot be used, or nothing of it can be compared with the twin.
         """
-        self._pass += 1
-        of_recording = partial(_work_on, work=work, part=self._part, kept=self._kept, progress=self._progress)
-        found = list(self._each(of_recording, self._paths, f"pass {self._pass} over healthy recordings"))
-        self.trays = [tray for of_one in found for tray, _ in of_one]
-        return (statistics for of_one in found for _, statistics in of_one)
+        learn = partial(_learn, source=self._source)
+        return [*chain.from_iterable(self._each(learn, self._paths, "learning from healthy recordings"))]
+
+    def decided(self, limit: Limit | FreeLimit) -> list[DecidedRun]:
+        """The alarms of each run, all of which are false. Raises as `learned`."""
+        decide = partial(_decide, source=self._source, limit=limit)
+        return [*chain.from_iterable(self._each(decide, self._paths, "counting false alarms"))]
 
     def sha256(self) -> dict[Path, str]:
-        """Of the recordings that were used in the last pass."""
-        used = list(dict.fromkeys(tray.path for tray in self.trays))
-        return dict(self._each(_path_and_sha256, used, "naming the recordings in the card"))
-
-    def timing(self) -> Timing:
-        """The times of the scorer in the configuration of the recordings, with the overrides applied.
-
-        Raises:
-            UserError: a recording cannot be used; the times are not the same in all; or some trays have one fan and
-                others several.
-        """
-        _refuse_one_fan_among_several([tray for facts in self._facts.values() for tray in facts.trays])
-        found: dict[Timing, Path] = {}
-        for facts in self._facts.values():
-            found.setdefault(facts.timing, facts.path)
-        first, *others = found
-        for other in others:
-            names = [name for name in Timing.model_fields if getattr(first, name) != getattr(other, name)]
-            raise UserError(
-                f"{found[first]} and {found[other]} differ in scorer.{names[0]}, which limits depend on: "
-                "choose one with --set"
-            )
-        return first
-
-    def longest_fan_s(self) -> float:
-        """An upper bound of the time that can be scored, s, summed over fans: without scoring anything.
-
-        Raises:
-            UserError: a recording cannot be used, or ends before the part of it that is wanted.
-        """
-        return sum(facts.longest_fan_s for facts in self._facts.values())
-
-    @property
-    def speed_unit(self) -> SpeedUnit:
-        """The unit in which people are shown the speeds of the first recording.
-
-        Raises:
-            UserError: it cannot be used.
-        """
-        return next(iter(self._facts.values())).speed_unit
-
-    @cached_property
-    def _facts(self) -> dict[Path, _Facts]:
-        found = self._each(partial(_facts_of, part=self._part), self._paths, "opening healthy recordings")
-        return {facts.path: facts for facts in found}
+        """Of the recordings that were used."""
+        return dict(self._each(_path_and_sha256, self._paths, "naming the recordings in the card"))
 
 
-def _facts_of(path: Path, part: HealthyPart) -> _Facts:
-    with part.opened(path) as replay_input:
-        trays = tuple(RecordedTray(path, tray.name, tray.fans) for tray in replay_input.trays)
-        recorded_s = CLOCK_MARGIN * longest_s(path, replay_input.first_sample_t_ns) + 1.0
-        scorer = replay_input.config.sections["scorer"]
-        timing = scorer.timing(default_timing(trays[0].fans))  # type: ignore[attr-defined]  the scorer's own settings
-        speed_unit = replay_input.trays[0].speed_unit
-    part_s = min(recorded_s, part.to_s) - part.from_s
-    if part_s <= 0.0:
-        raise UserError(f"{path}: no samples from {part.from_s:g} s to {part.to_s:g} s; see --from and --to")
-    return _Facts(path, trays, timing, part_s * sum(tray.fans for tray in trays), speed_unit)
+@dataclass(frozen=True)
+class _Source:
+    """Runs of recordings, computed as the stages do unless they are kept."""
+
+    part: HealthyPart
+    kept: KeptBins | None
+    progress: Callable[[str], None]
+
+    def runs(self, path: Path) -> Iterator[TrayRun]:
+        """Those of a recording."""
+        runs = self.kept and self.kept.of(path)
+        if not runs:
+            runs = _computed(path, self.part)
+            runs = self.kept.keep(path, runs) if self.kept else runs
+        try:
+            for run in runs:
+                what = f"{path.name} {run.tray.tray}"
+                yield replace(run, bins=_reported(run.bins, run.bin_ns, what, self.progress))
+        except CodecError as error:
+            raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
+
+    def fans(self, tray: RecordedTray) -> Fans:
+        """What the twin tells of the fans of a tray."""
+        return modelled_fans(load_tray_twin(self.part.twin, tray.fans))
+
+
+def _learn(path: Path, source: _Source) -> list[LearnedRun]:
+    found = [learn(run, source.fans(run.tray)) for run in source.runs(path)]
+    if not any(run.fan_hours for run in found):
+        raise UserError(f"{path}: nothing in it could be compared with the twin; `fantwin info` shows what is missing")
+    return found
+
+
+def _decide(path: Path, source: _Source, limit: Limit | FreeLimit) -> list[DecidedRun]:
+    return [decide(run, source.fans(run.tray), limit) for run in source.runs(path)]
+
+
+def learn(run: TrayRun, fans: Fans) -> LearnedRun:
+    """What a run of these fans tells of the priors."""
+    healthy = HealthyRun(fans, run.bin_ns)
+    for one in run.bins:
+        healthy.take(one)
+    return LearnedRun(run.tray, healthy.sums)
+
+
+def decide(run: TrayRun, fans: Fans, limit: Limit | FreeLimit) -> DecidedRun:
+    """The alarms of a run of these fans."""
+    decision = limit.decision(fans, run.bin_ns, run.period_ns)
+    alarms, excursions = [0] * run.tray.fans, Excursions(run.tray.fans)
+    for one in run.bins:
+        for change in decision.take(one):
+            alarms[change.fan] += change.raised
+        excursions.take(decision.score * limit.factor)
+    return DecidedRun(run.tray, tuple(alarms), tuple(excursions.peaks))
 
 
 def _path_and_sha256(path: Path) -> tuple[Path, str]:
     return path, sha256_of(path)
 
 
-def _work_on(
-    path: Path, work: RunWork, part: HealthyPart, kept: KeptSamples | None, progress: Callable[[str], None]
-) -> list[tuple[RecordedTray, HealthyStatistics]]:
-    twin = load_tray_twin(part.twin)
-    found: list[tuple[RecordedTray, HealthyStatistics]] = []
-    try:
-        for tray, blocks in (kept and kept.of(path)) or _computed(path, part, kept):
-            known_as = range(tray.fans) if twin.fans > 1 else None
-            reported = _reported(blocks, f"{path.name} {tray.tray}", progress)
-            run = HealthyRun(str(path), tray.fans, reported, known_as, twin.card.tacho, tray.tray)
-            found.append((tray, work(run)))
-    except CodecError as error:
-        raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
-    except MixedRatesError as error:
-        rates = f"{NS_PER_S / error.first[1]:g} Hz and {NS_PER_S / error.other[1]:g} Hz"
-        raise UserError(
-            f"{path}: its grid changes between {rates}, and limits hold for one rate: calibrate without it"
-        ) from error
-    return found
-
-
-def _computed(path: Path, part: HealthyPart, kept: KeptSamples | None) -> TrayRuns:
-    """The samples of each tray of a recording, computed as the stages do."""
-    unseen_error = load_tray_twin(part.twin).unseen_error
+def _computed(path: Path, part: HealthyPart) -> Iterator[TrayRun]:
     with part.opened(path) as replay_input:
+        for tray in replay_input.trays:
+            spans = concerning(part.left_out, path, replay_input.config.site, tray.name)
+            blocks = (without(block, spans) for block in replay_input.pipeline(tray.name).predictions())
+            first = next(blocks, None)
+            if first is None:
+                wanted = f"from {part.from_s:g} s to {part.to_s:g} s; see --from and --to"
+                raise UserError(f"{path}: {tray.name}: no samples {wanted}")
+            twin = load_tray_twin(part.twin, tray.fans)
+            fans = modelled_fans(twin)
+            bin_ns = bin_ns_of(first.period_ns, float(fans.held_s.min()))
+            bins = Bins(bin_ns, fans.top_rad_s, twin.unseen_error)
+            recorded = RecordedTray(path, tray.name, tray.fans, tray.speed_unit)
+            yield TrayRun(recorded, bin_ns, first.period_ns, _binned(bins, chain([first], blocks)))
 
-        def blocks_of(tray: str) -> Iterator[Samples]:
-            spans = concerning(part.left_out, path, replay_input.config.site, tray)
-            for block in replay_input.pipeline(tray).predictions():
-                yield samples_of(without(block, spans), unseen_error)
 
-        runs = ((RecordedTray(path, tray.name, tray.fans), blocks_of(tray.name)) for tray in replay_input.trays)
-        yield from kept.keep(path, runs) if kept else runs
-
-
-def _reported(blocks: Iterable[Samples], what: str, progress: Callable[[str], None]) -> Iterator[Samples]:
-    scored_s, shown_s = 0.0, time.monotonic()
+def _binned(bins: Bins, blocks: Iterable[Prediction]) -> Iterator[Bin]:
     for block in blocks:
-        yield block
-        scored_s += len(block.t_ns) * block.period_ns / NS_PER_S
-        if time.monotonic() - shown_s > REPORTED_EVERY_S:
+        yield from bins.take(block)
+
+
+def _reported(bins: Iterable[Bin], bin_ns: int, what: str, progress: Callable[[str], None]) -> Iterator[Bin]:
+    done, shown_s = 0, time.monotonic()
+    for done, one in enumerate(bins, start=1):
+        yield one
+        if done % 1000 == 0 and time.monotonic() - shown_s > REPORTED_EVERY_S:
             shown_s = time.monotonic()
-            progress(f"{what}, {scored_s / 3600.0:.1f} h")
+            progress(f"{what}, {done * bin_ns / NS_PER_S / 3600.0:.1f} h")
 
 
-def _refuse_one_fan_among_several(trays: Sequence[RecordedTray]) -> None:
-    """What fans of a tray share is followed apart, and their baselines follow slowly: limits hold with it or without.
+def _require_that_all_fit(twin: Path, path: Path, trays: Sequence[TrayConfig]) -> None:
+    """Refuse trays of which the twin fits some only."""
+    fans = load_tray_twin(twin).fans
+    if fans > 1 and len({tray.fans == fans for tray in trays}) > 1:
+        found = ", ".join(f"{tray.name} of {_fans(tray.fans)}" for tray in trays)
+        raise UserError(f"{path}: several trays, {found}, and a twin of {_fans(fans)}: choose one with --tray")
 
-    Raises:
-        UserError: some trays have one fan and others several.
-    """
-    alone = next((tray for tray in trays if tray.fans < LEAST_FANS), None)
-    beside_others = next((tray for tray in trays if tray.fans >= LEAST_FANS), None)
-    if alone and beside_others:
-        raise UserError(
-            f"{alone.path} has a tray of one fan and {beside_others.path} one of {beside_others.fans}, and limits hold "
-            "for one kind of tray, since fans beside others are compared with them: calibrate twice, and write one of "
-            "the twins to another file with -o; --tray chooses a tray of recordings with several"
-        )
+
+def _fans(count: int) -> str:
+    return f"{count} fan{'s' * (count != 1)}"

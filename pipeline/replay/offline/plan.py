@@ -74,10 +74,10 @@ class Session:
     """of its newest recorded output"""
     first_position: InputPosition | None = None
     """of its first recorded output"""
-    causes_from_t_ns: int = BEGINNING
-    """of alarms before this, the causes rest on samples that the recording lacks"""
+    lacks_evidence: bool = False
+    """it continues from a snapshot in the middle of a recorded session, which had evidence that no snapshot keeps"""
     snapshots_t_ns: list[int] = field(default_factory=list)
-    """when it took the recorded snapshots, in order: a replay takes its own there. Only where these are compared"""
+    """when it took the recorded snapshots, in order: a replay takes its own there, because evidence is rounded then"""
 
     def set_limit(self, t_ns: int, reason: str) -> None:
         """Its outputs after `t_ns` cannot be reproduced. The earliest limit holds."""

@@ -174,8 +174,6 @@ class PlanReader:
             session.last_t_ns = max(session.last_t_ns, known_t_ns)
             if span.last is not None:
                 span.last = max(span.last, session.last_t_ns)
-            saved = [t_ns for (producer, _), t_ns in self._saved_t_ns.items() if producer == session.producer]
-            session.snapshots_t_ns = saved
 
     def _add_side(self, message: Message) -> None:
         header = message.header
@@ -206,6 +204,7 @@ class PlanReader:
         for producer, session in sessions.items():
             session.twins = self.twins
             session.snapshot = self._snapshots.get(producer)
+            session.snapshots_t_ns = [t_ns for (saved_by, _), t_ns in self._saved_t_ns.items() if saved_by == producer]
         for (producer, name), (_, t_ns) in sorted(self._answers.items(), key=lambda answer: answer[1]):
             if name in self._requests and producer in sessions:
                 sessions[producer].requests.append((t_ns, self._requests[name]))

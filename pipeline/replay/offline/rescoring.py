@@ -134,6 +134,7 @@ def _rescore_tray(
             lambda topic: replay_input.envelopes(tray, (topic,)),
             pipeline.limit_of,
             replay_input.metadata.left_out,
+            [session.producer for session in plan.last if session.lacks_evidence],
         )
         if verify and plan
         else None

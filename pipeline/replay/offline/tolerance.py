@@ -23,11 +23,6 @@ SPEED_RAD_S = 1e-6
 """absolute, of speeds and variances of speeds: a hundred-thousandth of a revolution a minute"""
 OTHERS = 1e-9
 """absolute, of all other numbers: scores, torque balances, probabilities, sizes of faults"""
-FIXED_POINT = 4
-"""absolute, of integer sums: a number that lies halfway between two of their units is rounded to either"""
-FIXED_POINT_SUMS = frozenset({"sums", "products", "squares", "scaling_squares", "motions", "speeds"})
-"""entries of snapshots that hold integer sums of numbers; all other integers are compared exactly"""
-
 SENTENCES = frozenset({"message", "evidence"})
 """texts with numbers that are rounded from other fields; all other texts are compared exactly"""
 
@@ -59,7 +54,7 @@ def differences(one: Any, other: Any, note: Callable[[Apart], None], path: tuple
     """The places in which two nested values differ by more than the tolerance: keys and list indices, joined by dots.
 
     Sentences are compared without their numbers, because these are rounded from numbers that are compared anyway.
-    note: called with each difference within the tolerance.
+    note: called with each difference within the tolerance, of an array with the largest.
     """
     if isinstance(one, dict) and isinstance(other, dict):
         for key in {**one, **other}:
@@ -71,16 +66,34 @@ def differences(one: Any, other: Any, note: Callable[[Apart], None], path: tuple
         for number, (mine, others) in enumerate(zip(one, other, strict=True)):
             if mine != others:
                 yield from differences(mine, others, note, (*path, str(number)))
-    elif one != other:
+    elif isinstance(one, np.ndarray) or isinstance(other, np.ndarray) or one != other:
         apart = _apart(path, one, other)
         if apart.share > 1.0:
             yield ".".join(path)
-        else:
+        elif apart.share:
             note(apart)
+
+
+def _arrays_apart(name: str, one: Array, other: Array) -> Apart:
+    if one.shape != other.shape or one.dtype != other.dtype:
+        return Apart(math.inf)
+    differs = one != other
+    if one.dtype.kind == "f":
+        differs &= ~(np.isnan(one) & np.isnan(other))
+    if not differs.any():
+        return Apart()
+    if one.dtype.kind != "f":
+        return Apart(math.inf)
+    one, other = one[differs], other[differs]
+    share = shares(name, one, other)
+    largest = int(np.argmax(share))
+    return Apart(float(share[largest]), name, abs(float(one[largest]) - float(other[largest])))
 
 
 def _apart(path: tuple[str, ...], one: Any, other: Any) -> Apart:
     name = next((key for key in reversed(path) if not key.isdigit()), "")
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return _arrays_apart(name, one, other)
     if isinstance(one, str) and isinstance(other, str) and name in SENTENCES:
         is_alike = _NUMBER.sub("#", one) == _NUMBER.sub("#", other)
         return Apart(0.0 if is_alike else math.inf)
@@ -88,7 +101,4 @@ def _apart(path: tuple[str, ...], one: Any, other: Any) -> Apart:
         if math.isnan(one) and math.isnan(other):
             return Apart()
         return Apart(float(shares(name, np.array(one), np.array(other))), name, abs(one - other))
-    if isinstance(one, int) and isinstance(other, int) and name in FIXED_POINT_SUMS:
-        apart = abs(one - other)
-        return Apart(apart / max(FIXED_POINT, RELATIVE * max(abs(one), abs(other))), name, apart)
     return Apart(math.inf)

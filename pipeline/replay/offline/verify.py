@@ -1,7 +1,8 @@
 """Comparison of replayed scores and alarms with the recorded ones; of snapshots if scores are not recorded.
 
 Decisions must be equal: states, statistics, validity and its reasons, times, and alarms with the order of their causes.
-Numbers may differ within a tolerance (pipeline.replay.offline.tolerance).
+Numbers may differ within a tolerance (pipeline.replay.offline.tolerance); those of alarm clips by more, and in time
+(pipeline.replay.offline.clip_tolerance).
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from dataclasses import asdict
 import numpy as np
 
 from pipeline.recordings.dates import format_utc
+from pipeline.replay.offline.clip_tolerance import LACKS_EVIDENCE, OF_EVIDENCE, may_be_alone, nearest
 from pipeline.replay.offline.compare_snapshots import SnapshotVerifier
 from pipeline.replay.offline.comparison import Comparison
-from pipeline.replay.offline.plan import BEGINNING, Limit, Session
+from pipeline.replay.offline.plan import Limit, Session
 from pipeline.replay.offline.tolerance import Apart, differences, shares
 from schemas.blocks import cut
 from schemas.enums import Transition
@@ -24,7 +26,6 @@ from schemas.fields import columns
 from schemas.messages import Alarm, Array, Score, ScorerSnapshot
 
 SCORE, SNAPSHOT = "score", "snapshot"
-CAUSES = "causes of alarms soon after the beginning of a clip rest on samples from before it"
 AT_A_LIMIT = (
     "although all numbers agree within the tolerance: one lies so close to its limit that processors decide "
     "differently, or the way of deciding has changed"
@@ -51,11 +52,14 @@ class TrayVerifier:
         read: Callable[[str], Iterable[Envelope]],
         limit_of: Callable[[str], Limit | None],
         left_out: Collection[str] = (),
+        lacking_evidence: Collection[str] = (),
     ) -> None:
         """read: the recorded messages of a topic of the tray, from the beginning at each call. limit_of: the limit of a
-        session of the scorer, as known when its last scores were made. left_out: topics that are not recorded."""
+        session of the scorer, as known when its last scores were made. left_out: topics that are not recorded.
+        lacking_evidence: sessions of the scorer with `lacks_evidence`."""
         self._read = read
         self._limit_of = limit_of
+        self._lacking_evidence = lacking_evidence
         self._producer: str | None = None
         self._recorded: RecordedSession | None = None
         self._visited: set[str] = set()
@@ -73,7 +77,8 @@ class TrayVerifier:
         if self._recorded is None or producer != self._producer:
             self._end_session()
             self._recorded = self._begin_session(producer)
-        compare_scores(score, self._recorded, self._found, self._limit_of(producer))
+        lacks_evidence = producer in self._lacking_evidence
+        compare_scores(score, self._recorded, self._found, self._limit_of(producer), lacks_evidence=lacks_evidence)
 
     def finish(self, sessions: Sequence[Session], alarms: Sequence[Alarm], recorded: Sequence[Alarm]) -> Comparison:
         """Compare what is left, and the alarms; the result."""
@@ -86,8 +91,8 @@ class TrayVerifier:
                 [alarm for alarm in listed if alarm.header.producer == session.producer]
                 for listed in (alarms, recorded)
             )
-            limit = self._limit_of(session.producer)
-            compare_alarms(replayed, known, session.last_t_ns, self._found, limit, session.causes_from_t_ns)
+            limit, lacks_evidence = self._limit_of(session.producer), session.lacks_evidence
+            compare_alarms(replayed, known, session.last_t_ns, self._found, limit, lacks_evidence=lacks_evidence)
             if limit is not None and limit.t_ns < session.last_t_ns and not self._found.has_scores:
                 self._found.add_limit(limit)
         return self._found
@@ -132,8 +137,15 @@ class RecordedSession:
             self._rest = next(self._blocks, None)
 
 
-def compare_scores(made: Score, recorded: RecordedSession, found: Comparison, limit: Limit | None = None) -> None:
-    """Compare a block of scores with the recorded ones up to its last sample."""
+def compare_scores(
+    made: Score,
+    recorded: RecordedSession,
+    found: Comparison,
+    limit: Limit | None = None,
+    *,
+    lacks_evidence: bool = False,
+) -> None:
+    """Compare a block of scores with the recorded ones up to its last sample. lacks_evidence: see Session."""
     taken = 0
     for block in recorded.until(int(made.t_ns[-1])):
         at = np.searchsorted(made.t_ns, block.t_ns)
@@ -142,16 +154,25 @@ def compare_scores(made: Score, recorded: RecordedSession, found: Comparison, li
         rows = at[is_made]
         taken += len(rows)
         within = _within(block.t_ns[is_made], limit)
+        in_part = np.zeros(len(rows), np.bool_)
         if block.fans != made.fans:
             different = np.ones(len(rows), np.bool_)
             found.name(f"{found.tray}: {made.fans} fans replayed, {block.fans} recorded")
         else:
             one, other = _columns(made, rows), _columns(block, is_made)
+            if lacks_evidence:
+                of_evidence = [(name, one.pop(name), other.pop(name)) for name in OF_EVIDENCE]
+                in_part = np.any([_differ(*each, found).any(axis=1) for each in of_evidence], axis=0)
             different = _compare_samples(block.t_ns[is_made], one, other, within, found)
+            in_part &= ~different
         if limit is not None:
             found.add_not_comparable(int((different & ~within).sum()), limit)
+        if in_part.any():
+            found.in_part += int(in_part.sum())
+            found.not_comparable += int(in_part.sum())
+            found.add_reason(f"{found.tray}: {LACKS_EVIDENCE}")
         found.different += int((different & within).sum())
-        found.equal += int((~different).sum())
+        found.equal += int((~different & ~in_part).sum())
     found.not_recorded += len(made.t_ns) - taken
 
 
@@ -214,31 +235,27 @@ def compare_alarms(
     last_scored_t_ns: int,
     found: Comparison,
     limit: Limit | None = None,
-    causes_from_t_ns: int = BEGINNING,
+    *,
+    lacks_evidence: bool = False,
 ) -> None:
     """Compare the alarms of one session with the recorded ones, matched by fan, time, transition and request.
 
     An alarm is published right after its score, so those of the last recorded score may be missing in the recording.
-    causes_from_t_ns: the causes of earlier ones rest on samples that the recording lacks.
+    lacks_evidence: see Session.
     """
-
-    def is_of_causes(alarm: Alarm, other: Alarm | None) -> bool:
-        """Whether only the causes may differ."""
-        is_same = other is not None and not first_difference(alarm, other, found.note, ("causes", "message"))
-        return alarm.t_ns < causes_from_t_ns and (is_same or alarm.transition == Transition.DIAGNOSED)
-
     at_a_limit = f" ({AT_A_LIMIT})" if found.equal and not found.numbers_different else ""
-    left = {(alarm.fan, alarm.t_ns, alarm.transition, alarm.request): alarm for alarm in recorded}
+    left = {_key(alarm): alarm for alarm in recorded}
+    unlike: list[Alarm] = []
     for alarm in made:
-        other = left.pop((alarm.fan, alarm.t_ns, alarm.transition, alarm.request), None)
+        other = left.pop(_key(alarm), None)
         where = first_difference(alarm, other, found.note) if other is not None else ""
         if other is not None and not where:
             found.alarms_equal += 1
         elif limit is not None and alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
-        elif is_of_causes(alarm, other):
-            found.alarms_not_comparable += 1
-            found.add_reason(f"{found.tray}: {CAUSES}")
+        elif lacks_evidence:
+            unlike.append(alarm)
+            left |= {_key(other): other} if other is not None else {}
         elif other is not None:
             found.alarms_different += 1
             found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, {other.message!r} recorded: {where} differs")
@@ -247,16 +264,39 @@ def compare_alarms(
         else:
             found.alarms_different += 1
             found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, none recorded{at_a_limit}")
+    if lacks_evidence:
+        _compare_in_time(unlike, left, last_scored_t_ns, found)
     for alarm in left.values():
         if limit is not None and alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
             continue
-        if is_of_causes(alarm, None):
-            found.alarms_not_comparable += 1
-            found.add_reason(f"{found.tray}: {CAUSES}")
-            continue
         found.alarms_different += 1
         found.name(f"{found.tray}: alarm {_describe(alarm)} recorded, none replayed{at_a_limit}")
+
+
+def _key(alarm: Alarm) -> tuple[int, int, Transition, str]:
+    return alarm.fan, alarm.t_ns, alarm.transition, alarm.request
+
+
+def _compare_in_time(
+    made: Iterable[Alarm], left: dict[tuple[int, int, Transition, str], Alarm], last_t_ns: int, found: Comparison
+) -> None:
+    """Compare the alarms of a clip that are not equal to a recorded one, and take what need not be equal from those
+    that are left."""
+    for alarm in made:
+        other = nearest(alarm, left.values())
+        if other is not None:
+            del left[_key(other)]
+        if other is not None or may_be_alone(alarm, last_t_ns):
+            found.alarms_not_comparable += 1
+            found.add_reason(f"{found.tray}: {LACKS_EVIDENCE}")
+        else:
+            found.alarms_different += 1
+            found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, none recorded at about that time")
+    for key in [key for key, alarm in left.items() if may_be_alone(alarm, last_t_ns)]:
+        del left[key]
+        found.alarms_not_comparable += 1
+        found.add_reason(f"{found.tray}: {LACKS_EVIDENCE}")
 
 
 def _scores(envelopes: Iterable[Envelope], producer: str) -> Iterator[Score]:
@@ -273,12 +313,9 @@ def _scores(envelopes: Iterable[Envelope], producer: str) -> Iterator[Score]:
     yield from decode_together(Score, waiting)
 
 
-def first_difference(alarm: Alarm, other: Alarm, note: Callable[[Apart], None], left_out: Collection[str] = ()) -> str:
-    """The first field in which two alarms differ by more than the tolerance; empty if none. left_out: may differ."""
-    one, beside = (
-        {name: value for name, value in asdict(each).items() if name not in ("header", *left_out)}
-        for each in (alarm, other)
-    )
+def first_difference(alarm: Alarm, other: Alarm, note: Callable[[Apart], None]) -> str:
+    """The first field in which two alarms differ by more than the tolerance; empty if none."""
+    one, beside = ({name: value for name, value in asdict(each).items() if name != "header"} for each in (alarm, other))
     return next(differences(one, beside, note), "")
 
 

@@ -30,12 +30,10 @@ from schemas.messages import Alarm, Diagnosis, Message, Request
 from schemas.topics import BY_NAME, tray_key
 from scoring.alarms.current_alarms import CurrentAlarm, clock
 from scoring.alarms.fan_condition import AlarmState, ConditionSettings
-from scoring.alarms.tray_conditions import TrayConditions
-from scoring.wear.followed import shared_by_all
-from scoring.wear.slow_change import WEAR_HINT
+from scoring.alarms.tray_conditions import Decided, TrayConditions
+from scoring.wear.slow_change import own_change, shared_change
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
-from tests.support.score_alone import by_score, scores_alone
 from tests.support.score_data import one_sample
 
 FANS = 8
@@ -46,11 +44,12 @@ CAUSES = (
 
 
 class AlarmOnRequestScorer(Core):
-    """The conditions of a tray whose ratios a test sets; answers requests as a scorer does."""
+    """The conditions of a tray whose fans have the alarms that a test says; answers requests as a scorer does."""
 
     def __init__(self) -> None:
-        self.conditions = TrayConditions(FANS, ConditionSettings(0, by_score(0), earlier_alarms=4))
-        self.ratio: dict[int, float] = {}
+        self.conditions = TrayConditions(FANS, ConditionSettings(earlier_alarms=4))
+        self.has_alarm: set[int] = set()
+        self._raised_t_ns = np.zeros(FANS, np.int64)
         self.deaf = False
         self.not_judged: tuple[InvalidReason, ...] = ()
         self.noted: list[str] = []
@@ -61,9 +60,11 @@ class AlarmOnRequestScorer(Core):
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         self._now_ns = now_ns
-        ratio = np.array([[self.ratio.get(fan, 0.0) for fan in range(FANS)]])
-        result = self.conditions.update(*scores_alone(np.array([now_ns]), 1, ratio))
-        alarms = [self._alarm(c.fan, c.transition, c.alarm_state, "too slow") for c in result.events]
+        active = np.isin(np.arange(FANS), list(self.has_alarm))
+        self._raised_t_ns = np.where(active & (self._raised_t_ns > 0), self._raised_t_ns, now_ns * active)
+        severity, judged = np.full(FANS, int(Severity.ALARM)), np.ones(FANS, np.bool_)
+        events = self.conditions.update(Decided(now_ns, judged, active, severity, self._raised_t_ns))
+        alarms = [self._alarm(each.fan, each.transition, each.alarm_state, "too slow") for each in events]
         return [one_sample(FANS, *self.not_judged), *alarms]
 
     def step(self, item: Any) -> Sequence[Message]:
@@ -93,7 +94,7 @@ class AlarmOnRequestScorer(Core):
             t_ns=self._now_ns,
             onset_t_ns=standing.onset_t_ns,
             residual_rad_s=0.0,
-            limit_rad_s=1.0,
+            residual_std_rad_s=1.0,
             message=message,
             transition=transition,
             acknowledged=standing.acknowledged,
@@ -141,8 +142,8 @@ class Site:
         self._stop.set()
         self._thread.join(20)
 
-    def raise_alarm(self, fan: int, ratio: float = 2.0) -> None:
-        self.core.ratio[fan] = ratio
+    def raise_alarm(self, fan: int) -> None:
+        self.core.has_alarm = {*self.core.has_alarm, fan}
         eventually(lambda: self.core.conditions.alarm_state(fan).active, f"fan {fan} has an alarm")
 
     def ask(self, *words: object) -> str:
@@ -171,7 +172,7 @@ def test_the_list_shows_current_alarms_and_with_all_also_those_that_are_over(sit
     assert site.ask() == "no alarms\n"
     site.raise_alarm(3)
     site.raise_alarm(5)
-    site.core.ratio[5] = 0.0
+    site.core.has_alarm = site.core.has_alarm - {5}
     eventually(lambda: not site.core.conditions.alarm_state(5).active, "it has cleared")
     before_ns = time.time_ns()
     assert [(a["tray"], a["fan"], a["active"]) for a in site.listed()] == [(TRAY, 3, True), (TRAY, 5, False)]
@@ -208,13 +209,12 @@ def test_the_list_says_when_a_message_was_true_and_whether_the_fan_is_stopped_or
 
 
 def test_what_most_fans_of_a_tray_share_is_listed_beside_the_slow_changes_of_single_fans(site):
-    (shared,) = shared_by_all(-0.024, 0.03)
-    one = f"fan 2: drag +5.1 % in 3.0 h, +1.7 % an hour: {WEAR_HINT}"
+    shared, one = shared_change(-0.04), own_change(2, -0.051, 3 * 3600 * 10**9, None)
     site.core.noted = ["98.0 % of the fans' samples judged", one, shared]
     lines = [f"scorer, {TRAY}: {one}", f"scorer, {TRAY}: {shared}"]
     eventually(lambda: json.loads(site.ask("--json"))["slow_changes"] == lines, "the notes are heard")
     assert site.ask().splitlines() == [*lines, "no alarms"]
-    assert shared.startswith("most fans turn 2.4 % slower than")
+    assert shared.startswith("most fans turn 4 % slower than")
 
 
 def test_row_01_no_alarms_is_not_said_while_a_fan_is_not_judged(site):
@@ -228,7 +228,7 @@ def test_row_01_no_alarms_is_not_said_while_a_fan_is_not_judged(site):
 
 def test_an_alarm_of_a_newer_scorer_is_listed_with_its_number():
     scorer = AlarmOnRequestScorer()
-    scorer.ratio[0] = 2.0
+    scorer.has_alarm = {0}
     (*_, alarm) = (each for t_ns in range(3) for each in scorer.tick(t_ns) if isinstance(each, Alarm))
     newest = replace(alarm, severity=Severity(7), transition=Transition(88), active=True)
     assert "UNKNOWN (7)" in alarm_lines(CurrentAlarm(newest, newest.message, (), "")).plain
@@ -273,7 +273,7 @@ def test_watching_prints_what_happens_as_it_happens(site):
         standing = json.loads(watching.stdout.readline())
         site.core.not_judged = ()
         assert watching.stderr.readline().endswith(f"  {TRAY}: every fan is judged now\n")
-        site.core.ratio[3] = 0.0
+        site.core.has_alarm = site.core.has_alarm - {3}
         cleared = json.loads(watching.stdout.readline())
         site.ask("ack", TRAY, 3, "--operator", "Ann")
         acknowledged = json.loads(watching.stdout.readline())
@@ -334,7 +334,7 @@ def test_an_operator_says_whether_an_alarm_was_true_while_it_stands_and_after_it
         "the door was open",
     )
     assert "marked as a false alarm by ann: the door was open" in site.ask().splitlines()[0]
-    site.core.ratio[3] = 0.0
+    site.core.has_alarm = site.core.has_alarm - {3}
     eventually(lambda: not site.core.conditions.alarm_state(3).active, "it has cleared")
     shown = datetime.fromtimestamp(first["onset_t_ns"] / 1e9)
     (answer,) = json.loads(site.ask("true-alarm", TRAY, 3, "--onset", f"{shown:%Y-%m-%d %H:%M:%S}", "--json"))[

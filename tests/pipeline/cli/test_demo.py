@@ -44,7 +44,7 @@ def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
     assert [(fault["fan"], fault["kind"]) for fault in summary["faults"]] == [(2, "inlet"), (5, "rotor")]
     for fault in summary["faults"]:
         assert fault["start_ns"] < fault["alarm_ns"] < fault["stop_ns"] < fault["cleared_ns"]
-    assert summary["samples_sent"] == summary["samples_recorded"] == 3400
+    assert summary["samples_sent"] == summary["samples_recorded"] == 3600
     assert (summary["false_alarms"], summary["lost"], summary["problems"]) == (0, 0, [])
     assert 0 < summary["latency_ms"]["p50"] <= summary["latency_ms"]["p99"]
 

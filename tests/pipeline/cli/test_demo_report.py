@@ -98,7 +98,7 @@ def alarm(number: int, fan: int, active: bool, t_ns: int) -> Alarm:
         t_ns=t_ns,
         onset_t_ns=t_ns,
         residual_rad_s=0.0,
-        limit_rad_s=0.0,
+        residual_std_rad_s=0.0,
         message="",
         transition=Transition.RAISED if active else Transition.CLEARED,
     )

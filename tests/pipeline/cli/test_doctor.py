@@ -86,7 +86,7 @@ def test_a_configuration_in_order_can_start(capsys, tmp_path, port):
         ("run_folder='/etc/hostname/x'", ["run_folder /etc/hostname/x", "not a folder this user may write to"]),
         ("bus.endpoint='tcp/127.0.0.1:99999'", ["bus.endpoint", "port 99999 is out of range"]),
         ("bus.endpoint='tcp/no-such-host.invalid:7447'", ["bus.endpoint", "'no-such-host.invalid' cannot be found"]),
-        ("scorer.on_dealy_s=1", ["scorer.on_dealy_s", "did you mean 'on_delay_s'"]),
+        ("scorer.alarm_shrae=1", ["scorer.alarm_shrae", "did you mean 'alarm_share'"]),
     ],
 )
 def test_each_problem_is_one_line_that_says_what_to_do(capsys, tmp_path, port, setting, words):

@@ -113,13 +113,13 @@ def test_columns_that_the_messages_lack_are_empty_and_alarms_are_a_separate_tabl
     (row,) = table(tmp_path / f"r.tray1.alarm.{form}").to_dict("records")
     assert (row["t_ns"], row["onset_t_ns"], row["fan"], row["active"]) == (70, 50, 0, True)
     assert (row["severity"], row["message"], row["producer"]) == ("ALARM", "alarm 0", "scorer-1")
-    assert (row["transition"], row["statistic"]) == ("RAISED", "SPEED_DRIFT")
+    assert (row["transition"], row["statistic"]) == ("RAISED", "DEVIATION")
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_every_enum_column_has_names_and_an_unknown_value_of_a_newer_producer_is_its_number(tmp_path, form):
     (score, *_), _ = made_up_tray(seconds=1)
-    statistic = np.arange(score.statistic.size, dtype=np.uint8).reshape(score.statistic.shape) % 8
+    statistic = np.arange(score.statistic.size, dtype=np.uint8).reshape(score.statistic.shape) % 5
     state = score.state.copy()
     state[1, 2] = 99
     path = write(tmp_path / "r.mcap", [replace(score, statistic=statistic, state=state)])

@@ -94,7 +94,7 @@ def test_no_first_twin_is_learned_of_tachos_that_are_not_declared(
     assert not TwinVersions(tmp_path, "tray1").all()
 
 
-def test_the_first_version_is_a_target_only_and_more_healthy_running_tightens_the_limits(site: Path) -> None:
+def test_the_first_version_is_a_target_only_and_the_next_is_from_more_healthy_running(site: Path) -> None:
     first, second = TwinVersions(site, "tray1").all()
     assert (first.name, first.how, first.outcome, first.reference) == ("tray1-1", "trained", "taken", "tray1-1")
     assert first.is_target
@@ -106,7 +106,7 @@ def test_the_first_version_is_a_target_only_and_more_healthy_running_tightens_th
     assert second.hours > 3.0 * first.hours
     within = [[drop.within_a_minute for drop in each.drops] for each in (first, second)]
     assert all(drop for drops in within for drop in drops)
-    assert sum(drop or 0.0 for drop in within[1]) < sum(drop or 0.0 for drop in within[0])
+    assert sum(drop or 0.0 for drop in within[1]) <= sum(drop or 0.0 for drop in within[0])
     assert load_tray_twin(site / "tray1-2.onnx", FANS).card.name == "tray1-2"
     assert not list(site.glob("learning-*")), "the working folder is gone"
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import onnx
 import pytest
 from typer.testing import Result
 
@@ -15,6 +16,7 @@ from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.enums import InvalidReason
 from schemas.messages import Alarm, Raw, Score
+from schemas.twin_card import CARD_PROPERTY
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import short_name
 from tests.support.fantwin_command import error_of, fantwin
@@ -31,6 +33,16 @@ def replay(*words: object) -> Result:
 
 def error(*words: object) -> str:
     return error_of("replay", "--offline", *words)
+
+
+def unlimited(twin: bytes, folder: Path) -> Path:
+    """The same twin with a limit that no evidence reaches."""
+    model = onnx.load_model_from_string(twin)
+    (entry,) = (each for each in model.metadata_props if each.key == CARD_PROPERTY)
+    card = json.loads(entry.value)
+    entry.value = json.dumps(card | {"calibration": card["calibration"] | {"limit_factor": 1e3}})
+    onnx.save(model, folder / "unlimited.onnx")
+    return folder / "unlimited.onnx"
 
 
 @pytest.fixture(scope="module")
@@ -58,16 +70,16 @@ def test_equal_is_exit_code_0():
 def test_a_difference_is_exit_code_1_and_named(tmp_path):
     def doubled(entry):
         if entry.topic == "score":
-            entry.message.smoothed_residual_rad_s.setflags(write=True)
-            entry.message.smoothed_residual_rad_s[:] *= 2
+            entry.message.expected_residual_rad_s.setflags(write=True)
+            entry.message.expected_residual_rad_s[:] *= 2
         return entry.message
 
     result = replay("--verify", changed(GOLDEN, tmp_path / "doubled.mcap", doubled))
     assert result.exit_code == 1
-    assert "DIFFERS" in result.stdout and "smoothed_residual_rad_s" in result.stdout
+    assert "DIFFERS" in result.stdout and "expected_residual_rad_s" in result.stdout
 
 
-@pytest.mark.parametrize("words", [("--twin",), ("--set", "scorer.on_delay_s=1"), ("--start", "2")])
+@pytest.mark.parametrize("words", [("--twin",), ("--set", "scorer.alarm_share=1"), ("--start", "2")])
 def test_verifying_with_other_settings_is_refused_exit_code_2(tmp_path, words):
     if words == ("--twin",):
         (tmp_path / "twin.onnx").write_bytes(read_metadata(GOLDEN).attachments["tray1.onnx"])
@@ -88,7 +100,7 @@ def test_no_scores_cannot_be_compared_exit_code_2(tmp_path):
 def test_the_decision_as_json_names_counts_and_reasons_for_unscored_samples_apart(golden):
     (alarm,) = golden["alarms"]
     assert alarm["fan"] == 1 and alarm["raised_ns"] < alarm["cleared_ns"]
-    assert alarm["severity"] == "alarm" and alarm["residual"] < 0
+    assert alarm["severity"] == "warning" and alarm["residual"] < 0
     assert golden["samples"] > 400 and golden["lost"] == 0
     not_judged = sum(golden["not_judged"]["tray1"].values()) / 2
     assert golden["hours"] == pytest.approx((golden["samples"] - not_judged) * 0.02 / 3600, abs=1e-4)
@@ -98,7 +110,7 @@ def test_the_decision_as_json_names_counts_and_reasons_for_unscored_samples_apar
     assert reasons.isdisjoint(counts) and "not_predicted_out_of_range" in counts
 
 
-def test_the_list_names_severity_and_probable_cause_and_is_not_wide(golden):
+def test_the_list_names_severity_and_probable_cause_and_is_not_wide(golden, tmp_path):
     (alarm,) = golden["alarms"]
     first, what = alarm["causes"][0], alarm["message"].partition(": ")[2][:12]
     lines = replay(GOLDEN).stdout.splitlines()
@@ -107,7 +119,8 @@ def test_the_list_names_severity_and_probable_cause_and_is_not_wide(golden):
     assert "_" not in cause
     for expected in (alarm["severity"], cause, what):
         assert expected in row
-    what_if = replay(GOLDEN, "--set", "scorer.limit_factor=1000").stdout.splitlines()
+    twin = unlimited(read_metadata(GOLDEN).attachments["tray1.onnx"], tmp_path)
+    what_if = replay(GOLDEN, "--twin", twin).stdout.splitlines()
     assert "against the recording: 1 alarms lost" in what_if
     (gone,) = [line for line in what_if if line.lstrip().startswith("tray1")]
     assert alarm["severity"] in gone and cause in gone
@@ -115,13 +128,12 @@ def test_the_list_names_severity_and_probable_cause_and_is_not_wide(golden):
 
 
 def test_another_configuration_file_is_taken(golden, tmp_path):
-    text = (
-        read_metadata(GOLDEN).attachments["configuration.toml"].decode().replace("on_delay_s = 0.3", "on_delay_s = 2.5")
-    )
+    text = read_metadata(GOLDEN).attachments["configuration.toml"].decode()
+    text = text.replace("alarm_share = 0.2", "alarm_share = 0.01")
     config = tmp_path / "other.toml"
     config.write_text(text.replace('twin = "twin.onnx"\n', ""))
     before, now = golden["alarms"], json.loads(replay("--json", GOLDEN, "-c", config).stdout)["alarms"]
-    assert now[0]["raised_ns"] - before[0]["raised_ns"] == pytest.approx(2.2e9, abs=0.2e9)
+    assert [each["severity"] for each in (*before, *now)] == ["warning", "alarm"]
 
 
 def test_the_output_is_a_whole_recording_with_the_requests_that_its_alarms_answer(golden, output):
@@ -147,10 +159,11 @@ def test_an_imported_table_is_judged_at_the_rate_of_the_twin(tmp_path):
         for entry in read_recording(table):
             writer.add_message(entry.key, entry.message, entry.received_t_ns)
     assert "--twin" in error("--json", bare)
-    document = json.loads(
-        replay("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "scorer.limit_factor=1000").stdout
+    twin, share = tmp_path / "twin.onnx", "scorer.alarm_share=9"
+    before, now = (
+        json.loads(replay("--json", bare, "--twin", twin, *words).stdout)["alarms"] for words in ((), ("--set", share))
     )
-    assert document["alarms"] == [], "keys are set on top of the defaults"
+    assert [each["severity"] for each in (*before, *now)] == ["alarm", "warning"], "keys are set on top of the defaults"
     refused = error("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "no.such_key=1")
     assert "no.such_key" in refused.replace("'no'", "no.such_key")
     out = tmp_path / "out.mcap"
@@ -190,7 +203,7 @@ def test_no_file_is_ever_written_over(tmp_path):
 
 
 def test_a_time_range_is_judged_and_compared_with_the_recorded_alarms_of_that_range():
-    document = json.loads(replay("--json", GOLDEN, "--end", "3", "--set", "scorer.on_delay_s=0.2").stdout)
+    document = json.loads(replay("--json", GOLDEN, "--end", "3", "--set", "scorer.alarm_share=0.2").stdout)
     assert document["what_if"] == {"gained": [], "lost": [], "kept": []}, "the alarm comes later"
     assert 120 < document["samples"] < 160
     assert "--start" in error("--json", GOLDEN, "--start", "1000")

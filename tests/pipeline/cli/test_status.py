@@ -64,7 +64,7 @@ ALARM = Alarm(
     t_ns=1_700_000_000 * NS_PER_S,
     onset_t_ns=1_699_999_999 * NS_PER_S,
     residual_rad_s=-20.0,
-    limit_rad_s=9.0,
+    residual_std_rad_s=9.0,
     message="fan 2 is slower than its twin",
 )
 

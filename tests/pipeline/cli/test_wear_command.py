@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import pickle
 import re
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,35 +21,22 @@ from pipeline.runtime.stage import BuiltStage, Core, Stage
 from schemas.header import Header
 from schemas.messages import Message, ScorerSnapshot
 from schemas.topics import tray_key
-from tests.pipeline.cli.conftest import MadeOnce
-from tests.scoring.wear.test_wear_monitor import (
-    DAY_NS,
-    GROWTH_PER_DAY,
-    HEALTHY,
-    LIMIT,
-    WORN,
-    core_for_days,
-    live_through,
-)
+from scoring.wear.recorded_wear import shown
+from scoring.wear.trend import NS_PER_DAY, WearSeries
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, SITE, TRAY
-from tests.support.scored_blocks import EPOCH_NS, snapshot_of
+from tests.support.wear_data import LOSS, START_NS, worn_snapshot
 
 KEY = tray_key(SITE, TRAY, "snapshot")
+FANS, HEALTHY, WORN = 3, 0, 1
+PER_DAY = -LOSS / 30.0
 
 
 @pytest.fixture(scope="module")
-def notes(made_once: MadeOnce) -> list[ScorerSnapshot]:
-    """The snapshots of a scorer after three days and after six."""
-
-    def make(folder: Path) -> None:
-        worn, noted = core_for_days(), []
-        for number, (from_day, days) in enumerate(((0, 3), (3, 6))):
-            assert list(live_through(worn, days, from_day, swing=0.005)) == []
-            noted.append(replace(snapshot_of(worn), header=Header("scorer-1", number, TRAY)))
-        (folder / "notes").write_bytes(pickle.dumps(noted))
-
-    return pickle.loads((made_once("wear", make) / "notes").read_bytes())
+def notes() -> list[ScorerSnapshot]:
+    """The snapshots of a scorer after 15 days and after 30."""
+    made = [(days, worn_snapshot(TRAY, FANS, WORN, START_NS + days * NS_PER_DAY, days)) for days in (15, 30)]
+    return [replace(snapshot, header=Header("scorer-1", days, TRAY)) for days, snapshot in made]
 
 
 def recording(path: Path, notes: Sequence[ScorerSnapshot]) -> Path:
@@ -59,24 +46,27 @@ def recording(path: Path, notes: Sequence[ScorerSnapshot]) -> Path:
     return path
 
 
-def rows(*words: object) -> dict[tuple[int, str], dict[str, Any]]:
+def rows(*words: object) -> dict[int, dict[str, Any]]:
     done = fantwin("wear", *words, "--json")
     assert done.exit_code == 0, done.exception
-    return {(row["fan"], row["parameter"]): row for row in json.loads(done.stdout)["wear"]}
+    return {row["fan"]: row for row in json.loads(done.stdout)["wear"]}
 
 
 def test_a_recording_reports_what_wears_and_when_its_limit_is_reached(tmp_path, notes):
     found = rows(recording(tmp_path / "r.mcap", notes))
-    assert sorted(found) == [(fan, name) for fan in (0, 1) for name in ("balance", "drag", "friction", "gain")]
-    balance = found[WORN, "balance"]
-    assert balance["t_ns"] == notes[-1].t_ns
-    assert balance["change"] == pytest.approx(6 * GROWTH_PER_DAY, rel=0.1)
-    assert balance["per_day"]["low"] < GROWTH_PER_DAY < balance["per_day"]["high"]
-    assert balance["limit"] == pytest.approx(LIMIT)
-    likely = (balance["reached_t_ns"]["likely"] - EPOCH_NS) / DAY_NS
-    assert likely == pytest.approx(LIMIT / GROWTH_PER_DAY, rel=0.1)
-    assert found[HEALTHY, "balance"]["reached_t_ns"] is None
-    assert found[HEALTHY, "balance"]["unknown_reason"]
+    assert sorted(found) == list(range(FANS))
+    worn = found[WORN]
+    assert worn["t_ns"] == notes[-1].t_ns and 0 <= worn["t_ns"] - worn["seen_t_ns"] < NS_PER_DAY // 24
+    assert (worn["parameter"], worn["unit"], worn["limit"]) == ("speed", "relative", 0.1)
+    assert worn["change"] == pytest.approx(-LOSS, abs=2.0 * worn["change_std_error"])
+    assert abs(worn["beside"]) < 0.02
+    assert worn["per_day"]["low"] < PER_DAY < worn["per_day"]["high"] < 0.0
+    earliest, likely, latest = (
+        (worn["reached_t_ns"][name] - START_NS) / NS_PER_DAY for name in ("earliest", "likely", "latest")
+    )
+    assert earliest < 60.0 < latest and likely == pytest.approx(60.0, rel=0.15)
+    assert found[HEALTHY]["reached_t_ns"] is None
+    assert found[HEALTHY]["unknown_reason"]
 
 
 def test_parts_in_any_order_give_the_last_snapshot(tmp_path, notes):
@@ -85,48 +75,39 @@ def test_parts_in_any_order_give_the_last_snapshot(tmp_path, notes):
     assert rows(first) != rows(second)
 
 
-def test_people_are_shown_a_table(tmp_path, notes):
+def test_people_are_shown_a_table_that_says_when_its_values_hold(tmp_path, notes):
     done = fantwin("wear", recording(tmp_path / "r.mcap", notes))
     assert done.exit_code == 0
     lines = done.stdout.splitlines()
     assert lines[0].startswith(f"wear of {TRAY} up to ")
-    (worn,) = [line for line in lines if line.lstrip().startswith("1  ")]
-    assert re.search(r"balance +\+0.3\d+ +\+0.0\d+ ± 0.0\d+ +in 6.\d days \(", worn)
-    assert not [line for line in lines if line.lstrip().startswith("drag") and "days" in line]
-    assert "balance, friction: command in %; drag, gain: % of healthy" in lines[-2]
+    (worn,) = [line for line in lines if line.lstrip().startswith(f"{WORN}  ")]
+    seen_t_ns = json.loads(notes[-1].state_json)["wear"]["fans"][WORN]["seen_t_ns"]
+    at = f"{datetime.fromtimestamp(seen_t_ns / 1e9):%m-%d %H:%M}"
+    columns = r"-\d\.\d ± 1\.\d +[+-]\d\.\d +-0\.1\d\d ± 0\.0\d\d +in \d+ days \(\d+ to \d+\)"
+    assert re.search(f"{at} +{columns}", worn)
+    assert [line for line in lines if "no significant trend" in line]
+    assert "% of the speed, ± 95 %, since commissioning; beside: the change of the fans beside it" in lines[-1]
 
 
-def test_before_a_trend_the_error_of_the_last_point_is_shown(tmp_path, notes):
-    state = json.loads(notes[0].state_json)
-    drag = state["wear"]["fans"][WORN]["parameters"]["drag"]
-    drag |= {"change": 0.275, "per_day": None}
-    drag["series"]["std_error"][-1] = 0.18
-    early = replace(notes[0], state_json=json.dumps(state))
-    path = recording(tmp_path / "r.mcap", [early])
-    found = rows(path)
-    assert found[WORN, "drag"]["change_std_error"] == 0.18
-    trend = rows(recording(tmp_path / "later.mcap", notes))[WORN, "balance"]
-    assert trend["per_day"] and trend["change_std_error"] is None
-    assert re.search(r"drag +\+27.5 ± 36 +no trend yet", fantwin("wear", path).stdout)
+def test_before_a_trend_the_change_is_shown_with_its_interval(tmp_path):
+    path = recording(tmp_path / "r.mcap", [worn_snapshot(TRAY, FANS, WORN, START_NS, 0.3)])
+    assert rows(path)[WORN]["per_day"] is None
+    assert re.search(r"[+-]\d\S* ± \d\S* .* no trend yet +too few points", fantwin("wear", path).stdout)
 
 
 def without_points(note: ScorerSnapshot, *fans: int) -> ScorerSnapshot:
     state = json.loads(note.state_json)
     for fan in fans:
-        state["wear"]["fans"][fan]["t_ns"] = 0
-        for reported in state["wear"]["fans"][fan]["parameters"].values():
-            series = reported["series"]
-            reported.clear()
-            reported |= {"unit": "relative", "series": series}
+        state["wear"]["fans"][fan] |= dict.fromkeys(shown(None)) | {"series": WearSeries().snapshot()}
     return replace(note, state_json=json.dumps(state))
 
 
 def test_a_fan_without_points_is_named_below_the_table_and_a_tray_without_is_one_line(tmp_path, notes):
     path = recording(tmp_path / "r.mcap", [without_points(notes[0], HEALTHY)])
-    assert {fan for fan, _ in rows(path)} == {WORN}
-    later = "a fan has its first point some time after commissioning"
-    assert f"no data yet for fan 0: {later}" in fantwin("wear", path).stdout
-    path = recording(tmp_path / "none.mcap", [without_points(notes[0], HEALTHY, WORN)])
+    assert set(rows(path)) == set(range(FANS)) - {HEALTHY}
+    later = "a fan has its first point about an hour after commissioning"
+    assert f"no data yet for fan {HEALTHY}: {later}" in fantwin("wear", path).stdout
+    path = recording(tmp_path / "none.mcap", [without_points(notes[0], *range(FANS))])
     assert error_of("wear", path, "--json").startswith(f"no data yet for any fan of {TRAY}: {later}")
 
 

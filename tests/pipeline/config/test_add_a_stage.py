@@ -153,6 +153,6 @@ def alarm(tray: str) -> Alarm:
         t_ns=1,
         onset_t_ns=1,
         residual_rad_s=-3.0,
-        limit_rad_s=2.0,
+        residual_std_rad_s=2.0,
         message="too slow",
     )

@@ -15,7 +15,7 @@ name = "a"
 fans = 8
 port = "/dev/ttyUSB0"
 [scorer]
-on_delay_s = 0.25
+alarm_share = 0.25
 """
 
 
@@ -27,7 +27,7 @@ def test_a_good_file_gives_every_enabled_stage_its_section():
     config = parse(GOOD)
     assert config.site == "lab"
     assert config.tray("a").fans == 8
-    assert config.sections["scorer"].model_dump()["on_delay_s"] == 0.25
+    assert config.sections["scorer"].model_dump()["alarm_share"] == 0.25
     of_all = {"acquisition", "resampler", "twin_integrator", "scorer", "recorder", "viewer", "gateway"}
     assert set(config.sections) == of_all | {"learner"}, "the tray names no twin"
     assert set(parse(GOOD.replace("fans = 8", 'fans = 8\ntwin = "a.onnx"')).sections) == of_all
@@ -37,7 +37,7 @@ def test_a_good_file_gives_every_enabled_stage_its_section():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (GOOD + "on_dealy_s = 1\n", ["scorer.on_dealy_s", "did you mean 'on_delay_s'"]),
+        (GOOD + "alarm_shrae = 1\n", ["scorer.alarm_shrae", "did you mean 'alarm_share'"]),
         (GOOD.replace("fans = 8", "fnas = 8"), ["tray.0.fnas", "did you mean 'fans'"]),
         (GOOD.replace("[scorer]", "[scorrer]"), ["unknown key 'scorrer'", "did you mean 'scorer'"]),
         (GOOD.replace("fans = 8", "fans = 99"), ["fans = 99: a serial source carries at most 64 fans"]),
@@ -55,7 +55,7 @@ def test_a_good_file_gives_every_enabled_stage_its_section():
         ),
         ("format = '1'\n" + GOOD, ["a configuration of format '1'; ", "write format = 1, or leave it out"]),
         ("site = \n", ["not valid TOML"]),
-        (GOOD.replace("0.25", "inf"), ["scorer.on_delay_s = inf", "finite"]),
+        (GOOD.replace("0.25", "inf"), ["scorer.alarm_share = inf", "finite"]),
         (GOOD.replace("fans = 8", "fans = 8\nspeed_max = nan"), ["tray.0.speed_max = nan", "finite"]),
         (GOOD.replace("fans = 8", 'fans = 8\ntacho = { kind = "count" }'), ["tray.0.tacho", "needs window_s"]),
         (
@@ -64,7 +64,7 @@ def test_a_good_file_gives_every_enabled_stage_its_section():
         ),
         (GOOD.replace("fans = 8", "fans = 8\ntacho = [{}, {}]"), ["tray.0", "2 tachos for 8 fans"]),
         (GOOD + '[launcher]\nstages = ["scorr"]\n', ["unknown stage 'scorr'", "did you mean 'scorer'"]),
-        ("scorer = 3\n" + GOOD.replace("[scorer]\non_delay_s = 0.25", ""), ["'scorer' must be a section"]),
+        ("scorer = 3\n" + GOOD.replace("[scorer]\nalarm_share = 0.25", ""), ["'scorer' must be a section"]),
     ],
 )
 def test_a_mistake_is_one_line_with_file_key_and_remedy(text, words):
@@ -94,7 +94,7 @@ def test_launcher_stages_says_which_stages_are_enabled():
 
 
 def test_only_the_sections_of_the_stages_asked_for_are_checked():
-    wrong = GOOD + "on_dealy_s = 1\n"
+    wrong = GOOD + "alarm_shrae = 1\n"
     config = parse_config(wrong, Path("conf/fan.toml"), stages=("recorder",))
     assert set(config.sections) == {"recorder"}
     with pytest.raises(ConfigError, match="unknown key 'scorrer'"):
@@ -123,8 +123,8 @@ def test_two_trays_of_one_name_are_refused():
 
 
 def test_overrides_set_nested_keys_and_keep_their_types():
-    config = parse(GOOD, "scorer.on_delay_s=2.5", "tray.0.port=/dev/ttyACM1", "bus.endpoint='tcp/127.0.0.1:1'")
-    assert config.sections["scorer"].model_dump()["on_delay_s"] == 2.5
+    config = parse(GOOD, "scorer.alarm_share=2.5", "tray.0.port=/dev/ttyACM1", "bus.endpoint='tcp/127.0.0.1:1'")
+    assert config.sections["scorer"].model_dump()["alarm_share"] == 2.5
     assert config.tray("a").source == SerialConfig(port="/dev/ttyACM1")
     assert config.bus.endpoint == "tcp/127.0.0.1:1"
 
@@ -166,10 +166,10 @@ def test_a_file_that_is_not_utf_8_is_one_line(tmp_path):
             "recorder.part_bytes = 1000000000000000000000000000000: too large",
         ),
         (GOOD, ["recorder.part_bytes=" + 5000 * "9"], "longer than 1,000 characters"),
-        (GOOD + "smoothing_s = " + 5000 * "9", [], "not valid TOML: Exceeds the limit"),
-        (GOOD + "smoothing_s = " + 4000 * "9", [], "scorer.smoothing_s = 9999"),
-        (GOOD + "smoothing_s = " + 5000 * "[" + 5000 * "]", [], "nested too deeply"),
-        (GOOD, ["scorer.smoothing_s=" + 400 * "[" + 400 * "]"], "scorer.smoothing_s = [[[["),
+        (GOOD + "wear_every_s = " + 5000 * "9", [], "not valid TOML: Exceeds the limit"),
+        (GOOD + "wear_every_s = " + 4000 * "9", [], "scorer.wear_every_s = 9999"),
+        (GOOD + "wear_every_s = " + 5000 * "[" + 5000 * "]", [], "nested too deeply"),
+        (GOOD, ["scorer.wear_every_s=" + 400 * "[" + 400 * "]"], "scorer.wear_every_s = [[[["),
         (GOOD, [".".join(["scorer", *400 * ["a"]]) + "=1"], "unknown key 'scorer.a'"),
         (GOOD, [400 * "9" + "=1"], "unknown key '9999"),
         (GOOD, ["tray.0.command_min=1.5"], "tray.0: command_min = 1.5 is greater than command_max = 1"),

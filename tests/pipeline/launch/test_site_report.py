@@ -154,7 +154,7 @@ def test_an_alarm_that_came_and_went_between_two_looks_is_said_to_have_been_rais
             active=active,
             message=f"fan 2: {message}",
             residual_rad_s=1.0,
-            limit_rad_s=1.0,
+            residual_std_rad_s=1.0,
         )
 
     def cleared(onset_t_ns: int) -> Alarm:

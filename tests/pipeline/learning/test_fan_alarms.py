@@ -11,14 +11,14 @@ from schemas.messages import Score
 from schemas.units import NS_PER_S
 
 N, S, A, R = FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING
-SAY_NOTHING = [FanState.UNKNOWN, FanState.COMMISSIONING, FanState.STOPPED, FanState.STARTING]
+SAY_NOTHING = [FanState.UNKNOWN, FanState.STOPPED, FanState.STARTING]
 
 
 def score(*rows: list[FanState], first_s: int = 0) -> Score:
     """One row a second; a row has the state of each fan."""
     state = np.array([[int(each) for each in row] for row in rows], np.uint8)
     zeros = np.zeros(state.shape)
-    arrays = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s")
+    arrays = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance")
     return Score(
         fans=state.shape[1],
         period_ns=NS_PER_S,
@@ -62,10 +62,8 @@ def test_an_alarm_that_ends_in_the_same_score_is_seen() -> None:
 
 
 def test_fans_are_judged_where_one_has_a_known_state_or_is_idle() -> None:
-    unknown, stopped, commissioning = FanState.UNKNOWN, FanState.STOPPED, FanState.COMMISSIONING
-    seen = FanAlarms(2).update(
-        score([unknown, unknown], [unknown, N], [commissioning, unknown], [stopped, unknown], [A, N])
-    )
+    unknown, stopped = FanState.UNKNOWN, FanState.STOPPED
+    seen = FanAlarms(2).update(score([unknown, unknown], [unknown, N], [unknown, unknown], [stopped, unknown], [A, N]))
     assert seen.judged_t_ns.tolist() == [1 * NS_PER_S, 3 * NS_PER_S, 4 * NS_PER_S]
 
 

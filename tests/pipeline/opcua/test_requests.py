@@ -5,21 +5,19 @@ from __future__ import annotations
 import pytest
 
 from pipeline.opcua.requests import FAN_METHODS, METHODS, SHELVING_METHODS, status_of
-from schemas.enums import Action, Transition
+from schemas.enums import Action, Severity, Transition
 from schemas.messages import Alarm
 from scoring.alarms.fan_condition import GIVES_FEEDBACK, ConditionSettings, FanCondition
-from scoring.alarms.return_rule import ReturnEvidence
 from tests.stages.test_gateway import alarm
-from tests.support.score_alone import by_score
 
 NOW_NS = 1_790_000_000_000_000_000
 
 
 def answers(*actions: Action, confirming: bool = True, raised: bool = True, duration_ns: float = 0.0) -> Alarm:
     """What a fan's condition answers to the last of several requests."""
-    condition = FanCondition(ConditionSettings(0, by_score(10**9), confirming=confirming))
+    condition = FanCondition(ConditionSettings(confirming=confirming))
     if raised:
-        condition.update(NOW_NS, 10**7, 3.0, ReturnEvidence([3.0], 1.0))
+        condition.update(active=True, severity=Severity.ALARM, onset_t_ns=NOW_NS)
     transition = Transition.NONE
     for action in actions:
         transition, _ = condition.request(action, NOW_NS, duration_ns, "ann", "")

@@ -61,7 +61,7 @@ def raw(
 
 def alarm(sequence: int) -> Alarm:
     fields = {"onset_t_ns": 50, "residual_rad_s": 3.5, "message": f"alarm {sequence}", "active": sequence % 2 == 0}
-    fields |= {"transition": Transition.RAISED, "statistic": Statistic.SPEED_DRIFT}
+    fields |= {"transition": Transition.RAISED, "statistic": Statistic.DEVIATION}
     return made_messages.alarm(sequence, 70 + sequence, sequence=sequence, **fields)
 
 
@@ -149,7 +149,7 @@ def test_an_event_is_a_row(tmp_path):
     assert alarms["message"].tolist() == ["alarm 0", "alarm 1"]
     assert alarms.names("severity").tolist() == ["ALARM", "ALARM"]
     assert alarms.names("transition").tolist() == ["RAISED", "88"]
-    assert alarms.names("statistic").tolist() == ["SPEED_DRIFT", "SPEED_DRIFT"]
+    assert alarms.names("statistic").tolist() == ["DEVIATION", "DEVIATION"]
     (commands,) = read_arrays(path, "command")
     np.testing.assert_array_equal(commands["command"], [[1, nan]])
     assert commands["set_point_rad_s"].size == 0

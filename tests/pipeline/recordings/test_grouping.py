@@ -22,7 +22,7 @@ def test_parts_are_found_by_session_or_by_name_in_one_folder_and_nothing_else_is
     first = file(here / "day.mcap", recording="day.mcap", session="s1")
     restarted = file(here / "day-2.mcap", recording="day.mcap", session="s2")
     at_a_port = file(here / "day-4.mcap", recording="day.mcap", overrides=json.dumps(ANOTHER_PLACE))
-    deciding = file(here / "day-5.mcap", recording="day.mcap", overrides='["scorer.on_delay_s=1"]')
+    deciding = file(here / "day-5.mcap", recording="day.mcap", overrides='["scorer.alarm_share=1"]')
     moved = file(there / "day-3.mcap", recording="day.mcap", session="s2")
     of_another_tray = file(tmp_path / "elsewhere" / "day.mcap", recording="day.mcap", session="s9")
     of_another_site = file(here / "day-9.mcap", recording="day.mcap", session="s1", site="other")

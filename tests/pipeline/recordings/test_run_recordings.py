@@ -98,7 +98,7 @@ def test_shards_of_hosts_that_run_at_different_places_are_one_run_and_those_that
         assert [tray.name for tray in both.trays] == list(TRAYS)
     other = tmp_path / "other"
     other.mkdir()
-    strict = shard(sites, other, 2, overrides='["scorer.alarm_sigmas=9.0"]')
+    strict = shard(sites, other, 2, overrides='["scorer.alarm_share=0.9"]')
     with (
         pytest.raises(RecordingError, match="they differ in keys set on the command line"),
         open_replay_input([here, strict], None, (), None),

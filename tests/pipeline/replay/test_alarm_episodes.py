@@ -17,7 +17,7 @@ def alarm(
     t_ns: int, transition: Transition = Transition.RAISED, *, fan: int = 0, tray: str = "a", **more: Any
 ) -> Alarm:
     fields: dict[str, Any] = {"active": transition != Transition.CLEARED, "severity": Severity.WARNING, "onset_t_ns": 5}
-    fields |= {"residual_rad_s": float(t_ns), "limit_rad_s": 1.0, "message": transition.name.lower()}
+    fields |= {"residual_rad_s": float(t_ns), "residual_std_rad_s": 1.0, "message": transition.name.lower()}
     return Alarm(header=Header("p", 0, tray), fan=fan, t_ns=t_ns, transition=transition, **fields | more)
 
 

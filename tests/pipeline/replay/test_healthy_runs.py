@@ -4,51 +4,56 @@ from __future__ import annotations
 
 import errno
 import os
-import pickle
 import shutil
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import fields
-from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, NoReturn
 
-import numpy as np
 import pytest
 
+from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.errors import UserError
-from pipeline.recordings.reading import read_metadata
-from pipeline.replay.offline import healthy_runs
-from pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
-from pipeline.replay.offline.kept_samples import KeptSamples
-from pipeline.runtime.tray_twin import load_tray_twin
-from scoring.calibration.healthy_statistics import HealthyRun, MixedRatesError, statistics_of_run
-from scoring.limits import Limits
-from scoring.samples import Samples
+from pipeline.replay.offline import healthy_runs, kept_bins
+from pipeline.replay.offline.healthy_runs import DecidedRun, HealthyPart, HealthyRuns, LearnedRun, Limit
+from pipeline.replay.offline.kept_bins import KeptBins
+from scoring.model.learned import learned_priors
+from scoring.model.priors import Priors
+from tests.support.healthy_site import recorded, start_ns
+from tests.support.twin_files import write_twin
 
-GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
-ROOM = 1_000_000
-
-
-@pytest.fixture
-def part(tmp_path: Path) -> HealthyPart:
-    twin = tmp_path / "twin.onnx"
-    twin.write_bytes(read_metadata(GOLDEN).attachments["tray1.onnx"])
-    return HealthyPart(twin)
+ROOM_BYTES = 10_000_000
+LIMIT = Limit(Priors(), 60.0)
 
 
-def kept_in(folder: Path, room: int) -> KeptSamples:
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("healthy")
+    return [recorded(folder / f"{seed}.mcap", seed, 20.0 + seed, has_fault=seed == 3) for seed in range(1, 4)]
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> HealthyPart:
+    return HealthyPart(write_twin(tmp_path_factory.mktemp("twin") / "twin.onnx", fans=2))
+
+
+def kept_in(folder: Path, room_bytes: int = ROOM_BYTES) -> KeptBins:
     folder.mkdir()
-    return KeptSamples(folder, room)
+    return KeptBins(folder, room_bytes)
 
 
-def samples_in(runs: HealthyRuns) -> list[Samples]:
-    """All blocks of a pass."""
-    collect: Any = lambda run: list(run.blocks)  # noqa: E731  stands for the work of calibration
-    return [block for blocks in runs(collect) for block in blocks]  # type: ignore[union-attr]
+def told(run: LearnedRun | DecidedRun) -> Any:
+    """What a run tells, to be compared."""
+    if isinstance(run, DecidedRun):
+        return run
+    return run.tray, [values.tolist() for values in vars(run.sums).values()]
 
 
-def computed_at_each_opening(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+def of_both_passes(runs: HealthyRuns) -> list[Any]:
+    return [told(run) for run in (*runs.learned(), *runs.decided(LIMIT))]
+
+
+def counted_openings(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     opened: list[Path] = []
     open_input: Callable[..., Any] = healthy_runs.open_replay_input
 
@@ -60,71 +65,97 @@ def computed_at_each_opening(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return opened
 
 
-def test_samples_are_computed_once_and_then_read_from_the_folder(
-    part: HealthyPart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_several_processes_that_keep_bins_find_what_one_does_that_keeps_none(
+    recordings: list[Path], part: HealthyPart, tmp_path: Path
 ) -> None:
-    opened = computed_at_each_opening(monkeypatch)
-    runs = HealthyRuns([GOLDEN], part, kept=kept_in(tmp_path / "kept", ROOM))
-    first, again = samples_in(runs), samples_in(runs)
-    assert opened == [GOLDEN]
-    assert len(first) == len(again) > 0
-    for one, other in zip(first, again, strict=True):
-        for column in fields(Samples):
-            np.testing.assert_array_equal(getattr(one, column.name), getattr(other, column.name))
-    assert [(tray.tray, tray.fans) for tray in runs.trays] == [("tray1", 2)]
+    alone = HealthyRuns(recordings, part)
+    with RecordingsInParallel(jobs=2) as pool:
+        together = HealthyRuns(recordings, part, pool.map, kept_in(tmp_path / "kept"))
+        assert of_both_passes(together) == of_both_passes(alone)
+        priors = [learned_priors([run.sums for run in runs.learned()]) for runs in (alone, together)]
+    assert priors[0] == priors[1]
+    assert {run.alarms for run in alone.decided(LIMIT)} != {(0, 0)}, "or there was nothing to compare"
+    assert [run.tray.path for run in together.learned()] == recordings
 
 
-def test_where_room_or_the_disk_is_full_samples_are_computed_again(
-    part: HealthyPart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_bins_are_computed_once_and_then_read_from_the_folder(
+    recordings: list[Path], part: HealthyPart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened = computed_at_each_opening(monkeypatch)
-    whole = len(samples_in(HealthyRuns([GOLDEN], part)))
-    short = kept_in(tmp_path / "short", 100)
-    runs = HealthyRuns([GOLDEN], part, kept=short)
-    assert len(samples_in(runs)) == len(samples_in(runs)) == whole
-    assert opened == [GOLDEN] * 3
-    assert sum(file.stat().st_size for file in short.folder.iterdir()) < 100_000
-    opened.clear()
-    kept = kept_in(tmp_path / "kept", ROOM)
-    runs = HealthyRuns([GOLDEN], part, kept=kept)
+    monkeypatch.setattr(kept_bins, "AT_ONCE", 17)
+    opened = counted_openings(monkeypatch)
+    runs = HealthyRuns(recordings, part, kept=kept_in(tmp_path / "kept"))
+    first = of_both_passes(runs)
+    assert opened == recordings
+    assert of_both_passes(runs) == first
+    assert opened == recordings
 
-    def refused_after_some(_content: object, file: BinaryIO) -> NoReturn:
-        file.write(bytes(10))
+
+def test_what_is_kept_is_compact(recordings: list[Path], part: HealthyPart, tmp_path: Path) -> None:
+    kept = kept_in(tmp_path / "kept")
+    HealthyRuns(recordings, part, kept=kept).learned()
+    size = sum(file.stat().st_size for file in kept.folder.iterdir())
+    bins_of_fans = 2 * 10 * sum(20 + seed for seed in range(1, 4))
+    assert size / bins_of_fans < 120 + 10 * 30, "of a bin of ten samples, as at MOST_KEPT_BYTES of `calibrate`"
+
+
+def test_where_room_or_the_disk_is_full_bins_are_computed_again(
+    recordings: list[Path], part: HealthyPart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = counted_openings(monkeypatch)
+    whole = of_both_passes(HealthyRuns(recordings[:1], part))
+    short = kept_in(tmp_path / "short", 1000)
+    assert of_both_passes(HealthyRuns(recordings[:1], part, kept=short)) == whole
+    assert len(opened) == 4
+    assert list(short.folder.iterdir()) == []
+
+    def refused() -> NoReturn:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(pickle, "dump", refused_after_some)
-    assert len(samples_in(runs)) == len(samples_in(runs)) == whole
-    assert opened == [GOLDEN] * 2
-    assert sum(file.stat().st_size for file in kept.folder.iterdir()) < 100
+    kept = kept_in(tmp_path / "kept")
+    real_open = Path.open
+    monkeypatch.setattr(
+        Path, "open", lambda path, mode="r", *more: refused() if mode == "ab" else real_open(path, mode)
+    )
+    assert of_both_passes(HealthyRuns(recordings[:1], part, kept=kept)) == whole
+    assert list(kept.folder.iterdir()) == []
 
 
-def test_a_recording_whose_grid_changes_is_a_bad_one(part: HealthyPart) -> None:
-    def found_to_change(run: HealthyRun) -> NoReturn:
-        raise MixedRatesError((run.name, 10_000_000), (run.name, 20_000_000))
-
-    with pytest.raises(UserError, match="golden.mcap: its grid changes between 100 Hz and 50 Hz"):
-        list(HealthyRuns([GOLDEN], part)(found_to_change))
-
-
-def test_a_pass_that_ends_early_is_not_taken_for_a_whole_recording(part: HealthyPart, tmp_path: Path) -> None:
-    runs = HealthyRuns([GOLDEN], part, kept=kept_in(tmp_path / "kept", ROOM))
-    first_block: Any = lambda run: next(iter(run.blocks))  # noqa: E731
-    list(runs(first_block))
-    whole = samples_in(HealthyRuns([GOLDEN], part))
-    assert [len(block.t_ns) for block in samples_in(runs)] == [len(block.t_ns) for block in whole]
+def test_a_pass_that_ends_early_is_not_taken_for_a_whole_recording(
+    recordings: list[Path], part: HealthyPart, tmp_path: Path
+) -> None:
+    kept = kept_in(tmp_path / "kept")
+    for run in healthy_runs._Source(part, kept, lambda _: None).runs(recordings[0]):  # pyright: ignore[reportPrivateUsage]
+        next(iter(run.bins))
+    assert kept.of(recordings[0]) is None
 
 
-def test_many_recordings_take_no_more_memory_than_one(part: HealthyPart, tmp_path: Path) -> None:
-    limits = Limits.model_validate(load_tray_twin(part.twin).card.calibration)
-    copies = [Path(shutil.copy(GOLDEN, tmp_path / f"{number}.mcap")) for number in range(4)]
+def test_what_was_left_out_and_what_lies_outside_the_part_is_not_counted(
+    recordings: list[Path], part: HealthyPart
+) -> None:
+    def hours(of: HealthyPart) -> float:
+        return sum(run.fan_hours for run in HealthyRuns(recordings[:1], of).learned())
 
-    def peak_of(recordings: list[Path]) -> int:
-        score: Callable[[HealthyRun], Any] = partial(statistics_of_run, limits=limits, top_speed_rad_s=200.0)
+    whole = hours(part)
+    assert whole == pytest.approx(2 * 21.0 / 3600.0, rel=0.1)
+    first_half = HealthyPart(part.twin, to_s=10.0)
+    assert hours(first_half) == pytest.approx(0.5 * whole, rel=0.2)
+    span = healthy_runs.LeftOut("", None, "tray1", 1, start_ns(1), start_ns(2))
+    assert hours(HealthyPart(part.twin, left_out=(span,))) == pytest.approx(0.5 * whole, rel=0.01)
+    with pytest.raises(UserError, match=r"1.mcap: tray1: no samples from 500 s to inf s; see --from and --to"):
+        hours(HealthyPart(part.twin, from_s=500.0))
+
+
+def test_many_recordings_take_no_more_memory_than_one(
+    recordings: list[Path], part: HealthyPart, tmp_path: Path
+) -> None:
+    copies = [Path(shutil.copy(recordings[0], tmp_path / f"{number}.mcap")) for number in range(3)]
+
+    def peak_of(paths: list[Path]) -> int:
         tracemalloc.start()
-        found = list(HealthyRuns(recordings, part)(score))
+        found = of_both_passes(HealthyRuns(paths, HealthyPart(part.twin, to_s=6.0)))
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        assert len(found) == len(recordings)
+        assert len(found) == 2 * len(paths)
         return peak
 
     peak_of(copies[:1])  # what is imported and cached once

@@ -19,12 +19,12 @@ from pipeline.recordings.records import RecordReader
 from pipeline.replay.offline.alarm_episodes import episodes
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import rescore
-from schemas.enums import Action, FanState, Transition
+from schemas.enums import Action, FanState, Severity, Transition
 from schemas.messages import Alarm, Score
 from schemas.units import NS_PER_S
 from tests.support.killed_site import CHAIN, Site
 from tests.support.offline_replay import alarms_of, changed, made_equal, recorded, verified
-from tests.support.twin_files import write_twin
+from tests.support.twin_files import small_hybrid, write_twin
 
 
 def test_a_run_that_nothing_disturbed_is_decided_the_same(undisturbed):
@@ -109,15 +109,16 @@ def test_a_site_that_was_presented_by_a_replay_began_without_its_snapshot_and_so
     assert made_equal(verified(path)) == sum(len(score.t_ns) for score in scores) > 250
 
 
-def test_with_other_limits_a_session_continues_from_the_replayed_state_of_the_one_before(scorer_killed):
-    with open_replay_input([scorer_killed], None, ("scorer.limit_factor=1000",), None) as replay_input:
+def test_with_another_setting_a_session_continues_from_the_replayed_state_of_the_one_before(scorer_killed):
+    with open_replay_input([scorer_killed], None, ("scorer.alarm_share=9.0",), None) as replay_input:
         (tray,) = rescore(replay_input, None, verify=False)
-    assert any(alarm.transition == Transition.REPUBLISHED for alarm in tray.recorded_alarms)
-    assert tray.alarms == []
+    for alarms, severity in ((tray.recorded_alarms, Severity.ALARM), (tray.alarms, Severity.WARNING)):
+        (republished,) = [alarm for alarm in alarms if alarm.transition == Transition.REPUBLISHED and alarm.active]
+        assert republished.severity == severity
     assert tray.counts["snapshots_of_another_twin"] == 0
 
 
-def test_with_another_twin_a_restart_costs_no_commissioning(scorer_killed, tmp_path):
+def test_with_another_twin_a_restart_takes_no_snapshot_of_another_one(scorer_killed, tmp_path):
     other = write_twin(tmp_path / "other.onnx", fans=1)
     with open_replay_input([scorer_killed], None, (), other) as replay_input:
         (tray,) = rescore(replay_input, None, verify=False)
@@ -176,13 +177,13 @@ def test_parts_that_overlap_are_one_recording(tmp_path):
 
 
 def test_another_twin_is_a_what_if(undisturbed, tmp_path):
-    other = write_twin(tmp_path / "other.onnx", fans=1)
+    other = write_twin(tmp_path / "other.onnx", small_hybrid(), fans=1)
     with open_replay_input([undisturbed], None, (), other) as replay_input:
         assert not replay_input.is_as_recorded
         (tray,) = rescore(replay_input, None, verify=False)
     assert tray.samples == sum(len(score.t_ns) for score in recorded(undisturbed, "score"))
     assert 1 not in {alarm.fan for alarm in tray.recorded_alarms}
-    assert {alarm.fan for alarm in tray.alarms} == {0, 1, 2}, "it is of another fan"
+    assert 1 in {alarm.fan for alarm in tray.alarms}, "it is of another fan"
 
 
 def test_the_output_is_a_recording_that_is_decided_the_same(tmp_path):
@@ -237,7 +238,7 @@ def test_a_recorded_snapshot_is_restored_and_its_replay_is_equal():
     tray = verified(DATA / "golden-restart.mcap")
     assert [session.snapshot is not None for session in tray.plan.last] == [False, True] and tray.plan.restarts == 1
     assert made_equal(tray, share=1.0) > 250
-    assert tray.comparison and tray.comparison.alarms_equal == 8
+    assert tray.comparison and tray.comparison.alarms_equal == 7
     restored = [alarm for alarm in tray.alarms if alarm.transition == Transition.REPUBLISHED]
     operators = {
         alarm.fan: (alarm.acknowledged, alarm.shelved_until_t_ns > 0, alarm.out_of_service) for alarm in restored
@@ -266,7 +267,7 @@ def test_row_13_alarms_stand_where_the_clock_of_the_stages_before_was_set_back_a
     tmp_path, restored_s_before_data
 ):
     site = Site(tmp_path, seed=1, raw_samples=4, calibrated=True)
-    site.run(120)
+    site.run(200)
     site.restart_source()
     for stage in CHAIN:
         site.kill(stage)
@@ -284,11 +285,11 @@ def test_row_13_alarms_stand_where_the_clock_of_the_stages_before_was_set_back_a
 
 
 @pytest.mark.parametrize("set_back_s", [2, 3600])
-def test_row_13_a_site_restarted_after_its_clock_was_set_back_goes_on_with_its_baselines_and_alarms(
+def test_row_13_a_site_restarted_after_its_clock_was_set_back_goes_on_with_what_it_learned_and_its_alarms(
     tmp_path, set_back_s
 ):
     site = Site(tmp_path, seed=1, raw_samples=4, calibrated=True)
-    site.run(120)
+    site.run(200)
     site.set_clock_back(set_back_s)
     site.restart_source()
     for stage in CHAIN:
@@ -305,8 +306,9 @@ def test_row_13_a_site_restarted_after_its_clock_was_set_back_goes_on_with_its_b
     ]
     assert after[0].t_ns[0] < before[-1].t_ns[-1], "it is judged at once"
     states = np.concatenate([score.state for score in after])
-    assert not (states == FanState.COMMISSIONING).any()
-    assert [a.transition for a in alarms_of(site.path)][3:6] == [Transition.REPUBLISHED] * 3
-    assert all(a.active and a.onset_t_ns < site.now_ns for a in alarms_of(site.path)[3:6])
+    assert not (states[:100, 0] == FanState.NORMAL).any()
+    raised, republished, *_ = alarms_of(site.path)
+    assert (raised.transition, republished.transition) == (Transition.RAISED, Transition.REPUBLISHED)
+    assert republished.active and republished.onset_t_ns < site.now_ns
     assert made_equal(tray) == sum(len(score.t_ns) for score in recorded(site.path, "score"))
     assert tray.comparison and tray.comparison.alarms_equal == len(alarms_of(site.path))

@@ -30,7 +30,7 @@ def packet(sequence: int, producer: str = PRODUCER) -> Envelope:
         t_ns=0,
         onset_t_ns=0,
         residual_rad_s=0,
-        limit_rad_s=0,
+        residual_std_rad_s=0,
         message="",
     )
     return Envelope(KEY, "alarm", b"", 0, alarm)

@@ -238,7 +238,7 @@ def test_row_07_alarms_of_a_second_scorer_are_not_shown(config):
                 t_ns=1,
                 onset_t_ns=1,
                 residual_rad_s=0,
-                limit_rad_s=0,
+                residual_std_rad_s=0,
                 message="",
             )
             site.publisher(key, BY_NAME["alarm"], type_name(Alarm), session.producer).put(encode(alarm))

@@ -89,12 +89,12 @@ def test_a_file_that_is_no_whole_snapshot_is_refused_in_one_line(tmp_path: Path)
     assert str(refused.value) == f"{tmp_path}: cannot read the scorer's snapshot: Is a directory"
 
 
-@pytest.mark.parametrize(("number", "advice"), [(0, "remove it to start without one"), (2, "update fantwin")])
+@pytest.mark.parametrize(("number", "advice"), [(0, "remove it to start without one"), (3, "update fantwin")])
 def test_a_snapshot_of_an_unknown_format_is_refused_in_one_line(tmp_path: Path, number: int, advice: str) -> None:
     unknown = replace(snapshot(9), format=number)
     store = SnapshotStore(tmp_path / "m.snapshot")
     store.save(unknown)
-    with pytest.raises(StageError, match=rf"m\.snapshot: a scorer's snapshot .*reads format 1: {advice}"):
+    with pytest.raises(StageError, match=rf"m\.snapshot: a scorer's snapshot .*reads format 2: {advice}"):
         store.load()
     with pytest.raises(StageError, match=rf"m: the snapshot that the recorder keeps: .*{advice}"):
         SnapshotStore(tmp_path / "n" / "m.snapshot", lambda _is_patient: ([unknown], "")).load()

@@ -19,7 +19,7 @@ CALM = {"active": False, "severity": Severity.NONE}
 @pytest.mark.parametrize(
     ("transition", "more", "level", "text"),
     [
-        (RAISED, {"statistic": Statistic.BALANCE_DRIFT}, "WARN", "warning raised, torque balance 1.7 x its limit"),
+        (RAISED, {"statistic": Statistic.DEVIATION}, "WARN", "warning raised, speed off, evidence 1.7 x its limit"),
         (
             Transition.SEVERITY,
             {"severity": Severity.ALARM, "statistic": Statistic.STANDSTILL},
@@ -43,7 +43,7 @@ def test_a_line_says_what_happened_and_is_short(
     transition: Transition, more: dict[str, Any], level: str, text: str
 ) -> None:
     fields = {"fan": 0, "active": True, "severity": Severity.WARNING, "t_ns": 1, "onset_t_ns": 1, "score": 1.73}
-    fields |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so " * 99, "transition": transition}
+    fields |= {"residual_rad_s": 0.0, "residual_std_rad_s": 0.0, "message": "so " * 99, "transition": transition}
     line = log_line(Alarm(header=Header("p", 0, "tray1"), **fields | more))
     assert line == ("tray1", 1, level, f"fan 0: {text}")
     assert len(line.text) <= LINE_LENGTH

@@ -26,7 +26,7 @@ class Transitions:
         self._count += 1
         onset_t_ns = START_NS + fan * 1_000_000_000
         fields = {"active": True, "severity": Severity.ALARM, "confirmed": True, "t_ns": onset_t_ns, "score": 2.0}
-        fields |= {"residual_rad_s": 0.0, "limit_rad_s": 1.0, "statistic": Statistic.SPEED_DRIFT, "message": "so"}
+        fields |= {"residual_rad_s": 0.0, "residual_std_rad_s": 1.0, "statistic": Statistic.DEVIATION, "message": "so"}
         header = Header("scorer", self._count, "tray1")
         self._table.add(
             Alarm(header=header, fan=fan, onset_t_ns=onset_t_ns, transition=transition, **{**fields, **more})
@@ -49,7 +49,7 @@ def test_active_alarms_come_first_with_cause_and_who_has_seen_them_and_those_ove
     alarms.add(1, Transition.ACKNOWLEDGED, acknowledged=True, operator_name="ann|b")
     assert rows(table) == [
         r"| **tray1/1** | alarm | 22:13:21 | more drag 90 % | ann\|b |",
-        "| **tray1/2** | warning | 22:13:22 | speed 2 x its limit | nobody |",
+        "| **tray1/2** | warning | 22:13:22 | speed off, evidence 2 x its limit | nobody |",
         "| tray1/3 | over | 22:13:23 |  | nobody |",
     ]
     assert table.text().startswith("#### 2 active, 1 over")

@@ -23,10 +23,7 @@ ALARMS = {
     *("tray1 / fan 2 speed (rad/s)", "tray1 / fan 2 torque balance", "tray1 / fan 2 score"),
     *("state of each fan", "alarms", "alarm log"),
 }
-WEAR = {
-    *("tray1 / torque balance since commissioning (command)", "tray1 / drag since commissioning (% of healthy)"),
-    *("tray1 / friction since commissioning (command)", "tray1 / gain since commissioning (% of healthy)"),
-}
+WEAR = {"tray1 / speed since commissioning (%)"}
 
 
 @pytest.mark.slow

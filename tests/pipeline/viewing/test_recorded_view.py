@@ -85,7 +85,7 @@ def test_a_recording_has_the_entities_and_components_of_the_live_view_and_the_sa
     shown = ("/tray1/fan_2/speed", "/tray1/fan_2/deviation", "/tray1/balance/page_0", "/tray1/score/page_0")
     for entity in (*shown, "/tray1/temperature_c/fan_0", "/tray1/state/fan_2", "/tray1/log", "/site/alarms"):
         assert "time" in parts[entity], entity
-    assert parts["/wear/drag/tray1/fan_2"] == {"day", "Measurements:values", "Measurements:variances"} | {
+    assert parts["/wear/tray1/fan_2"] == {"day", "Measurements:values", "Measurements:variances"} | {
         f"Measurements:{name}" for name in ("names", "colors", "widths")
     }
     assert "TextDocument:text" in parts["/stages"]

@@ -32,7 +32,14 @@ OVER = {"active": False, "acknowledged": True, "confirmed": True}
 )
 def test_a_state_and_its_message_agree_on_retained_silenced_presented_and_listed(flags, retained, silenced):
     message = Alarm(
-        fan=0, severity=Severity.ALARM, t_ns=1, onset_t_ns=1, residual_rad_s=0.0, limit_rad_s=0.0, message="", **flags
+        fan=0,
+        severity=Severity.ALARM,
+        t_ns=1,
+        onset_t_ns=1,
+        residual_rad_s=0.0,
+        residual_std_rad_s=0.0,
+        message="",
+        **flags,
     )
     for alarm in (AlarmState(**flags), message):
         assert (is_retained(alarm), is_silenced(alarm)) == (retained, silenced)

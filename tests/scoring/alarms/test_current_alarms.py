@@ -20,7 +20,12 @@ def alarm(
     transition: Transition = Transition.RAISED, t_ns: int = 1, *, tray: str = "a", producer: str = "p", **more: Any
 ) -> Alarm:
     fields: dict[str, Any] = {"fan": 0, "active": True, "severity": Severity.WARNING, "onset_t_ns": 1}
-    fields |= {"confirmed": True, "residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": f"{transition.name} at {t_ns}"}
+    fields |= {
+        "confirmed": True,
+        "residual_rad_s": 0.0,
+        "residual_std_rad_s": 0.0,
+        "message": f"{transition.name} at {t_ns}",
+    }
     return Alarm(header=Header(producer, next(_numbers), tray), t_ns=t_ns, transition=transition, **fields | more)
 
 

@@ -1,151 +1,90 @@
-"""scoring.diagnosis.standstill_causes: a blocked fan and one without power, by the readings of a counting tacho."""
+"""scoring.diagnosis.standstill_causes: a blocked fan and one without power, whatever its tacho."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from schemas.standstill import Standstill
-from schemas.tacho import Tacho
-from scoring.diagnosis.diagnosis import RankedCause
-from scoring.diagnosis.regression_window import HealthyBalance, Window
-from scoring.diagnosis.standstill_causes import coming_to_rest, standstill_causes
-from simulation.four_pin import FourPinDamage, FourPinFans, four_pin_tray
-from simulation.tacho import CountingTacho
+from scoring.diagnosis.standstill_causes import BEGUN, Fall, Standing, standstill_causes
 
-PERIOD_S, FAULT_S, FANS = 0.1, 30.0, 12
-HEALTHY = Standstill(
-    turning_command=0.15,
-    standing_below_rad_s=14.1,
-    off_command=0.0,
-    start_s=1.5,
-    coast_s=7.0,
-    coast_time_constant_s=1.25,
-)
-BALANCE = HealthyBalance(0.002, 0.004, 0.0, 0.07, 0.0, np.zeros((4, 4)), 3.0, 0.02, 0.1)
-PLATEAU, HIGH = 0.16, 0.8
-"""duties"""
-OF_TURNING = (RankedCause("gain_down", 0.8, None, ""), RankedCause("cannot_tell", 0.2, None, ""))
-Floats = NDArray[np.float64]
+AT_ONCE_S, RESTS = 0.03, 0.08
+"""time constant of a rotor that is held; share of the speed below which a reading is of a fan at rest"""
+PHASES = np.linspace(0.0, 1.0, 20, endpoint=False)
+COASTS_S = np.array([0.8, 1.3, 2.0, 4.0])
 
 
-def readings(duty: float, tacho: Tacho, damage: Callable[[NDArray[np.bool_]], FourPinDamage]) -> tuple[Floats, Floats]:
-    """(n, FANS) of fans of which each has a fault from FAULT_S on, or up to a second later; and since when, (FANS,)."""
-    fault_s = FAULT_S + np.random.default_rng(1).random(FANS)
-    fans = FourPinFans(four_pin_tray(FANS, 2), np.random.default_rng(3), 1)
-    counter = CountingTacho((tacho,) * FANS, 0.0, 0.0, np.random.default_rng(4))
-    readings = []
-    for number in range(round((FAULT_S + 10.0) / PERIOD_S)):
-        now_s, before = number * PERIOD_S, fans.speed_rad_s
-        fans.damage = damage(now_s >= fault_s)
-        fans.advance(np.full(FANS, duty), PERIOD_S)
-        counter.turn(now_s, before, now_s + PERIOD_S, fans.speed_rad_s)
-        readings.append(counter.reading_rad_s.copy())
-    return np.array(readings), fault_s
+def lasted_s(constant_s: float, held_s: float, phase: float) -> float:
+    """What a tacho shows of an exponential fall that begins at a phase of a reading, each a mean over held_s."""
+    ends_s = held_s * np.arange(1.0, np.ceil(8.0 * constant_s / held_s) + 3.0)
+    after_s = np.maximum(np.concatenate(([0.0], ends_s)) - phase * held_s, 0.0)
+    turned = np.diff(np.concatenate(([0.0], ends_s)) - after_s + constant_s * -np.expm1(-after_s / constant_s))
+    shares = turned / held_s
+    return float(held_s * shares[(shares < BEGUN) & (shares > RESTS)].sum())
 
 
-def blocked(is_faulty: NDArray[np.bool_]) -> FourPinDamage:
-    return FourPinDamage(is_blocked=is_faulty)
+def probabilities(fall: Fall) -> dict[str, float]:
+    return {each.cause: each.probability for each in standstill_causes(Standing.CAME_TO_REST, fall)}
 
 
-def unpowered(is_faulty: NDArray[np.bool_]) -> FourPinDamage:
-    return FourPinDamage(is_unpowered=is_faulty)
+def right_first(cause: str, held_in_coasts: float) -> float:
+    """Share of falls, over tachos, phases and fans, of which the cause is named first."""
+    hits = []
+    for coast_s in COASTS_S:
+        for factor in (0.75, 0.9, 1.0, 1.15, 1.4):
+            constant_s = coast_s * factor if cause == "no_power" else AT_ONCE_S
+            held_s = held_in_coasts * coast_s
+            hits += [
+                max(found, key=found.__getitem__) == cause
+                for found in (
+                    probabilities(Fall(lasted_s(constant_s, held_s, phase), coast_s, held_s)) for phase in PHASES
+                )
+            ]
+    return float(np.mean(hits))
 
 
-def slowed(is_faulty: NDArray[np.bool_]) -> FourPinDamage:
-    """To half of the speed."""
-    return FourPinDamage(speed_factor=np.where(is_faulty, 0.5, 1.0))
+@pytest.mark.parametrize(("held_in_coasts", "least"), [(0.02, 0.99), (0.1, 0.99), (0.3, 0.99), (0.5, 0.95), (0.8, 0.7)])
+def test_a_blocked_fan_and_one_without_power_are_told_apart_by_how_long_they_ran_on(held_in_coasts, least) -> None:
+    assert right_first("no_power", held_in_coasts) >= least
+    assert right_first("blocked", held_in_coasts) >= least
 
 
-def causes(duty: float, window_s: float, *, is_blocked: bool) -> list[dict[str, float]]:
-    """Of several fans, half a second after each reads as if it stood."""
-    tacho = Tacho(kind="count", window_s=window_s)
-    speed, fault_s = readings(duty, tacho, blocked if is_blocked else unpowered)
-    began = np.arange(len(speed))[:, np.newaxis] * PERIOD_S > fault_s
-    stands = ((speed < HEALTHY.standing_below_rad_s) & began).argmax(axis=0) + 6
-    found = []
-    for fan, end in enumerate(stands.tolist()):
-        window = Window(PERIOD_S, np.full(end, duty), speed[:end, fan], onset=end - 6)
-        found.append(probabilities(standstill_causes(window, HEALTHY, BALANCE, tacho)))
-    return found
+def test_a_tacho_that_is_slower_than_a_coast_tells_nothing() -> None:
+    for lasted in np.linspace(0.0, 3.75, 9):
+        assert max(probabilities(Fall(float(lasted), 0.5, 5.0)).values()) < 0.5
 
 
-def first_after(
-    duty: float, window_s: float, damage: Callable[[NDArray[np.bool_]], FourPinDamage], after_s: float
-) -> list[str]:
-    """The cause named first of each fan so long after its fault, where those of a fan that turns name a weak drive."""
-    tacho = Tacho(kind="count", window_s=window_s)
-    speed, fault_s = readings(duty, tacho, damage)
-    named = []
-    for fan, fault in enumerate(fault_s.tolist()):
-        end = round((fault + after_s) / PERIOD_S)
-        window = Window(PERIOD_S, np.full(end, duty), speed[:end, fan], onset=end - 10)
-        rest = coming_to_rest(window, HEALTHY, BALANCE, tacho)
-        ranked = rest.beside(OF_TURNING) if rest else OF_TURNING
-        assert sum(probabilities(ranked).values()) == pytest.approx(1.0)
-        named.append(ranked[0].cause)
-    return named
+def test_a_longer_fall_never_makes_a_blocked_rotor_likelier_than_no_power() -> None:
+    for held_s in (0.02, 0.1, 0.5, 1.0):
+        found = [probabilities(Fall(float(each), 1.3, held_s)) for each in np.linspace(0.0, 6.0, 120)]
+        ratio = [each.get("no_power", 0.0) - each.get("blocked", 0.0) for each in found]
+        assert ratio[0] < 0.0 < ratio[-1]
+        assert np.count_nonzero(np.diff(np.sign(ratio))) == 1, held_s
 
 
-def probabilities(ranked: tuple[RankedCause, ...]) -> dict[str, float]:
-    return {each.cause: each.probability for each in ranked}
+def test_a_fall_at_once_may_be_the_tachos_and_its_length_is_in_the_words() -> None:
+    first, second = standstill_causes(Standing.CAME_TO_REST, Fall(0.04, 1.3, 0.1), 25.0)
+    assert (first.cause, second.cause) == ("blocked", "no_tacho")
+    assert first.probability == pytest.approx(0.6, abs=0.02)
+    assert (
+        first.evidence
+        == "does not turn although commanded to 25; it ran on for 0.0 s, without power it would for 1.3 s"
+    )
+    assert (first.parameter, first.change, first.unit) == ("command", 25.0, "command")
 
 
-@pytest.mark.parametrize(("duty", "window_s"), [(PLATEAU, 1.0), (HIGH, 0.5)])
-def test_a_fan_without_power_is_told_from_a_blocked_one(duty: float, window_s: float) -> None:
-    for is_blocked, cause in ((True, "blocked"), (False, "no_power")):
-        found = causes(duty, window_s, is_blocked=is_blocked)
-        first = [max(each, key=lambda name: each[name]) for each in found]
-        wrong = [each for each, name in zip(found, first, strict=True) if name != cause]
-        assert len(wrong) <= 0.25 * FANS
-        assert all(max(each.values()) < 0.6 for each in wrong), "where it is wrong, it is not sure"
-    assert np.mean([each["no_power"] for each in found]) > 0.7
-
-
-@pytest.mark.parametrize(("duty", "window_s"), [(PLATEAU, 1.0), (HIGH, 0.5)])
-def test_no_power_is_named_while_the_fan_coasts(duty: float, window_s: float) -> None:
-    assert set(first_after(duty, window_s, unpowered, 3.0)) == {"no_power"}
-    for after_s in (1.0, 1.5, 2.0, 2.5):
-        assert "blocked" not in first_after(duty, window_s, unpowered, after_s)
-
-
-@pytest.mark.parametrize(("duty", "window_s"), [(PLATEAU, 1.0), (HIGH, 0.5)])
-def test_a_blocked_fan_is_not_named_as_one_without_power_while_its_reading_falls(duty: float, window_s: float) -> None:
-    for after_s in (window_s / 2, window_s, 2 * window_s):
-        assert "no_power" not in first_after(duty, window_s, blocked, after_s)
-    assert first_after(duty, window_s, blocked, 2.5).count("blocked") >= 0.75 * FANS
-
-
-@pytest.mark.parametrize(("duty", "window_s"), [(PLATEAU, 1.0), (HIGH, 0.5)])
-def test_a_fan_that_slows_down_to_another_speed_has_the_causes_of_one_that_turns(duty: float, window_s: float) -> None:
-    for after_s in (1.0, 2.0, 3.0, 5.0, 8.0):
-        assert not {"no_power", "blocked", "no_tacho"} & set(first_after(duty, window_s, slowed, after_s))
-    assert set(first_after(duty, window_s, slowed, 8.0)) == {"gain_down"}
-
-
-@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
-    ("before", "after", "coast_s"),
-    [(HIGH, 0.0, 1.25), (HIGH, HIGH, None), (0.0, HIGH, 1.25)],
-    ids=["it is stopped", "no coast is known", "it had just started"],
+    ("standing", "causes", "words"),
+    [
+        (Standing.CAME_TO_REST, ["blocked", "no_power", "no_tacho"], "does not turn although commanded to turn"),
+        (Standing.NOT_STARTED, ["blocked", "no_power", "no_tacho"], "has not started although commanded to turn"),
+        (Standing.NO_READING, ["no_tacho", "no_power"], "gives no reading although commanded to turn"),
+        (Standing.KEEPS_SPEED, ["still_driven", "windmilling"], "keeps its speed although its command stops it"),
+        (Standing.COASTS_TOO_LONG, ["still_driven", "windmilling"], "turns although its command stops it"),
+        (Standing.TURNED_AGAIN, ["still_driven", "windmilling"], "turns again although its command stops it"),
+    ],
 )
-def test_a_fan_may_slow_down_without_coming_to_rest_by_a_fault(before: float, after: float, coast_s: float) -> None:
-    healthy = HEALTHY.model_copy(update={"coast_time_constant_s": coast_s})
-    number = np.arange(400)
-    command = np.where(number < 320, before, after)
-    speed = np.where(number < 320, 200.0 * (before > 0.0), np.where(number < 380, 200.0, 60.0))
-    window = Window(PERIOD_S, command, speed, onset=380)
-    for tacho in (Tacho(kind="count", window_s=0.5), Tacho()):
-        assert coming_to_rest(window, healthy, BALANCE, tacho) is None
-
-
-def test_where_the_readings_do_not_tell_neither_is_ruled_out() -> None:
-    """Readings that are missing while the fan comes to rest."""
-    speed = np.where(np.arange(200) < 150, 31.0, np.nan)
-    speed[185:] = 0.0
-    window = Window(PERIOD_S, np.full(200, PLATEAU), speed, onset=190)
-    found = probabilities(standstill_causes(window, HEALTHY, BALANCE, Tacho(kind="count", window_s=1.0)))
-    assert 0.2 < found["no_power"] < found["blocked"] < 0.55
+def test_what_is_not_seen_leaves_the_priors(standing, causes, words) -> None:
+    found = standstill_causes(standing, None)
+    assert [each.cause for each in found] == causes
+    assert {each.evidence for each in found} == {words}
+    assert sum(each.probability for each in found) == pytest.approx(1.0, abs=0.06)

@@ -1,304 +1,221 @@
-"""scoring.wear.wear_monitor, through the scorer: days of bearing wear, with 15 s measured in each hour."""
+"""scoring.wear.wear_monitor: weeks of a tray, of which a filter says how much slower than its twin each fan turns."""
 
 from __future__ import annotations
 
+import copy
 import json
-import re
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from schemas.blocks import cut
-from schemas.enums import Action, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Prediction, ScorerSnapshot
-from scoring.diagnosis.regression_window import HealthyBalance
-from scoring.torque_balance import BalanceModel, TorqueBalance
-from scoring.wear.slow_change import WEAR_HINT
-from stages.scorer import ScorerCore
-from tests.support.scored_blocks import (
-    CALIBRATION,
-    EPOCH_NS,
-    SIGMA,
-    SIGMA_COMMAND,
-    TWIN_SPEED,
-    balance_of_a_fan,
-    core_of,
+from schemas.messages import Array
+from scoring.wear.slow_change import LIMIT_SHARE, MOST_FANS, WEAR_HINT
+from scoring.wear.trend import NS_PER_DAY
+from scoring.wear.wear_monitor import SETTLING_INTERVALS, WearMonitor
+from tests.support.wear_data import (
+    DAYS_OF_WEAR,
+    EVERY_S,
+    LOSS,
+    PER_DAY,
+    START_NS,
     feed,
-    request_of,
-    snapshot_of,
+    loss_of,
+    slow_states,
+    times_ns,
+    worn_monitor,
 )
 
-HOUR_NS = 3600 * 10**9
-DAY_NS = 24 * HOUR_NS
-STEP_NS = 20_000_000
-WORN, HEALTHY = 1, 0
-GROWTH_PER_DAY = 0.06
-"""of the friction, in units of the command"""
-DAY_AND_NIGHT = 0.02
-LIMIT = (1.0 + 0.5) * SIGMA_COMMAND
-"""the adaptation limit, and the reference value of the drift"""
+FANS, WORN = 4, 2
+EVERY_NS = round(EVERY_S * 1e9)
 
 
-def burst(
-    hour: float,
-    growth_per_day: float = GROWTH_PER_DAY,
-    swing: float = DAY_AND_NIGHT,
-    seconds: float = 15.0,
-    speed: float | None = None,
-    by: Sequence[HealthyBalance] | None = None,
-    twin: str = "t",
-) -> Prediction:
-    """Predictions of two fans at a held speed that differs from hour to hour; the friction of the second grows.
-
-    by: the torque balance of the twin, of each fan; None: that of the fans without wear. twin: its name.
-    """
-    rng = np.random.default_rng(round(hour * 4))
-    fan, n = balance_of_a_fan(), round(seconds * 1e9 / STEP_NS)
-    t_ns = EPOCH_NS + round(hour * HOUR_NS) + np.arange(n) * STEP_NS
-    twin_speed = TWIN_SPEED * rng.uniform(0.9, 1.1) if speed is None else speed
-    friction = swing * np.sin(2 * np.pi * hour / 24) + np.array([0.0, growth_per_day * hour / 24])
-    needed = fan.viscous * twin_speed + fan.drag * twin_speed**2 + fan.friction
-    command = np.broadcast_to(needed + friction, (n, 2))
-    measured = twin_speed + rng.normal(0.0, 0.3, (n, 2))
-    of_twin = by or (fan, fan)
-    names = ("inertia", "viscous", "drag", "friction", "lag_s")
-    columns = {name: np.array([getattr(each, name) for each in of_twin]) for name in names}
-    model = BalanceModel(
-        **columns,
-        filter_rate_per_s=fan.filter_rate_per_s,
-        lowest_speed_rad_s=np.full(2, fan.lowest_speed_rad_s),
-        highest_speed_rad_s=1000.0,
-    )
-    return Prediction(
-        header=Header("integrator-1", round(hour * 4), "tray1"),
-        fans=2,
-        period_ns=STEP_NS,
-        t_ns=t_ns,
-        command=command,
-        measured_speed_rad_s=measured,
-        predicted_speed_rad_s=np.full((n, 2), twin_speed),
-        sigma_rad_s=np.full(2, SIGMA),
-        valid=np.ones((n, 2), np.bool_),
-        invalid_reason=np.zeros((n, 2), np.uint8),
-        twin=twin,
-        torque_balance_command=TorqueBalance(model).update(STEP_NS / 1e9, command, measured, np.ones((n, 2), np.bool_)),
-        torque_balance_sigma_command=np.full(2, SIGMA_COMMAND),
-    )
+def change_of(monitor: WearMonitor, fan: int) -> tuple[float, float]:
+    found = monitor.of(fan)
+    assert found is not None
+    return found.change, found.std_error
 
 
-def core() -> ScorerCore:
-    return core_of(2, calibration=CALIBRATION, off_delay_s=1.0)
+def after(change: Array, monitor: WearMonitor | None = None, from_day: float = 0.0, seed: int = 1) -> WearMonitor:
+    """A monitor of a tray with this change, (n, fans), from a day on."""
+    monitor = monitor or WearMonitor(change.shape[1], EVERY_S)
+    start_ns = START_NS + round(from_day * NS_PER_DAY)
+    feed(monitor, times_ns(len(change) / PER_DAY, start_ns), *slow_states(change, seed))
+    return monitor
 
 
-def core_for_days() -> ScorerCore:
-    """With longer intervals of the baseline: over days they make no difference, and most of the time goes into them."""
-    return core_of(2, calibration=CALIBRATION, baseline_s=3.0)
-
-
-def live_through(
-    core: ScorerCore, days: float, from_day: float = 0.0, every_hours: float = 1.0, **more: Any
-) -> Iterator[Alarm]:
-    for hour in np.arange(from_day * 24, days * 24, every_hours).tolist():
-        yield from (message for message in core.step(burst(hour, **more)) if isinstance(message, Alarm))
-
-
-def wear_of(memory: ScorerSnapshot) -> Any:
-    return json.loads(memory.state_json)["wear"]
-
-
-def worn(fan: int, parameter: str, core: ScorerCore) -> Any:
-    return wear_of(snapshot_of(core))["fans"][fan]["parameters"][parameter]
-
-
-@pytest.fixture(scope="module")
-def after_eight_days() -> tuple[ScorerCore, list[Alarm]]:
-    eight = core_for_days()
-    return eight, list(live_through(eight, 8))
-
-
-@pytest.fixture(scope="module")
-def after_twelve_days(after_eight_days) -> tuple[ScorerCore, list[Alarm]]:
-    twelve = restored(after_eight_days[0])
-    return twelve, list(live_through(twelve, 12, from_day=8))
-
-
-def test_the_growth_of_friction_is_found_with_an_interval_that_holds_it(after_eight_days) -> None:
-    core, alarms = after_eight_days
-    assert alarms == []
-    fan = balance_of_a_fan()
-    truth = {
-        "balance": GROWTH_PER_DAY,
-        "friction": GROWTH_PER_DAY,
-        "drag": GROWTH_PER_DAY / (fan.drag * TWIN_SPEED**2),
-        "gain": -GROWTH_PER_DAY / 50.0,
-    }
-    for parameter, slope in truth.items():
-        found = worn(WORN, parameter, core)
-        per_day = found["per_day"]
-        assert per_day["value"] == pytest.approx(slope, rel=0.1), parameter
-        if parameter in ("balance", "friction"):  # growing friction is not quite a drag that grows
-            assert per_day["low"] < slope < per_day["high"], parameter
-        assert found["change"] == pytest.approx(8 * slope, rel=0.1), parameter
-
-
-def test_the_alarm_comes_within_the_forecast(after_eight_days, after_twelve_days) -> None:
-    core, _ = after_eight_days
-    twelve, alarms = after_twelve_days
-    found = worn(WORN, "balance", core)
-    assert found["limit"] == pytest.approx(LIMIT)
-    times = found["reached_t_ns"]
-    days = [(times[name] - EPOCH_NS) / DAY_NS for name in ("earliest", "likely", "latest")]
-    assert days[0] < LIMIT / GROWTH_PER_DAY < days[2]
-    assert days[1] == pytest.approx(LIMIT / GROWTH_PER_DAY, rel=0.05)
-    assert days[2] - days[0] < 4.0
-    raised = next(iter([*alarms, *live_through(restored(twelve), 13.5, from_day=12)]))
-    assert (raised.fan, raised.transition) == (WORN, Transition.RAISED)
-    assert days[0] - 0.5 < (raised.t_ns - EPOCH_NS) / DAY_NS < days[2] + 0.5
-
-
-def test_a_healthy_fan_shows_no_wear(after_eight_days) -> None:
-    core, _ = after_eight_days
-    for parameter in ("balance", "friction", "drag", "gain"):
-        per_day = worn(HEALTHY, parameter, core)["per_day"]
-        assert per_day["low"] < 0.0 < per_day["high"], parameter
-    assert worn(HEALTHY, "balance", core)["reached_t_ns"] is None
-    assert "no significant trend" in worn(HEALTHY, "balance", core)["unknown_reason"]
-
-
-def test_a_limit_within_days_is_reported_in_health_and_raises_no_alarm(after_eight_days) -> None:
-    core, _ = after_eight_days
-    assert (
-        core.problem()
-        == "fan 1 is wearing: its torque balance will reach the limit in about 5 days (4 to 5); inspect it"
-    )
-    assert list(live_through(restored(core), 8.5, from_day=8)) == []
-
-
-def test_wear_that_is_far_from_its_limit_is_not_reported() -> None:
-    slow = core_for_days()
-    assert list(live_through(slow, 4, growth_per_day=0.04, swing=0.002)) == []
-    assert worn(WORN, "balance", slow)["reached_t_ns"] is not None
-    assert slow.problem() == ""
-
-
-def test_slow_change_is_noticed_before_it_is_an_alarm() -> None:
-    """Half a day, in which one of two fans takes 5 % more command; limits are wide."""
-    clogging = core_of(2, calibration=CALIBRATION, baseline_s=3.0, limit_factor=5.0)
-    assert list(live_through(clogging, 0.5, every_hours=0.5, growth_per_day=5.0, swing=0.0)) == []
-    (notice,) = [note for note in clogging.notes() if note.endswith(WEAR_HINT)]
-    assert re.match(r"fan 1: drag \+\d\.\d % in 1\d h, \+0\.\d\d % an hour, the fans beside it [+-]0\.\d\d %: ", notice)
-    assert clogging.problem() == ""
-
-
-def test_less_than_a_day_gives_no_forecast() -> None:
-    young = core_for_days()
-    assert list(live_through(young, 0.9, every_hours=0.5, growth_per_day=0.1, swing=0.0)) == []
-    assert worn(WORN, "balance", young)["unknown_reason"] == "less than a day was observed"
-    assert young.problem() == ""
-
-
-def restored(core: ScorerCore) -> ScorerCore:
-    successor = core_for_days()
-    successor.restore(snapshot_of(core))
+def restored(snapshot: Any, fans: int = FANS) -> WearMonitor:
+    successor = WearMonitor(fans, EVERY_S)
+    successor.restore(json.loads(json.dumps(snapshot, allow_nan=False)))
     return successor
 
 
-def test_a_restart_forgets_nothing_of_it(after_eight_days) -> None:
-    core, _ = after_eight_days
-    successor = restored(core)
-    assert wear_of(snapshot_of(successor)) == wear_of(snapshot_of(core))
-    assert successor.problem() == core.problem()
-    assert list(live_through(successor, 8.25, from_day=8)) == []
-    assert worn(WORN, "friction", successor)["series"]["t_ns"][-1] > worn(WORN, "friction", core)["series"]["t_ns"][-1]
+@pytest.mark.parametrize("days", [DAYS_OF_WEAR, 45])
+def test_the_limit_is_forecast_within_its_interval(days: int) -> None:
+    """Each of the fans loses 5 % in 30 days, so it will have lost 10 % on day 60."""
+    fans = 40
+    monitor = after(np.repeat(loss_of(0, 1, days), fans, axis=1))
+    likely, held, near = [], [], []
+    for fan in range(fans):
+        found = monitor.of(fan)
+        assert found is not None and found.forecast.likely_ns, fan
+        times_ns = (found.forecast.earliest_ns, found.forecast.likely_ns, found.forecast.latest_ns)
+        earliest, middle, latest = (((t_ns or 0) - START_NS) / NS_PER_DAY for t_ns in times_ns)
+        likely.append(middle)
+        held.append(earliest <= 60.0 <= latest)
+        near.append(abs(found.change + LOSS * days / DAYS_OF_WEAR) <= 2.0 * found.std_error)
+        assert latest - earliest < 45.0
+    assert np.median(likely) == pytest.approx(60.0, rel=0.05)
+    assert np.mean(held) >= 0.95 and np.mean(near) >= 0.95
 
 
-def test_blocks_make_no_difference() -> None:
-    found = []
-    for block in (37, 750):
-        one = core()
-        for hour in (0, 1, 2):
-            whole = burst(hour)
-            for first in range(0, 750, block):
-                one.step(cut(whole, first, min(first + block, 750)))
-        found.append(wear_of(snapshot_of(one)))
-    assert len(found[0]["fans"][0]["parameters"]["drag"]["series"]["t_ns"]) == 3
-    assert found[1] == found[0]
+def test_a_fan_that_wears_is_noticed_then_forecast_and_then_over() -> None:
+    early, month, late, near, end = (worn_monitor(FANS, WORN, days) for days in (5, 30, 58, 65, 80))
+    assert early.notices() == [] and month.problem(START_NS + 30 * NS_PER_DAY) == ""
+    (line,) = month.notices()
+    assert line.startswith(f"fan {WORN}: speed -") and " % in 30 days, the fans beside it " in line
+    assert line.endswith(WEAR_HINT)
+    problem = late.problem(START_NS + 58 * NS_PER_DAY)
+    assert problem.startswith(f"fan {WORN} is wearing: it will have lost 10 % of its speed in about ")
+    assert problem.endswith("); inspect it")
+    assert not late.is_over.any() and late.problem(START_NS + 90 * NS_PER_DAY) == "", "the forecast has passed"
+    reached = near.problem(START_NS + 65 * NS_PER_DAY)
+    assert reached == f"fan {WORN} is wearing: it has lost about 10 % of its speed; inspect it"
+    assert not near.is_over.any(), "that is not sure"
+    assert end.is_over.tolist() == [fan == WORN for fan in range(FANS)]
+    assert end.problem(START_NS + 80 * NS_PER_DAY) == "", "there is an alarm"
 
 
-def test_wear_starts_again_for_a_fan_that_is_commissioned_again(after_eight_days) -> None:
-    successor = restored(after_eight_days[0])
-    successor.step(request_of(Action.COMMISSION, WORN))
-    assert worn(WORN, "friction", successor)["series"]["t_ns"] == []
-    assert worn(HEALTHY, "friction", successor)["series"]["t_ns"] != []
-    assert successor.problem() == ""
+def test_what_all_fans_share_is_no_wear_of_one() -> None:
+    days = np.arange(40 * PER_DAY)[:, np.newaxis] / PER_DAY
+    weather = -0.08 * days / 40.0 + 0.01 * np.sin(2.0 * np.pi * days)
+    monitor = after(np.repeat(weather, FANS, axis=1))
+    (line,) = monitor.notices()
+    assert line.startswith(f"{MOST_FANS} ") and " % slower than when they were commissioned: the air" in line
+    assert monitor.problem(START_NS + 40 * NS_PER_DAY) == ""
+    for fan in range(FANS):
+        found = monitor.of(fan)
+        assert found is not None and found.beside == pytest.approx(found.change, abs=0.02)
+    assert after(weather).notices()[0].startswith("fan 0: speed -"), "a fan without others is judged by itself"
+    faster = after(np.repeat(-weather, 3, axis=1)).notices()
+    assert len(faster) == 1 and "% faster than" in faster[0]
 
 
-def test_a_fan_above_half_its_limit_gets_no_point() -> None:
-    one = core()
-    list(live_through(one, 0.3))
-    before = len(worn(WORN, "friction", one)["series"]["t_ns"])
-    for hour in range(8, 12):
-        list(one.step(burst(hour, growth_per_day=5.0)))
-    assert len(worn(WORN, "friction", one)["series"]["t_ns"]) == before
-    assert len(worn(HEALTHY, "friction", one)["series"]["t_ns"]) > before
+def test_two_fans_of_four_are_not_most_of_them() -> None:
+    change = loss_of(WORN, FANS, DAYS_OF_WEAR) + loss_of(0, FANS, DAYS_OF_WEAR)
+    assert [line for line in after(change).notices() if line.startswith(MOST_FANS)] == []
 
 
-def first_point_s(fan: int, core: ScorerCore) -> float | None:
-    times = worn(fan, "friction", core)["series"]["t_ns"]
-    return (times[0] - EPOCH_NS) / 1e9 if times else None
+def test_a_replaced_fan_starts_again_and_is_compared_with_the_others_from_then_on() -> None:
+    """All fans lose 6 % in 30 days, and again 6 % in the 20 days since one was replaced."""
+    share = np.concatenate((np.linspace(0.0, 0.06, 30 * PER_DAY), np.linspace(0.06, 0.12, 20 * PER_DAY)))
+    shares, std_error = slow_states(np.repeat(-share[:, np.newaxis], FANS, axis=1))
+    t_ns, cut, monitor = times_ns(50), 30 * PER_DAY, WearMonitor(FANS, EVERY_S)
+    feed(monitor, t_ns[:cut], shares[:cut], std_error[:cut])
+    monitor.forget(np.arange(FANS) == WORN, START_NS + 30 * NS_PER_DAY)
+    assert monitor.of(WORN) is None and monitor.of(0) is not None
+    monitor = restored(monitor.snapshot())
+    feed(monitor, t_ns[cut:], shares[cut:], std_error[cut:])
+    assert change_of(monitor, 0)[0] == pytest.approx(-0.12, abs=0.02)
+    found = monitor.of(WORN)
+    assert found is not None and found.change == pytest.approx(-0.06, abs=0.02)
+    assert found.beside == pytest.approx(-0.06, abs=0.02)
+    assert [line for line in monitor.notices() if line.startswith("fan ")] == []
 
 
-def test_a_fan_gets_a_point_once_its_disturbance_is_out_of_the_window() -> None:
-    one, block = core(), burst(0, seconds=60.0)
-    measured = block.measured_speed_rad_s.copy()
-    measured[435:520, WORN] = measured[434, WORN]  # more than half as long as a reading may repeat itself
-    one.step(replace(block, measured_speed_rad_s=measured))
-    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 51.0)
+def test_a_limit_is_reached_only_surely_and_until_the_change_is_below_it_again() -> None:
+    t_ns, error = times_ns(8), 0.01
+    beyond = np.array([0.0, 0.0, 0.005, 0.05, 0.005, -0.01])
+    steps = np.repeat(np.where(beyond == 0.0, 0.0, LIMIT_SHARE + beyond), PER_DAY)
+    monitor, seen = WearMonitor(2, EVERY_S), []
+    for day in range(6):
+        rows = slice(day * PER_DAY, (day + 1) * PER_DAY)
+        feed(monitor, t_ns[rows], steps[rows, np.newaxis] * [-1.0, 1.0], np.full(PER_DAY, error))
+        monitor = restored(monitor.snapshot(), 2)
+        seen.append(monitor.is_over.tolist())
+    assert seen == [[False] * 2] * 3 + [[True] * 2] * 2 + [[False] * 2]
 
 
-def with_a_fault(first_s: int = 7) -> Prediction:
-    """A block in which the second fan needs 2 more of the command for 2 s."""
-    block = burst(0, seconds=60.0)
-    more = np.zeros((len(block.t_ns), 2))
-    more[50 * first_s : 50 * (first_s + 2), WORN] = 2.0
-    return replace(block, command=block.command + more, torque_balance_command=block.torque_balance_command + more)
+def test_points_are_taken_at_the_times_of_samples_whatever_comes_between() -> None:
+    asked = []
+
+    def shares_at(t_ns: int) -> tuple[Array, Array]:
+        asked.append(t_ns)
+        return np.sin(t_ns / 1e14 + np.arange(FANS)), np.full(FANS, 0.01)
+
+    def run(period_ns: int) -> WearMonitor:
+        monitor = WearMonitor(FANS, EVERY_S)
+        for t_ns in range(START_NS, START_NS + 20 * EVERY_NS, period_ns):
+            gap = START_NS + 9 * EVERY_NS <= t_ns < START_NS + 12 * EVERY_NS
+            monitor.update(t_ns, np.array([True, not gap, True, True]), lambda t_ns=t_ns: shares_at(t_ns))
+        return monitor
+
+    coarse = run(10 * 10**9)
+    times = [np.array(fan["series"]["t_ns"]) - START_NS for fan in coarse.snapshot()["fans"]]
+    assert [int(t_ns[0]) for t_ns in times] == [SETTLING_INTERVALS * EVERY_NS + fan * EVERY_NS // 4 for fan in range(4)]
+    assert set(np.diff(times[0]).tolist()) == {EVERY_NS}
+    assert sorted(set(np.diff(times[1]).tolist())) == [EVERY_NS // 4, EVERY_NS, EVERY_NS // 4 * 15]
+    assert len(asked) == len(set(asked)) == len(np.unique(np.concatenate(times))), "asked only when one is due"
+    assert run(2 * 10**9).snapshot() == coarse.snapshot()
 
 
-@pytest.mark.parametrize(("block", "first_s"), [(37, 7), (512, 11)])
-def test_how_far_back_a_fault_is_does_not_depend_on_blocks(block: int, first_s: int) -> None:
-    whole, cut_up, faulty = core(), core(), with_a_fault(first_s)
-    feed(whole, [faulty])
-    feed(cut_up, [cut(faulty, first, min(first + block, 3000)) for first in range(0, 3000, block)])
-    assert wear_of(snapshot_of(cut_up)) == wear_of(snapshot_of(whole))
+def test_a_restored_monitor_goes_on_as_if_nothing_had_been() -> None:
+    shares, std_error = slow_states(loss_of(WORN, FANS, 12))
+    t_ns, whole = times_ns(12), WearMonitor(FANS, EVERY_S)
+    feed(whole, t_ns, shares, std_error)
+    for cut in (3, 200):
+        first = WearMonitor(FANS, EVERY_S)
+        feed(first, t_ns[:cut], shares[:cut], std_error[:cut])
+        second = restored(first.snapshot())
+        assert second.snapshot() == first.snapshot() and second.notices() == first.notices()
+        feed(second, t_ns[cut:], shares[cut:], std_error[cut:])
+        assert second.snapshot() == whole.snapshot()
 
 
-def test_after_a_restart_it_is_known_how_far_back_a_fault_is() -> None:
-    killed, successor, faulty = core(), core(), with_a_fault()
-    feed(killed, [cut(faulty, 0, 1500)])
-    successor.restore(snapshot_of(killed))
-    feed(successor, [cut(faulty, 1500, 3000)])
-    assert first_point_s(WORN, successor) == 51.0
+@pytest.mark.parametrize("earlier", [True, False])
+def test_a_damaged_snapshot_is_refused_and_changes_nothing(earlier: bool) -> None:
+    monitor = worn_monitor(FANS, WORN, days=2)
+    before, whole = monitor.snapshot(), worn_monitor(FANS, WORN, days=3).snapshot()
+    damaged: list[Any] = [{}, [], None, worn_monitor(FANS + 1, WORN, days=2).snapshot()]
+    for path in (("state",), ("fans",), ("state", "shift"), ("state", "t_ns"), ("fans", 1, "series")):
+        for other in (None, "x", [0] * FANS):
+            broken = copy.deepcopy(whole)
+            place: Any = broken
+            for key in path[:-1]:
+                place = place[key]
+            place[path[-1]] = other
+            damaged += [broken] if path != ("state", "shift") or other != [0] * FANS else []
+    restore = monitor.restore_of_earlier_twin if earlier else monitor.restore
+    for snapshot in damaged:
+        with pytest.raises((ValueError, LookupError, TypeError, AttributeError)):
+            restore(snapshot)
+        assert monitor.snapshot() == before
 
 
-def test_no_wear_point_uses_samples_from_before_a_fan_was_commissioned_again() -> None:
-    one, block = core(), burst(0, seconds=60.0)
-    feed(one, [cut(block, 0, 500), request_of(Action.COMMISSION, WORN), cut(block, 500, 3000)])
-    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 51.0)
+def test_the_change_goes_on_with_another_twin() -> None:
+    """It has taken the fan as it was on day 15 for healthy."""
+    change = loss_of(WORN, FANS, 30)
+    first, second = change[: 15 * PER_DAY], change[15 * PER_DAY :] - change[15 * PER_DAY] + 0.03
+    before = after(first)
+    monitor = WearMonitor(FANS, EVERY_S)
+    monitor.restore_of_earlier_twin(json.loads(json.dumps(before.snapshot())))
+    assert [change_of(monitor, fan) for fan in range(FANS)] == [change_of(before, fan) for fan in range(FANS)]
+    after(second, monitor, from_day=15.0, seed=2)
+    found, std_error = change_of(monitor, WORN)
+    assert found == pytest.approx(-LOSS, abs=2.0 * std_error)
+    assert change_of(before, WORN)[1] < std_error < 0.02, "a takeover is no surer than the last point and the first"
+    assert abs(change_of(monitor, 0)[0]) < 0.02
+    series = monitor.snapshot()["fans"][WORN]["series"]
+    assert np.abs(np.diff(series["value"])).max() < 0.015, "there is no step"
+    other = WearMonitor(FANS, EVERY_S)
+    other.restore(before.snapshot())
+    after(second, other, from_day=15.0, seed=2)
+    assert abs(change_of(other, WORN)[0] + LOSS) > 0.01, "without it there is one"
 
 
-def test_a_fan_at_standstill_reports_nothing() -> None:
-    one = core()
-    for hour in range(6):
-        one.step(burst(hour, speed=10.0))
-    assert worn(WORN, "friction", one)["series"]["t_ns"] == []
-
-
-def test_a_twin_without_calibration_has_trends_and_no_limit() -> None:
-    one = core_of(2, baseline_s=1.0)
-    list(live_through(one, 1.5, swing=0.0))
-    assert worn(WORN, "balance", one)["unknown_reason"] == "the twin is not calibrated"
-    assert worn(WORN, "friction", one)["per_day"]["low"] > 0.0
+def test_what_is_no_number_is_no_point() -> None:
+    monitor = WearMonitor(2, EVERY_S)
+    feed(monitor, times_ns(1), np.full((PER_DAY, 2), [0.0, np.nan]), np.full(PER_DAY, 0.01))
+    assert monitor.of(0) is not None and monitor.of(1) is None
+    feed(monitor, times_ns(1, START_NS + NS_PER_DAY), np.zeros((PER_DAY, 2)), np.full(PER_DAY, 0.01))
+    assert change_of(monitor, 1)[0] == 0.0

@@ -1,1 +1,0 @@
-"""Statistics on residuals: one detector a file."""

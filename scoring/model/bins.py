@@ -1,0 +1,210 @@
+"""Predictions of one tray, sample by sample, to bins: all that the model sees of them.
+
+A bin is a fixed stretch of time since the epoch, so how samples are cut into messages changes nothing. Within a bin of
+several samples, one that lies far from their median is a wrong reading of the tacho and does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.enums import InvalidReason
+from schemas.messages import Array, Prediction
+from schemas.units import NS_PER_S
+from scoring.samples import BALANCE_COUNTS, NO_SPEED, among, reading_missing_of
+from scoring.unseen_error import UnseenError
+
+SHORTEST_S = 0.1
+WRONG_SHARE = 0.05
+"""share of the top speed: a reading that is farther from the median of its bin is wrong"""
+FASTEST = 10.0
+"""times the top speed: a faster reading is as impossible as this"""
+RANKED_FROM = 4
+"""samples of a bin; of fewer none can be said to be wrong"""
+COLUMNS = (
+    "measured",
+    "predicted",
+    "half_range",
+    "unseen",
+    "command",
+    "balance",
+    "counts",
+    "missing",
+    "after_missing",
+    "pair",
+)
+"""of samples, (n, fans) each"""
+READS = (int(InvalidReason.NONE), int(InvalidReason.WARMING_UP), NO_SPEED)
+"""states in which a tacho should give readings"""
+
+
+@dataclass(frozen=True, eq=False)
+class Bin:
+    """What is known of the fans of a tray within one bin. All (fans,) but where it says so. t_ns: of its end."""
+
+    t_ns: int
+    row: int
+    """of the sample with which it ended, in its block"""
+    judged: Array
+    """whether a reading or a torque balance is compared with the twin"""
+    deviations_rad_s: Array
+    """(n, fans) distance of each reading from the free run; NaN where it cannot be compared"""
+    balances_command: Array
+    """(n, fans) torque balance of each sample, or NaN"""
+    wrong: Array
+    """(n, fans) readings far from the others of the bin"""
+    half_ranges_rad_s: Array
+    """(n, fans) half of the range of readings that the tacho may show of the predicted speed"""
+    readings: Array
+    """number of readings that can be compared with the free run"""
+    deviation_rad_s: Array
+    """their mean distance from it"""
+    predicted_rad_s: Array
+    measured_rad_s: Array
+    """their mean; NaN without a reading"""
+    newest_rad_s: Array
+    """the newest reading; NaN without one"""
+    balances: Array
+    """number of samples with a torque balance"""
+    balance_command: Array
+    """their mean"""
+    half_range_rad_s: Array
+    """half of the range of readings that the tacho may show of the predicted speed"""
+    unseen_rad_s: Array
+    """standard deviation of the twin's error where it was not trained"""
+    command: Array
+    missing: Array
+    """(fans, 4) readings after a reading, and those of them that are missing; after a missing one, and missing"""
+
+
+class Bins:
+    """Collects the samples of one tray."""
+
+    def __init__(self, bin_ns: int, top_rad_s: Array, unseen: UnseenError | None) -> None:
+        """Begin without a sample. top_rad_s: (fans,)."""
+        self._bin_ns, self._top, self._unseen = bin_ns, top_rad_s, unseen
+        self._parts: list[dict[str, Array]] = []
+        self._number = 0
+        self.unseen_rad_s: Array | float = 0.0
+        """(n, fans) of the samples of the last block"""
+        self._before = np.zeros((2, len(top_rad_s)), np.bool_)
+        """(2, fans) of the newest sample: the reading was missing, and there should have been one"""
+
+    def take(self, block: Prediction) -> Iterator[Bin]:
+        """The bins that end with a sample of a block, or before it."""
+        columns, numbers = self._columns(block), block.t_ns // self._bin_ns
+        for rows in np.split(np.arange(len(numbers)), np.flatnonzero(np.diff(numbers)) + 1):
+            number = int(numbers[rows[0]])
+            if self._parts and number != self._number:
+                yield self._close(int(rows[0]))
+            self._number = number
+            self._parts.append({name: column[rows] for name, column in columns.items()})
+            if int(block.t_ns[rows[-1]]) + block.period_ns >= (number + 1) * self._bin_ns:
+                yield self._close(int(rows[-1]))
+
+    def snapshot(self) -> tuple[int, dict[str, Array]]:
+        """The time of the open bin, ns, 0 for none, and its samples."""
+        if not self._parts:
+            return 0, {"before": self._before}
+        return self._number * self._bin_ns, {"before": self._before, **self._open()}
+
+    def restore(self, open_t_ns: int, stored: Mapping[str, Array]) -> None:
+        """Continue from a snapshot.
+
+        Raises:
+            KeyError, ValueError: it is of another number of fans.
+        """
+        if stored["before"].shape != self._before.shape:
+            raise ValueError("samples of another number of fans")
+        self._before[...] = stored["before"]
+        self._number = open_t_ns // self._bin_ns
+        self._parts = [{name: stored[name] for name in COLUMNS}] if open_t_ns else []
+
+    def _open(self) -> dict[str, Array]:
+        return {name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]}
+
+    def _columns(self, block: Prediction) -> dict[str, Array]:
+        predicted, reason = block.predicted_speed_rad_s, block.invalid_reason
+        measured = block.measured_speed_rad_s.clip(-FASTEST * self._top, FASTEST * self._top)
+        nothing = np.zeros(measured.shape)
+        missing = reading_missing_of(block) | (reason == NO_SPEED)
+        reads = among(reason, *READS)
+        before = np.concatenate((self._before[:, np.newaxis], np.stack((missing, reads))), axis=1)[:, :-1]
+        self._before = np.stack((missing[-1], reads[-1]))
+        unseen = self.unseen_rad_s = np.nan_to_num(self._unseen.of(block)[0]) if self._unseen else nothing
+        return {
+            "measured": measured,
+            "predicted": predicted,
+            "half_range": block.reading_range_rad_s if len(block.reading_range_rad_s) else nothing,
+            "unseen": unseen,
+            "command": np.nan_to_num(block.command),
+            "balance": np.where(among(reason, *BALANCE_COUNTS), block.torque_balance_command, np.nan),
+            "counts": block.valid & np.isfinite(measured) & np.isfinite(predicted) & ~missing,
+            "missing": missing,
+            "after_missing": before[0],
+            "pair": reads & before[1],
+        }
+
+    def _close(self, row: int) -> Bin:
+        rows = self._open()
+        self._parts = []
+        deviation = np.where(rows["counts"], rows["measured"] - rows["predicted"], np.nan)
+        wrong = self._wrong(deviation, rows["half_range"])
+        counts = rows["counts"] & ~wrong
+        measured, predicted = np.isfinite(rows["measured"]), np.isfinite(rows["predicted"])
+        has_balance = np.isfinite(rows["balance"]) & measured & ~wrong
+        speed = mean(rows["measured"], measured)
+        pair, after, missing = rows["pair"], rows["after_missing"], rows["missing"]
+        transitions = (pair & ~after, pair & ~after & missing, pair & after, pair & after & missing)
+        return Bin(
+            t_ns=(self._number + 1) * self._bin_ns,
+            row=row,
+            judged=np.asarray((rows["counts"] | has_balance).any(axis=0)),
+            deviations_rad_s=deviation,
+            balances_command=np.where(measured, rows["balance"], np.nan),
+            wrong=wrong,
+            half_ranges_rad_s=rows["half_range"],
+            readings=counts.sum(axis=0),
+            deviation_rad_s=mean(deviation, counts),
+            predicted_rad_s=np.where(predicted.any(axis=0), mean(rows["predicted"], predicted), speed),
+            measured_rad_s=np.where(measured.any(axis=0), speed, np.nan),
+            newest_rad_s=newest(rows["measured"], measured),
+            balances=has_balance.sum(axis=0),
+            balance_command=mean(rows["balance"], has_balance),
+            half_range_rad_s=mean(rows["half_range"], counts),
+            unseen_rad_s=mean(rows["unseen"], counts),
+            command=rows["command"].mean(axis=0),
+            missing=np.stack([each.sum(axis=0) for each in transitions], axis=1),
+        )
+
+    def _wrong(self, deviation: Array, half_range: Array) -> Array:
+        """(n, fans) readings far from the others of a bin, where these are more."""
+        if len(deviation) < RANKED_FROM:
+            return np.zeros(deviation.shape, np.bool_)
+        count = np.isfinite(deviation).sum(axis=0)
+        middle = np.take_along_axis(np.sort(deviation, axis=0), np.maximum(count - 1, 0)[np.newaxis] // 2, axis=0)
+        with np.errstate(invalid="ignore"):
+            wrong = np.abs(deviation - middle) > WRONG_SHARE * self._top + half_range
+        found: Array = wrong & (3 * wrong.sum(axis=0) <= np.maximum(count, 3))
+        return found
+
+
+def mean(values: Array, counts: Array) -> Array:
+    """(fans,) the mean of those values that count, (n, fans); 0 where none does."""
+    total: Array = np.where(counts, values, 0.0).sum(axis=0)
+    return total / np.maximum(counts.sum(axis=0), 1)
+
+
+def newest(values: Array, counts: Array) -> Array:
+    """(fans,) the last of those values that count, (n, fans); NaN where none does."""
+    last = len(values) - 1 - counts[::-1].argmax(axis=0)
+    found: Array = np.where(counts.any(axis=0), values[last, np.arange(values.shape[1])], np.nan)
+    return found
+
+
+def bin_ns_of(period_ns: int, held_s: float) -> int:
+    """Length of a bin: SHORTEST_S, or as long as a tacho holds a reading, in whole samples."""
+    return max(1, round(max(SHORTEST_S, held_s) * NS_PER_S / period_ns)) * period_ns

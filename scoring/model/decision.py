@@ -1,0 +1,335 @@
+"""The decision on the fans of one tray at the end of each bin: which have an alarm, and how far they are from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from schemas.messages import Array
+from schemas.units import NS_PER_S
+from scoring.model.bins import Bin
+from scoring.model.faults import BEFORE_GROWTH, FAULTS, forces
+from scoring.model.healthy import FAULT, SLOW, SLOWEST_RAD_S, HealthyFans
+from scoring.model.in_alarm import FanInAlarm
+from scoring.model.missing import MissingReadings
+from scoring.model.onsets import Evidence, Hypotheses
+from scoring.model.operation import Fans, Inputs, Operation
+from scoring.model.priors import Priors
+from scoring.model.saved import Saved, part, within
+from scoring.model.wrong import FAR_SIGMAS, WrongReadings
+
+AGREED_SIGMAS = 8.0
+"""far readings that agree count no farther from what is expected"""
+OF_RATE = 0.8
+"""share of the declared rate that the speed has; missing readings have the rest"""
+WALKS_PER_SQRT_S = 0.1
+"""how fast the fault of an alarm may change, of its largest size"""
+OVER_S, OVER_ODDS = 10.0, 100.0
+"""time for which a healthy fan is likelier, by these odds, than the fault at its largest, until that is over"""
+PROBABLE = 0.05
+"""probability from which a fault may be that of an alarm"""
+SMALLEST = 0.01
+"""share of the speed: what a fault takes at least"""
+FORGETS_S = 60.0
+"""after a longer gap nothing of the evidence before it counts"""
+KEPT_FROM = 0.5
+"""score from which a snapshot keeps the evidence; less begins again"""
+HIGHEST_SCORE = 99.0
+
+
+@dataclass(frozen=True)
+class Change:
+    """An alarm of a fan was raised or cleared."""
+
+    fan: int
+    raised: bool
+
+
+class Decision(Saved):
+    """Alarms of the fans of one tray. What it tells of a fan is that of the end of the last bin."""
+
+    KEPT = (
+        "log_statistic",
+        "active",
+        "_raised",
+        "_peak",
+        "_over_s",
+        "onset",
+        "is_returning",
+        "in_balance",
+        "deviation_rad_s",
+        "deviation_std_rad_s",
+        "_shape",
+        "_is_probable",
+        "_shows",
+    )
+
+    def __init__(
+        self, fans: Fans, bin_ns: int, period_s: float, declared_s: float, priors: Priors, limit_factor: float = 1.0
+    ) -> None:
+        """Begin without an alarm. period_s: of the samples; declared_s: mean time between two false alarms of a fan;
+        limit_factor: of the log of the limit."""
+        count = len(fans.top_rad_s)
+        self._fans, self._bin_ns, self.bin_s = fans, bin_ns, bin_ns / NS_PER_S
+        self.operation = Operation(fans, bin_ns)
+        self.model = HealthyFans(fans, priors, self.bin_s, period_s)
+        self._hypotheses = Hypotheses(FAULTS, fans.has_own_drive)
+        self._evidence = Evidence(count, self._hypotheses, self.bin_s)
+        bins = declared_s / self.bin_s
+        self.log_limit = math.log(bins / OF_RATE) * limit_factor
+        self.missing = MissingReadings(count, math.log(bins / (1.0 - OF_RATE)) * limit_factor)
+        self.log_statistic = np.full(count, -np.inf)
+        self._wrong = WrongReadings(fans, self.bin_s, period_s, math.log(bins / OF_RATE))
+        self.alarms: dict[int, FanInAlarm] = {}
+        """what speaks for the causes of each alarm"""
+        self.active = np.zeros(count, np.bool_)
+        """(fans,) whether the speed or the torque balance has an alarm"""
+        self._raised, self.onset = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        """(fans,) bins in which an alarm was raised, and in which its fault probably began"""
+        self._peak, self._over_s = np.zeros(count), np.zeros(count)
+        """(fans,) share of the speed that the fault took at most, with its sign; and how long it has been over"""
+        faults = len(self._hypotheses.faults)
+        self._shape, self._is_probable = np.ones((count, faults)), np.zeros((count, faults), np.bool_)
+        """(fans, faults) share of the speed that each takes where that of an alarm was at its largest; which it may
+        be"""
+        self._shows = np.ones(count)
+        """(fans,) how much of its largest share a fault takes at the present speed, at least"""
+        self.is_returning = np.zeros(count, np.bool_)
+        """(fans,) an alarm is active and a healthy fan is likelier"""
+        self.in_balance = np.zeros(count, np.bool_)
+        """(fans,) whether the torque balance is what is compared"""
+        self.now: Inputs | None = None
+        """of the last bin"""
+        self.deviation_rad_s, self.deviation_std_rad_s = np.zeros(count), np.zeros(count)
+        """(fans,) newest reading less what is expected of this fan when it is healthy, and the standard deviation of
+        that; by the torque balance, of the speed that it tends to"""
+
+    @property
+    def number(self) -> int:
+        """Of the last bin."""
+        return self._evidence.number
+
+    @property
+    def has_alarm(self) -> Array:
+        """(fans,) of either kind."""
+        return self.active | self.missing.is_active
+
+    def take(self, one: Bin) -> list[Change]:
+        """What changes with a bin. Bins come in order of time."""
+        passed = (one.t_ns - self.operation.t_ns) // self._bin_ns if self.operation.t_ns else 1
+        if passed > 1:
+            self._rest(passed - 1)
+        before = self.has_alarm
+        was_active = self.active.copy()
+        self.missing.take(one.missing)
+        now = self.operation.inputs(one)
+        now = replace(now, is_new=now.is_new | (self._wrong.waits & (now.readings > 0)))  # what is far cannot wait
+        now, pushes = self._weigh(one, now)
+        self.now = now
+        known = now.readings > 0
+        self.in_balance = np.where(known, now.is_balance, self.in_balance)
+        for fan in np.flatnonzero(known & ~self.active & (self.log_statistic > self.log_limit)).tolist():
+            self._raise(fan, pushes[fan], float(now.speed_rad_s[fan]))
+        if self.active.any():
+            for fan in np.flatnonzero(was_active & self._is_over(known, self._shares(now, pushes))).tolist():
+                self._end(fan)
+        off = now.deviation_rad_s - self.model.expected_rad_s
+        self.deviation_rad_s = np.where(known, off, self.deviation_rad_s)
+        after = self.has_alarm
+        return [Change(fan, bool(after[fan])) for fan in np.flatnonzero(before != after).tolist()]
+
+    @property
+    def deviation_score(self) -> Array:
+        """(fans,) log of the statistic over that of the limit; of an alarm the log of the odds of its fault, over the
+        same: below 1 while a healthy fan is likelier."""
+        before = (self.log_statistic / self.log_limit).clip(0.0, 1.0)
+        odds = self._log_odds() / self.log_limit
+        during = np.where(self.is_returning, odds.clip(0.0, 1.0), odds.clip(1.0, HIGHEST_SCORE))
+        return np.where(self.active, during, before)
+
+    @property
+    def score(self) -> Array:
+        """(fans,) the larger one of that and of the score of missing readings."""
+        return np.maximum(self.deviation_score, self.missing.score)
+
+    def raised_s(self, fan: int) -> float:
+        """How long ago the alarm of a fan was raised."""
+        return float(self.number - self._raised[fan]) * self.bin_s
+
+    def go_on_from(self, before: Decision) -> None:
+        """Take over what another one has learned, whose bins are of another length; evidence begins again."""
+        super().restore(before.arrays())
+        self.model.restore(before.model.arrays())
+        self.missing.restore(before.missing.arrays())
+        self.log_statistic[:] = -np.inf
+        self._raised[:] = self.onset[:] = 0
+
+    @property
+    def fault(self) -> tuple[Array, Array]:
+        """(fans,) what the fault of an alarm takes (-) or adds, and its standard deviation: shares of the speed."""
+        return self.model.mean[:, FAULT], np.sqrt(self.model.covariance[:, FAULT, FAULT])
+
+    def begin_again(self, fans: Array) -> None:
+        """Forget what was learned of some fans, (fans,) of bool, and end their alarms."""
+        self.missing.forget(fans)
+        for fan in np.flatnonzero(fans).tolist():
+            if self.active[fan]:
+                self._end(fan)
+            self.model.begin_again(fan)
+            self._forget(fan)
+
+    def snapshot(self) -> tuple[dict[str, int], dict[str, Array]]:
+        """The state: times in ns, and arrays. Evidence that is small is not kept."""
+        kept = np.flatnonzero(self.score > KEPT_FROM)
+        arrays = {
+            **within("decision", self.arrays()),
+            **within("operation", self.operation.arrays()),
+            **within("model", self.model.arrays()),
+            **within("missing", self.missing.arrays()),
+            **within("wrong", self._wrong.arrays()),
+            **within("evidence", self._evidence.kept(kept)),
+        }
+        for fan, alarm in self.alarms.items():
+            arrays |= within(f"alarm {fan}", alarm.kept())
+        return {"t_ns": self.operation.t_ns}, arrays
+
+    def restore(self, stored: Mapping[str, Array], t_ns: int = 0) -> None:
+        """Continue from a snapshot.
+
+        Raises:
+            KeyError, ValueError: it is of another number of fans, or none.
+        """
+        super().restore(part("decision", stored))
+        self.operation.restore(part("operation", stored))
+        self.model.restore(part("model", stored))
+        self.missing.restore(part("missing", stored))
+        self._wrong.restore(part("wrong", stored))
+        self._evidence.restore_kept(part("evidence", stored))
+        self.operation.t_ns = t_ns
+        self.alarms = {}
+        for fan in np.flatnonzero(self.active).tolist():
+            of_alarm = part(f"alarm {fan}", stored)
+            if of_alarm:
+                alarm = FanInAlarm(fan, self._fans, self.model, self._evidence, self._hypotheses)
+                alarm.restore(of_alarm)
+                self.alarms[fan] = alarm
+
+    def _rest(self, bins: int) -> None:
+        """Let a gap pass."""
+        self.model.rest(bins)
+        self._wrong.forget()
+        self._evidence.number += bins
+        for alarm in self.alarms.values():
+            alarm.rest(bins, self.bin_s)
+        if bins * self.bin_s > FORGETS_S:
+            self._evidence.since[:] = self.number
+            self.log_statistic[:] = -np.inf
+            self.alarms.clear()
+
+    def _weigh(self, one: Bin, now: Inputs) -> tuple[Inputs, Array]:
+        """Let model and evidence take the readings up; returns what counts, and what the columns of the faults do."""
+        model, evidence = self.model, self._evidence
+        evidence.begin(now.moved_to_rad_s - now.moves_rad_s2 * self.bin_s)
+        largest = self._peak * self._shows
+        model.noise[:, FAULT] = np.where(self.active, np.square(WALKS_PER_SQRT_S * largest) * self.bin_s, 0.0)
+        evidence.show(now.newest_rad_s)
+        model.predict(now)
+        now = self.operation.read(one, now, self._counts(one, now))
+        found, counts = model.innovation(now), now.readings > 0
+        root = np.sqrt(found.variance)
+        gain = found.with_states * (counts / found.variance)[:, np.newaxis]
+        gain[self.active, SLOW] = 0.0
+        farthest = np.where(self._wrong.agree, np.inf, FAR_SIGMAS) * root
+        agreed = found.distance_rad_s.clip(-farthest, farthest)
+        pushes = forces(self._fans, now, evidence.age_s, evidence.then_rad_s, self._hypotheses.columns)
+        evidence.add(pushes, model, found, gain, agreed)
+        farthest = np.where(self.active, AGREED_SIGMAS, FAR_SIGMAS) * root
+        model.update(found, gain, agreed.clip(-farthest, farthest))
+        for fan, alarm in self.alarms.items():
+            alarm.take(now.of(fan), self.bin_s)
+        known = counts
+        self.deviation_std_rad_s = np.where(known, root, self.deviation_std_rad_s)
+        self.log_statistic = np.where(known, evidence.log_statistic(), self.log_statistic)
+        return now, pushes
+
+    def _counts(self, one: Bin, now: Inputs) -> Array:
+        """(n, fans) whether a sample of a bin counts: it is none of a tacho gone wrong."""
+        fans, found = self._fans, self.model.innovation(now)
+        expected = now.deviation_rad_s - found.distance_rad_s
+        of_sample = np.square(fans.noise_rad_s) * (1.0 - 1.0 / np.maximum(now.readings, 1.0))  # of which it is a mean
+        of_count = np.where(now.is_new, 0.0, np.square(fans.pulse_rad_s) / 6.0)  # the filter waits for its end
+        std = np.sqrt(found.variance + np.where(now.is_balance, 0.0, of_sample + of_count))
+        samples = self.operation.samples_rad_s(one, now)
+        is_known, is_held = np.isfinite(samples), fans.held_s > 0.0
+        # what is not held is judged by the mean of its bin: a fan that vibrates is far on both sides in turn
+        distance = np.where(is_known & ~is_held, found.distance_rad_s, samples - expected)
+        counts = self._wrong.counts(distance, std, learns=~self.active)
+        return is_known & counts & (~one.wrong | self._wrong.agree)
+
+    def _raise(self, fan: int, pushes: Array, speed_rad_s: float) -> None:
+        """Begin an alarm: what the filter has taken of the likeliest fault is given back, and the fault becomes a
+        state. pushes: (onsets, COLUMNS) of `forces`."""
+        evidence, model = self._evidence, self.model
+        self.alarms[fan] = FanInAlarm(fan, self._fans, model, evidence, self._hypotheses)
+        terms = evidence.log_terms(fan)
+        onset, fault = (int(index) for index in np.unravel_index(int(np.argmax(terms)), terms.shape))
+        columns = np.array(self._hypotheses.faults[fault].columns)
+        sizes, of_sizes = self._hypotheses.sizes(evidence.sums, fan, onset, fault)
+        makes = evidence.sums.taken(fan, onset)[columns]  # of the states less what the filter has taken for its own
+        makes[:, FAULT] = pushes[onset, columns] / max(speed_rad_s, SLOWEST_RAD_S)
+        model.mean[fan] += sizes @ makes
+        model.covariance[fan] += makes.T @ of_sizes @ makes
+        size = float(model.mean[fan, FAULT])
+        self._peak[fan] = math.copysign(max(abs(size), SMALLEST), size)
+        self.active[fan], self._over_s[fan] = True, 0.0
+        self._raised[fan], self.onset[fan] = evidence.number, evidence.began[onset]
+        self._forget(fan)
+
+    def _end(self, fan: int) -> None:
+        self.alarms.pop(fan, None)
+        model = self.model
+        model.mean[fan, FAULT] = 0.0
+        model.covariance[fan, FAULT], model.covariance[fan, :, FAULT] = 0.0, 0.0
+        self.active[fan] = self.is_returning[fan] = False
+        self._forget(fan)
+
+    def _forget(self, fan: int) -> None:
+        self._evidence.forget(fan)
+        self.log_statistic[fan] = -np.inf
+
+    def _shares(self, now: Inputs, pushes: Array) -> Array:
+        """(fans, faults) share of the present speed that each takes, of a size that does not grow."""
+        first = [BEFORE_GROWTH.get(fault.columns[0], fault.columns[0]) for fault in self._hypotheses.faults]
+        return pushes[:, 0, first] / np.maximum(now.speed_rad_s, SLOWEST_RAD_S)[:, np.newaxis]
+
+    def _log_odds(self) -> Array:
+        """(fans,) log of how much likelier the fault of an alarm is, as large as it was at most and as it shows at this
+        speed, than a healthy fan."""
+        size, variance = self.model.mean[:, FAULT], self.model.covariance[:, FAULT, FAULT]
+        expected = self._peak * self._shows
+        return expected * (size - 0.5 * expected) / np.maximum(variance, 1e-12)
+
+    def _is_over(self, known: Array, shares: Array) -> Array:
+        """(fans,) whether for some time a healthy fan has been likelier than the fault at its largest. shares: see
+        `_shares`."""
+        model, peak = self.model, self._peak
+        size, variance = model.mean[:, FAULT], model.covariance[:, FAULT, FAULT]
+        surely = np.sign(size) * (np.abs(size) - 2.0 * np.sqrt(variance))
+        is_larger = known & self.active & (surely * np.sign(size) > np.abs(peak))
+        self._peak = np.where(is_larger, surely, peak)
+        is_largest = is_larger | (self._raised == self.number)
+        self._shape = np.where(is_largest[:, np.newaxis], shares, self._shape)
+        for fan, alarm in self.alarms.items():
+            self._is_probable[fan] = alarm.probabilities.sum(axis=0) > PROBABLE
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shows = np.where(self._is_probable, shares / self._shape, 1.0).min(axis=1, initial=1.0)
+        self._shows = np.where(known, np.nan_to_num(shows).clip(0.0), self._shows)
+        is_healthy = self.active & (self._log_odds() < -math.log(OVER_ODDS))
+        self.is_returning = np.where(known, is_healthy, self.is_returning)
+        over_s = np.where(is_healthy, self._over_s + self.bin_s, 0.0)
+        self._over_s = np.where(known, over_s, self._over_s)
+        found: Array = self._over_s >= OVER_S
+        return found

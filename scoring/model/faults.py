@@ -1,0 +1,80 @@
+"""Faults as changes of the model of a healthy fan: a row each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.messages import Array
+from scoring.model.operation import Fans, Inputs
+
+DRAG, DRAG_GROWS, FRICTION, FRICTION_GROWS, DRIVE, SCALE, STUCK, RISES, FALLS = range(9)
+OF_TACHO = slice(SCALE, STUCK + 1)
+"""what changes the reading and not the rotor"""
+BEFORE_GROWTH = {DRAG_GROWS: DRAG, FRICTION_GROWS: FRICTION}
+"""what each that grows is multiplied by its age of"""
+COLUMNS = 9
+GROWS_S = 60.0
+"""unit of time of what grows"""
+LARGEST_FRICTION = 10.0
+"""times the speed: what a friction that is harmless at the top speed does at a low one"""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A cause, and how it shows: columns of `forces` with prior standard deviations of their sizes (shares of the top
+    speed, in GROWS_S where it grows; s for RISES and FALLS), and the sign of the first (0: both)."""
+
+    cause: str
+    columns: tuple[int, ...]
+    std: tuple[float, ...]
+    sign: int
+    mean: float
+    """prior mean of the size of the first"""
+    weight: float
+    """prior probability, of a fan whose command is a torque: there the course over the speed tells one from another"""
+    of_own_drive: float
+    """and of one that controls its speed by itself: there the course over the time tells"""
+
+
+FAULTS = (
+    Fault("external_torque", (DRAG,), (0.12,), -1, 0.0, 0.0, 0.25),
+    Fault("external_torque", (FRICTION,), (0.08,), -1, 0.0, 0.25, 0.10),
+    Fault("drag_up", (DRAG,), (0.12,), -1, 0.0, 0.13, 0.0),
+    Fault("drag_up", (DRAG_GROWS,), (0.02,), -1, 0.0, 0.10, 0.18),
+    Fault("drag_up", (DRAG_GROWS,), (0.1,), -1, 0.0, 0.07, 0.10),
+    Fault("friction_up", (DRAG, RISES, FALLS), (0.04, 0.6, 0.4), -1, 0.0, 0.0, 0.10),
+    Fault("friction_up", (FRICTION_GROWS,), (0.05,), -1, 0.0, 0.15, 0.07),
+    Fault("gain_down", (DRIVE,), (0.12,), -1, 0.0, 0.13, 0.08),
+    Fault("drag_down", (DRAG,), (0.12,), +1, 0.0, 0.15, 0.10),
+    Fault("sensor_scaling", (SCALE,), (0.2,), 0, 0.0, 0.02, 0.02),
+    Fault("sensor_stuck", (STUCK,), (0.05,), 0, 1.0, 0.02, 0.02),
+)
+
+
+def forces(fans: Fans, now: Inputs, age_s: Array, then_rad_s: Array, columns: int = COLUMNS) -> Array:
+    """(fans, onsets, columns) what each column of size 1 adds to what a fan tends to, rad/s, or to its reading.
+
+    A torque moves the steady speed by itself over the slope of the torque that the fan needs; of a fan that controls
+    its speed by itself drag takes a share of the speed. age_s: (onsets,); then_rad_s: (fans, onsets), the speed at the
+    onset; columns: number of the first ones, which are asked for.
+    """
+    speed, top = now.speed_rad_s, fans.top_rad_s
+    steeper = fans.slope(top) / fans.slope(speed)
+    needed = (fans.viscous + fans.drag * speed) * speed + fans.friction
+    at_top = (fans.viscous + fans.drag * top) * top + fans.friction
+    full = top * steeper
+    of_fans = np.empty((len(speed), COLUMNS))
+    of_drag = np.where(fans.has_own_drive, speed, steeper * speed**2 / top)
+    of_fans[:, DRAG] = of_fans[:, DRAG_GROWS] = of_drag
+    of_fans[:, FRICTION] = of_fans[:, FRICTION_GROWS] = np.minimum(full, LARGEST_FRICTION * speed)
+    of_fans[:, DRIVE] = full * needed / at_top
+    of_fans[:, SCALE] = np.where(now.is_balance, 0.0, now.moved_to_rad_s)
+    of_fans[:, STUCK] = -of_fans[:, SCALE]
+    of_fans[:, RISES], of_fans[:, FALLS] = np.minimum(-now.moves_rad_s2, 0.0), np.maximum(-now.moves_rad_s2, 0.0)
+    over_ages = np.ones((len(age_s), columns))
+    over_ages[:, DRAG_GROWS] = over_ages[:, FRICTION_GROWS] = age_s / GROWS_S
+    made: Array = of_fans[:, np.newaxis, :columns] * over_ages
+    made[:, :, STUCK] += np.where(now.is_balance[:, np.newaxis], 0.0, then_rad_s)
+    return made

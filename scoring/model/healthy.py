@@ -1,0 +1,263 @@
+"""The model of a healthy fan: what may make its speed differ from the prediction of its twin.
+
+With w the speed, w' its rate, both as the twin predicts them, a healthy fan in bin k deviates from its twin by
+
+    s = w (h(w).theta + load sag + a + c + v + u + f) - rise w'+ - fall w'-  what it tends to
+    x = keep x + (1 - keep) s,   keep = exp(-bin / time constant)        its rotor follows
+    y = mean of x - late w' - e_k-1 + e_k + white                        and its tacho shows
+
+    theta       share of the speed   error of the twin over speed (hat functions on KNOTS)
+    rise, fall  s                    errors of its time constants
+    late        s                    how late the tacho shows the speed, other than when the twin was trained
+    sag         share                what the load of the other fans of the tray does to the supply
+    a           share                age: how the fan changes within days and months, a random walk
+    c           share                what the air does: an Ornstein-Uhlenbeck process over an hour
+    v           share                what theta does not resolve: it stays while speed and command stay
+    u           share                the wandering of the speed: an Ornstein-Uhlenbeck process over seconds
+    f           share                what a fault takes: 0, and a random walk while there is an alarm
+    e           rad/s                part of a pulse that a count misses; the next count has it
+    x, mean     rad/s                deviation of the rotor at the end of the bin, and its mean over the bin
+    q           rad/s                s as the torque balance shows it, which passes the filter of the balance
+
+The time constant is that of the twin's torque balance, J w' = torque - viscous w - drag w|w| - friction: the deviation
+of two solutions of it decays with (viscous + drag (w + w_twin)) / J. So one state joins both residuals: the speed
+shows x, and the torque balance what x tends to. Where the free run is not known, or is known worse, the balance is
+what is read.
+
+A Kalman filter gives the innovations and their variance. All that is uncertain is in it: twin, few data, air, motion,
+counts. Nothing else widens a limit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.messages import Array
+from scoring.model.operation import Fans, Inputs
+from scoring.model.priors import Priors
+from scoring.model.saved import Saved
+
+KNOTS = np.array([0.09, 0.14, 0.2, 0.28, 0.38, 0.5, 0.63, 0.77, 0.9, 1.02])
+"""shares of the top speed"""
+K = len(KNOTS)
+RISE, FALL, LATE, SAG, AGE, AIR, LOCAL, WANDER, FAULT, COUNT, ROTOR, BALANCE, SHOWN = range(K, K + 13)
+STATES = K + 13
+SLOW = slice(WANDER)
+"""the states that stay what they are during a fault"""
+FADING = slice(AIR, WANDER + 1)
+"""the states of which a bin keeps a share"""
+FOLLOWING = slice(ROTOR, SHOWN + 1)
+"""the states that follow what a fan tends to"""
+HALF = np.tril_indices(STATES)
+CARRIED = SHOWN
+"""number of the states that the next bin follows from: all but the last, what a tacho shows but for e_k and white"""
+BOTH_BUT_NOT = np.array([[1.0], [-1.0]])
+"""what a reading tells of two states, but not between two of which nothing is learned"""
+SLOWEST_RAD_S = 10.0
+"""errors in rad/s are no larger share of a lower speed"""
+
+
+def hats(share: Array) -> Array:
+    """(n, K) hat functions on KNOTS at shares of the top speed, (n,)."""
+    place = np.interp(share, KNOTS, np.arange(K))
+    return np.maximum(0.0, 1.0 - np.abs(place[:, np.newaxis] - np.arange(K)))
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """What the readings of a bin tell: how far each is from what was expected, (fans,), and how sure that was."""
+
+    distance_rad_s: Array
+    variance: Array
+    with_states: Array
+    """(fans, STATES) covariance of the states with the reading"""
+    shown: Array
+    """(fans,) the state that is read"""
+
+
+class HealthyFans(Saved):
+    """The filter, all fans as columns of one state: mean (fans, STATES) and covariance (fans, STATES, STATES)."""
+
+    KEPT = ("mean", "_has_begun")
+
+    def __init__(self, fans: Fans, priors: Priors, bin_s: float, period_s: float) -> None:
+        """Begin with the priors. period_s: of the samples."""
+        self._fans, self._priors, self._bin_s, self._period_s = fans, priors, bin_s, period_s
+        count = len(fans.top_rad_s)
+        self._rows = np.arange(count)
+        self.mean = np.zeros((count, STATES))
+        self.covariance = _prior(fans, priors, period_s)
+        self.kept = np.ones((count, 3))
+        """of FADING, from one bin to the next"""
+        self.tends = np.zeros((count, 3, STATES))
+        """rows of FOLLOWING: these are the rows times the states before"""
+        self.follows = np.ones((count, 3))
+        """how far they go to what a fan tends to in a bin"""
+        self._has_begun = np.zeros(count, np.bool_)
+        """(fans,) whether there was a reading: at the first one a rotor is where it tends to"""
+        self._holds = np.ones(count)
+        """(fans,) 1 where there is no new reading, so that what the last count missed stays"""
+        self._filters = 1.0 - math.exp(-bin_s * fans.balance_filter_per_s)
+        self.kept[:, WANDER - AIR], self.kept[:, 0] = np.exp(-bin_s / priors.wander_s), np.exp(-bin_s / priors.air_s)
+        self.noise = np.zeros((count, STATES))
+        """(fans, STATES) variance that a bin adds"""
+        self.noise[:, AGE] = priors.ageing_per_sqrt_h**2 * bin_s / 3600.0
+        self.noise[:, WANDER] = priors.wander**2 * (1.0 - self.kept[:, WANDER - AIR] ** 2)
+        self.noise[:, AIR] = priors.air**2 * (1.0 - self.kept[:, 0] ** 2)
+        self._missed = np.square(priors.count * fans.pulse_rad_s) / 12.0
+        self._of_balance = np.zeros(count)
+        """(fans,) variance of the noise of the torque balance, as speed"""
+        self.tends[:, SHOWN - ROTOR, COUNT] = -1.0
+        self.steady = np.zeros((count, COUNT))
+        """(fans, COUNT) what a fan tends to is this times the states"""
+
+    def of(self, fan: int) -> HealthyFans:
+        """A copy for one fan."""
+        copied = HealthyFans(self._fans.of(fan), self._priors, self._bin_s, 0.0)
+        copied.mean, copied.covariance = self.mean[[fan]], self.covariance[[fan]]
+        copied._has_begun = self._has_begun[[fan]]
+        return copied
+
+    def arrays(self) -> dict[str, Array]:
+        """See Saved. Half of a covariance is the other half."""
+        return {**super().arrays(), "covariance": self.covariance[:, *HALF]}
+
+    def restore(self, stored: Mapping[str, Array]) -> None:
+        """See Saved."""
+        super().restore(stored)
+        self.covariance[:, *HALF] = stored["covariance"]
+        self.covariance[:, *HALF[::-1]] = stored["covariance"]
+
+    def begin_again(self, fan: int) -> None:
+        """Return a fan to the priors."""
+        self.mean[fan], self._has_begun[fan] = 0.0, False
+        self.covariance[fan] = _prior(self._fans.of(fan), self._priors, self._period_s)[0]
+
+    def rest(self, bins: int) -> None:
+        """Let time pass in which nothing is known: at the next reading a rotor is where it tends to."""
+        passed_s, p = bins * self._bin_s, self._priors
+        kept = np.ones(STATES)
+        kept[LOCAL], kept[WANDER] = math.exp(-passed_s / p.local_s), math.exp(-passed_s / p.wander_s)
+        kept[AIR], kept[COUNT] = math.exp(-passed_s / p.air_s), 0.0
+        self.mean *= kept
+        self.covariance *= kept[:, np.newaxis] * kept
+        variance = np.einsum("nii->ni", self.covariance)  # a view
+        variance[:, AGE] += p.ageing_per_sqrt_h**2 * passed_s / 3600.0
+        for state, std in ((WANDER, p.wander), (AIR, p.air)):
+            variance[:, state] += std**2 * (1.0 - kept[state] ** 2)
+        variance[:, LOCAL] += np.square(p.local_rad_s / (0.5 * self._fans.top_rad_s)) * (1.0 - kept[LOCAL] ** 2)
+        self._has_begun[:] = False
+
+    @property
+    def expected_rad_s(self) -> Array:
+        """(fans,) how far a healthy fan tends to deviate from its twin at the present speed."""
+        return np.asarray(np.einsum("ni,ni->n", self.steady[:, :FAULT], self.mean[:, :FAULT]))
+
+    @property
+    def age(self) -> tuple[Array, Array]:
+        """(fans,) how much faster (+) or slower each fan has become, and its standard deviation: shares of the
+        speed."""
+        return self.mean[:, AGE].copy(), np.sqrt(self.covariance[:, AGE, AGE])
+
+    def predict(self, now: Inputs) -> None:
+        """Go on by one bin."""
+        p, covariance = self._priors, self.covariance
+        moved = np.abs(now.rate_rad_s2) * self._bin_s / self._fans.top_rad_s
+        stays = np.exp(-(moved + now.turned) / p.local_length - self._bin_s / p.local_s)
+        self.kept[:, LOCAL - AIR] = stays
+        new = (p.local_rad_s**2 + now.unseen_rad_s**2) / np.square(np.maximum(now.speed_rad_s, SLOWEST_RAD_S))
+        self.noise[:, LOCAL] = new * (1.0 - stays**2)
+        faded = covariance[:, FADING] * self.kept[:, :, np.newaxis]
+        faded[:, :, FADING] *= self.kept[:, np.newaxis, :]
+        covariance[:, FADING], covariance[:, :, FADING] = faded, faded.swapaxes(1, 2)
+        variance = covariance.reshape(len(stays), -1)[:, :: STATES + 1]  # a view
+        variance += self.noise
+        lags = variance[:, RISE : FALL + 1]
+        walked = np.minimum(lags + (p.lag_s**2 * moved)[:, np.newaxis], (2.0 * p.lag_s) ** 2)
+        np.maximum(lags, walked, out=lags)
+        self._follow(now)
+        with_states = self.tends @ covariance
+        own = with_states @ self.tends.swapaxes(1, 2)
+        self._of_balance = np.square(self._fans.balance_noise / self._fans.slope(now.speed_rad_s))
+        own[:, 1, 1] += self._of_balance * (1.0 - np.square(1.0 - self.follows[:, 1]))
+        covariance[:, FOLLOWING] = with_states
+        covariance[:, :, FOLLOWING] = with_states.swapaxes(1, 2)
+        covariance[:, FOLLOWING, FOLLOWING] = own
+        covariance[:, COUNT] *= self._holds[:, np.newaxis]
+        covariance[:, :, COUNT] *= self._holds[:, np.newaxis]
+        covariance[:, COUNT, COUNT] += (1.0 - self._holds) * self._missed
+        self.carry(self.mean[:, :, np.newaxis])
+
+    def carry(self, states: Array) -> None:
+        """Take (fans, STATES, n) states on to the present bin."""
+        states[:, FADING] *= self.kept[:, :, np.newaxis]
+        states[:, FOLLOWING] = self.tends @ states
+        states[:, COUNT] *= self._holds[:, np.newaxis]
+
+    def _follow(self, now: Inputs) -> None:
+        """Set how rotor, balance and tacho follow what the fan tends to at this speed."""
+        fans, speed, tends, follows = self._fans, now.speed_rad_s, self.tends, self.follows
+        decay = np.maximum(fans.viscous + fans.drag * (now.measured_rad_s + speed), 1e-9) / fans.inertia * self._bin_s
+        follows[:, 0], follows[:, 1] = -np.expm1(-decay), self._filters
+        follows[:, 2] = 1.0 - follows[:, 0] / decay  # the mean over the bin
+        is_new = now.is_new
+        self._holds = 1.0 - is_new
+        begins = is_new & ~self._has_begun
+        if begins.any():
+            follows[begins] = 1.0
+            self._has_begun |= begins
+        steady, moves = self.steady, now.moves_rad_s2
+        np.multiply(hats(speed / fans.top_rad_s), speed[:, np.newaxis], out=steady[:, :K])
+        np.minimum(-moves, 0.0, out=steady[:, RISE])
+        np.maximum(-moves, 0.0, out=steady[:, FALL])
+        np.multiply(speed, now.load, out=steady[:, SAG])
+        steady[:, AGE:] = speed[:, np.newaxis]
+        np.multiply(follows[:, :, np.newaxis], steady[:, np.newaxis, :], out=tends[:, :, :COUNT])
+        tends[:, ::2, ROTOR] = 1.0 - follows[:, ::2]
+        tends[:, 1, BALANCE] = 1.0 - follows[:, 1]
+        tends[:, 2, LATE] = -moves
+
+    def innovation(self, now: Inputs) -> Innovation:
+        """What the readings of the bin tell."""
+        p, fans = self._priors, self._fans
+        shown = np.where(now.is_balance, BALANCE, SHOWN)
+        with_states = self.covariance[self._rows, shown]
+        white = np.square(fans.noise_rad_s) / np.maximum(now.readings, 1.0)
+        white += np.square(p.half_range * now.half_range_rad_s) + np.square(fans.timing_s * now.rate_rad_s2)
+        missed = np.where(now.is_balance, 0.0, self._missed)
+        white = np.where(now.is_balance, p.balance**2 * self._of_balance, white + missed)
+        variance = with_states[self._rows, shown] + white
+        with_states[:, COUNT] += missed
+        expected = self.mean[self._rows, shown]
+        distance = np.where(now.readings > 0, now.deviation_rad_s - expected, 0.0)
+        return Innovation(distance, variance, with_states, shown)
+
+    def update(self, found: Innovation, gain: Array, distance_rad_s: Array) -> None:
+        """Take the readings up. gain: (fans, STATES), with_states over variance, or 0 where nothing is learned;
+        distance: as far as it counts."""
+        self.mean += gain * distance_rad_s[:, np.newaxis]
+        told = np.empty((len(gain), STATES, 2))
+        np.divide(found.with_states, np.sqrt(found.variance)[:, np.newaxis], out=told[:, :, 0])
+        np.multiply(told[:, :, 0], gain == 0.0, out=told[:, :, 1])
+        self.covariance -= told @ np.multiply(told.swapaxes(1, 2), BOTH_BUT_NOT, order="C")
+
+
+def _prior(fans: Fans, p: Priors, period_s: float) -> Array:
+    top = fans.top_rad_s
+    covariance = np.zeros((len(top), STATES, STATES))
+    near = np.exp(-0.5 * np.square((KNOTS[:, np.newaxis] - KNOTS) / p.twin_length))
+    local = np.minimum(p.twin_rad_s / (KNOTS * top[:, np.newaxis]), p.largest_twin_share)
+    covariance[:, :K, :K] = p.twin_share**2 + near * local[:, :, np.newaxis] * local[:, np.newaxis, :]
+    covariance[:, :K, :K] += 1e-8 * np.eye(K)
+    low = fans.may_have_plateau[:, np.newaxis] * np.where(p.plateau_ends > KNOTS, p.plateau / KNOTS, 0.0)
+    covariance[:, :K, :K] += low[:, :, np.newaxis] * low[:, np.newaxis, :]
+    for state, std in ((RISE, p.lag_s), (FALL, p.lag_s), (SAG, p.sag), (AIR, p.air), (WANDER, p.wander)):
+        covariance[:, state, state] = std**2
+    phase_s = (fans.held_s + period_s) / math.sqrt(6.0)  # of window and sample: two phases, then and now
+    covariance[:, LATE, LATE] = np.square(phase_s)
+    covariance[:, LOCAL, LOCAL] = np.square(p.local_rad_s / (0.5 * top))
+    return covariance

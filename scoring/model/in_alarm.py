@@ -1,0 +1,146 @@
+"""What speaks for each cause of an alarm, from its onset on, for as long as it lasts.
+
+The model of a healthy fan goes on as though nothing were wrong, and the sums of each onset that was possible when the
+alarm was raised go on with it, so what a fan does long afterwards still counts. What grows may end to grow: each onset
+stands once for each time after which it may have ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from schemas.messages import Array
+from scoring.diagnosis.cause_words import PossibleCause
+from scoring.model.faults import BEFORE_GROWTH, GROWS_S, forces
+from scoring.model.healthy import HealthyFans
+from scoring.model.onsets import Evidence, Hypotheses, Sums, differ
+from scoring.model.operation import Fans, Inputs
+from scoring.model.saved import part, within
+
+ENDS_S = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0, np.inf)
+"""times after its onset at which a growth may end, equally probable"""
+FIRST = np.arange(1)
+HOPELESS, MOST = 12.0, 24
+"""log of the odds against an onset from which on it no longer counts; and number of those that do"""
+
+
+class FanInAlarm:
+    """One fan with an alarm."""
+
+    def __init__(self, fan: int, fans: Fans, model: HealthyFans, evidence: Evidence, hypotheses: Hypotheses) -> None:
+        """Begin with the bin that raised the alarm; model: which has not heard of the alarm."""
+        self._fans, self._model, self._hypotheses = fans.of(fan), model.of(fan), hypotheses.of(fan)
+        onsets = np.flatnonzero(np.isfinite(evidence.log_terms(fan)).any(axis=1))
+        ages_s = evidence.age_s[onsets]
+        ends_s = np.array(ENDS_S)
+        which, end = np.nonzero(ends_s[np.newaxis, :] > ages_s[:, np.newaxis])
+        self._ends_s, self._ages_s = ends_s[end], ages_s[which]
+        self._then_rad_s = evidence.then_rad_s[[fan]][:, onsets[which]]
+        self._log_weight = np.log(evidence.weight[onsets] / np.bincount(which, minlength=len(onsets)))[which]
+        self._sums = evidence.sums.of(fan, onsets[which], self._hypotheses.columns)
+        self._has_changed = evidence.has_changed[[fan]][:, onsets[which]]
+        self._newest_rad_s = evidence.newest_rad_s[[fan]]
+        self._terms = self._log_terms()
+        self._drop_hopeless()
+
+    @property
+    def age_s(self) -> float:
+        """Of the likeliest onset."""
+        return float(self._ages_s[self._terms.max(axis=1).argmax()])
+
+    def take(self, now: Inputs, bin_s: float) -> None:
+        """Take the reading of a bin up. now: of this fan."""
+        self._ages_s = self._ages_s + bin_s
+        self._has_changed |= differ(self._newest_rad_s, now.newest_rad_s)[:, np.newaxis]
+        self._newest_rad_s = np.where(np.isfinite(now.newest_rad_s), now.newest_rad_s, self._newest_rad_s)
+        self._model.predict(now)
+        found = self._model.innovation(now)
+        gain = found.with_states * ((now.readings > 0) / found.variance)[:, np.newaxis]
+        pushes = forces(self._fans, now, self._grown_s, self._then_rad_s, self._hypotheses.columns)
+        self._sums.add(pushes, self._model, found, gain, found.distance_rad_s)
+        self._model.update(found, gain, found.distance_rad_s)
+        if gain.any():
+            self._terms = self._log_terms()
+            self._drop_hopeless()
+
+    def rest(self, bins: int, bin_s: float) -> None:
+        """Let a gap pass."""
+        self._ages_s = self._ages_s + bins * bin_s
+        self._model.rest(bins)
+
+    @property
+    def probabilities(self) -> Array:
+        """(onsets, faults) of the posterior."""
+        weights = np.exp(self._terms - self._terms.max())
+        return np.asarray(weights / weights.sum())
+
+    def causes(self) -> list[PossibleCause]:
+        """All causes, the most probable first."""
+        weights = self.probabilities
+        probability: dict[str, float] = {}
+        best: dict[str, tuple[float, int, int]] = {}
+        for fault, row in enumerate(self._hypotheses.faults):
+            onset = int(weights[:, fault].argmax())
+            weight = float(weights[:, fault].sum())
+            probability[row.cause] = probability.get(row.cause, 0.0) + weight
+            best[row.cause] = max(best.get(row.cause, (-1.0, 0, 0)), (weight, onset, fault))
+        found = []
+        for cause, share in probability.items():
+            _, onset, fault = best[cause]
+            sizes, covariance = self._hypotheses.sizes(self._sums, 0, onset, fault)
+            grows = self._hypotheses.faults[fault].columns[0] in BEFORE_GROWTH
+            times = float(self._grown_s[onset]) / GROWS_S if grows else 1.0
+            found.append(PossibleCause(cause, share, times * float(sizes[0]), times * float(covariance[0, 0]) ** 0.5))
+        return sorted(found, key=lambda each: -each.probability)
+
+    def kept(self) -> dict[str, Array]:
+        """The state."""
+        own = {
+            "ends_s": self._ends_s,
+            "ages_s": self._ages_s,
+            "then_rad_s": self._then_rad_s,
+            "log_weight": self._log_weight,
+            "has_changed": self._has_changed,
+            "newest_rad_s": self._newest_rad_s,
+        }
+        return {**own, **within("model", self._model.arrays()), **within("sums", self._sums.kept(FIRST))}
+
+    def restore(self, stored: Mapping[str, Array]) -> None:
+        """Continue from a state.
+
+        Raises:
+            KeyError, ValueError: it is none.
+        """
+        self._ends_s, self._ages_s = stored["ends_s"], stored["ages_s"]
+        self._then_rad_s, self._log_weight = stored["then_rad_s"], stored["log_weight"]
+        self._has_changed, self._newest_rad_s = stored["has_changed"], stored["newest_rad_s"]
+        self._model.restore(part("model", stored))
+        self._sums = Sums(1, len(self._ages_s), self._hypotheses.columns, self._hypotheses.pairs)
+        self._sums.restore(FIRST, part("sums", stored))
+        self._terms = self._log_terms()
+
+    @property
+    def _grown_s(self) -> Array:
+        return np.minimum(self._ages_s, self._ends_s)
+
+    def _log_terms(self) -> Array:
+        """(onsets, faults) as in `Hypotheses`, with the weight of the onset."""
+        hypotheses = self._hypotheses
+        terms = hypotheses.log_bayes_factors(self._sums, self._has_changed)[:, 0] + hypotheses.log_weights()
+        return np.asarray((terms + self._log_weight).T)
+
+    def _drop_hopeless(self) -> None:
+        if not len(self._terms):  # it goes on from a state
+            return
+        best = self._terms.max(axis=1)
+        kept = np.sort(np.argsort(best)[-MOST:])
+        kept = kept[best[kept] > best.max() - HOPELESS]
+        if len(kept) == len(best):
+            return
+        self._ends_s, self._ages_s, self._log_weight = (
+            each[kept] for each in (self._ends_s, self._ages_s, self._log_weight)
+        )
+        self._then_rad_s, self._has_changed = self._then_rad_s[:, kept], self._has_changed[:, kept]
+        self._sums, self._terms = self._sums.of(0, kept, self._hypotheses.columns), self._terms[kept]

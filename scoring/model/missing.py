@@ -1,0 +1,76 @@
+"""Missing readings: a loose wire against a healthy line, whose losses may come in bursts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from schemas.messages import Array
+from scoring.model.saved import Saved
+
+SHARES = np.array([0.03, 0.07, 0.15, 0.35, 0.7, 0.95])
+"""shares of missing readings of a loose wire, equally probable"""
+PRIOR = np.array([300.0, 0.5, 4.0, 1.0])
+"""readings after a reading, missing ones of them, readings after a missing one, and missing ones of them"""
+NOTHING, LARGEST = -30.0, 60.0
+"""limits of the log of the statistic"""
+LEAST_RATIO, LARGEST_SHARE = 2.0, 0.9
+"""a loose wire loses at least so many times what a healthy line loses"""
+
+
+class MissingReadings(Saved):
+    """Shiryaev-Roberts again: a healthy line loses a share of readings and another of those after a missing one."""
+
+    KEPT = ("_counts", "_log_terms", "_returned", "is_active")
+
+    def __init__(self, fans: int, log_limit: float) -> None:
+        """Begin without a reading. log_limit: of the statistic."""
+        self._log_limit = log_limit
+        self._counts = PRIOR.copy()
+        self._log_terms = np.full((fans, len(SHARES)), NOTHING)
+        self._returned = np.zeros(fans)
+        self.is_active = np.zeros(fans, np.bool_)
+        self.score = np.zeros(fans)
+        """(fans,) log of the statistic over that of the limit; in an alarm until it clears"""
+
+    def take(self, missing: Array) -> None:
+        """The counts of a bin, (fans, 4), as in `Bin.missing`."""
+        gain = missing @ self._log_ratios()
+        moved = np.minimum(np.logaddexp(self._log_terms, 0.0) + gain, LARGEST)
+        self._log_terms = np.where(self.is_active[:, np.newaxis], self._log_terms, moved)
+        log_statistic = np.log(np.exp(self._log_terms).sum(axis=1)) - math.log(len(SHARES))
+        cleared = self._is_over(gain) if self.is_active.any() else np.zeros(len(missing), np.bool_)
+        self.is_active = (self.is_active | (log_statistic > self._log_limit)) & ~cleared
+        if cleared.any():
+            self._log_terms[cleared], self._returned[cleared] = NOTHING, 0.0
+        back = 1.0 - self._returned / self._log_limit
+        self.score = np.where(self.is_active, back, np.maximum(log_statistic / self._log_limit, 0.0))
+        self._counts = self._counts + missing[~self.is_active].sum(axis=0)
+
+    def forget(self, fans: Array) -> None:
+        """Begin again for some fans, (fans,) of bool."""
+        self._log_terms[fans], self._returned[fans], self.is_active[fans] = NOTHING, 0.0, False
+
+    @property
+    def share(self) -> Array:
+        """(fans,) likeliest share of missing readings."""
+        found: Array = SHARES[self._log_terms.argmax(axis=1)]
+        return found
+
+    def _is_over(self, gain: Array) -> Array:
+        """(fans,) whether a line is healthy again."""
+        likeliest = self._log_terms.argmax(axis=1)[:, np.newaxis]
+        back = self._returned - np.take_along_axis(gain, likeliest, axis=1)[:, 0]
+        self._returned = np.where(self.is_active, np.maximum(back, 0.0), 0.0)
+        found: Array = self.is_active & (self._returned > self._log_limit)
+        return found
+
+    def _log_ratios(self) -> Array:
+        """(4, SHARES) log of how much likelier each reading is of a loose wire than of a healthy line, as `Bin.missing`
+        counts them."""
+        readings, lost, missing, lost_again = self._counts.tolist()
+        healthy = np.array([[lost / readings], [lost_again / missing]])
+        shares = np.maximum(SHARES, min(LEAST_RATIO * lost / readings, LARGEST_SHARE))
+        loses, stays = np.log(shares / healthy), np.log((1.0 - shares) / (1.0 - healthy))
+        return np.stack((stays[0], loses[0] - stays[0], stays[1], loses[1] - stays[1]))

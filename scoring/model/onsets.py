@@ -1,0 +1,374 @@
+"""Evidence for a fault: Bayes factors of its onset and cause, added up to a Shiryaev-Roberts statistic.
+
+A fault that began with bin tau changes the innovations by rho times its sizes, where rho is what it adds to the
+readings less what the filter has taken up of it since (Willsky and Jones, 1976). With normal priors of the sizes, each
+onset and cause has a Bayes factor against a healthy fan from two sums alone,
+
+    A = sum rho rho' / S,   B = sum rho nu / S,   log BF = B' (A + 1/prior)^-1 B / 2 - log|1 + prior A| / 2
+
+R, the sum of all of them by their weights, grows by one a bin in the mean while a fan is healthy (R_t - t is a
+martingale), so the mean time until R > L is at least L bins: the limit is the declared time itself.
+
+Onsets of about geometric age stand for all; one that is dropped hands its weight on.
+
+The filter answers all onsets and causes alike: what they are now follows from what they were some bins ago, from what
+they have done since, and from what was read since, by factors that are those of the filter alone. So only the factors
+are followed from bin to bin, and every BATCH bins all is gathered.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+from scipy.special import erfc
+
+from schemas.messages import Array
+from scoring.model.faults import OF_TACHO, STUCK, Fault
+from scoring.model.healthy import CARRIED, FOLLOWING, STATES, HealthyFans, Innovation
+
+ONSETS = 20
+LONGEST_S = 900.0
+NEVER = -1
+BATCH = 8
+"""bins"""
+HAIR = 1e-3
+"""share of a reading: readings that differ by more are two"""
+LEAST_LOG_CHANCE = -30.0
+"""of a size having the sign of its fault"""
+LARGEST_LOG = 600.0
+"""a larger one is no logarithm of a number"""
+
+
+class Sums:
+    """What speaks for each onset, of all fans side by side: A and B of the module, and what they follow from.
+
+    What each column has made of the states, less what the filter took up, is `_factors` times `_parts`. The parts are
+    what it had made of the states at the last gathering, and for each bin since what it did to the rotor and its rho.
+    """
+
+    def __init__(self, fans: int, onsets: int, columns: int, pairs: Sequence[tuple[int, int]]) -> None:
+        """Begin without a reading. pairs: of columns, those that a fault has together."""
+        self._rows, self._pairs = np.arange(fans), pairs
+        self._parts = np.zeros((fans, CARRIED + 2 * BATCH, onsets * columns))
+        self._factors = np.zeros((fans, STATES, CARRIED + 2 * BATCH))
+        self._factors[:, :CARRIED, :CARRIED] = np.eye(CARRIED)
+        self._used = CARRIED
+        """number of parts so far"""
+        is_on_rotor = np.ones((onsets, columns))
+        is_on_rotor[:, OF_TACHO] = 0.0
+        self._is_on_rotor = is_on_rotor.ravel()
+        self.squares = np.zeros((fans, onsets, columns))
+        """(fans, onsets, columns) the diagonals of A"""
+        self.crossed = {pair: np.zeros((fans, onsets)) for pair in pairs}
+        """(fans, onsets) and what else is used of it"""
+        self.products = np.zeros((fans, onsets, columns))
+
+    def of(self, fan: int, onsets: Array, columns: int) -> Sums:
+        """A copy of some onsets and the first columns of one fan."""
+        copied = Sums(1, len(onsets), columns, self._pairs)
+        parts = self._parts[fan].reshape(-1, *self.squares.shape[1:])[:, onsets, :columns]
+        copied._parts[0], copied._factors[0] = parts.reshape(len(parts), -1), self._factors[fan]
+        copied._used = self._used
+        copied.squares[0] = self.squares[fan, onsets, :columns]
+        copied.products[0] = self.products[fan, onsets, :columns]
+        copied._pairs = [pair for pair in self._pairs if max(pair) < columns]
+        copied.crossed = {pair: self.crossed[pair][[fan]][:, onsets] for pair in copied._pairs}
+        return copied
+
+    def kept(self, fans: Array) -> dict[str, Array]:
+        """The state of some fans."""
+        taken = self._factors[fans, :CARRIED, : self._used] @ self._parts[fans, : self._used]
+        return {
+            "taken": taken.astype(np.float32),  # half as large
+            "squares": self.squares[fans],
+            "products": self.products[fans],
+            "crossed": np.array([each[fans] for each in self.crossed.values()]),
+        }
+
+    def restore(self, fans: Array, stored: Mapping[str, Array]) -> None:
+        """Continue for some fans from a state.
+
+        Raises:
+            KeyError, ValueError: it is none.
+        """
+        self._parts[fans, :CARRIED] = stored["taken"]
+        self.squares[fans], self.products[fans] = stored["squares"], stored["products"]
+        for each, crossed in zip(self.crossed.values(), stored["crossed"], strict=True):
+            each[fans] = crossed
+
+    def _of(self, onset: int) -> slice:
+        """The place of an onset among the parts."""
+        columns = self.squares.shape[2]
+        return slice(onset * columns, (onset + 1) * columns)
+
+    def taken(self, fan: int, onset: int) -> Array:
+        """(columns, STATES): what each column has made of the states less what the filter took up."""
+        found: Array = (self._factors[fan, :, : self._used] @ self._parts[fan, : self._used, self._of(onset)]).T
+        return found
+
+    def begin(self, onset: int) -> None:
+        """Begin an onset again."""
+        self._parts[:, : self._used, self._of(onset)] = 0.0
+        self.squares[:, onset] = self.products[:, onset] = 0.0
+        for each in self.crossed.values():
+            each[:, onset] = 0.0
+
+    def add(self, forces: Array, model: HealthyFans, found: Innovation, gain: Array, distance_rad_s: Array) -> None:
+        """The readings of a bin. forces: (fans, onsets, columns); gain: of the model, 0 where a reading does not count;
+        distance_rad_s: (fans,) as far as it counts."""
+        if self._used == self._parts.shape[1]:
+            self._gather()
+        done, read, self._used = self._used, self._used + 1, self._used + 2
+        parts, factors = self._parts[:, : self._used], self._factors[:, :, : self._used]
+        both = forces.reshape(len(forces), -1)
+        np.multiply(both, self._is_on_rotor, out=parts[:, done])
+        np.subtract(both, parts[:, done], out=parts[:, read])
+        model.carry(factors[:, :, :done])
+        factors[:, :, done:] = 0.0
+        factors[:, FOLLOWING, done] = model.follows
+        deviation = np.sqrt(found.variance)
+        weight = gain.any(axis=1) / deviation
+        reads = factors[self._rows, found.shown]
+        reads[:, read] = 1.0
+        rho = (reads * weight[:, np.newaxis])[:, np.newaxis, :] @ parts  # in standard deviations of the innovation
+        parts[:, read] = rho[:, 0]
+        np.multiply(gain, -deviation[:, np.newaxis], out=factors[:, :, read])
+        rho = rho.reshape(self.squares.shape)
+        for one, other in self._pairs:
+            self.crossed[one, other] += rho[:, :, one] * rho[:, :, other]
+        self.products += rho * (weight * distance_rad_s)[:, np.newaxis, np.newaxis]
+        self.squares += np.square(rho, out=rho)
+
+    def _gather(self) -> None:
+        self._parts[:, :CARRIED] = self._factors[:, :CARRIED, : self._used] @ self._parts[:, : self._used]
+        self._factors[:, :CARRIED, :CARRIED] = np.eye(CARRIED)
+        self._used = CARRIED
+
+
+def differ(before_rad_s: Array, newest_rad_s: Array) -> Array:
+    """Whether a tacho has not repeated its reading; not where one of them is missing (NaN)."""
+    found: Array = np.abs(newest_rad_s - before_rad_s) > HAIR * np.maximum(np.abs(newest_rad_s), np.abs(before_rad_s))
+    return found
+
+
+class Hypotheses:
+    """Faults with the prior sizes of their columns."""
+
+    def __init__(self, faults: Sequence[Fault], has_own_drive: Array) -> None:
+        """Take the rows of a table. has_own_drive: (fans,)."""
+        kinds = np.array([not has_own_drive.all(), has_own_drive.any()])
+        weights = np.array([(fault.weight, fault.of_own_drive) for fault in faults])
+        weights = weights / weights.sum(axis=0) * kinds
+        may_be = [(fault, weight) for fault, weight in zip(faults, weights, strict=True) if weight.any()]
+        may_be.sort(key=lambda one: one[0].sign == 0)
+        self.faults = [fault for fault, _ in may_be]
+        """those that one of the fans may have; those of a known sign come first"""
+        self._weights = np.array([weight for _, weight in may_be])
+        """(faults, 2) of a fan whose command is a torque, and of one with a drive of its own"""
+        self._has_own_drive = has_own_drive
+        self.columns = 1 + max(max(fault.columns) for fault in self.faults)
+        self.pairs = sorted({pair for fault in self.faults for pair in combinations(fault.columns, 2)})
+        self._first = np.zeros((len(self.faults), self.columns))
+        """(faults, columns) prior standard deviation of the first size"""
+        for row, fault in enumerate(self.faults):
+            self._first[row, fault.columns[0]] = fault.std[0]
+        self._sign = np.array([fault.sign for fault in self.faults if fault.sign], np.float64)
+        self._stuck = [row for row, fault in enumerate(self.faults) if STUCK in fault.columns]
+        self._means = [(row, fault.mean) for row, fault in enumerate(self.faults) if fault.mean]
+
+    def of(self, fan: int) -> Hypotheses:
+        """Those of one fan."""
+        return Hypotheses(self.faults, self._has_own_drive[[fan]])
+
+    def log_weights(self) -> Array:
+        """(faults, fans) logarithms of the prior weights."""
+        with np.errstate(divide="ignore"):
+            return np.log(self._weights)[:, self._has_own_drive.astype(np.int64)]
+
+    def weighed(self, bayes_factors: Array) -> Array:
+        """(fans, onsets): mean over the faults of Bayes factors (faults, fans, onsets)."""
+        of_kinds = self._weights.T @ bayes_factors.reshape(len(self.faults), -1)
+        of_torque, of_own = of_kinds.reshape(2, *bayes_factors.shape[1:])
+        return np.where(self._has_own_drive[:, np.newaxis], of_own, of_torque)
+
+    def log_bayes_factors(self, sums: Sums, has_changed: Array) -> Array:
+        """(faults, fans, onsets), by elimination of one size after the other; the first comes last, for its sign.
+
+        has_changed: (fans, onsets) whether the reading has since: then its tacho is not stuck.
+        """
+        shape = (len(self.faults), *sums.squares.shape[:2])
+        products = (self._first @ sums.products.reshape(-1, self.columns).T).reshape(shape)
+        pivots = (np.square(self._first) @ sums.squares.reshape(-1, self.columns).T).reshape(shape)
+        found = np.zeros(shape)
+        for row, mean in self._means:
+            first = self.faults[row].columns[0]
+            found[row] += mean * (sums.products[:, :, first] - 0.5 * mean * sums.squares[:, :, first])
+            products[row] -= mean / self.faults[row].std[0] * pivots[row]
+        pivots += 1.0
+        for row, fault in enumerate(self.faults):
+            if len(fault.columns) > 1:
+                found[row], pivots[row], products[row] = _without_others(fault, sums)
+        of_sign = slice(len(self._sign))
+        sized = products[of_sign] / np.sqrt(pivots[of_sign])
+        sized *= (-math.sqrt(0.5) * self._sign)[:, np.newaxis, np.newaxis]
+        found[of_sign] += np.log(np.maximum(erfc(sized), math.exp(LEAST_LOG_CHANCE)))
+        products *= products
+        products /= pivots
+        products -= np.log(pivots, out=pivots)
+        products *= 0.5
+        found += products
+        for row in self._stuck:
+            found[row][has_changed] = -np.inf
+        return found
+
+    def sizes(self, sums: Sums, fan: int, onset: int, fault: int) -> tuple[Array, Array]:
+        """Mean (columns,) and covariance of the sizes of a fault that began with an onset."""
+        columns = np.array(self.faults[fault].columns)
+        prior = np.diag(1.0 / np.square(self.faults[fault].std))
+        covariance = np.linalg.inv(_squares(self.faults[fault], sums)[:, :, fan, onset] + prior)
+        return covariance @ (sums.products[fan, onset, columns] + prior[0] * self.faults[fault].mean), covariance
+
+
+def _squares(fault: Fault, sums: Sums) -> Array:
+    """(columns, columns, fans, onsets) of A that a fault uses."""
+    columns = fault.columns
+    found = np.empty((len(columns), len(columns), *sums.squares.shape[:2]))
+    for one, column in enumerate(columns):
+        found[one, one] = sums.squares[:, :, column]
+        for other in range(one):
+            found[one, other] = found[other, one] = sums.crossed[columns[other], column]
+    return found
+
+
+def _without_others(fault: Fault, sums: Sums) -> tuple[Array, Array, Array]:
+    """(fans, onsets) what all sizes of a fault but the first tell, and what they leave of its pivot and product."""
+    std = np.array(fault.std)[:, np.newaxis, np.newaxis]
+    squares, products = _squares(fault, sums), np.stack([sums.products[:, :, column] for column in fault.columns])
+    found = fault.mean * (products[0] - 0.5 * fault.mean * squares[0, 0])
+    products -= fault.mean * squares[0]
+    products *= std
+    squares *= std[:, np.newaxis] * std
+    for one in range(len(std)):
+        squares[one, one] += 1.0
+    for one in range(len(std) - 1, 0, -1):
+        pivot, product = squares[one, one], products[one]
+        found += 0.5 * (product**2 / pivot - np.log(pivot))
+        ratio = squares[one, :one] / pivot
+        products[:one] -= ratio * product
+        squares[:one, :one] -= ratio[:, np.newaxis] * squares[one, :one]
+    return found, squares[0, 0], products[0]
+
+
+class Evidence:
+    """Onsets and what speaks for each, of all fans side by side."""
+
+    def __init__(self, fans: int, hypotheses: Hypotheses, bin_s: float) -> None:
+        """Begin without a reading."""
+        self._bin_s, self._hypotheses = bin_s, hypotheses
+        self.sums = Sums(fans, ONSETS, hypotheses.columns, hypotheses.pairs)
+        self.began = np.full(ONSETS, NEVER)
+        """(ONSETS,) bins at which they began, in no order; NEVER: not yet"""
+        self._order = list(range(ONSETS))
+        """places of the onsets, the oldest first"""
+        self.weight = np.ones(ONSETS)
+        self.then_rad_s = np.zeros((fans, ONSETS))
+        """(fans, ONSETS) speed at which they began"""
+        self.has_changed = np.zeros((fans, ONSETS), np.bool_)
+        """(fans, ONSETS) whether the reading is another than at the end of the bin of the onset"""
+        self.newest_rad_s = np.full(fans, np.nan)
+        self.since = np.full(fans, NEVER)
+        """(fans,) only onsets after this bin count"""
+        self._log_bayes_factors = np.zeros((len(hypotheses.faults), fans, ONSETS))
+        self.number = 0
+
+    @property
+    def age_s(self) -> Array:
+        """(ONSETS,) at the end of the present bin."""
+        return (self.number - self.began + 1) * self._bin_s
+
+    def begin(self, speed_rad_s: Array) -> None:
+        """A new bin: one onset more, in the place of one of the older ones. speed_rad_s: (fans,) before it."""
+        self.number += 1
+        slot = self._place()
+        self.began[slot], self.weight[slot] = self.number, 1.0
+        self.then_rad_s[:, slot], self.has_changed[:, slot] = speed_rad_s, False
+        self.sums.begin(slot)
+
+    def show(self, newest_rad_s: Array) -> None:
+        """The newest readings of the bin, (fans,), NaN without one."""
+        self.has_changed |= differ(self.newest_rad_s, newest_rad_s)[:, np.newaxis] & (self.began < self.number)
+        self.newest_rad_s = np.where(np.isfinite(newest_rad_s), newest_rad_s, self.newest_rad_s)
+
+    def _place(self) -> int:
+        """An unused one, the oldest if it is too old, or the one without which the ages are nearest to geometric."""
+        order = self._order
+        began = self.began[order]
+        drop = 0
+        if began[0] != NEVER and self.number - began[0] < LONGEST_S / self._bin_s:
+            drop = 1 + int(np.argmin((began[2:] - began[:-2]) / (self.number - began[1:-1])))
+            self.weight[order[drop - 1]] += self.weight[order[drop]]
+        order.append(order.pop(drop))
+        return order[-1]
+
+    def add(self, forces: Array, model: HealthyFans, found: Innovation, gain: Array, distance_rad_s: Array) -> None:
+        """The readings of a bin, as in `Sums.add`."""
+        self.sums.add(forces, model, found, gain, distance_rad_s)
+        self._log_bayes_factors = self._hypotheses.log_bayes_factors(self.sums, self.has_changed)
+
+    @property
+    def _counts(self) -> Array:
+        """(fans, ONSETS) whether an onset counts."""
+        return self.began > self.since[:, np.newaxis]
+
+    def log_terms(self, fan: int) -> Array:
+        """(ONSETS, faults) log of Bayes factor and weight of a fan's onsets and faults."""
+        terms = self._log_bayes_factors[:, fan] + self._hypotheses.log_weights()[:, fan, np.newaxis]
+        found: Array = np.where(self._counts[fan], terms + np.log(self.weight), -np.inf).T
+        return found
+
+    def forget(self, fan: int) -> None:
+        """Begin again for a fan."""
+        self.since[fan] = self.number
+
+    def kept(self, fans: Array) -> dict[str, Array]:
+        """The state of some fans; of the others it begins again."""
+        return {
+            "fans": fans,
+            "number": np.array(self.number),
+            "began": self.began,
+            "weight": self.weight,
+            "then_rad_s": self.then_rad_s[fans],
+            "has_changed": self.has_changed[fans],
+            "newest_rad_s": self.newest_rad_s,
+            "since": self.since[fans],
+            **self.sums.kept(fans),
+        }
+
+    def restore_kept(self, stored: Mapping[str, Array]) -> None:
+        """Continue from such a state.
+
+        Raises:
+            KeyError, ValueError: it is none.
+        """
+        fans, self.number = stored["fans"], int(stored["number"])
+        self.began, self.weight = stored["began"].copy(), stored["weight"].copy()
+        self._order = np.argsort(self.began, kind="stable").tolist()
+        self.since[:] = self.number
+        self.since[fans], self.then_rad_s[fans] = stored["since"], stored["then_rad_s"]
+        self.has_changed[fans], self.newest_rad_s = stored["has_changed"], stored["newest_rad_s"].copy()
+        self.sums.restore(fans, stored)
+
+    def log_statistic(self) -> Array:
+        """(fans,) log R."""
+        logs, counts, beyond = self._log_bayes_factors, self._counts, 0.0
+        if logs.max() > LARGEST_LOG:
+            logs = np.where(counts, logs, -np.inf)
+            beyond = np.maximum(logs.max(axis=(0, 2)) - LARGEST_LOG, 0.0)
+            logs = logs - beyond[:, np.newaxis]
+        terms = self._hypotheses.weighed(np.exp(logs))
+        terms *= counts * self.weight
+        with np.errstate(divide="ignore"):
+            return np.log(terms.sum(axis=1)) + beyond

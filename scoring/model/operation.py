@@ -1,0 +1,186 @@
+"""What drives the model within a bin: speed, movement and load of each fan, and what its tacho has shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from schemas.messages import Array
+from schemas.units import NS_PER_S
+from scoring.model.bins import Bin
+from scoring.model.saved import Saved
+
+BACKLASH = 0.01
+"""share of the top speed: a smaller movement may be what a speed loop makes of the noise of its tacho"""
+FASTEST = 2.0
+"""times the top speed: a free run that is beyond it has diverged"""
+LOWEST_ERROR = 0.01
+"""standard deviation of the lowest command that acts, share of the commands"""
+STEADY_S = 0.5
+"""time over which the measured speed is averaged where the torque balance is used: that tells what a fan tends to at a
+speed, and not what its speed loop does around it"""
+
+
+@dataclass(frozen=True, eq=False)
+class Fans:
+    """What the twin's card tells about the fans of a tray, (fans,) each. Torque is in the unit of the command."""
+
+    top_rad_s: Array
+    inertia: Array
+    viscous: Array
+    drag: Array
+    friction: Array
+    noise_rad_s: Array
+    """standard deviation of one reading"""
+    pulse_rad_s: Array
+    """what a pulse more in a count is worth; 0: the tacho does not count"""
+    held_s: Array
+    """how long a tacho holds a reading"""
+    timing_s: Array
+    """standard deviation of the time of a reading"""
+    coasts_s: Array
+    """how long a fan without power turns on: the integral of its speed over that before"""
+    balance_noise: Array
+    """standard deviation of the healthy torque balance"""
+    balance_filter_per_s: float
+    lowest_command: Array
+    """a smaller one acts as this one; NaN: there is none"""
+    commands: float
+    """range of the commands that the twin was trained on"""
+    has_own_drive: Array
+    """whether it controls its speed by itself, so that the torque of the card is no torque of its motor"""
+    may_have_plateau: Array
+    """whether its speed may stay the same below some command, of which the twin knows nothing"""
+    prefers_balance: Array
+    """whether the torque balance tells more than the speed, where both are known"""
+
+    def of(self, fan: int) -> Fans:
+        """One of them."""
+        return replace(self, **{name: each[[fan]] for name, each in vars(self).items() if isinstance(each, np.ndarray)})
+
+    def slope(self, speed_rad_s: Array) -> Array:
+        """How the torque that a fan needs rises with its speed."""
+        return np.maximum(self.viscous + 2.0 * self.drag * speed_rad_s, 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What drives the model within a bin, (fans,) each."""
+
+    speed_rad_s: Array
+    """speed of the twin; where the torque balance is used, the measured one"""
+    measured_rad_s: Array
+    newest_rad_s: Array
+    """the newest reading; NaN without one"""
+    rate_rad_s2: Array
+    moved_to_rad_s: Array
+    """the speed as far as it has moved by more than what a speed loop makes of the noise of its tacho"""
+    moves_rad_s2: Array
+    """and its rate"""
+    load: Array
+    """mean of the squares of the shares of the top speed of the other fans of the tray"""
+    turned: Array
+    """how far the command has moved, share of the largest command so far"""
+    unseen_rad_s: Array
+    """standard deviation of the twin's error where it was not trained, and where its lowest command begins to act"""
+    half_range_rad_s: Array
+    readings: Array
+    """0: nothing new is known"""
+    is_new: Array
+    """whether a reading ends that its tacho holds"""
+    deviation_rad_s: Array
+    """distance from the free run; or what it would be at a steady speed by the torque balance"""
+    is_balance: Array
+
+    def of(self, fan: int) -> Inputs:
+        """Those of one fan."""
+        return Inputs(**{name: each[[fan]] for name, each in vars(self).items()})
+
+
+class Operation(Saved):
+    """Follows the fans of one tray from bin to bin."""
+
+    KEPT = ("_held", "_speed", "_was_balance", "_moved_to", "_command", "_largest")
+
+    def __init__(self, fans: Fans, bin_ns: int) -> None:
+        """Begin with fans that stand."""
+        count = len(fans.top_rad_s)
+        self._fans, self._bin_ns, self._bin_s = fans, bin_ns, bin_ns / NS_PER_S
+        self.bins_held = np.maximum(np.round(fans.held_s / self._bin_s), 1).astype(np.int64)
+        """(fans,) a reading is held for so many bins"""
+        self._held = np.zeros((3, count))
+        """(3, fans) readings that have not counted yet: number, sum of deviations, sum of half ranges"""
+        self.t_ns = 0
+        """end of the last bin; 0: there was none"""
+        self._speed, self._was_balance = np.zeros(count), np.zeros(count, np.bool_)
+        self._moved_to = np.zeros(count)
+        self._command, self._largest = np.zeros(count), np.full(count, 1e-9)
+        self._has_lowest = np.isfinite(fans.lowest_command).any()
+
+    def inputs(self, one: Bin) -> Inputs:
+        """Those of a bin; bins come in order of time."""
+        fans = self._fans
+        predicted = np.minimum(np.abs(one.predicted_rad_s), FASTEST * fans.top_rad_s)
+        measured = np.where(np.isfinite(one.measured_rad_s), np.abs(one.measured_rad_s), predicted)
+        is_steady = fans.held_s == 0.0  # a reading that is held steps, and a step is an impulse of the balance
+        is_balance = (one.balances > 0) & is_steady & (fans.prefers_balance | (one.readings == 0))
+        steady = np.where(self._was_balance, self._speed, measured)
+        steady = steady + (measured - steady) * -np.expm1(-self._bin_s / STEADY_S)
+        speed = np.where(is_balance, steady, predicted)
+        backlash = BACKLASH * fans.top_rad_s
+        moved_to = np.clip(self._moved_to, speed - backlash, speed + backlash)
+        follows = one.t_ns - self.t_ns == self._bin_ns
+        rate = np.where(follows & (self._was_balance == is_balance), speed - self._speed, 0.0) / self._bin_s
+        moves = (moved_to - self._moved_to) / self._bin_s if follows else np.zeros(len(speed))
+        share = np.square(speed / fans.top_rad_s)
+        self._largest = np.maximum(self._largest, np.abs(one.command))
+        turned = np.abs(one.command - self._command) / self._largest
+        self.t_ns, self._speed, self._was_balance, self._moved_to = one.t_ns, speed, is_balance, moved_to
+        self._command = one.command
+        readings = np.where(is_balance, one.balances, one.readings)
+        ends = (one.t_ns // self._bin_ns) % self.bins_held == 0
+        return Inputs(
+            speed,
+            measured,
+            one.newest_rad_s,
+            rate,
+            moved_to,
+            moves,
+            (share.sum() - share) / max(len(share) - 1, 1),
+            turned,
+            np.hypot(one.unseen_rad_s, self._of_lowest(one.command)) if self._has_lowest else one.unseen_rad_s,
+            one.half_range_rad_s,
+            readings,
+            ends & (self._held[0] + readings > 0.0),
+            np.where(is_balance, -one.balance_command / fans.slope(speed), one.deviation_rad_s),
+            is_balance,
+        )
+
+    def _of_lowest(self, command: Array) -> Array:
+        """(fans,) error of the speed near the command from which on it rises: the twin knows it to LOWEST_ERROR."""
+        fans = self._fans
+        error = LOWEST_ERROR * fans.commands
+        slope = fans.top_rad_s / np.maximum(fans.commands - fans.lowest_command, error)
+        near = np.exp(-0.5 * np.square((command - fans.lowest_command) / (2.0 * error)))
+        return np.nan_to_num(error * slope * near)
+
+    def samples_rad_s(self, one: Bin, now: Inputs) -> Array:
+        """(n, fans) deviation of each sample of a bin, as that of its inputs; NaN where there is none."""
+        balances = -one.balances_command / self._fans.slope(now.speed_rad_s)
+        found: Array = np.where(now.is_balance, balances, one.deviations_rad_s)
+        return found
+
+    def read(self, one: Bin, now: Inputs, counts: Array) -> Inputs:
+        """The inputs with what counts of the readings that end now: a reading that is held counts once.
+
+        counts: (n, fans) samples of the bin.
+        """
+        held = self._held
+        held[0] += counts.sum(axis=0)
+        held[1] += np.where(counts, self.samples_rad_s(one, now), 0.0).sum(axis=0)
+        held[2] += np.where(counts, one.half_ranges_rad_s, 0.0).sum(axis=0)
+        means = held[1:] / np.maximum(held[0], 1.0)
+        readings = held[0] * now.is_new
+        held *= ~now.is_new
+        return replace(now, readings=readings, deviation_rad_s=means[0], half_range_rad_s=means[1])

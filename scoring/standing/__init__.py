@@ -1,0 +1,1 @@
+"""Whether fans stand and turn as commanded: no prediction is needed for it."""

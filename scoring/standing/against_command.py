@@ -1,0 +1,108 @@
+"""Fans that stand or turn against their command. Until they have done as commanded for a while, the alarm stands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from schemas.messages import Array, Prediction
+from schemas.standstill import Standstill
+from schemas.tacho import Tacho
+from schemas.units import NS_PER_S
+from scoring.diagnosis.standstill_causes import Standing
+from scoring.model.saved import Saved, part, within
+from scoring.samples import arrived
+from scoring.standing import runs_on, stands_still
+from scoring.standing.durations import Durations
+from scoring.standing.runs_on import RunsOn
+from scoring.standing.stands_still import StandsStill
+
+CERTAIN = 2.0
+"""score of a fan that does not do as commanded"""
+OBEYS_S = 2.0
+"""for how long a fan does as commanded until its alarm is over"""
+NEVER_NS = -(1 << 62)
+KINDS = (None, *Standing)
+
+
+class AgainstCommand(Saved):
+    """What each fan of a tray does against its command. A fan that could not show that it obeys changes nothing."""
+
+    KEPT = ("_arrived_t_ns", "_obeyed_ns", "_is_against")
+
+    def __init__(self, healthy: Standstill, tachos: Sequence[Tacho]) -> None:
+        """Begin with fans of which nothing is known. tachos: of each fan."""
+        self._stands, self._runs = StandsStill(healthy, tachos), RunsOn(healthy, tachos)
+        count = len(tachos)
+        self._arrived_t_ns = np.full(count, NEVER_NS, np.int64)
+        self._obeyed_ns = np.zeros((2, count), np.int64)
+        """for how long each has obeyed a command to turn, and one to stop, since it did not"""
+        self._is_against = np.zeros((2, count), np.bool_)
+        self.active = np.zeros((0, count), np.bool_)
+        """(n, fans) of the samples of the last block"""
+        self.score = np.zeros((0, count))
+        """(n, fans) of them: the longest time against a command, in multiples of what is healthy; CERTAIN above 1"""
+        self.kind = np.zeros((0, count), np.int64)
+        """(n, fans) of them: the number in KINDS, 0 where a fan does as commanded"""
+
+    def take(self, block: Prediction) -> None:
+        """Judge a block of samples."""
+        is_here, speed = arrived(block.invalid_reason), block.measured_speed_rad_s
+        n = len(block.t_ns)
+        self.active, self.score = np.zeros(speed.shape, np.bool_), np.zeros(speed.shape)
+        self.kind = np.zeros(speed.shape, np.int64)
+        missed_ns = self._missed_ns(block.t_ns, block.period_ns, is_here)
+        ends = [*np.flatnonzero((missed_ns > 0).any(axis=1)).tolist(), n]
+        begin = 0
+        for end in ends:
+            if end > begin:
+                rows = slice(begin, end)
+                self._judge(rows, block.command[rows], speed[rows], Durations(is_here[rows], block.period_ns))
+            if end < n:
+                self._stands.forget(missed_ns[end] > self._stands.memory_s * NS_PER_S)
+                self._runs.forget(missed_ns[end] > self._runs.memory_s * NS_PER_S)
+            begin = end
+
+    def forget(self, fans: Array) -> None:
+        """Begin again for some fans, (fans,) of bool."""
+        self._stands.forget(fans)
+        self._runs.forget(fans)
+        self._is_against[:, fans] = False
+
+    def kept(self) -> dict[str, Array]:
+        """The state."""
+        return {
+            **within("own", self.arrays()),
+            **within("stands", self._stands.arrays()),
+            **within("runs", self._runs.arrays()),
+        }
+
+    def restore(self, stored: Mapping[str, Array]) -> None:
+        """Continue from a state, see Saved."""
+        super().restore(part("own", stored))
+        self._stands.restore(part("stands", stored))
+        self._runs.restore(part("runs", stored))
+
+    def _judge(self, rows: slice, command: Array, speed: Array, counts: Durations) -> None:
+        kinds = (stands_still.KINDS, runs_on.KINDS)
+        for number, each in enumerate((self._stands, self._runs)):
+            ratio, obeys, kind = each.update(command, speed, counts)
+            against = ratio > 1.0
+            was = self._is_against[number].copy()
+            obeyed_ns = counts.of(obeys & ~against, against, self._obeyed_ns[number])
+            has_been = np.logical_or.accumulate(against, axis=0) | was
+            active = has_been & (obeyed_ns < OBEYS_S * NS_PER_S)
+            self._is_against[number] = active[-1]
+            of_kind = np.array([KINDS.index(standing) for standing in kinds[number]])[kind]
+            self.kind[rows] = np.where(against, of_kind, self.kind[rows])
+            self.active[rows] |= active
+            self.score[rows] = np.maximum(self.score[rows], np.where(against, CERTAIN, ratio))
+
+    def _missed_ns(self, t_ns: Array, period_ns: int, is_here: Array) -> Array:
+        """(n, fans) how long nothing had arrived before a sample that did; 0 where nothing was missed."""
+        seen = np.where(is_here, t_ns[:, np.newaxis], NEVER_NS)
+        latest = np.maximum.accumulate(np.vstack((self._arrived_t_ns, seen)), axis=0)
+        self._arrived_t_ns = latest[-1]
+        missed = t_ns[:, np.newaxis] - latest[:-1] - period_ns
+        return np.where(is_here & (latest[:-1] != NEVER_NS), missed, 0).clip(0)

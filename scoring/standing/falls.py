@@ -1,0 +1,48 @@
+"""How fans lose their speed: what tells a rotor that is held from one that has no power."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scoring.diagnosis.standstill_causes import Fall
+from scoring.model.operation import Fans, Inputs
+from scoring.model.saved import Saved
+
+STANDS, FALLS = 0.08, 0.85
+"""shares of the expected speed: below, a fan stands; above, it has not begun to fall"""
+FALLING = 0.6
+"""share of the expected speed: a fan below it may come to rest"""
+
+
+class Falls(Saved):
+    """Follows the fans of one tray from bin to bin."""
+
+    KEPT = ("_lasted_s", "_passed_s", "stands", "is_falling")
+
+    def __init__(self, fans: Fans, bin_s: float) -> None:
+        """Begin with fans that turn."""
+        self._fans, self._bin_s = fans, bin_s
+        count = len(fans.top_rad_s)
+        self._passed_s = np.zeros(count)
+        """(fans,) since the newest reading"""
+        self._lasted_s = np.zeros(count)
+        """(fans,) integral of the speed as a share of the expected one, since it fell"""
+        self.stands = np.zeros(count, np.bool_)
+        self.is_falling = np.zeros(count, np.bool_)
+
+    def take(self, now: Inputs) -> None:
+        """Follow the readings of a bin."""
+        known = now.is_new & np.isfinite(now.newest_rad_s)
+        self._passed_s = self._passed_s + self._bin_s
+        expected = now.speed_rad_s - np.where(now.is_balance, now.deviation_rad_s, 0.0)
+        share = np.abs(now.newest_rad_s) / np.maximum(expected, 1.0)
+        lasted_s = np.where(share > FALLS, 0.0, self._lasted_s + share * self._passed_s)
+        self._lasted_s = np.where(known, lasted_s, self._lasted_s)
+        self._passed_s = np.where(known, 0.0, self._passed_s)
+        self.stands = np.where(known, share < STANDS, self.stands)
+        self.is_falling = np.where(known, share < FALLING, self.is_falling)
+
+    def of(self, fan: int) -> Fall:
+        """That of a fan that stands."""
+        held_s = max(float(self._fans.held_s[fan]), self._bin_s)
+        return Fall(float(self._lasted_s[fan]), float(self._fans.coasts_s[fan]), held_s)

@@ -1,0 +1,70 @@
+"""A fan that stands although its command turns it.
+
+It needs no prediction: what commands do to healthy fans, and how long starts and coasts take, is in the twin's card
+(schemas.standstill). While a fan starts it may read as standing for three times the longest healthy start. Once it has
+turned, only lapses of its tacho explain a reading of a fan that stands. A tacho that gives no reading may not be read
+for its reach and `MISSING_S` more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from schemas.messages import Array
+from schemas.standstill import Standstill
+from schemas.tacho import Tacho
+from schemas.units import NS_PER_S
+from scoring.diagnosis.standstill_causes import Standing
+from scoring.model.saved import Saved
+from scoring.standing.durations import Durations
+from scoring.standing.healthy_times import lapse_limit_s, start_limit_s
+
+MISSING_S = 2.0  # beyond the reach of the tacho
+UNKNOWN_STARTED_S = 5.0  # beyond the reach: the length of a start, if none was seen
+KINDS = (Standing.NO_READING, Standing.CAME_TO_REST, Standing.NOT_STARTED)
+
+
+class StandsStill(Saved):
+    """How long each fan has stood or given no reading against its command."""
+
+    KEPT = ("_lasted_ns",)
+
+    def __init__(self, healthy: Standstill, tachos: Sequence[Tacho]) -> None:
+        """Begin with fans of which nothing is known. tachos: of each fan."""
+        self._healthy = healthy
+        reach_s = np.array([tacho.reach_s for tacho in tachos])
+        started_s = UNKNOWN_STARTED_S + reach_s if healthy.start_s is None else healthy.start_s + 0.0 * reach_s
+        self._started_ns = started_s * NS_PER_S
+        self._lapse_limit_s = lapse_limit_s(healthy)
+        self._start_limit_s = start_limit_s(healthy, reach_s)
+        self._missing_limit_s: Array = reach_s + MISSING_S
+        self._lasted_ns = np.zeros((4, len(tachos)), np.int64)
+        """for how long the fan has been driven, turned, stood, and given no reading"""
+
+    @property
+    def memory_s(self) -> float:
+        """After a longer gap nothing is known about how the fan was started."""
+        return float(np.max(self._start_limit_s))
+
+    def update(self, command: Array, speed_rad_s: Array, counts: Durations) -> tuple[Array, Array, Array]:
+        """(n, fans) the time in multiples of what is healthy; whether the fan turns as it should; and the number of
+        the kind in KINDS. command, speed_rad_s: (n, fans)."""
+        healthy = self._healthy
+        drives, known, turns = healthy.drives(command), np.isfinite(speed_rad_s), healthy.turns(speed_rad_s)
+        driven = counts.of(drives, ~drives, self._lasted_ns[0])
+        turned, stood, silent = counts.of(
+            np.array((drives & turns & (driven >= self._started_ns), drives & known & ~turns, drives & ~known)),
+            np.array((~drives, ~drives | turns, ~drives | known)),
+            self._lasted_ns[1:],
+        )
+        has_turned = turned > 0
+        of_stood = stood / np.where(has_turned, self._lapse_limit_s, self._start_limit_s) / NS_PER_S
+        of_silent = silent / self._missing_limit_s / NS_PER_S
+        kind = np.where(of_silent > of_stood, 0, np.where(has_turned, 1, 2))
+        return np.maximum(of_stood, of_silent), drives & turns, kind
+
+    def forget(self, fans: Array) -> None:
+        """Begin again for some fans, (fans,) of bool."""
+        self._lasted_ns[:, fans] = 0

@@ -1,0 +1,133 @@
+"""Alarm of a fault: it keeps its size, nothing is learned in it, it clears once, and it goes on after a restart."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from scoring.model.decision import OVER_S, Decision
+from scoring.model.faults import DRAG, DRAG_GROWS, DRIVE, FRICTION, GROWS_S
+from scoring.model.healthy import K
+from tests.support.made_bins import Changes, MadeFans, plays
+from tests.support.scored_blocks import TWIN_SPEED, twin_of
+
+FANS = 4
+
+
+def steady(_time_s: float) -> float:
+    return TWIN_SPEED
+
+
+def moving(time_s: float) -> float:
+    return 280.0 + 100.0 * math.sin(2.0 * math.pi * time_s / 40.0)
+
+
+def taken_rad_s(made: MadeFans, drag: float) -> float:
+    """What a drag takes of TWIN_SPEED."""
+    top = made.fans.top_rad_s[:1]
+    return float(drag * made.fans.slope(top)[0] / made.fans.slope(np.array([TWIN_SPEED]))[0] * TWIN_SPEED**2 / top[0])
+
+
+def test_of_a_slow_fault_what_was_taken_up_before_its_alarm_is_given_back_and_it_does_not_shrink_in_its_alarm() -> None:
+    made = MadeFans(twin_of(FANS).fans, 0.2, steady, seed=2)
+    decision = made.decision()
+    plays(made, decision, 30.0)
+    healthy = decision.model.expected_rad_s.copy()
+    made.fault_from_s, made.sizes[:, DRAG_GROWS] = 30.0, -0.03
+    raised = plays(made, decision, 150.0)
+    assert len(raised) == FANS and min(raised)[0] > 60.0, "the filter has had time to take it for its own"
+    made.sizes[:, DRAG], made.sizes[:, DRAG_GROWS] = -0.03 * 150.0 / GROWS_S, 0.0
+    takes = taken_rad_s(made, 0.03 * 150.0 / GROWS_S)
+    for _ in range(3):
+        assert plays(made, decision, 15.0) == []
+        share, std = decision.fault
+        assert np.abs(share * TWIN_SPEED + takes).max() < 0.25 * takes
+        assert (std * TWIN_SPEED < 0.2 * takes).all()
+        assert np.abs(decision.model.expected_rad_s - healthy).mean() < 0.07 * takes
+
+
+def with_faults(made: MadeFans, *columns: int) -> Decision:
+    """A decision whose fans have one each of these from 20 s on, which take 8 to 12 %, some 120 s in their alarms."""
+    decision = made.decision()
+    made.fault_from_s = 20.0
+    made.sizes[np.arange(len(columns)), columns] = -0.12
+    raised = plays(made, decision, 30.0)
+    assert sorted((fan, is_raised) for _, fan, is_raised in raised) == [(fan, True) for fan in range(len(columns))]
+    return decision
+
+
+@pytest.mark.parametrize("column", [DRAG, DRIVE, FRICTION], ids=["drag", "drive", "friction"])
+def test_an_alarm_stays_while_the_command_moves_and_clears_once_ten_seconds_after_its_fault(column: int) -> None:
+    made = MadeFans(twin_of(2).fans, 0.2, moving, seed=2)
+    decision = with_faults(made, column, column)
+    assert plays(made, decision, 90.0) == []
+    ends_s, made.sizes[:] = made.time_s, 0.0
+    cleared = plays(made, decision, 60.0)
+    assert sorted(fan for _, fan, _ in cleared) == [0, 1]
+    assert all(OVER_S <= time_s - ends_s < OVER_S + 4.0 and not is_raised for time_s, _, is_raised in cleared)
+
+
+def test_forgetting_a_fan_ends_its_alarm_and_its_new_state_is_healthy_while_the_others_go_on() -> None:
+    made = MadeFans(twin_of(2).fans, 0.1, steady, seed=4)
+    decision = with_faults(made, DRAG, DRAG)
+    made.sizes[0] *= 0.3
+    assert plays(made, decision, 5.0) == []
+    decision.begin_again(np.array([True, False]))
+    assert decision.has_alarm.tolist() == [False, True]
+    std = np.sqrt(np.einsum("nii->ni", decision.model.covariance)[:, :K].mean(axis=1))
+    assert std[0] > 1.2 * std[1], "it is as little known as a new one"
+    assert plays(made, decision, 20.0) == [], "what it does now is what it does when healthy"
+    assert decision.model.expected_rad_s[0] == pytest.approx(-0.3 * taken_rad_s(made, 0.12), abs=12.0)
+
+
+def continued(made: MadeFans, decision: Decision) -> Decision:
+    """Another one that goes on from the snapshot."""
+    times, arrays = decision.snapshot()
+    other = made.decision()
+    other.restore({name: array.copy() for name, array in arrays.items()}, **times)
+    return other
+
+
+def outcome(
+    made: MadeFans, decision: Decision, of_alarm: int, cuts: set[int]
+) -> tuple[Changes, list[str], list[float]]:
+    """All changes of 40 s, and at the end the causes of an alarm, and numbers that tell of it and of all fans."""
+    changes: Changes = []
+    for number in range(400):
+        if number in cuts:
+            decision = continued(made, decision)
+        if number == 200:
+            made.sizes[1, DRAG] = -0.12
+        if number == 250:
+            made.sizes[0] = 0.0
+        changes += plays(made, decision, made.bin_s)
+    causes = decision.alarms[of_alarm].causes()
+    told = [each for cause in causes for each in (cause.probability, cause.change)]
+    told += [float(decision.deviation_score[of_alarm]), *decision.fault[0].tolist()]
+    told += decision.model.mean.ravel().tolist()
+    return changes, [cause.cause for cause in causes], told
+
+
+def test_a_decision_that_goes_on_from_a_snapshot_decides_the_same_at_the_same_times_also_in_an_alarm() -> None:
+    runs: list[tuple[Changes, list[str], list[float]]] = []
+    for cuts in (set[int](), {100}, {230, 255, 300}):
+        made = MadeFans(twin_of(3).fans, 0.1, steady, seed=4)
+        decision = made.decision()
+        made.fault_from_s, made.sizes[0, DRAG] = 10.0, -0.12
+        plays(made, decision, 20.0)
+        runs.append(outcome(made, decision, 1, cuts))
+    assert {(fan, is_raised) for _, fan, is_raised in runs[0][0]} == {(0, False), (1, True)}
+    for run in runs[1:]:
+        assert run[:2] == runs[0][:2]
+        np.testing.assert_allclose(run[2], runs[0][2], rtol=1e-4, atol=1e-7)
+
+
+def test_a_snapshot_of_another_number_of_fans_is_refused() -> None:
+    made = MadeFans(twin_of(2).fans, 0.1, steady, seed=4)
+    decision = made.decision()
+    plays(made, decision, 1.0)
+    times, arrays = decision.snapshot()
+    with pytest.raises(ValueError, match="has the shape"):
+        MadeFans(twin_of(3).fans, 0.1, steady, seed=4).decision().restore(arrays, **times)

@@ -1,0 +1,89 @@
+"""scoring.model.learned: healthy runs widen and narrow the priors of what they show, in any order."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scoring.model import learned
+from scoring.model.bins import Bin, Bins, bin_ns_of
+from scoring.model.decision import Decision
+from scoring.model.learned import HealthyRun, RunSums, learned_priors
+from scoring.model.operation import Fans
+from scoring.model.priors import Priors
+from tests.support.healthy_running import made_fans, running
+
+FANS = 24
+BIN_NS = bin_ns_of(running(1, 1.0, 0).period_ns, 0.0)
+RUN_S = 600.0
+
+
+def bins_of(seconds: float, seed: int, **varies: float) -> list[Bin]:
+    return list(Bins(BIN_NS, made_fans(FANS).top_rad_s, None).take(running(FANS, seconds, seed, **varies)))
+
+
+def sums_of(bins: Sequence[Bin], fans: Fans | None = None) -> RunSums:
+    run = HealthyRun(fans or made_fans(FANS), BIN_NS)
+    for one in bins:
+        run.take(one)
+    return run.sums
+
+
+def priors_of(**varies: float) -> Priors:
+    return learned_priors([sums_of(bins_of(RUN_S, seed, **varies)) for seed in range(2)])
+
+
+def alarms(priors: Priors, seeds: range, **varies: float) -> int:
+    """Those of other runs of a minute, of which 1.2 are declared."""
+    found = 0
+    for seed in seeds:
+        decision = Decision(made_fans(FANS), BIN_NS, 0.1, 3600.0, priors)
+        found += sum(change.raised for one in bins_of(60.0, seed, **varies) for change in decision.take(one))
+    return found
+
+
+def test_fans_that_differ_from_run_to_run_widen_the_prior_and_then_keep_the_rate_in_other_runs() -> None:
+    priors = priors_of(mean=0.06)
+    assert 0.03 < priors.twin_share < 0.07
+    others = range(100, 103)
+    assert alarms(Priors(), others, mean=0.06) > 4, "or there was nothing to learn"
+    assert alarms(priors, others, mean=0.06) <= 4
+
+
+def test_each_prior_follows_what_was_planted_and_narrows_where_there_is_less() -> None:
+    quiet, windy, wandering = priors_of(), priors_of(air=0.05), priors_of(wander=0.006)
+    of_population = Priors()
+    assert quiet.twin_share < of_population.twin_share and quiet.wander < of_population.wander
+    assert 0.025 < windy.air < 0.1
+    assert wandering.wander == pytest.approx(0.006, rel=0.2)
+    learned_ones = {"twin_share", "air", "wander"}
+    assert {name for name, value in vars(windy).items() if value != vars(of_population)[name]} == learned_ones
+
+
+def test_the_order_of_runs_and_where_they_were_added_up_change_no_bit() -> None:
+    runs = [sums_of(bins_of(100.0, seed, mean=0.05)) for seed in range(8)]
+    shuffled = runs.copy()
+    random.Random(1).shuffle(shuffled)
+    assert learned_priors(runs) == learned_priors(shuffled) != Priors()
+
+
+def test_stretches_are_compared_a_few_at_a_time_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    bins = bins_of(400.0, 1)
+    at_once = sums_of(bins)
+    monkeypatch.setattr(learned, "COMPARED_AT_ONCE", 7)
+    in_parts = sums_of(bins)
+    assert in_parts.pairs.tolist() == at_once.pairs.tolist()
+    assert in_parts.squares == pytest.approx(at_once.squares)
+
+
+def test_of_tachos_that_count_only_the_means_are_learned_and_of_nothing_nothing() -> None:
+    counting = replace(made_fans(FANS), pulse_rad_s=np.full(FANS, 3.0))
+    runs = [sums_of(bins_of(300.0, seed, mean=0.06), counting) for seed in range(2)]
+    priors = learned_priors(runs)
+    assert priors.twin_share > Priors().twin_share
+    assert (priors.air, priors.wander) == (Priors().air, Priors().wander)
+    assert learned_priors([]) == learned_priors([sums_of([])]) == Priors()

@@ -1,0 +1,52 @@
+"""Missing readings: a healthy line keeps the declared rate, and a loose wire is one alarm."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.stats import poisson
+
+from schemas.messages import Array
+from scoring.model.missing import MissingReadings
+
+FANS, DECLARED = 200, 2000
+SURE = 0.999
+
+
+def counts(missing: Array, before: Array) -> Array:
+    """(fans, 4) of one reading each: whether it and the one before are missing."""
+    return np.stack((~before, ~before & missing, before, before & missing), axis=1).astype(float)
+
+
+def alarms(declared: float, share: float, again: float, readings: int, begins: int = 0, ends: int = 0) -> list[Array]:
+    """Where alarms are active, (fans,) of each reading.
+
+    declared: readings between false alarms; share, again: that is lost after a reading, and after a lost one; between
+    `begins` and `ends` a third of all.
+    """
+    rng, found = np.random.default_rng(3), []
+    line, before = MissingReadings(FANS, math.log(declared)), np.zeros(FANS, np.bool_)
+    for number in range(readings):
+        chance = np.where(before, again, share) if not begins <= number < ends else 0.35
+        missing = rng.random(FANS) < chance
+        line.take(counts(missing, before))
+        before = missing
+        found.append(line.is_active.copy())
+    return found
+
+
+def test_a_healthy_line_that_loses_readings_also_in_bursts_keeps_the_declared_rate() -> None:
+    for share, again in ((0.002, 0.1), (0.002, 0.3)):
+        active = np.array(alarms(DECLARED, share, again, 1000))
+        raised = int((active[1:] & ~active[:-1]).sum())
+        assert raised <= poisson.ppf(SURE, active.size / DECLARED)
+
+
+def test_a_loose_wire_is_one_alarm_of_a_few_seconds_delay_that_ends_once_after_it() -> None:
+    active = np.array(alarms(1e8, 0.001, 0.1, 900, begins=200, ends=600)).astype(int)
+    changes = np.diff(active, axis=0)
+    assert ((changes == 1).sum(axis=0) == 1).mean() > 0.95
+    assert 200 < np.median(np.argwhere(changes == 1)[:, 0]) < 240
+    assert 600 < np.median(np.argwhere(changes == -1)[:, 0]) < 660
+    assert not active[-1].any()

@@ -1,0 +1,85 @@
+"""Rate of false alarms: the statistic of a healthy fan grows by one a bin, so its limit is the declared time."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.stats import poisson
+
+from schemas.messages import Array
+from scoring.model.bins import Bin
+from scoring.model.operation import Fans
+from tests.support.made_bins import MadeFans, plays, with_reading
+from tests.support.scored_blocks import twin_of
+
+DECLARED_S, LASTS_S = 100.0, 150.0
+FANS = 20
+SURE = 0.999
+NO_ALARM_S = 1e12
+
+
+def moved(time_s: float) -> float:
+    return 300.0 + 60.0 * np.sin(time_s / 10.0) if time_s < LASTS_S / 2 else 300.0
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of fans up to their first false alarm, or the end."""
+
+    alarms: int
+    fan_s: float
+    statistic: Array
+    bins: Array
+
+
+def statistics(fans: Fans, bin_s: float, seeds: range) -> Statistics:
+    alarms, statistic, bins = 0, list[float](), list[int]()
+    for seed in seeds:
+        made = MadeFans(fans, bin_s, moved, seed=seed)
+        log_limit = made.decision(DECLARED_S).log_limit
+        decision = made.decision(NO_ALARM_S)  # so that the statistic goes on beyond the limit, and can be read
+        is_free = np.ones(made.count, np.bool_)
+        while made.time_s < LASTS_S:
+            decision.take(made.next())
+            found = is_free & (decision.log_statistic > log_limit)
+            ends = is_free if made.time_s >= LASTS_S else found
+            alarms += int(found.sum())
+            statistic += np.exp(decision.log_statistic[ends]).tolist()
+            bins += [made.number] * int(ends.sum())
+            is_free &= ~found
+    return Statistics(alarms, bin_s * sum(bins), np.array(statistic), np.array(bins))
+
+
+def counting(fans: Fans) -> Fans:
+    """The same with a tacho that counts pulses for half a second."""
+    count = len(fans.top_rad_s)
+    return replace(fans, pulse_rad_s=np.full(count, 6.3), held_s=np.full(count, 0.5), noise_rad_s=np.full(count, 0.8))
+
+
+@pytest.mark.parametrize("of_tacho", [lambda fans: fans, counting], ids=["at once", "counting"])
+def test_healthy_fans_of_a_population_have_at_most_the_declared_false_alarms_and_the_statistic_keeps_to_the_time(
+    of_tacho,
+) -> None:
+    found = statistics(of_tacho(twin_of(FANS).fans), 0.5, range(2))
+    declared = found.fan_s / DECLARED_S
+    assert found.alarms <= poisson.ppf(SURE, declared)
+    assert found.alarms > 0.05 * declared, "a limit that nothing reaches would be no promise"
+    surplus = found.statistic - found.bins
+    assert surplus.mean() < 3.0 * surplus.std() / np.sqrt(len(surplus)), "R - t is no more than a martingale"
+    assert found.statistic.mean() > 0.2 * found.bins.mean()
+
+
+def test_one_wrong_reading_in_fifty_of_any_kind_raises_nothing() -> None:
+    made = MadeFans(twin_of(FANS).fans, 0.1, moved, seed=5)
+    rng, kinds = np.random.default_rng(5), np.array([0.0, 0.5, 2.0, 4.0])
+    numbers = itertools.count()
+
+    def with_wrong(one: Bin) -> Bin:
+        is_wrong = (next(numbers) + 7 * np.arange(FANS)) % 50 == 49
+        measured = one.measured_rad_s * np.where(is_wrong, rng.choice(kinds, FANS), 1.0)
+        return with_reading(one, measured - one.predicted_rad_s)
+
+    assert plays(made, made.decision(), 60.0, with_wrong) == []

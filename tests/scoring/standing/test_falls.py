@@ -1,0 +1,44 @@
+"""Falls of the speed: how long a fan ran on, by which a held rotor is told from one without power."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from scoring.model.operation import Operation
+from scoring.standing.falls import Falls
+from tests.support.made_bins import bin_of, with_reading
+from tests.support.scored_blocks import TWIN_SPEED, twin_of
+
+BIN_S = 0.1
+COASTS_S = 2.0
+
+
+@pytest.mark.parametrize(
+    ("course", "least_s", "most_s"),
+    [
+        (lambda _since_s: 0.0, 0.0, 0.1),
+        (lambda since_s: math.exp(-since_s / COASTS_S), 1.4, 2.1),
+    ],
+    ids=["held", "without power"],
+)
+def test_a_fan_that_comes_to_rest_stands_and_has_run_on_for_as_long_as_its_readings_say(
+    course: Callable[[float], float], least_s: float, most_s: float
+) -> None:
+    fans = twin_of(1).fans
+    operation = Operation(fans, round(BIN_S * 1e9))
+    falls = Falls(fans, BIN_S)
+    for number in range(140):
+        since_s = number * BIN_S - 5.0
+        speed = TWIN_SPEED * (course(since_s) if since_s >= 0.0 else 1.0)
+        one = bin_of(number, round(BIN_S * 1e9), 1, TWIN_SPEED)
+        one = with_reading(one, speed - one.predicted_rad_s)
+        now = operation.inputs(one)
+        falls.take(now)
+        assert falls.stands[0] == (speed < 0.08 * TWIN_SPEED)
+        assert falls.is_falling[0] == (speed < 0.6 * TWIN_SPEED)
+    fall = falls.of(0)
+    assert least_s <= fall.lasted_s <= most_s
+    assert fall.coasts_s == pytest.approx(COASTS_S)
