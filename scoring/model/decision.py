@@ -131,7 +131,8 @@ class Decision(Saved):
         self.now = now
         known = now.readings > 0
         self.in_balance = np.where(known, now.is_balance, self.in_balance)
-        for fan in np.flatnonzero(known & ~self.active & (self.log_statistic > self.log_limit)).tolist():
+        is_over_limit = np.isfinite(self.log_statistic) & (self.log_statistic > self.log_limit)
+        for fan in np.flatnonzero(known & ~self.active & is_over_limit).tolist():
             self._raise(fan, pushes[fan], float(now.speed_rad_s[fan]))
         if self.active.any():
             for fan in np.flatnonzero(was_active & self._is_over(known, self._shares(now, pushes))).tolist():
