@@ -112,6 +112,8 @@ class RecordReader:
     """
 
     path: Path
+    for_repair: bool = False
+    """a description of the recording whose format number cannot be read is damaged, and no reason to stop"""
     is_complete: bool = field(default=False, init=False)
     """the file ends with a footer and the closing magic"""
     end: int = field(default=0, init=False)
@@ -149,6 +151,8 @@ class RecordReader:
                 file.seek(resumed)
                 continue
             self.end = record.end
+            if self.for_repair and _is_without_number(record.parsed):
+                record = record._replace(parsed=None)
             _check_format(record.parsed, self.path)
             yield record
             if record.opcode == Opcode.FOOTER and len(record.content) == _FOOTER_BYTES:
@@ -292,6 +296,11 @@ def _second_record(file: BinaryIO) -> McapRecord | None:
 def this_program() -> str:
     """Name and version of this program, as the maker of a recording."""
     return f"fantwin {version('fantwin')}"
+
+
+def _is_without_number(record: McapRecord | None) -> bool:
+    is_description = isinstance(record, Metadata) and record.name == METADATA_NAME
+    return is_description and whole_number(record.metadata.get(FORMAT_KEY, "")) is None
 
 
 def _check_format(record: McapRecord | None, path: Path | str) -> None:

@@ -171,7 +171,7 @@ def _write_repaired(found: Scan, file: BinaryIO) -> None:
         c.id: writer.register_channel(c.topic, c.message_encoding, schemas.get(c.schema_id, 0), c.metadata)
         for c in found.index.channels.values()
     }
-    for record in RecordReader(found.path):
+    for record in RecordReader(found.path, for_repair=True):
         if record.offset in found.damaged_offsets:
             continue
         data = b""

@@ -111,7 +111,7 @@ def scan(path: Path) -> Scan:
     Raises:
         RecordingError: it cannot be read, or is not an MCAP file.
     """
-    found = Scan(path, RecordReader(path))
+    found = Scan(path, RecordReader(path, for_repair=True))
     try:
         footer = _read_to_footer(found)
         found.has_index = footer is not None and found.reader.is_complete and _has_valid_summary(path, footer)
