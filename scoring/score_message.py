@@ -39,7 +39,7 @@ class ScoreColumns:
 
     @classmethod
     def empty(cls, *shape: int) -> Self:
-        """Of fans of which nothing is known."""
+        """Columns of fans of which nothing is known."""
         return cls(
             score=np.zeros(shape),
             statistic=np.full(shape, int(Statistic.DEVIATION), np.uint8),
@@ -48,11 +48,6 @@ class ScoreColumns:
             expected_residual_rad_s=np.zeros(shape),
             expected_balance_command=np.zeros(shape),
         )
-
-    @classmethod
-    def of_rows(cls, rows: int, fans: int) -> Self:
-        """To be filled."""
-        return cls.empty(rows, fans)
 
     def fill(self, rows: slice, of: ScoreColumns) -> None:
         """Write what holds for some rows."""

@@ -115,7 +115,7 @@ def prepared(
 
 
 def kept_bins(folder: Path, fleet: Fleet) -> list[HealthyBins]:
-    """Where the healthy runs of each tray are kept."""
+    """Folder in which the healthy runs of each tray are kept."""
     return [HealthyBins(folder / f"healthy-{twin.stem}", twin) for twin in fleet.twins]
 
 

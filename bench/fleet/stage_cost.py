@@ -55,7 +55,7 @@ BEGINNING_S = 10.0
 
 @dataclass
 class Cost:
-    """Of the samples so far."""
+    """Figures of the samples so far."""
 
     seconds: dict[str, float] = field(default_factory=dict[str, float])
     """of the processor, by stage"""

@@ -206,7 +206,7 @@ class SiteModel:
             return {fan: SHOWN_CLASSES[each].group for fan, each in zip(self._fleet.fans, classes, strict=True)}
 
     def words_now(self, fans: Sequence[Fan]) -> list[str]:
-        """Of each: that it is stopped, starting or like a healthy fan again; empty: none of these."""
+        """Words for each: that it is stopped, starting or like a healthy fan again; empty: none of these."""
         with self._lock:
             classes = classes_of(self._fleet)
             return [SHOWN_CLASSES[classes[self._fleet.index(fan)]].now for fan in fans]

@@ -62,7 +62,7 @@ class HealthyTwin:
     fans: Fans
     steady_fans: Sequence[SteadyFan]
     tachos: Sequence[Tacho]
-    """of each fan"""
+    """the tacho of each fan"""
     advice: Advice = Advice()
     standstill: Standstill | None = None
     unseen_error: UnseenError | None = None

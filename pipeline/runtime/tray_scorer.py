@@ -22,9 +22,9 @@ from scoring.alarms.alarm_manager import AlarmManager, Measured
 from scoring.alarms.alarm_text import AlarmText
 from scoring.alarms.fan_condition import ConditionSettings
 from scoring.alarms.tray_conditions import Decided
-from scoring.diagnosis.advice import SeenSinceOnset
+from scoring.diagnosis.advice import KNOWN_SOON, SeenSinceOnset
 from scoring.diagnosis.cause_words import CauseWords, PossibleCause
-from scoring.diagnosis.shown_causes import CANNOT_TELL, SENSOR_DROPOUT, SLOW_CHANGE
+from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE
 from scoring.diagnosis.standstill_causes import Standing, standstill_causes
 from scoring.model.bins import Bin, Bins, bin_ns_of
 from scoring.model.decision import Decision
@@ -37,14 +37,13 @@ from scoring.wear.wear_monitor import WearMonitor
 
 NAMED_AFTER_S, FALLING_S = 3.0, 4.0
 """an onset is so old before a cause is named; so long after an alarm a fan that has lost much speed may come to rest"""
-KNOWN_SOON = "cannot tell yet: more is known in a few seconds"
 
 
 class TrayScorer:
     """The scores, alarms and wear of one tray's fans. What it tells of a fan is that of the end of the last bin."""
 
     def __init__(self, fans: int, text: AlarmText, config: ScorerConfig, twin: HealthyTwin) -> None:
-        """From the beginning: nothing is known of a fan but its twin, and none has an alarm."""
+        """Begin with fans of which nothing is known but their twin, and without an alarm."""
         self.fans, self.twin = fans, twin
         self._alarm_share = config.alarm_share
         self._words = CauseWords(twin.advice, has_supply=twin.has_supply)
@@ -80,7 +79,7 @@ class TrayScorer:
             self._open(item.period_ns)
         if self._against:
             self._against.take(item)
-        columns = ScoreColumns.of_rows(len(item.t_ns), self.fans)
+        columns = ScoreColumns.empty(len(item.t_ns), self.fans)
         alarms: list[Alarm] = []
         begin = 0
         for one in self._bins.take(item):
@@ -150,7 +149,7 @@ class TrayScorer:
             return ()
         is_new = decision.raised_s(fan) < FALLING_S
         if alarm.age_s < NAMED_AFTER_S or (is_new and falls.is_falling[fan]):
-            return (Diagnosis(cause=CANNOT_TELL, probability=1.0, evidence=KNOWN_SOON),)
+            return (Diagnosis(cause=CANNOT_TELL, probability=1.0, evidence=f"{CAUSES[CANNOT_TELL]}: {KNOWN_SOON}"),)
         return self._words.of(alarm.causes(), self._seen_since(fan, alarm.age_s), self.twin.steady_fans[fan])
 
     def _seen_since(self, fan: int, age_s: float) -> SeenSinceOnset:
@@ -192,8 +191,8 @@ class TrayScorer:
         decision = self._decision
         assert decision.now is not None
         expected = decision.model.expected_rad_s
-        missing = decision.missing.score
-        statistic = np.where(missing > np.where(decision.active, score, decision.deviation_score), 2, 1)
+        is_missing = ~decision.active & (decision.missing.score > decision.deviation_score)
+        statistic = np.where(is_missing, int(Statistic.MISSING_READINGS), int(Statistic.DEVIATION))
         statistic = np.where(is_worn & ~decision.has_alarm, int(Statistic.WEAR), statistic)
         statistic = np.where(self._stands, int(Statistic.STANDSTILL), statistic)
         return ScoreColumns(

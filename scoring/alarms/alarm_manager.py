@@ -41,11 +41,11 @@ class FanFacts(Protocol):
     """What is known of the fans of a tray at the end of a bin."""
 
     def measured(self, fan: int) -> Measured:
-        """Of a fan with an alarm."""
+        """What is measured of a fan with an alarm."""
         ...
 
     def causes(self, fan: int) -> tuple[Diagnosis, ...]:
-        """Of its alarm, most probable first."""
+        """Causes of its alarm, most probable first."""
         ...
 
     @property

@@ -8,7 +8,7 @@ from schemas.messages import Alarm
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
 SIGMAS = 2.0
-"""of the interval of a size"""
+"""half of the interval of a size"""
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,9 @@ class Decided:
     """whether something was: else the rest says nothing"""
     active: Array
     severity: Array
-    """of schemas.enums.Severity, of an active alarm"""
+    """value of schemas.enums.Severity, where an alarm is active"""
     onset_t_ns: Array
-    """of an active alarm"""
+    """when the fault of an active alarm began"""
 
 
 class TrayConditions:

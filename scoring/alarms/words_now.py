@@ -9,7 +9,7 @@ STOPPED, STARTING = "stopped by its command", "starting"
 
 
 def words_now(state: int, invalid_reason: int = InvalidReason.NONE) -> str:
-    """After "now": that the fan is stopped, starting or like a healthy fan again; empty: none of these.
+    """Words after "now": that the fan is stopped, starting or like a healthy fan again; empty: none of these.
 
     state and invalid_reason: `FanState` and `InvalidReason` of the newest sample.
     """

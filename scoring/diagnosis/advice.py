@@ -16,7 +16,7 @@ SLOWER, FASTER = 2.0 / 3.0, 4.0 / 3.0
 SURELY_TURNS = 2.0
 """times the lowest command that turns a fan"""
 SOON_S = 3.0
-"""until then an onset is too young for a command to be worth moving"""
+"""age below which an onset is too young for a command to be worth moving"""
 DIGITS = 2
 
 KNOWN_SOON = "more is known in a few seconds"

@@ -26,14 +26,14 @@ from scoring.diagnosis.steady_fan import OF_BALANCE, SteadyFan
 CLEAR = 0.5
 """probability from which a cause is named first"""
 DRIVER_SHARE = 0.5
-"""of the prior of less drive: the other half is a weak supply"""
+"""share of the prior of less drive: the other half is a weak supply"""
 NEWS = 0.1
 """change of a probability that is worth a message"""
 SIGMAS = 1.96
 """half of a 95 % interval"""
 UNITS = {Size.FRICTION: "share", Size.TORQUE: "share", Size.MISSING: "share", Size.SPREAD: "times"}
-"""of the change: share of the torque at the top speed or of the readings, multiples of a healthy fan's; else relative
-to the healthy value"""
+"""unit of the change: share of the torque at the top speed or of the readings, multiples of a healthy fan's; else
+relative to the healthy value"""
 STEADY_SHARE = 0.05
 """a speed that varies by less than this share tells drag, friction and gain little apart"""
 NARROW = 2.0

@@ -82,7 +82,7 @@ CAUSES = {row.cause: row.name for row in ROWS}
 WHAT_TO_DO = {row.cause: row.to_do for row in ROWS if row.to_do}
 """by cause; what is to be done where the cause is unclear is part of the evidence"""
 STANDSTILL_CAUSES = {cause: CAUSES[cause] for cause in (BLOCKED, NO_POWER, NO_TACHO, STILL_DRIVEN, WINDMILLING)}
-"""of a fan that does not turn or stop as commanded"""
+"""causes of a fan that does not turn or stop as commanded"""
 
 
 class RatedCause(Protocol):

@@ -52,7 +52,7 @@ PRIORS = {
     Standing.TURNED_AGAIN: RUNS_ON,
 }
 UNPLUGGED = 0.1
-"""of no power: the whole connector is off, with the tacho"""
+"""share of no power in which the whole connector is off, with the tacho"""
 HELD, BRAKED = 0.05, 0.1
 """share of a coast that a held rotor turns; share of blocked rotors that are only braked"""
 BEGUN = 0.85
@@ -60,7 +60,7 @@ BEGUN = 0.85
 COAST, COAST_SPREAD = 0.92, 0.25
 """median of a coast until the reading of a fan at rest, of a whole one; and spread of its logarithm"""
 PHASES = 20
-"""of the readings, at which a fall may begin"""
+"""number of phases of a reading at which a fall may begin"""
 LEAST_HELD_S = 0.02
 LEAST_DENSITY = 1e-3
 """per coast: of a fall that lasts longer than any cause explains"""
@@ -115,7 +115,7 @@ def _weighed(priors: Mapping[str, float], fall: Fall) -> dict[str, float]:
 
 
 def _density(area: Callable[[float], float], constant: float, lasted: float, tacho: float) -> float:
-    """Of how long a fall lasted, by the distribution of its area and its time constant, over the phases of a reading.
+    """Density of how long a fall lasted: by distribution of its area and time constant, over the phases of a reading.
 
     The first reading of the fall adds full speed before it; where it is too high to belong to the fall, it takes what
     the rotor turned in it, or until the next is low enough.

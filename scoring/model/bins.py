@@ -22,6 +22,8 @@ WRONG_SHARE = 0.05
 """share of the top speed: a reading that is farther from the median of its bin is wrong"""
 FASTEST = 10.0
 """times the top speed: a faster reading is as impossible as this"""
+LARGEST_COMMAND = 1e9
+"""a larger command or torque balance is as impossible as this"""
 RANKED_FROM = 4
 """samples of a bin; of fewer none can be said to be wrong"""
 COLUMNS = (
@@ -36,7 +38,7 @@ COLUMNS = (
     "after_missing",
     "pair",
 )
-"""of samples, (n, fans) each"""
+"""what is collected of samples, (n, fans) each"""
 READS = (int(InvalidReason.NONE), int(InvalidReason.WARMING_UP), NO_SPEED)
 """states in which a tacho should give readings"""
 
@@ -47,7 +49,7 @@ class Bin:
 
     t_ns: int
     row: int
-    """of the sample with which it ended, in its block"""
+    """row of the sample with which it ended, in its block"""
     judged: Array
     """whether a reading or a torque balance is compared with the twin"""
     deviations_rad_s: Array
@@ -140,8 +142,12 @@ class Bins:
             "predicted": predicted,
             "half_range": block.reading_range_rad_s if len(block.reading_range_rad_s) else nothing,
             "unseen": unseen,
-            "command": np.nan_to_num(block.command),
-            "balance": np.where(among(reason, *BALANCE_COUNTS), block.torque_balance_command, np.nan),
+            "command": np.nan_to_num(block.command).clip(-LARGEST_COMMAND, LARGEST_COMMAND),
+            "balance": np.where(
+                among(reason, *BALANCE_COUNTS),
+                block.torque_balance_command.clip(-LARGEST_COMMAND, LARGEST_COMMAND),
+                np.nan,
+            ),
             "counts": block.valid & np.isfinite(measured) & np.isfinite(predicted) & ~missing,
             "missing": missing,
             "after_missing": before[0],

@@ -22,7 +22,7 @@ from scoring.model.saved import Saved, part, within
 from scoring.model.wrong import FAR_SIGMAS, WrongReadings
 
 AGREED_SIGMAS = 8.0
-"""far readings that agree count no farther from what is expected"""
+"""the filter of a fan in alarm takes no reading for farther from what is expected"""
 OF_RATE = 0.8
 """share of the declared rate that the speed has; missing readings have the rest"""
 WALKS_PER_SQRT_S = 0.1
@@ -34,7 +34,7 @@ PROBABLE = 0.05
 SMALLEST = 0.01
 """share of the speed: what a fault takes at least"""
 FORGETS_S = 60.0
-"""after a longer gap nothing of the evidence before it counts"""
+"""longest gap after which the evidence before it counts"""
 KEPT_FROM = 0.5
 """score from which a snapshot keeps the evidence; less begins again"""
 HIGHEST_SCORE = 99.0
@@ -102,14 +102,14 @@ class Decision(Saved):
         self.in_balance = np.zeros(count, np.bool_)
         """(fans,) whether the torque balance is what is compared"""
         self.now: Inputs | None = None
-        """of the last bin"""
+        """what drove the model within the last bin; None: there was none"""
         self.deviation_rad_s, self.deviation_std_rad_s = np.zeros(count), np.zeros(count)
         """(fans,) newest reading less what is expected of this fan when it is healthy, and the standard deviation of
         that; by the torque balance, of the speed that it tends to"""
 
     @property
     def number(self) -> int:
-        """Of the last bin."""
+        """Number of the last bin."""
         return self._evidence.number
 
     @property
@@ -251,9 +251,8 @@ class Decision(Saved):
         model.update(found, gain, agreed.clip(-farthest, farthest))
         for fan, alarm in self.alarms.items():
             alarm.take(now.of(fan), self.bin_s)
-        known = counts
-        self.deviation_std_rad_s = np.where(known, root, self.deviation_std_rad_s)
-        self.log_statistic = np.where(known, evidence.log_statistic(), self.log_statistic)
+        self.deviation_std_rad_s = np.where(counts, root, self.deviation_std_rad_s)
+        self.log_statistic = np.where(counts, evidence.log_statistic(), self.log_statistic)
         return now, pushes
 
     def _counts(self, one: Bin, now: Inputs) -> Array:

@@ -92,7 +92,7 @@ class HealthyFans(Saved):
         self.mean = np.zeros((count, STATES))
         self.covariance = _prior(fans, priors, period_s)
         self.kept = np.ones((count, 3))
-        """of FADING, from one bin to the next"""
+        """(fans, 3) share of FADING that a bin keeps"""
         self.tends = np.zeros((count, 3, STATES))
         """rows of FOLLOWING: these are the rows times the states before"""
         self.follows = np.ones((count, 3))

@@ -47,7 +47,7 @@ class FanInAlarm:
 
     @property
     def age_s(self) -> float:
-        """Of the likeliest onset."""
+        """Age of the likeliest onset."""
         return float(self._ages_s[self._terms.max(axis=1).argmax()])
 
     def take(self, now: Inputs, bin_s: float) -> None:

@@ -37,7 +37,7 @@ BATCH = 8
 HAIR = 1e-3
 """share of a reading: readings that differ by more are two"""
 LEAST_LOG_CHANCE = -30.0
-"""of a size having the sign of its fault"""
+"""least log of the chance that a size has the sign of its fault"""
 LARGEST_LOG = 600.0
 """a larger one is no logarithm of a number"""
 

@@ -21,7 +21,7 @@ from scoring.standing.stands_still import StandsStill
 CERTAIN = 2.0
 """score of a fan that does not do as commanded"""
 OBEYS_S = 2.0
-"""for how long a fan does as commanded until its alarm is over"""
+"""time for which a fan does as commanded until its alarm is over"""
 NEVER_NS = -(1 << 62)
 KINDS = (None, *Standing)
 
@@ -37,7 +37,7 @@ class AgainstCommand(Saved):
         count = len(tachos)
         self._arrived_t_ns = np.full(count, NEVER_NS, np.int64)
         self._obeyed_ns = np.zeros((2, count), np.int64)
-        """for how long each has obeyed a command to turn, and one to stop, since it did not"""
+        """(2, fans) time for which each has obeyed a command to turn, and one to stop, since it did not"""
         self._is_against = np.zeros((2, count), np.bool_)
         self.active = np.zeros((0, count), np.bool_)
         """(n, fans) of the samples of the last block"""
@@ -52,6 +52,11 @@ class AgainstCommand(Saved):
         n = len(block.t_ns)
         self.active, self.score = np.zeros(speed.shape, np.bool_), np.zeros(speed.shape)
         self.kind = np.zeros(speed.shape, np.int64)
+        is_ahead = self._arrived_t_ns > block.t_ns[0]  # of a clock that was set back since: how long ago is not known
+        if is_ahead.any():
+            self._arrived_t_ns[is_ahead] = NEVER_NS
+            self._stands.forget(is_ahead)
+            self._runs.forget(is_ahead)
         missed_ns = self._missed_ns(block.t_ns, block.period_ns, is_here)
         ends = [*np.flatnonzero((missed_ns > 0).any(axis=1)).tolist(), n]
         begin = 0

@@ -44,14 +44,14 @@ class RunsOn(Saved):
         self._coast_limit_s = coast_limit_s(healthy, reach_s)
         self._slowing_limit_s = np.minimum(slowing_limit_s(healthy, reach_s), self._coast_limit_s)
         self._lasted_ns = np.zeros((4, len(tachos)), np.int64)
-        """for how long the fan has turned although it is stopped, has been stopped, at rest, and at rest for the lag"""
+        """(4, fans) time for which each has turned although stopped, been stopped, at rest, and at rest for the lag"""
         self._lasted_ns[1] = LONG_AGO_NS
         self._peak_rad_s = np.zeros(len(tachos))
         """highest reading within the lag since the command stopped it; 0 if there is none"""
 
     @property
     def memory_s(self) -> float:
-        """In a gap the fan may have been started and stopped again."""
+        """No gap: in one the fan may have been started and stopped again."""
         return 0.0
 
     def update(self, command: Array, speed_rad_s: Array, counts: Durations) -> tuple[Array, Array, Array]:

@@ -41,11 +41,11 @@ class StandsStill(Saved):
         self._start_limit_s = start_limit_s(healthy, reach_s)
         self._missing_limit_s: Array = reach_s + MISSING_S
         self._lasted_ns = np.zeros((4, len(tachos)), np.int64)
-        """for how long the fan has been driven, turned, stood, and given no reading"""
+        """(4, fans) time for which each has been driven, turned, stood, and given no reading"""
 
     @property
     def memory_s(self) -> float:
-        """After a longer gap nothing is known about how the fan was started."""
+        """Longest gap after which it is known how the fan was started."""
         return float(np.max(self._start_limit_s))
 
     def update(self, command: Array, speed_rad_s: Array, counts: Durations) -> tuple[Array, Array, Array]:

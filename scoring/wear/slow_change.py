@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # it loads scipy, which a command that shows alarms does not 
     from scoring.wear.trend import LimitForecast, Trend
 
 LIMIT_SHARE = 0.1
-"""of the speed; an alarm is raised where a change has surely reached it"""
+"""share of the speed; an alarm is raised where a change has surely reached it"""
 WEAR_HINT = "see fantwin wear"
 """each notice about one fan ends with it"""
 MOST_FANS = "most fans turn"

@@ -34,7 +34,7 @@ NS_PER_DAY = 86_400 * NS_PER_S
 CAPACITY = 128
 MIN_POINTS = 10
 MAX_ERROR_RATIO = 3.0
-"""to the median error of the points; a trend leaves out those with larger errors"""
+"""ratio to the median error of the points; a trend leaves out those with larger errors"""
 MIN_EFFECTIVE_POINTS = 5.0
 BATCHES = 24
 MAX_HORIZON_RATIO = 10.0

@@ -29,7 +29,7 @@ MIN_FORECAST_DAYS = 1.0
 HALF_INTERVAL = 1.96
 """half of a 95 % interval, in standard errors"""
 MIN_CHANGE = 0.03
-"""of the speed; any healthy fan shows smaller changes"""
+"""share of the speed; any healthy fan shows smaller changes"""
 NOTICED_INTERVALS = 2.0
 """a change is noticed from so many half intervals on: every fan is tested again with every point"""
 TOGETHER_NS = 1800 * NS_PER_S

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.broker.config import MqttConfig
@@ -142,6 +142,7 @@ def test_a_core_survives_any_message_of_its_topics_and_makes_the_same_of_the_sam
     st.lists(st.tuples(st.floats(allow_nan=True), st.floats(allow_nan=True)), min_size=1, max_size=20),
     st.integers(1, 40),
 )
+@example(10_000_000, [(0.0, 0.0), (0.0, 1.8e307)], 15)
 def test_a_fan_of_any_speed_and_command_is_diagnosed(period_ns: int, values: list, repeats: int) -> None:
     core = core_of(1, **OFTEN)
     samples = np.repeat(np.array(values), repeats, axis=0)

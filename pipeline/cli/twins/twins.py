@@ -16,7 +16,7 @@ from pipeline.errors import UsageError
 from pipeline.learning.versions import TimeSpan, TwinVersions, learning_folder
 from schemas.units import NS_PER_S
 
-CONSEQUENCE = "alarms are discarded and the fans are learned anew, unless only the calibration differs"
+CONSEQUENCE = "alarms are discarded and what was learned of the fans begins again, unless only the calibration differs"
 
 
 def twins(

@@ -165,7 +165,7 @@ class HealthyRuns:
         return [*chain.from_iterable(self._each(decide, self._paths, "counting false alarms"))]
 
     def sha256(self) -> dict[Path, str]:
-        """Of the recordings that were used."""
+        """SHA-256 of the recordings that were used."""
         return dict(self._each(_path_and_sha256, self._paths, "naming the recordings in the card"))
 
 

@@ -1,4 +1,4 @@
-"""Falls of the speed: how long a fan ran on, by which a held rotor is told from one without power."""
+"""Falls of the speed: how long a fan ran on, which distinguishes a held rotor from one without power."""
 
 from __future__ import annotations
 
