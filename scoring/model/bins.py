@@ -31,6 +31,7 @@ COLUMNS = (
     "predicted",
     "half_range",
     "unseen",
+    "unseen_balance",
     "command",
     "balance",
     "counts",
@@ -77,6 +78,8 @@ class Bin:
     """half of the range of readings that the tacho may show of the predicted speed"""
     unseen_rad_s: Array
     """standard deviation of the twin's error where it was not trained"""
+    unseen_balance_command: Array
+    """and that of the torque balance"""
     command: Array
     missing: Array
     """(fans, 4) readings after a reading, and those of them that are missing; after a missing one, and missing"""
@@ -136,12 +139,14 @@ class Bins:
         reads = among(reason, *READS)
         before = np.concatenate((self._before[:, np.newaxis], np.stack((missing, reads))), axis=1)[:, :-1]
         self._before = np.stack((missing[-1], reads[-1]))
-        unseen = self.unseen_rad_s = np.nan_to_num(self._unseen.of(block)[0]) if self._unseen else nothing
+        unseen, unseen_balance = map(np.nan_to_num, self._unseen.of(block)) if self._unseen else (nothing, nothing)
+        self.unseen_rad_s = unseen
         return {
             "measured": measured,
             "predicted": predicted,
             "half_range": block.reading_range_rad_s if len(block.reading_range_rad_s) else nothing,
             "unseen": unseen,
+            "unseen_balance": unseen_balance,
             "command": np.nan_to_num(block.command).clip(-LARGEST_COMMAND, LARGEST_COMMAND),
             "balance": np.where(
                 among(reason, *BALANCE_COUNTS),
@@ -182,6 +187,7 @@ class Bins:
             balance_command=mean(rows["balance"], has_balance),
             half_range_rad_s=mean(rows["half_range"], counts),
             unseen_rad_s=mean(rows["unseen"], counts),
+            unseen_balance_command=mean(rows["unseen_balance"], has_balance),
             command=rows["command"].mean(axis=0),
             missing=np.stack([each.sum(axis=0) for each in transitions], axis=1),
         )

@@ -57,6 +57,9 @@ CARRIED = SHOWN
 """number of the states that the next bin follows from: all but the last, what a tacho shows but for e_k and white"""
 BOTH_BUT_NOT = np.array([[1.0], [-1.0]])
 """what a reading tells of two states, but not between two of which nothing is learned"""
+UNSEEN_S = 100.0
+"""how long an error of the twin where it was not trained stays what it is: how heat and supply move it there is not
+known either"""
 SLOWEST_RAD_S = 10.0
 """errors in rad/s are no larger share of a lower speed"""
 
@@ -167,10 +170,13 @@ class HealthyFans(Saved):
         """Go on by one bin."""
         p, covariance = self._priors, self.covariance
         moved = np.abs(now.rate_rad_s2) * self._bin_s / self._fans.top_rad_s
-        stays = np.exp(-(moved + now.turned) / p.local_length - self._bin_s / p.local_s)
+        local = p.local_rad_s**2 + np.square(now.unseen_rad_s)
+        is_seen = p.local_rad_s**2 / local
+        per_s = is_seen / p.local_s + (1.0 - is_seen) / UNSEEN_S
+        # a fault that moves a fan must not widen what is not known of it
+        stays = np.exp(-(is_seen * moved + now.turned) / p.local_length - self._bin_s * per_s)
         self.kept[:, LOCAL - AIR] = stays
-        new = (p.local_rad_s**2 + now.unseen_rad_s**2) / np.square(np.maximum(now.speed_rad_s, SLOWEST_RAD_S))
-        self.noise[:, LOCAL] = new * (1.0 - stays**2)
+        self.noise[:, LOCAL] = local / np.square(np.maximum(now.speed_rad_s, SLOWEST_RAD_S)) * (1.0 - stays**2)
         faded = covariance[:, FADING] * self.kept[:, :, np.newaxis]
         faded[:, :, FADING] *= self.kept[:, np.newaxis, :]
         covariance[:, FADING], covariance[:, :, FADING] = faded, faded.swapaxes(1, 2)
@@ -229,7 +235,8 @@ class HealthyFans(Saved):
         white = np.square(fans.noise_rad_s) / np.maximum(now.readings, 1.0)
         white += np.square(p.half_range * now.half_range_rad_s) + np.square(fans.timing_s * now.rate_rad_s2)
         missed = np.where(now.is_balance, 0.0, self._missed)
-        white = np.where(now.is_balance, p.balance**2 * self._of_balance, white + missed)
+        of_balance = p.balance**2 * self._of_balance + np.square(p.balance_time_s * now.moves_rad_s2)
+        white = np.where(now.is_balance, of_balance, white + missed)
         variance = with_states[self._rows, shown] + white
         with_states[:, COUNT] += missed
         expected = self.mean[self._rows, shown]

@@ -140,6 +140,8 @@ class Operation(Saved):
         self._command = one.command
         readings = np.where(is_balance, one.balances, one.readings)
         ends = (one.t_ns // self._bin_ns) % self.bins_held == 0
+        slope = fans.slope(speed)
+        unseen = np.where(is_balance, one.unseen_balance_command / slope, one.unseen_rad_s)
         return Inputs(
             speed,
             measured,
@@ -149,11 +151,11 @@ class Operation(Saved):
             moves,
             (share.sum() - share) / max(len(share) - 1, 1),
             turned,
-            np.hypot(one.unseen_rad_s, self._of_lowest(one.command)) if self._has_lowest else one.unseen_rad_s,
+            np.hypot(unseen, self._of_lowest(one.command)) if self._has_lowest else unseen,
             one.half_range_rad_s,
             readings,
             ends & (self._held[0] + readings > 0.0),
-            np.where(is_balance, -one.balance_command / fans.slope(speed), one.deviation_rad_s),
+            np.where(is_balance, -one.balance_command / slope, one.deviation_rad_s),
             is_balance,
         )
 

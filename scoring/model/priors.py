@@ -41,3 +41,5 @@ class Priors:
     """white error, of half the range of readings that the tacho may show"""
     balance: Positive = 0.3
     """white error, of the noise of the torque balance; the rest passes its filter"""
+    balance_time_s: Positive = 0.04
+    """how early or late a movement may show in the torque balance: its filter is no mean over the same time"""

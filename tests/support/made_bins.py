@@ -46,6 +46,7 @@ def bin_of(number: int, bin_ns: int, fans: int, speed_rad_s: Array | float, **mo
         balance_command=nothing,
         half_range_rad_s=nothing,
         unseen_rad_s=nothing,
+        unseen_balance_command=nothing,
         command=nothing + speed_rad_s,
         missing=np.zeros((fans, 4)),
     )
@@ -62,6 +63,19 @@ def with_reading(one: Bin, deviation_rad_s: Array) -> Bin:
         deviations_rad_s=deviation_rad_s[np.newaxis],
         measured_rad_s=measured,
         newest_rad_s=measured,
+    )
+
+
+def with_balance(one: Bin, balance_command: Array) -> Bin:
+    """The bin with one torque balance of each fan, in the place of its readings."""
+    nothing = np.zeros(len(balance_command))
+    return replace(
+        one,
+        readings=nothing,
+        deviations_rad_s=np.full((1, len(nothing)), np.nan),
+        balances=nothing + 1.0,
+        balance_command=balance_command,
+        balances_command=balance_command[np.newaxis],
     )
 
 
