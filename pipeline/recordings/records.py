@@ -299,8 +299,9 @@ def this_program() -> str:
 
 
 def _is_without_number(record: McapRecord | None) -> bool:
-    is_description = isinstance(record, Metadata) and record.name == METADATA_NAME
-    return is_description and whole_number(record.metadata.get(FORMAT_KEY, "")) is None
+    if not isinstance(record, Metadata) or record.name != METADATA_NAME:
+        return False
+    return whole_number(record.metadata.get(FORMAT_KEY, "")) is None
 
 
 def _check_format(record: McapRecord | None, path: Path | str) -> None:

@@ -96,14 +96,11 @@ class TrayTwin:
 
     @property
     def unseen_error(self) -> UnseenError | None:
-        """How far it may be wrong where healthy runs do not show it; None where the card says nothing about it."""
-        card, table = self.card, self.card.model_uncertainty
-        if table is not None and not table.seen_std_rad_s:
-            table = None
-        if table is None and card.drive is None:
+        """How far it may be wrong where it was not trained; None where the card says nothing about it."""
+        table = self.card.model_uncertainty
+        if table is None or not table.seen_std_rad_s:
             return None
-        low, high = card.command_range
-        return UnseenError(table, card.drive, self.balance.viscous, self.balance.drag, high - low)
+        return UnseenError(table, self.card.drive, self.balance.viscous, self.balance.drag)
 
 
 def for_fans(values: tuple[Any, ...], fans: int) -> Array:

@@ -169,12 +169,14 @@ class HealthyFans(Saved):
     def predict(self, now: Inputs) -> None:
         """Go on by one bin."""
         p, covariance = self._priors, self.covariance
-        moved = np.abs(now.rate_rad_s2) * self._bin_s / self._fans.top_rad_s
-        local = p.local_rad_s**2 + np.square(now.unseen_rad_s)
-        is_seen = p.local_rad_s**2 / local
-        per_s = is_seen / p.local_s + (1.0 - is_seen) / UNSEEN_S
-        # a fault that moves a fan must not widen what is not known of it
-        stays = np.exp(-(is_seen * moved + now.turned) / p.local_length - self._bin_s * per_s)
+        moved = np.abs(now.moves_rad_s2) * self._bin_s / self._fans.top_rad_s
+        variances = np.stack((now.of_lowest_rad_s, now.unseen_rad_s)) ** 2
+        local = p.local_rad_s**2 + variances.sum(axis=0)
+        is_of_lowest, is_unseen = variances / local
+        # what is unseen is not renewed by the speed: a fault must not widen what is not known of a fan
+        path = now.command_moved + (1.0 - is_unseen) * moved + is_of_lowest * now.command_path
+        per_s = (1.0 - is_unseen) / p.local_s + is_unseen / UNSEEN_S
+        stays = np.exp(-path / p.local_length - self._bin_s * per_s)
         self.kept[:, LOCAL - AIR] = stays
         self.noise[:, LOCAL] = local / np.square(np.maximum(now.speed_rad_s, SLOWEST_RAD_S)) * (1.0 - stays**2)
         faded = covariance[:, FADING] * self.kept[:, :, np.newaxis]
@@ -201,7 +203,7 @@ class HealthyFans(Saved):
     def carry(self, states: Array) -> None:
         """Take (fans, STATES, n) states on to the present bin."""
         states[:, FADING] *= self.kept[:, :, np.newaxis]
-        states[:, FOLLOWING] = self.tends @ states
+        states[:, FOLLOWING] = self.tends.astype(states.dtype, copy=False) @ states
         states[:, COUNT] *= self._holds[:, np.newaxis]
 
     def _follow(self, now: Inputs) -> None:

@@ -467,7 +467,7 @@ def test_a_first_warm_up_is_reported_only_after_a_minute_and_a_silent_line_does_
 
 def test_the_unseen_error_of_a_twin_widens_the_band_and_what_a_fan_may_do_there() -> None:
     table = by_speed((0.0, 600.0), (0.0, 100.0), ((20.0, 20.0), (20.0, 20.0)), 0.0)
-    everywhere = UnseenError(table, None, np.array([0.05]), np.array([0.0002]), command_width=100.0)
+    everywhere = UnseenError(table, None, np.array([0.05]), np.array([0.0002]))
     raised = []
     for unseen, std in ((None, 0.0), (everywhere, 20.0)):
         moves = prediction_of(noise_of(12 * SECOND))

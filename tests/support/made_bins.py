@@ -118,7 +118,7 @@ class MadeFans:
         one = bin_of(self.number, self.bin_ns, self.count, self._speed(time_s))
         self.number += 1
         now = self._operation.inputs(one)
-        self._move(np.abs(now.rate_rad_s2) * self.bin_s / self.fans.top_rad_s, now.turned, now.speed_rad_s)
+        self._move(np.abs(now.moves_rad_s2) * self.bin_s / self.fans.top_rad_s + now.command_moved, now.speed_rad_s)
         states, speed, top = self.states, now.speed_rad_s, self.fans.top_rad_s
         tends = speed * (np.sum(hats(speed / top) * states[:, :K], axis=1) + states[:, SAG] * now.load)
         tends += speed * (states[:, AGE] + states[:, AIR] + states[:, LOCAL] + states[:, WANDER])
@@ -142,14 +142,14 @@ class MadeFans:
         deviation = np.where(is_stuck, then_rad_s[:, 0] - one.predicted_rad_s, deviation)
         return with_reading(one, deviation)
 
-    def _move(self, moved: Array, turned: Array, speed: Array) -> None:
+    def _move(self, moved: Array, speed: Array) -> None:
         """Let the states go on by one bin."""
         states, p, own = self.states, PRIORS, self._own
         states[:, AGE] += own * p.ageing_per_sqrt_h * np.sqrt(self.bin_s / 3600.0) * self._drawn()
         for state, std, time_s in ((WANDER, p.wander, p.wander_s), (AIR, own * p.air, p.air_s)):
             kept = np.exp(-self.bin_s / time_s)
             states[:, state] = kept * states[:, state] + std * np.sqrt(1.0 - kept**2) * self._drawn()
-        kept = np.exp(-(moved + turned) / p.local_length - self.bin_s / p.local_s)
+        kept = np.exp(-moved / p.local_length - self.bin_s / p.local_s)
         new = own * p.local_rad_s / np.maximum(speed, 10.0) * np.sqrt(1.0 - kept**2)
         states[:, LOCAL] = kept * states[:, LOCAL] + new * self._drawn()
 

