@@ -246,9 +246,13 @@ class Decision(Saved):
         farthest = np.where(self._wrong.agree, np.inf, FAR_SIGMAS) * root
         agreed = found.distance_rad_s.clip(-farthest, farthest)
         pushes = forces(self._fans, now, evidence.age_s, evidence.then_rad_s, self._hypotheses.columns)
-        evidence.add(pushes, model, found, gain, agreed)
         farthest = np.where(self.active, AGREED_SIGMAS, FAR_SIGMAS) * root
-        model.update(found, gain, agreed.clip(-farthest, farthest))
+        learned = agreed.clip(-farthest, farthest)
+        is_clipped = np.divide(
+            learned, agreed, out=np.ones(len(root)), where=agreed != 0.0
+        )  # share that the filter takes
+        evidence.add(pushes, model, found, gain * is_clipped[:, np.newaxis], agreed)
+        model.update(found, gain, learned)
         for fan, alarm in self.alarms.items():
             alarm.take(now.of(fan), self.bin_s)
         self.deviation_std_rad_s = np.where(counts, root, self.deviation_std_rad_s)

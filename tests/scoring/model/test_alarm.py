@@ -9,7 +9,7 @@ import pytest
 
 from scoring.model.decision import OVER_S, Decision
 from scoring.model.faults import DRAG, DRAG_GROWS, DRIVE, FRICTION, GROWS_S
-from scoring.model.healthy import K
+from scoring.model.healthy import SLOW, K
 from tests.support.made_bins import Changes, MadeFans, plays
 from tests.support.scored_blocks import TWIN_SPEED, twin_of
 
@@ -108,6 +108,17 @@ def outcome(
     told += [float(decision.deviation_score[of_alarm]), *decision.fault[0].tolist()]
     told += decision.model.mean.ravel().tolist()
     return changes, [cause.cause for cause in causes], told
+
+
+def test_what_the_filter_took_of_a_large_fault_before_its_alarm_is_given_back() -> None:
+    """The speed falls when the fault begins: what it takes looks like a lag at first."""
+    made = MadeFans(twin_of(4).fans, 0.1, lambda time_s: 320.0 - 60.0 * min(max(time_s - 20.0, 0.0), 2.0), seed=6)
+    decision = made.decision()
+    assert plays(made, decision, 20.0) == []
+    before, std = decision.model.mean[:, SLOW].copy(), np.sqrt(np.einsum("nii->ni", decision.model.covariance)[:, SLOW])
+    made.fault_from_s, made.sizes[:, DRAG] = 20.0, -0.6
+    assert len(plays(made, decision, 1.0)) == 4
+    assert np.all(np.abs(decision.model.mean[:, SLOW] - before) < 0.5 * std)
 
 
 def test_a_decision_that_goes_on_from_a_snapshot_decides_the_same_at_the_same_times_also_in_an_alarm() -> None:
