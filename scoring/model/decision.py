@@ -248,13 +248,11 @@ class Decision(Saved):
         pushes = forces(self._fans, now, evidence.age_s, evidence.then_rad_s, self._hypotheses.columns)
         farthest = np.where(self.active, AGREED_SIGMAS, FAR_SIGMAS) * root
         learned = agreed.clip(-farthest, farthest)
-        is_clipped = np.divide(
-            learned, agreed, out=np.ones(len(root)), where=agreed != 0.0
-        )  # share that the filter takes
-        evidence.add(pushes, model, found, gain * is_clipped[:, np.newaxis], agreed)
+        takes = np.divide(learned, agreed, out=np.ones(len(root)), where=agreed != 0.0)  # the filter, of a far reading
+        evidence.add(pushes, model, found, gain * takes[:, np.newaxis], agreed)
         model.update(found, gain, learned)
         for fan, alarm in self.alarms.items():
-            alarm.take(now.of(fan), self.bin_s)
+            alarm.take(now.of(fan), self.bin_s, float(found.distance_rad_s[fan] ** 2 / found.variance[fan]))
         self.deviation_std_rad_s = np.where(counts, root, self.deviation_std_rad_s)
         self.log_statistic = np.where(counts, evidence.log_statistic(), self.log_statistic)
         return now, pushes
@@ -331,7 +329,9 @@ class Decision(Saved):
         with np.errstate(divide="ignore", invalid="ignore"):
             shows = np.where(self._is_probable, shares / self._shape, 1.0).min(axis=1, initial=1.0)
         self._shows = np.where(known, np.nan_to_num(shows).clip(0.0), self._shows)
-        is_healthy = self.active & (self._log_odds() < -math.log(OVER_ODDS))
+        varies = np.zeros(len(known), np.bool_)
+        varies[[fan for fan, alarm in self.alarms.items() if alarm.varies]] = True
+        is_healthy = self.active & ~varies & (self._log_odds() < -math.log(OVER_ODDS))
         self.is_returning = np.where(known, is_healthy, self.is_returning)
         over_s = np.where(is_healthy, self._over_s + self.bin_s, 0.0)
         self._over_s = np.where(known, over_s, self._over_s)

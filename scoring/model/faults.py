@@ -52,6 +52,10 @@ FAULTS = (
     Fault("sensor_stuck", (STUCK,), (0.05,), 0, 1.0, 0.02, 0.02),
 )
 
+UNSTEADY = ("unsteady", 0.05, (8.0, 30.0))
+"""cause, prior probability, and times of the variance of a healthy fan by which the readings vary more: a fault without
+a course"""
+
 
 def forces(fans: Fans, now: Inputs, age_s: Array, then_rad_s: Array, columns: int = COLUMNS) -> Array:
     """(fans, onsets, columns) what each column of size 1 adds to what a fan tends to, rad/s, or to its reading.

@@ -3,17 +3,22 @@
 The model of a healthy fan goes on as though nothing were wrong, and the sums of each onset that was possible when the
 alarm was raised go on with it, so what a fan does long afterwards still counts. What grows may end to grow: each onset
 stands once for each time after which it may have ended.
+
+A fault may also have no course: then the readings vary more than those of a healthy fan, by times of their variance S.
+With z = nu / sqrt(S), log BF = sum (z^2 r / (1 + r) - log(1 + r)) / 2 for r times.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.special import expit
 
 from schemas.messages import Array
 from scoring.diagnosis.cause_words import PossibleCause
-from scoring.model.faults import BEFORE_GROWTH, GROWS_S, forces
+from scoring.model.faults import BEFORE_GROWTH, GROWS_S, UNSTEADY, forces
 from scoring.model.healthy import HealthyFans
 from scoring.model.onsets import Evidence, Hypotheses, Sums, differ
 from scoring.model.operation import Fans, Inputs
@@ -22,6 +27,10 @@ from scoring.model.saved import part, within
 ENDS_S = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0, np.inf)
 """times after its onset at which a growth may end, equally probable"""
 FIRST = np.arange(1)
+FAR = 16.0
+"""largest square of a distance, in standard deviations: a wrong reading is no more than that"""
+RECENT_S, STEADY = 5.0, 1.5
+"""time over which a fan is looked at for whether it is steady again, and largest mean square then"""
 HOPELESS, MOST = 12.0, 24
 """log of the odds against an onset from which on it no longer counts; and number of those that do"""
 
@@ -42,6 +51,9 @@ class FanInAlarm:
         self._sums = evidence.sums.of(fan, onsets[which], self._hypotheses.columns)
         self._has_changed = evidence.has_changed[[fan]][:, onsets[which]]
         self._newest_rad_s = evidence.newest_rad_s[[fan]]
+        self._varies = np.zeros((2, 2))
+        """squares of distances, in standard deviations, and their number: from a healthy fan since the alarm, and from
+        one with its fault lately"""
         self._terms = self._log_terms()
         self._drop_hopeless()
 
@@ -50,8 +62,9 @@ class FanInAlarm:
         """Age of the likeliest onset."""
         return float(self._ages_s[self._terms.max(axis=1).argmax()])
 
-    def take(self, now: Inputs, bin_s: float) -> None:
-        """Take the reading of a bin up. now: of this fan."""
+    def take(self, now: Inputs, bin_s: float, square: float) -> None:
+        """Take the reading of a bin up. now: of this fan; square: of its distance, in standard deviations, from what is
+        expected with the fault of the alarm."""
         self._ages_s = self._ages_s + bin_s
         self._has_changed |= differ(self._newest_rad_s, now.newest_rad_s)[:, np.newaxis]
         self._newest_rad_s = np.where(np.isfinite(now.newest_rad_s), now.newest_rad_s, self._newest_rad_s)
@@ -62,6 +75,9 @@ class FanInAlarm:
         self._sums.add(pushes, self._model, found, gain, found.distance_rad_s)
         self._model.update(found, gain, found.distance_rad_s)
         if gain.any():
+            self._varies[1] *= math.exp(-bin_s / RECENT_S)
+            squares = np.array([found.distance_rad_s[0] ** 2 / found.variance[0], square])
+            self._varies += np.stack((squares.clip(max=FAR), np.ones(2)), axis=1)
             self._terms = self._log_terms()
             self._drop_hopeless()
 
@@ -72,13 +88,31 @@ class FanInAlarm:
 
     @property
     def probabilities(self) -> Array:
-        """(onsets, faults) of the posterior."""
+        """(onsets, faults) of the posterior, of faults with a course."""
         weights = np.exp(self._terms - self._terms.max())
         return np.asarray(weights / weights.sum())
 
+    @property
+    def unsteady(self) -> float:
+        """Probability that the fault has no course."""
+        _, prior, times = UNSTEADY
+        squares, number = self._varies[0]
+        logs = 0.5 * np.array([squares * r / (1.0 + r) - number * math.log1p(r) for r in times])
+        log_odds = (
+            np.logaddexp.reduce(logs) + math.log(prior / len(times)) - np.logaddexp.reduce(self._terms, axis=None)
+        )
+        return float(expit(log_odds))
+
+    @property
+    def varies(self) -> bool:
+        """Whether the fault probably has no course, and the fan is not steady again."""
+        squares, number = self._varies[1]
+        return squares > STEADY * number and self.unsteady > 0.5
+
     def causes(self) -> list[PossibleCause]:
         """All causes, the most probable first."""
-        weights = self.probabilities
+        unsteady = self.unsteady
+        weights = (1.0 - unsteady) * self.probabilities
         probability: dict[str, float] = {}
         best: dict[str, tuple[float, int, int]] = {}
         for fault, row in enumerate(self._hypotheses.faults):
@@ -86,7 +120,8 @@ class FanInAlarm:
             weight = float(weights[:, fault].sum())
             probability[row.cause] = probability.get(row.cause, 0.0) + weight
             best[row.cause] = max(best.get(row.cause, (-1.0, 0, 0)), (weight, onset, fault))
-        found = []
+        squares, number = self._varies[0]
+        found = [PossibleCause(UNSTEADY[0], unsteady, math.sqrt(squares / max(number, 1.0)), math.nan)]
         for cause, share in probability.items():
             _, onset, fault = best[cause]
             sizes, covariance = self._hypotheses.sizes(self._sums, 0, onset, fault)
@@ -104,6 +139,7 @@ class FanInAlarm:
             "log_weight": self._log_weight,
             "has_changed": self._has_changed,
             "newest_rad_s": self._newest_rad_s,
+            "varies": self._varies,
         }
         return {**own, **within("model", self._model.arrays()), **within("sums", self._sums.kept(FIRST))}
 
@@ -116,6 +152,7 @@ class FanInAlarm:
         self._ends_s, self._ages_s = stored["ends_s"], stored["ages_s"]
         self._then_rad_s, self._log_weight = stored["then_rad_s"], stored["log_weight"]
         self._has_changed, self._newest_rad_s = stored["has_changed"], stored["newest_rad_s"]
+        self._varies = stored["varies"]
         self._model.restore(part("model", stored))
         self._sums = Sums(1, len(self._ages_s), self._hypotheses.columns, self._hypotheses.pairs)
         self._sums.restore(FIRST, part("sums", stored))

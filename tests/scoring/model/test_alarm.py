@@ -69,6 +69,27 @@ def test_an_alarm_stays_while_the_command_moves_and_clears_once_ten_seconds_afte
     assert all(OVER_S <= time_s - ends_s < OVER_S + 4.0 and not is_raised for time_s, _, is_raised in cleared)
 
 
+@pytest.mark.parametrize("period_s", [3.0, 10.0])
+def test_a_fan_whose_speed_varies_is_unsteady_and_its_alarm_stays_until_it_is_steady_again(period_s: float) -> None:
+    made = MadeFans(twin_of(2).fans, 0.1, moving, seed=6)
+    decision = made.decision()
+    made.fault_from_s = 20.0
+    assert plays(made, decision, 20.0) == []
+    changes, is_returning = [], []
+    for number in range(500):
+        made.sizes[0, DRAG] = 0.06 * math.sin(2.0 * math.pi * number * made.bin_s / period_s)
+        changes += plays(made, decision, made.bin_s)
+        is_returning.append(bool(decision.is_returning[0]))
+    assert [each[1:] for each in changes] == [(0, True)]
+    assert not any(is_returning[250:])
+    first = decision.alarms[0].causes()[0]
+    assert (first.cause, first.probability > 0.95) == ("unsteady", True)
+    assert 1.5 < first.change < 3.0, "times as much as a healthy fan"
+    ends_s, made.sizes[:] = made.time_s, 0.0
+    (over,) = plays(made, decision, 40.0)
+    assert over[1:] == (0, False) and OVER_S <= over[0] - ends_s < OVER_S + 15.0
+
+
 def test_forgetting_a_fan_ends_its_alarm_and_its_new_state_is_healthy_while_the_others_go_on() -> None:
     made = MadeFans(twin_of(2).fans, 0.1, steady, seed=4)
     decision = with_faults(made, DRAG, DRAG)
