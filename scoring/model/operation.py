@@ -141,7 +141,8 @@ class Operation(Saved):
         share = np.square(speed / fans.top_rad_s)
         self._largest = np.maximum(self._largest, np.abs(one.command))
         slack = BACKLASH * self._largest
-        command = np.stack((one.command, np.clip(self._command[1], one.command - slack, one.command + slack)))
+        acting = np.fmax(one.command, fans.lowest_command)
+        command = np.stack((acting, np.clip(self._command[1], acting - slack, acting + slack)))
         command_path, command_moved = np.abs(command - self._command) / self._largest
         self.t_ns, self._speed, self._was_balance, self._moved_to = one.t_ns, speed, is_balance, moved_to
         self._command = command
@@ -177,7 +178,8 @@ class Operation(Saved):
         fans = self._fans
         error = LOWEST_ERROR * fans.commands
         slope = fans.top_rad_s / np.maximum(fans.commands - fans.lowest_command, error)
-        near = np.exp(-0.5 * np.square((command - fans.lowest_command) / (2.0 * error)))
+        beyond = np.maximum(command - fans.lowest_command, 0.0)  # below it the speed is that of its end
+        near = np.exp(-0.5 * np.square(beyond / (2.0 * error)))
         return np.nan_to_num(error * slope * near)
 
     def samples_rad_s(self, one: Bin, now: Inputs) -> Array:
