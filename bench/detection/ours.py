@@ -24,7 +24,7 @@ from twin.export.card_entries import with_card_entries
 
 NAME = "fantwin"
 ROOM_BYTES = 1 << 40
-"""of the bins of a run"""
+"""room for the bins of a run"""
 
 
 class Scorer:

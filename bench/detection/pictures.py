@@ -43,7 +43,7 @@ FAN, FANS, SEED = 2, 8, 11
 RATE_HZ, BIN_S = 100.0, 0.1
 SHOWN_FROM_S, CLOGS_FROM_S, END_S = 20.0, 60.0, 150.0
 CLOGS_PER_S = 0.003
-"""of the drag, each second"""
+"""growth of the drag, each second"""
 COMMANDS, HELD_S = (0.55, 0.6, 0.5, 0.65), 15.0
 """commands, one after the other"""
 RPM = RAD_S_PER_UNIT["rpm"]

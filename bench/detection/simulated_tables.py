@@ -65,7 +65,7 @@ class Bench:
     methods: list[Method]
     calibrated: list[Path]
     calibrations: list[TwinCalibration]
-    """of the twins"""
+    """calibrations of these twins"""
     calibration: Calibration | None
     """of the other methods, if there are any"""
 

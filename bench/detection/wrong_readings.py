@@ -41,7 +41,7 @@ IMPOSSIBLE_RAD_S = 2772.0
 """26,470 rpm, as a board has shown"""
 KINDS = ("half", "twice", "zero", "impossible")
 IN_A_ROW, CHANGING, FIRST = "two in a row", "while the command changes", "the first"
-"""of any kind"""
+"""when a reading is wrong, of any kind"""
 CHANGE, CHANGE_S = 0.05, 2.0
 """a command changes while it differs so much from what it was before this time"""
 PIECES = 12

@@ -31,7 +31,7 @@ from schemas.messages import Grid, Message
 
 STAGES = ("resampler", "twin_integrator")
 BEGINNING_S = 5.0
-"""in which the free runs begin; it is not measured"""
+"""time in which the free runs begin; it is not measured"""
 BLOCKS_S = (0.05, 0.01)
 
 

@@ -50,7 +50,7 @@ BLOCKS_S = (0.05, 0.1, 1.0)
 TRAYS = {8: 16, 64: 4, 500: 20}
 """fans of a tray, and number of trays"""
 BEGINNING_S = 10.0
-"""before there are scorers; it is not measured"""
+"""time before there are scorers; it is not measured"""
 
 
 @dataclass

@@ -45,7 +45,7 @@ from tests.support.running_chain import RunningCommand, eventually
 
 STAGES = ("resampler", "twin_integrator", "scorer", "recorder")
 BEGINNING_S = 30.0
-"""in which the fans become known; it is not measured"""
+"""time in which the fans become known; it is not measured"""
 LATE_S = 10.0
 """an alarm may come so long after the end of its fault"""
 DEADLINE_S = 1800.0

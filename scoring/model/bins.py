@@ -79,7 +79,7 @@ class Bin:
     unseen_rad_s: Array
     """standard deviation of the twin's error where it was not trained"""
     unseen_balance_command: Array
-    """and that of the torque balance"""
+    """standard deviation of the error of the torque balance there"""
     command: Array
     missing: Array
     """(fans, 4) readings after a reading, and those of them that are missing; after a missing one, and missing"""

@@ -249,10 +249,10 @@ class HealthyFans(Saved):
         """Take the readings up. gain: (fans, STATES), with_states over variance, or 0 where nothing is learned;
         distance: as far as it counts."""
         self.mean += gain * distance_rad_s[:, np.newaxis]
-        told = np.empty((len(gain), STATES, 2))
-        np.divide(found.with_states, np.sqrt(found.variance)[:, np.newaxis], out=told[:, :, 0])
-        np.multiply(told[:, :, 0], gain == 0.0, out=told[:, :, 1])
-        self.covariance -= told @ np.multiply(told.swapaxes(1, 2), BOTH_BUT_NOT, order="C")
+        halves = np.empty((len(gain), STATES, 2))
+        np.divide(found.with_states, np.sqrt(found.variance)[:, np.newaxis], out=halves[:, :, 0])
+        np.multiply(halves[:, :, 0], gain == 0.0, out=halves[:, :, 1])
+        self.covariance -= halves @ np.multiply(halves.swapaxes(1, 2), BOTH_BUT_NOT, order="C")
 
 
 def _prior(fans: Fans, p: Priors, period_s: float) -> Array:

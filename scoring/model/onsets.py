@@ -37,11 +37,11 @@ BATCH = 8
 HAIR = 1e-3
 """share of a reading: readings that differ by more are two"""
 FARTHEST, STEPS = 5.0, 256
-"""beyond which the chance that a size has the sign of its fault is as there, in standard deviations over the root of 2;
-and steps of the table of its logarithm within one"""
+"""largest argument for which the chance that a size has the sign of its fault is looked up, in standard deviations over
+the root of 2; and steps of the table of its logarithm within one"""
 LOG_ERFC = np.log(erfc(np.arange(-FARTHEST, FARTHEST + 2.0 / STEPS, 1.0 / STEPS))).astype(np.float32)
 LARGEST_LOG = 80.0
-"""a larger one is no logarithm of a number"""
+"""a larger one is no logarithm of a number in single precision"""
 
 
 class Sums:

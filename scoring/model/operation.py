@@ -83,11 +83,11 @@ class Inputs:
     command_path: Array
     """how far the command has moved, share of the largest command so far"""
     command_moved: Array
-    """and how far by more than BACKLASH"""
+    """share that it has moved by more than BACKLASH"""
     unseen_rad_s: Array
     """standard deviation of the twin's error where it was not trained"""
     of_lowest_rad_s: Array
-    """and near the command from which on the speed rises"""
+    """standard deviation of its error near the command from which on the speed rises, and below it"""
     half_range_rad_s: Array
     readings: Array
     """0: nothing new is known"""
@@ -120,7 +120,7 @@ class Operation(Saved):
         self._speed, self._was_balance = np.zeros(count), np.zeros(count, np.bool_)
         self._moved_to = np.zeros(count)
         self._command, self._largest = np.zeros((2, count)), np.full(count, 1e-9)
-        """(2, fans) of the last bin, as it was and as far as it has moved by more than BACKLASH; (fans,)"""
+        """(2, fans) command of the last bin, as it acts and as far as it moved by more than BACKLASH; the largest"""
         self._has_lowest = np.isfinite(fans.lowest_command).any()
 
     def inputs(self, one: Bin) -> Inputs:

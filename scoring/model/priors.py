@@ -17,7 +17,7 @@ class Priors:
     twin_share: Positive = 0.02
     """error of a twin that is common to all speeds"""
     twin_rad_s: Positive = 1.5
-    """and one that differs over `twin_length`, share of the top speed"""
+    """error that differs over `twin_length`, share of the top speed"""
     twin_length: Positive = 0.12
     largest_twin_share: Positive = 0.1
     plateau: Positive = 0.05

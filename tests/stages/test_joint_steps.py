@@ -35,7 +35,7 @@ FAULTS: tuple[tuple[Fault, ...], ...] = (
     (Fault("supply", 2, 14.0, 20.0, 0.85),),
     (),
 )
-"""of each tray; the fourth loses samples, and the last one is silent for 3 s"""
+"""faults of each tray; the fourth loses samples, and the last one is silent for 3 s"""
 LOSING, SILENT = 3, 4
 
 
@@ -53,7 +53,7 @@ class Counting:
 
 @pytest.fixture(scope="module")
 def grids() -> list[list[Grid]]:
-    """Of each tray."""
+    """Samples of each tray."""
     cores = cores_of("resampler")
     return [
         [grid for raw in raws(number) for grid in core.step(raw) if isinstance(grid, Grid)]
@@ -164,5 +164,5 @@ def test_trays_in_one_pass_are_predicted_as_each_alone_and_scored_alike(grids: l
 
 
 def predictions_of(messages: list[list[Message]]) -> list[list[Message]]:
-    """Of each tray."""
+    """Samples of each tray."""
     return [[each for each in of_tray if isinstance(each, Prediction)] for of_tray in messages]

@@ -17,7 +17,7 @@ from tests.support.scored_blocks import core_of, feed, prediction_of, request_of
 
 PERIOD_NS = NS_PER_S
 EXCURSION = [0.0] * 5 + [-90.0] * 6 + [0.0] * 19
-"""of 30 s: raises one alarm, and clears it"""
+"""deviation of 30 s: raises one alarm, and clears it"""
 SEQUENCES = count()
 
 

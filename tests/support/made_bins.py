@@ -22,7 +22,7 @@ from tests.support.scored_blocks import EPOCH_NS
 
 PRIORS = Priors()
 Course = Callable[[float], Array | float]
-"""of a speed over the time, s"""
+"""course of a speed over the time, s"""
 Changes = list[tuple[float, int, bool]]
 
 
@@ -100,7 +100,7 @@ class MadeFans:
         self._missed = np.zeros(self.count)
         self.number = 0
         self.sizes = np.zeros((self.count, COLUMNS))
-        """of the faults of now"""
+        """sizes of the faults of now"""
         self.fault_from_s = np.inf
 
     @property

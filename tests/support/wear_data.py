@@ -67,7 +67,7 @@ def loss_of(fan: int, fans: int, days: float) -> Array:
 
 
 def worn_monitor(fans: int, worn_fan: int, days: float = DAYS_OF_WEAR, start_ns: int = START_NS) -> WearMonitor:
-    """After these days of a tray with one fan that wears."""
+    """Monitor after these days of a tray with one fan that wears."""
     monitor = WearMonitor(fans, EVERY_S)
     feed(monitor, times_ns(days, start_ns), *slow_states(loss_of(worn_fan, fans, days)))
     return monitor

@@ -40,13 +40,14 @@ from scoring.model.priors import Priors
 
 EXIT_BROKEN = 3
 MOST_KEPT_BYTES = 1 << 30
-"""of bins, kept on the disk between passes, as many of each recording: about 120 of each fan and 30 of its samples"""
+"""room for bins on the disk between passes, the same for each recording; a bin takes about 120 for a fan and 30 for a
+sample of it"""
 MEANING = {
     "twin_share": "how far fans and runs differ from the twin in the mean, share of the speed",
     "air": "what the air does within an hour, share of the speed",
     "wander": "wandering of the speed over seconds, share of the speed",
 }
-"""of the priors that are learned"""
+"""words for the priors that are learned"""
 
 
 def calibrate(

@@ -28,7 +28,7 @@ DROPS = np.geomspace(0.002, 1.0, 11)
 """shares of the speed"""
 WITHIN_S = (1.0, 10.0, 60.0)
 STEADY_S = 60.0
-"""before the drop; a fan that has run for longer is known better"""
+"""time before the drop; a fan that has run for longer is known better"""
 
 
 @dataclass(frozen=True)

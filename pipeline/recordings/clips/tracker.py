@@ -21,7 +21,7 @@ LONGEST_NS = 600 * NS_PER_S
 LONGEST_DELAY_NS = 300 * NS_PER_S
 """of an alarm after its onset, that a clip goes back further"""
 JUDGED_NS = 100 * NS_PER_S
-"""of judged samples before the onset of an alarm: what is expected of the fan is known by then"""
+"""time of judged samples before the onset of an alarm: what is expected of the fan is known by then"""
 RETRY_NS = 10 * NS_PER_S
 """after a clip could not be cut"""
 SET_BACK_NS = NS_PER_S

@@ -26,7 +26,7 @@ from scoring.model.learned import learned_priors
 LARGEST_PER_DAY = 8640.0
 """that can be declared"""
 LARGEST_FACTOR, STEP = 3.0, 1.2
-"""of a limit: a statistic that goes further is that of a fault; and by which it is raised above the peaks"""
+"""times a limit: a statistic that goes further is that of a fault; and by which it is raised above the peaks"""
 
 
 @dataclass(frozen=True)

@@ -99,9 +99,9 @@ class DecidedRun:
 
     tray: RecordedTray
     alarms: tuple[int, ...]
-    """of each fan"""
+    """number for each fan"""
     peaks: tuple[float, ...]
-    """of the score, one for each time that it exceeds the limit by theory; with alarms only up to them"""
+    """peaks of the score, one for each time that it exceeds the limit by theory; with alarms only up to them"""
 
 
 @dataclass(frozen=True)

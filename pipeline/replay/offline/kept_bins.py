@@ -50,7 +50,7 @@ class KeptBins:
 
     folder: Path
     room_bytes: int
-    """of each recording: none is kept of a longer one, or on a full disk"""
+    """room for each recording: none is kept of a longer one, or on a full disk"""
 
     def of(self, recording: Path) -> Iterator[TrayRun] | None:
         """The runs of a recording that has been read to its end; None where they are not kept."""

@@ -35,7 +35,7 @@ def test_a_step_of_ten_per_cent_is_an_alarm_within_a_second_from_the_first_momen
     raised = plays(made, decision, 1.0 if at_s > 0.5 else 1.5)  # a rotor hardly moves while its free run begins
     assert sorted(fan for _, fan, is_raised in raised if is_raised) == list(range(FANS))
     onset_s = (decision.onset - 1) * made.bin_s
-    np.testing.assert_allclose(onset_s, at_s, atol=0.35, err_msg="when it began is told, too")
+    np.testing.assert_allclose(onset_s, at_s, atol=0.35, err_msg="it says when it began, too")
 
 
 @pytest.mark.parametrize("is_of_balance", [False, True], ids=["speed", "torque balance"])

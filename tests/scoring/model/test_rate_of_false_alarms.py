@@ -27,7 +27,7 @@ def moved(time_s: float) -> float:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of fans up to their first false alarm, or the end."""
+    """Statistics of fans up to their first false alarm, or the end."""
 
     alarms: int
     fan_s: float
