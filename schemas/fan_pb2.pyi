@@ -273,7 +273,7 @@ class PushedSamples(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., first_number: _Optional[int] = ..., newest_t_ns: _Optional[int] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Grid(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing", "supply_voltage_v", "current_a", "temperature_c")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing", "supply_voltage_v", "current_a", "temperature_c", "reading_repeated")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -286,6 +286,7 @@ class Grid(_message.Message):
     SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
     CURRENT_A_FIELD_NUMBER: _ClassVar[int]
     TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    READING_REPEATED_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     period_ns: int
@@ -298,10 +299,11 @@ class Grid(_message.Message):
     supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
     current_a: _containers.RepeatedScalarFieldContainer[float]
     temperature_c: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
+    reading_repeated: _containers.RepeatedScalarFieldContainer[bool]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ..., reading_repeated: _Optional[_Iterable[bool]] = ...) -> None: ...
 
 class Prediction(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command", "reading_range_rad_s", "averaged_command", "reading_missing", "air_density_ratio", "supply_voltage_v", "current_a", "temperature_c")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command", "reading_range_rad_s", "averaged_command", "reading_missing", "air_density_ratio", "supply_voltage_v", "current_a", "temperature_c", "reading_repeated")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -322,6 +324,7 @@ class Prediction(_message.Message):
     SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
     CURRENT_A_FIELD_NUMBER: _ClassVar[int]
     TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    READING_REPEATED_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     period_ns: int
@@ -342,7 +345,8 @@ class Prediction(_message.Message):
     supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
     current_a: _containers.RepeatedScalarFieldContainer[float]
     temperature_c: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., air_density_ratio: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
+    reading_repeated: _containers.RepeatedScalarFieldContainer[bool]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., air_density_ratio: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ..., reading_repeated: _Optional[_Iterable[bool]] = ...) -> None: ...
 
 class Score(_message.Message):
     __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "state", "valid", "invalid_reason", "torque_balance_command", "expected_residual_rad_s", "expected_balance_command", "score", "statistic", "supply_voltage_v", "current_a", "temperature_c")

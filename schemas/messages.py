@@ -109,6 +109,8 @@ class Grid:
     supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
     current_a: Array = column("samples x fans", np.float32, optional=True)
     temperature_c: Array = column("samples x fans", np.float32, optional=True)
+    reading_repeated: Array = column("samples x fans", np.bool_, optional=True)
+    """whether no raw sample has come since the grid sample before, whose reading is held"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -137,6 +139,8 @@ class Prediction:
     supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
     current_a: Array = column("samples x fans", np.float32, optional=True)
     temperature_c: Array = column("samples x fans", np.float32, optional=True)
+    reading_repeated: Array = column("samples x fans", np.bool_, optional=True)
+    """as in Grid"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -28,5 +28,13 @@ def among(values: Array, first: int, *others: int) -> Array:
 
 def reading_missing_of(prediction: Prediction) -> Array:
     """(n, fans) of bool: where the newest raw sample has no reading; nowhere if the message does not tell."""
-    given = prediction.reading_missing
+    return _or_nowhere(prediction.reading_missing, prediction)
+
+
+def reading_repeated_of(prediction: Prediction) -> Array:
+    """(n, fans) of bool: where a reading is that of the sample before, since no other has come."""
+    return _or_nowhere(prediction.reading_repeated, prediction)
+
+
+def _or_nowhere(given: Array, prediction: Prediction) -> Array:
     return given if len(given) else np.zeros(prediction.valid.shape, np.bool_)

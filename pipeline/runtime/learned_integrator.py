@@ -133,5 +133,6 @@ def _without_twin(grid: Grid) -> Prediction:
         torque_balance_command=unknown,
         torque_balance_sigma_command=sigma,
         reading_missing=grid.reading_missing,
+        reading_repeated=grid.reading_repeated,
         **auxiliary_columns(grid),
     )

@@ -62,6 +62,7 @@ class SampleGrid:
         gap is not published because its samples may still come."""
         self._fans = fans = len(tachos)
         self._is_held = np.array([tacho.held_s > 0.0 for tacho in tachos])
+        self._holds = bool(self._is_held.any())
         self._period_ns = timing.period_ns
         self._gap_limit_ns = timing.gap_limit_ns
         self._watermark_ns = timing.watermark_ns
@@ -296,7 +297,10 @@ class SampleGrid:
         if len(t_ns):
             self._in_gap = False
             auxiliary = interpolate_auxiliary(t_ns, at, samples) if self._auxiliary else samples.auxiliary
-            self._append(t_ns, samples.command.take(at, axis=0), speed, NO_SPEED, ~has.take(at, axis=0), auxiliary)
+            is_late = t_ns - samples.t_ns.take(at) >= self._period_ns
+            self._append(
+                t_ns, samples.command.take(at, axis=0), speed, NO_SPEED, ~has.take(at, axis=0), is_late, auxiliary
+            )
         return not waits
 
     def _fill_gap(self, until_t_ns: int) -> None:
@@ -307,7 +311,7 @@ class SampleGrid:
         self._count_gap(len(t_ns))
         command, nothing = np.broadcast_to(self._held.command[0], shape), np.zeros(shape, np.bool_)
         auxiliary = np.full((len(t_ns), len(AUXILIARY), self._fans), np.nan)
-        self._append(t_ns, command, np.full(shape, np.nan), reason[:, np.newaxis], nothing, auxiliary)
+        self._append(t_ns, command, np.full(shape, np.nan), reason[:, np.newaxis], nothing, nothing[:, 0], auxiliary)
 
     def _count_gap(self, samples: int) -> None:
         self._counts["gaps"] += not self._in_gap
@@ -324,9 +328,11 @@ class SampleGrid:
         speed: Array,
         reason: Array | np.uint8,
         reading_missing: Array,
+        is_late: Array,
         auxiliary: Array,
     ) -> None:
-        """Append grid samples, at least one; `reason` is the invalid_reason of those without a speed."""
+        """Append grid samples, at least one. reason: invalid_reason of those without a speed; is_late: (n,) whether the
+        raw sample was there at the grid time before."""
         valid = np.isfinite(speed)
         invalid_reason = np.zeros(speed.shape, np.uint8)
         if not all_true(valid):
@@ -346,6 +352,7 @@ class SampleGrid:
             valid=valid,
             invalid_reason=invalid_reason,
             reading_missing=reading_missing,
+            reading_repeated=is_late[:, np.newaxis] & self._is_held if self._holds else np.zeros(0),
             **columns,
         )
         self._pending.append(grid)

@@ -361,6 +361,7 @@ class TrayIntegrator:
             reading_range_rad_s=reading_range if self._averages else nothing,
             averaged_command=averaged_command if converts else nothing,
             reading_missing=grid.reading_missing,
+            reading_repeated=grid.reading_repeated,
             air_density_ratio=ratios.density if ratios is not None and self._needs_temperature else nothing,
             **auxiliary_columns(grid),
         )

@@ -35,6 +35,7 @@ from scoring.standing.against_command import KINDS, AgainstCommand
 from scoring.standing.falls import Falls
 from scoring.wear.wear_monitor import WearMonitor
 
+NO_READING = KINDS.index(Standing.NO_READING)
 NAMED_AFTER_S, FALLING_S = 3.0, 4.0
 """an onset is so old before a cause is named; so long after an alarm a fan that has lost much speed may come to rest"""
 
@@ -163,9 +164,11 @@ class TrayScorer:
         assert decision.now is not None
         self._falls.take(decision.now)
         nothing = np.zeros(self.fans, np.bool_)
-        self._stands = against.active[row] if against else nothing
+        self._stands = nothing
         if against:
             self._kind = np.where(against.kind[row] > 0, against.kind[row], self._kind)
+            is_loose = (self._kind == NO_READING) & decision.missing.explains_silence
+            self._stands = against.active[row] & ~is_loose
         score = decision.score
         is_steady = one.judged & ~self.alarms.active & ~decision.has_alarm & (score < ScoreColumns.SUSPECT_FROM)
         self.wear.update(one.t_ns, is_steady, lambda: decision.model.age)

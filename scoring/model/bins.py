@@ -14,7 +14,7 @@ import numpy as np
 from schemas.enums import InvalidReason
 from schemas.messages import Array, Prediction
 from schemas.units import NS_PER_S
-from scoring.samples import BALANCE_COUNTS, NO_SPEED, among, reading_missing_of
+from scoring.samples import BALANCE_COUNTS, NO_SPEED, among, reading_missing_of, reading_repeated_of
 from scoring.unseen_error import UnseenError
 
 SHORTEST_S = 0.1
@@ -136,7 +136,7 @@ class Bins:
         measured = block.measured_speed_rad_s.clip(-FASTEST * self._top, FASTEST * self._top)
         nothing = np.zeros(measured.shape)
         missing = reading_missing_of(block) | (reason == NO_SPEED)
-        reads = among(reason, *READS)
+        is_repeated, reads = reading_repeated_of(block), among(reason, *READS)
         before = np.concatenate((self._before[:, np.newaxis], np.stack((missing, reads))), axis=1)[:, :-1]
         self._before = np.stack((missing[-1], reads[-1]))
         unseen, unseen_balance = map(np.nan_to_num, self._unseen.of(block)) if self._unseen else (nothing, nothing)
@@ -153,7 +153,7 @@ class Bins:
                 block.torque_balance_command.clip(-LARGEST_COMMAND, LARGEST_COMMAND),
                 np.nan,
             ),
-            "counts": block.valid & np.isfinite(measured) & np.isfinite(predicted) & ~missing,
+            "counts": block.valid & np.isfinite(measured) & np.isfinite(predicted) & ~(missing | is_repeated),
             "missing": missing,
             "after_missing": before[0],
             "pair": reads & before[1],

@@ -103,7 +103,7 @@ class HealthyFans(Saved):
         self._has_begun = np.zeros(count, np.bool_)
         """(fans,) whether there was a reading: at the first one a rotor is where it tends to"""
         self._holds = np.ones(count)
-        """(fans,) 1 where there is no new reading, so that what the last count missed stays"""
+        """(fans,) 1 where no reading ends, so that what the last count missed stays"""
         self._filters = 1.0 - math.exp(-bin_s * fans.balance_filter_per_s)
         self.kept[:, WANDER - AIR], self.kept[:, 0] = np.exp(-bin_s / priors.wander_s), np.exp(-bin_s / priors.air_s)
         self.noise = np.zeros((count, STATES))
@@ -213,7 +213,7 @@ class HealthyFans(Saved):
         follows[:, 0], follows[:, 1] = -np.expm1(-decay), self._filters
         follows[:, 2] = 1.0 - follows[:, 0] / decay  # the mean over the bin
         is_new = now.is_new
-        self._holds = 1.0 - is_new
+        self._holds = 1.0 - (is_new | now.ends)
         begins = is_new & ~self._has_begun
         if begins.any():
             follows[begins] = 1.0

@@ -20,9 +20,13 @@ LEAST_RATIO, LARGEST_SHARE = 2.0, 0.9
 
 
 class MissingReadings(Saved):
-    """Shiryaev-Roberts again: a healthy line loses a share of readings and another of those after a missing one."""
+    """Shiryaev-Roberts again: a healthy line loses a share of readings and another of those after a missing one.
 
-    KEPT = ("_counts", "_log_terms", "_returned", "is_active")
+    In an alarm the shares of a loose wire are weighed by all that it has lost since, so that a burst with which it
+    began is not taken for its share.
+    """
+
+    KEPT = ("_counts", "_log_terms", "_returned", "_run", "is_active")
 
     def __init__(self, fans: int, log_limit: float) -> None:
         """Begin without a reading. log_limit: of the statistic."""
@@ -30,6 +34,9 @@ class MissingReadings(Saved):
         self._counts = PRIOR.copy()
         self._log_terms = np.full((fans, len(SHARES)), NOTHING)
         self._returned = np.zeros(fans)
+        """(fans,) log of how much likelier a healthy line is by the newest readings"""
+        self._run = np.zeros(fans)
+        """(fans,) readings that are missing one after the other"""
         self.is_active = np.zeros(fans, np.bool_)
         self.score = np.zeros(fans)
         """(fans,) log of the statistic over that of the limit; in an alarm until it clears"""
@@ -37,10 +44,11 @@ class MissingReadings(Saved):
     def take(self, missing: Array) -> None:
         """The counts of a bin, (fans, 4), as in `Bin.missing`."""
         gain = missing @ self._log_ratios()
-        moved = np.minimum(np.logaddexp(self._log_terms, 0.0) + gain, LARGEST)
-        self._log_terms = np.where(self.is_active[:, np.newaxis], self._log_terms, moved)
-        log_statistic = np.log(np.exp(self._log_terms).sum(axis=1)) - math.log(len(SHARES))
+        readings, lost = missing[:, ::2].sum(axis=1), missing[:, 1::2].sum(axis=1)
+        self._run = np.where(lost < readings, 0.0, self._run + lost)
         cleared = self._is_over(gain) if self.is_active.any() else np.zeros(len(missing), np.bool_)
+        self._log_terms = np.minimum(np.logaddexp(self._log_terms, self._begins()) + gain, LARGEST)
+        log_statistic = _log_sum(self._log_terms) - math.log(len(SHARES))
         self.is_active = (self.is_active | (log_statistic > self._log_limit)) & ~cleared
         if cleared.any():
             self._log_terms[cleared], self._returned[cleared] = NOTHING, 0.0
@@ -58,10 +66,21 @@ class MissingReadings(Saved):
         found: Array = SHARES[self._log_terms.argmax(axis=1)]
         return found
 
+    @property
+    def explains_silence(self) -> Array:
+        """(fans,) whether a loose wire loses so many readings one after the other as often as a false alarm comes."""
+        share = self.share
+        found: Array = self.is_active & (share < LARGEST_SHARE) & (-np.log(share) * self._run < self._log_limit)
+        return found
+
+    def _begins(self) -> Array:
+        """(fans, 1) log of the weight of an onset with this bin: none in an alarm."""
+        return np.where(self.is_active, -np.inf, 0.0)[:, np.newaxis]
+
     def _is_over(self, gain: Array) -> Array:
         """(fans,) whether a line is healthy again."""
-        likeliest = self._log_terms.argmax(axis=1)[:, np.newaxis]
-        back = self._returned - np.take_along_axis(gain, likeliest, axis=1)[:, 0]
+        self._log_terms -= np.where(self.is_active, self._log_terms.max(axis=1), 0.0)[:, np.newaxis]
+        back = self._returned - (_log_sum(self._log_terms + gain) - _log_sum(self._log_terms))
         self._returned = np.where(self.is_active, np.maximum(back, 0.0), 0.0)
         found: Array = self.is_active & (self._returned > self._log_limit)
         return found
@@ -74,3 +93,10 @@ class MissingReadings(Saved):
         shares = np.maximum(SHARES, min(LEAST_RATIO * lost / readings, LARGEST_SHARE))
         loses, stays = np.log(shares / healthy), np.log((1.0 - shares) / (1.0 - healthy))
         return np.stack((stays[0], loses[0] - stays[0], stays[1], loses[1] - stays[1]))
+
+
+def _log_sum(logs: Array) -> Array:
+    """(fans,) logarithm of the sums of what (fans, SHARES) are the logarithms of."""
+    largest = logs.max(axis=1)
+    found: Array = largest + np.log(np.exp(logs - largest[:, np.newaxis]).sum(axis=1))
+    return found

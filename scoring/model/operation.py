@@ -93,6 +93,8 @@ class Inputs:
     """0: nothing new is known"""
     is_new: Array
     """whether a reading ends that its tacho holds"""
+    ends: Array
+    """whether one ends, seen or not"""
     deviation_rad_s: Array
     """distance from the free run; or what it would be at a steady speed by the torque balance"""
     is_balance: Array
@@ -165,6 +167,7 @@ class Operation(Saved):
             one.half_range_rad_s,
             readings,
             ends & (self._held[0] + readings > 0.0),
+            ends,
             np.where(is_balance, -one.balance_command / slope, one.deviation_rad_s),
             is_balance,
         )

@@ -57,7 +57,7 @@ def split(message: Raw, size: int) -> Iterable[Raw]:
 
 def joined(grids: Iterable[Grid]) -> Grid:
     grids = list(grids)
-    names = ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing")
+    names = ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing", "reading_repeated")
     columns: dict[str, Any] = {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
     return Grid(fans=grids[0].fans, period_ns=grids[0].period_ns, **columns)
 
@@ -69,7 +69,7 @@ def run(messages: Iterable[Raw], fans: int = 1, **config: float) -> tuple[Grid, 
 
 
 def assert_same(a: Grid, b: Grid) -> None:
-    for name in ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing"):
+    for name in ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing", "reading_repeated"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 
@@ -217,6 +217,17 @@ def test_a_sample_that_arrives_after_its_grid_time_was_published_is_counted_as_l
     grid = joined(core.step(raw(at(0.01, 0.5, 0.55), np.array([5.0, 6.0, 7.0]))))
     assert core.counters()["lost_too_late"] == 1
     assert grid.t_ns[0] == given_up.t_ns[-1] + STEP_NS
+
+
+def test_a_reading_that_is_held_where_a_line_was_lost_is_known_to_be_repeated() -> None:
+    counts, reads_at_once = Tacho(kind="count", window_s=0.5), Tacho()
+    lines = raw(at(0.0, 0.01, 0.03, 0.04, 0.055), np.array([1.0, 2.0, 4.0, 5.0, 6.0]), fans=2)
+    core = ResamplerCore(2, FIXED, tachos=(counts, reads_at_once))
+    grid = joined([*core.step(lines), *core.close()])
+    np.testing.assert_array_equal(grid.speed_rad_s, [[1, 1], [2, 2], [2, 3], [4, 4], [5, 5], [5, 5 + 2 / 3]])
+    np.testing.assert_array_equal(grid.reading_repeated[:, 0], [False, False, True, False, False, True])
+    assert not grid.reading_repeated[:, 1].any()
+    assert grid.valid.all() and not grid.reading_missing.any()
 
 
 def test_a_missing_reading_is_interpolated_up_to_the_limit_and_the_other_fan_is_untouched() -> None:

@@ -9,13 +9,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from pipeline.runtime.healthy_twin import ScorerConfig
 from schemas.blocks import join
 from schemas.enums import Statistic, Transition
 from schemas.messages import Alarm, Prediction, Raw
+from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
 from stages.resampler import ResamplerConfig, ResamplerCore
 from stages.scorer import ScorerCore
-from tests.support.scored_blocks import EPOCH_NS, NEEDED, TWIN_SPEED, Floats, core_of, feed, prediction_of
+from tests.support.scored_blocks import EPOCH_NS, NEEDED, TWIN_SPEED, Floats, core_of, feed, prediction_of, twin_of
 
 PERIOD_NS = 100_000_000
 SECOND = 10
@@ -58,6 +60,26 @@ def on_the_grid(missing: Floats) -> Prediction:
     made = prediction_of(grid.speed_rad_s - TWIN_SPEED, grid.valid, period_ns=PERIOD_NS)
     assert np.array_equal(made.t_ns, grid.t_ns)
     return replace(made, invalid_reason=grid.invalid_reason, reading_missing=grid.reading_missing)
+
+
+def test_lost_lines_of_counting_tachos_are_no_alarm_though_the_grid_holds_the_count_before_them() -> None:
+    counts, fans, lines = Tacho(kind="count", window_s=0.5), 8, 1200
+    rng = np.random.default_rng(8)
+    edges = (
+        rng.random(fans)
+        + np.arange(lines + 1)[:, np.newaxis] * (TWIN_SPEED + np.arange(fans)) / counts.resolution_rad_s
+    )
+    arrives = rng.random(lines) > 0.1
+    t_ns = EPOCH_NS + NS_PER_S // 2 * np.flatnonzero(arrives)
+    speed = np.diff(np.floor(edges), axis=0)[arrives] * counts.resolution_rad_s
+    raw = Raw(fans=fans, host_receive_t_ns=t_ns, command=np.full(speed.shape, NEEDED), speed_rad_s=speed)
+    resampler = ResamplerCore(fans, ResamplerConfig(rate_hz=2.0), tachos=(counts,))
+    grid = join([*resampler.step(raw), *resampler.close()])
+    item = prediction_of(grid.speed_rad_s - TWIN_SPEED, grid.valid, period_ns=grid.period_ns)
+    item = replace(item, reading_missing=grid.reading_missing, reading_repeated=grid.reading_repeated)
+    twin = twin_of(fans, tachos=(counts,))
+    twin = replace(twin, fans=replace(twin.fans, noise_rad_s=np.full(fans, 0.1)))
+    assert feed(ScorerCore(fans, "rad/s", ScorerConfig(), twin), [item])[1] == []
 
 
 def test_a_loose_wire_is_one_alarm_though_the_grid_bridges_its_missing_readings() -> None:

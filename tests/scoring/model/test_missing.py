@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from scipy.stats import poisson
 
 from schemas.messages import Array
@@ -19,17 +20,19 @@ def counts(missing: Array, before: Array) -> Array:
     return np.stack((~before, ~before & missing, before, before & missing), axis=1).astype(float)
 
 
-def alarms(declared: float, share: float, again: float, readings: int, begins: int = 0, ends: int = 0) -> list[Array]:
+def alarms(
+    declared: float, share: float, again: float, readings: int, begins: int = 0, ends: int = 0, burst: int = 0
+) -> list[Array]:
     """Where alarms are active, (fans,) of each reading.
 
     declared: readings between false alarms; share, again: that is lost after a reading, and after a lost one; between
-    `begins` and `ends` a third of all.
+    `begins` and `ends` a third of all; burst: of which so many first.
     """
     rng, found = np.random.default_rng(3), []
     line, before = MissingReadings(FANS, math.log(declared)), np.zeros(FANS, np.bool_)
     for number in range(readings):
         chance = np.where(before, again, share) if not begins <= number < ends else 0.35
-        missing = rng.random(FANS) < chance
+        missing = (rng.random(FANS) < chance) | (begins <= number < begins + burst)
         line.take(counts(missing, before))
         before = missing
         found.append(line.is_active.copy())
@@ -43,10 +46,24 @@ def test_a_healthy_line_that_loses_readings_also_in_bursts_keeps_the_declared_ra
         assert raised <= poisson.ppf(SURE, active.size / DECLARED)
 
 
-def test_a_loose_wire_is_one_alarm_of_a_few_seconds_delay_that_ends_once_after_it() -> None:
-    active = np.array(alarms(1e8, 0.001, 0.1, 900, begins=200, ends=600)).astype(int)
+@pytest.mark.parametrize("burst", [0, 6], ids=["at random", "with a burst first"])
+def test_a_loose_wire_is_one_alarm_of_a_few_seconds_delay_that_ends_once_after_it(burst: int) -> None:
+    active = np.array(alarms(1e8, 0.001, 0.1, 900, begins=200, ends=600, burst=burst)).astype(int)
     changes = np.diff(active, axis=0)
-    assert ((changes == 1).sum(axis=0) == 1).mean() > 0.95
+    assert ((changes == 1).sum(axis=0) == 1).mean() > 0.99
     assert 200 < np.median(np.argwhere(changes == 1)[:, 0]) < 240
     assert 600 < np.median(np.argwhere(changes == -1)[:, 0]) < 660
     assert not active[-1].any()
+
+
+def test_a_loose_wire_explains_a_silence_that_it_makes_now_and_then_and_no_longer_one() -> None:
+    line, rng = MissingReadings(1, math.log(1e8)), np.random.default_rng(2)
+    before, lost = np.zeros(1, np.bool_), [*(rng.random(200) < 0.35), *[False], *[True] * 30]
+    explained = []
+    for each in lost:
+        missing = np.array([each])
+        line.take(counts(missing, before))
+        before = missing
+        explained.append(bool(line.explains_silence[0]))
+    assert line.is_active[0]
+    assert explained[-20] and not explained[-1]
