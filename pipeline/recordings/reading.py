@@ -57,6 +57,10 @@ class Reading:
     damaged_chunks: int = field(default=0, init=False)
     undecodable: int = field(default=0, init=False)
     """messages that do not have the type of their channel"""
+    without_channel: int = field(default=0, init=False)
+    """messages of channels that only damaged chunks declared"""
+    _declared: set[int] = field(default_factory=set, init=False)
+    """channels so far"""
 
     @property
     def damage(self) -> str:
@@ -66,6 +70,7 @@ class Reading:
             ("it is truncated, as after a crash; read up to that point", self.truncated and not self.being_written),
             (f"damaged chunks left out: {self.damaged_chunks}", self.damaged_chunks),
             (f"messages left out that cannot be decoded: {self.undecodable}", self.undecodable),
+            (f"messages left out whose channel is damaged: {self.without_channel}", self.without_channel),
         )
         text = "; ".join(line for line, is_so in found if is_so)
         return f"{self.path}: {text}" if text else ""
@@ -83,13 +88,18 @@ class Reading:
 
     def undecoded(self) -> Iterator[Envelope]:
         """The messages as bytes; `Envelope.message` decodes one, and may raise CodecError."""
-        self.truncated, self.damaged_chunks = False, 0
+        self.truncated, self.damaged_chunks, self.without_channel = False, 0, 0
         self.being_written = is_being_written(self.path)
         channels: dict[int, tuple[str, str]] = {}
+        self._declared.clear()
+        has_summary = False
         corrupt = 0
         reader = RecordReader(self.path)
         for record in reader:
             self.damaged_chunks = corrupt + len(reader.damaged_ranges)
+            if self.damaged_chunks and not has_summary:
+                has_summary = True
+                self._add_channels_of_summary(channels)
             try:
                 if isinstance(record.parsed, Chunk):
                     envelopes = self.envelopes_in(chunk_data(record.parsed), channels)
@@ -116,14 +126,23 @@ class Reading:
                 if channel in channels:
                     payload = data[at + MESSAGE.size : at + length]
                     envelopes.append(Envelope(*channels[channel], payload, received_t_ns, None, newest_t_ns))
+                elif channel not in self._declared:
+                    self.without_channel += 1
             elif opcode == Opcode.CHANNEL:
                 self.add_channel(parse(Channel, data[at : at + length]), channels)
             at += length
         return envelopes
 
+    def _add_channels_of_summary(self, channels: dict[int, tuple[str, str]]) -> None:
+        """Add the channels that a file without damage at its end declares again there."""
+        for record in RecordReader(self.path):
+            if record.opcode == Opcode.CHANNEL:
+                self.envelopes_in(record.data, channels)
+
     def add_channel(self, channel: Channel, channels: dict[int, tuple[str, str]]) -> None:
         """Add a channel to `channels`, by its id, if its messages are wanted."""
         key = channel.topic
+        self._declared.add(channel.id)
         try:
             topic = topic_of(key).name
         except KeyError:

@@ -64,6 +64,23 @@ def test_a_damaged_chunk_costs_only_that_chunk(tmp_path, what):
         assert reading.damage == f"{damaged}: damaged chunks left out: 1"
 
 
+def test_messages_of_a_channel_that_only_a_damaged_chunk_declared_are_counted_where_the_file_has_no_end(tmp_path):
+    path, envelopes = tmp_path / "r.mcap", list(read_recording(GOLDEN, ("raw",)).undecoded())[:4]
+    with RecordingWriter(path, {}) as writer:
+        for envelope in envelopes:
+            writer.add_message(envelope.key, envelope.message, envelope.received_t_ns)
+            writer.flush()
+    first, *_, last = (record for record in RecordReader(path) if record.opcode == Opcode.CHUNK)
+    content = bytearray(path.read_bytes())
+    content[first.end - 10] ^= 0xFF
+    path.write_bytes(content)
+    assert len(list(read_recording(path))) == 3
+    path.write_bytes(content[: last.end])
+    reading = read_recording(path)
+    assert list(reading) == []
+    assert reading.damage.endswith("damaged chunks left out: 1; messages left out whose channel is damaged: 3")
+
+
 def test_a_recording_that_is_renamed_while_it_is_read_is_one_line(tmp_path, monkeypatch):
     """The recorder that finishes it renames it."""
     path, read = tmp_path / "one.mcap", RecordReader.__iter__
