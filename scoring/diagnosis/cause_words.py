@@ -1,7 +1,7 @@
 """The causes that the model of a fan finds probable, as people read them: sizes with intervals, and what would tell.
 
-`cannot_tell` comes first where the best cause is less probable than all the others together. Its probability is that
-of naming the wrong one; those of the others add up to one without it.
+`cannot_tell` comes first where no cause is as probable as CLEAR. Its probability is that of naming the wrong one; those
+of the others add up to one without it.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from scoring.diagnosis.shown_causes import (
 )
 from scoring.diagnosis.steady_fan import OF_BALANCE, SteadyFan
 
-CLEAR = 0.5
-"""probability from which a cause is named first"""
+CLEAR = 0.6
+"""probability from which a cause is named first: with less the first one named is wrong too often"""
 DRIVER_SHARE = 0.5
 """share of the prior of less drive: the other half is a weak supply"""
 NEWS = 0.1

@@ -70,6 +70,8 @@ class Bin:
     """their mean; NaN without a reading"""
     newest_rad_s: Array
     """the newest reading; NaN without one"""
+    readings_rad_s: Array
+    """(n, fans) all of them"""
     balances: Array
     """number of samples with a torque balance"""
     balance_command: Array
@@ -183,6 +185,7 @@ class Bins:
             predicted_rad_s=np.where(predicted.any(axis=0), mean(rows["predicted"], predicted), speed),
             measured_rad_s=np.where(measured.any(axis=0), speed, np.nan),
             newest_rad_s=newest(rows["measured"], measured),
+            readings_rad_s=rows["measured"],
             balances=has_balance.sum(axis=0),
             balance_command=mean(rows["balance"], has_balance),
             half_range_rad_s=mean(rows["half_range"], counts),

@@ -268,7 +268,7 @@ class Decision(Saved):
         is_known, is_held = np.isfinite(samples), fans.held_s > 0.0
         # what is not held is judged by the mean of its bin: a fan that vibrates is far on both sides in turn
         distance = np.where(is_known & ~is_held, found.distance_rad_s, samples - expected)
-        counts = self._wrong.counts(distance, std, learns=~self.active)
+        counts = self._wrong.counts(distance, std, one.readings_rad_s, learns=~self.active)
         return is_known & counts & (~one.wrong | self._wrong.agree)
 
     def _raise(self, fan: int, pushes: Array, speed_rad_s: float) -> None:

@@ -2,7 +2,8 @@
 
 Boards show twice, half or an impossible speed, or none, for a reading or two. A fan with a fault stays far, so a far
 reading counts once others have agreed with it: as many as a healthy tacho does not show wrong, one after the other, in
-the declared time.
+the declared time. Two are surely two readings where they differ, or where the second is shown for longer than one would
+be.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.messages import Array
+from scoring.model.onsets import differ
 from scoring.model.operation import Fans
 from scoring.model.saved import Saved
 
@@ -18,14 +20,14 @@ FAR_SIGMAS = 4.5
 PRIOR = (0.5, 1000.0)
 """wrong readings, and readings, of a tacho of which nothing is known"""
 FEWEST, ONE_MORE = 2, 2
-"""readings that must agree at least; and samples more than they take: a reading may be seen in one sample more than
-its time, and the last one has to be seen"""
+"""readings that must agree at least; and samples more than they take where they are alike: a reading may be seen in one
+sample more than its time, and the last one has to be seen"""
 
 
 class WrongReadings(Saved):
     """Follows the far readings of the fans of one tray."""
 
-    KEPT = ("_wrong", "_readings", "_side", "_long", "agree")
+    KEPT = ("_wrong", "_readings", "_side", "_long", "_different", "_newest_rad_s", "agree")
 
     def __init__(self, fans: Fans, bin_s: float, period_s: float, log_limit: float) -> None:
         """Begin without a reading. bin_s: within which samples of a reading that is not held count as one; period_s: of
@@ -33,12 +35,18 @@ class WrongReadings(Saved):
         count = len(fans.top_rad_s)
         self._held = np.maximum(np.round(np.where(fans.held_s > 0.0, fans.held_s, bin_s) / period_s), 1.0)
         """(fans,) a reading is shown in so many samples"""
+        self._holds = fans.held_s > 0.0
+        """(fans,) whether a tacho holds its readings, so that they tell one from another"""
         self._log_limit = log_limit
         self._wrong, self._readings = np.full(count, PRIOR[0]), np.full(count, PRIOR[1])
         self._side = np.zeros(count)
         """(fans,) on which side the newest reading is far; 0: it is not"""
         self._long = np.zeros(count)
         """(fans,) how many samples ago the first far one on this side was, itself included"""
+        self._different = np.zeros(count)
+        """(fans,) how often the reading was another since, the first one included"""
+        self._newest_rad_s = np.zeros(count)
+        """(fans,) the newest of them"""
         self.agree = np.zeros(count, np.bool_)
         """(fans,) whether the newest reading is far, and enough before it were"""
 
@@ -47,11 +55,11 @@ class WrongReadings(Saved):
         """(fans,) whether the newest reading was far."""
         return self._side != 0.0
 
-    def counts(self, distance_rad_s: Array, std_rad_s: Array, *, learns: Array) -> Array:
+    def counts(self, distance_rad_s: Array, std_rad_s: Array, readings_rad_s: Array, *, learns: Array) -> Array:
         """(n, fans) whether each sample of a bin counts.
 
-        distance_rad_s: (n, fans) from what is expected, NaN without a reading; std_rad_s: (fans,) of that; learns:
-        (fans,) whether what is far is the tacho's, if it is gone soon.
+        distance_rad_s: (n, fans) from what is expected, NaN without a reading; std_rad_s: (fans,) of that;
+        readings_rad_s: (n, fans); learns: (fans,) whether what is far is the tacho's, if it is gone soon.
         """
         known = np.isfinite(distance_rad_s)
         with np.errstate(invalid="ignore"):
@@ -60,28 +68,37 @@ class WrongReadings(Saved):
         if not far.any() and not self._side.any():
             self.agree = np.zeros_like(self.agree)
             return known
-        side, needed = np.where(far, np.sign(distance_rad_s), 0.0), self._needed()
+        side, agree_at = np.where(far, np.sign(distance_rad_s), 0.0), self._agree_at()
         began, waits = np.zeros(known.shape[1], np.int64), np.zeros(known.shape, np.bool_)
         for row in range(len(known)):
             ends = known[row] & (side[row] != self._side)
-            was_wrong = ends & learns & (self._side != 0.0) & (self._long < needed)
+            was_wrong = ends & learns & (self._side != 0.0) & ~self._are_enough(agree_at)
             self._wrong += was_wrong * np.ceil(self._long / self._held)
             self._side, began[ends] = np.where(ends, side[row], self._side), row
             self._long = np.where(ends, 1.0, self._long + 1.0)
+            is_another = known[row] & self._holds & differ(self._newest_rad_s, readings_rad_s[row])
+            self._different = np.where(ends, 1.0, self._different + is_another)
+            self._newest_rad_s = np.where(known[row], readings_rad_s[row], self._newest_rad_s)
             waits[row] = far[row]
-            agree = far[row] & (self._long >= needed)
+            agree = far[row] & self._are_enough(agree_at)
             if agree.any():
                 waits &= ~agree | (np.arange(len(known))[:, np.newaxis] < began)
-        self.agree = (self._side != 0.0) & (self._long >= needed)
+        self.agree = (self._side != 0.0) & self._are_enough(agree_at)
         return known & ~waits
 
     def forget(self) -> None:
         """Nothing agrees with what was read before a gap."""
         self._side[:] = 0.0
 
-    def _needed(self) -> Array:
-        """(fans,) number of samples that have to be far, so that they are not wrong."""
+    def _are_enough(self, agree_at: Array) -> Array:
+        """(fans,) whether so many readings have been far by now."""
+        samples = (agree_at - 1.0) * self._held + ONE_MORE
+        found: Array = (self._long >= samples) | (self._different >= agree_at)
+        return found
+
+    def _agree_at(self) -> Array:
+        """(fans,) number of readings that have to be far, so that they are not wrong."""
         share = self._wrong / self._readings
         agree = np.ceil((self._log_limit + np.log(2.0)) / (np.log(2.0) - np.log(share)))
-        found: Array = (np.maximum(agree, FEWEST) - 1.0) * self._held + ONE_MORE
+        found: Array = np.maximum(agree, FEWEST)
         return found

@@ -83,3 +83,19 @@ def test_one_wrong_reading_in_fifty_of_any_kind_raises_nothing() -> None:
         return with_reading(one, measured - one.predicted_rad_s)
 
     assert plays(made, made.decision(), 60.0, with_wrong) == []
+
+
+@pytest.mark.parametrize(("shares", "raised_s"), [((0.4, 0.0, 0.0), 1.0), ((0.0, 0.0, 0.0), 1.5), ((0.0, 0.0), None)])
+def test_far_readings_of_a_counting_tacho_agree_where_they_differ_or_last_longer_than_one_may_be_shown(
+    shares: tuple[float, ...], raised_s: float | None
+) -> None:
+    made = MadeFans(counting(twin_of(1).fans), 0.5, moved, seed=5)
+    decision, shown = made.decision(86_400.0), iter(shares)
+    assert plays(made, decision, 30.0) == []
+
+    def with_far(one: Bin) -> Bin:
+        share = next(shown, None)
+        return one if share is None else with_reading(one, (share - 1.0) * one.predicted_rad_s)
+
+    raised = [time_s - 30.0 for time_s, _, is_raised in plays(made, decision, 3.0, with_far) if is_raised]
+    assert raised == ([] if raised_s is None else [raised_s])
