@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -143,6 +144,8 @@ class ScorerCore(Core):
             except RESTORE_ERRORS:
                 self._start_new()
                 self.tray.alarms.restore(state["alarms"])
+                with suppress(*RESTORE_ERRORS):
+                    self.tray.wear.restore(state["wear"])
                 self._counts["snapshots_not_understood"] += 1
                 self._not_restored = READ_IN_PART
         self._last_t_ns = self._snapshot_t_ns = snapshot.t_ns

@@ -35,6 +35,7 @@ def modelled_fans(twin: TrayTwin) -> Fans:
         np.where(at_once, twin.sigma_rad_s, COUNT_NOISE_RAD_S),
         np.array(pulses),
         np.array([tacho.held_s for tacho in twin.tachos]),
+        np.array([tacho.window_s == tacho.held_s for tacho in twin.tachos]),
         np.where(at_once, TIMING_S, TIMING_OF_WINDOW_S),
         coasts_s(twin),
         balance.sigma_command,

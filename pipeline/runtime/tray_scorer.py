@@ -29,7 +29,7 @@ from scoring.diagnosis.standstill_causes import Standing, standstill_causes
 from scoring.model.bins import Bin, Bins, bin_ns_of
 from scoring.model.decision import Decision
 from scoring.model.saved import as_json, from_json, part, within
-from scoring.samples import IDLE, among
+from scoring.samples import IDLE, among, arrived
 from scoring.score_message import ScoreColumns, score_of
 from scoring.standing.against_command import KINDS, AgainstCommand
 from scoring.standing.falls import Falls
@@ -170,12 +170,13 @@ class TrayScorer:
             is_loose = (self._kind == NO_READING) & decision.missing.explains_silence
             self._stands = against.active[row] & ~is_loose
         score = decision.score
-        is_steady = one.judged & ~self.alarms.active & ~decision.has_alarm & (score < ScoreColumns.SUSPECT_FROM)
+        is_steady = one.judged & ~self._stands & ~decision.has_alarm & (score < ScoreColumns.SUSPECT_FROM)
         self.wear.update(one.t_ns, is_steady, lambda: decision.model.age)
         is_worn = self.wear.is_over
         active = decision.has_alarm | self._stands | is_worn
         idle = among(item.invalid_reason[row], *IDLE)
-        judged = one.judged | idle | decision.missing.is_active | self._stands
+        is_silent = (decision.missing.is_active | self._stands) & arrived(item.invalid_reason[row])
+        judged = one.judged | idle | is_silent
         self._see(one, self.alarms.active)
         self._now = self._columns(score, active, is_worn, against.score[row] if against else np.zeros(self.fans))
         is_large = self._stands | (np.abs(decision.fault[0]) >= self._alarm_share)
@@ -186,6 +187,7 @@ class TrayScorer:
             active,
             np.where(is_large, int(Severity.ALARM), int(Severity.WARNING)),
             one.t_ns - began_ns * round(decision.bin_s * NS_PER_S),
+            round(decision.bin_s * NS_PER_S),
         )
         return self.alarms.update(decided, self)
 

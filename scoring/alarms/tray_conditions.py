@@ -40,6 +40,8 @@ class Decided:
     """value of schemas.enums.Severity, where an alarm is active"""
     onset_t_ns: Array
     """when the fault of an active alarm began"""
+    every_ns: int = 0
+    """time between two decisions"""
 
 
 class TrayConditions:
@@ -55,7 +57,8 @@ class TrayConditions:
     def update(self, now: Decided) -> list[AlarmEvent]:
         """Process a decision; returns the events, sorted by fan."""
         judged, since_ns = now.judged, now.t_ns - self._judged_t_ns
-        lost = self._active & (self._judged_t_ns != NEVER_NS) & (since_ns > self._settings.data_lost_after_ns)
+        longest_ns = max(self._settings.data_lost_after_ns, now.every_ns * 3 // 2)
+        lost = self._active & (self._judged_t_ns != NEVER_NS) & (since_ns > longest_ns)
         unshelved = self._shelved_until_t_ns <= now.t_ns
         events: list[AlarmEvent] = []
         for fan in np.flatnonzero(lost | unshelved | (judged & (self._active | now.active))).tolist():

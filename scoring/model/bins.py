@@ -158,7 +158,7 @@ class Bins:
             "counts": block.valid & np.isfinite(measured) & np.isfinite(predicted) & ~(missing | is_repeated),
             "missing": missing,
             "after_missing": before[0],
-            "pair": reads & before[1],
+            "pair": reads & before[1] & ~is_repeated,
         }
 
     def _close(self, row: int) -> Bin:

@@ -80,7 +80,7 @@ class Decision(Saved):
         self._evidence = Evidence(count, self._hypotheses, self.bin_s)
         bins = declared_s / self.bin_s
         self.log_limit = math.log(bins / OF_RATE) * limit_factor
-        self.missing = MissingReadings(count, math.log(bins / (1.0 - OF_RATE)) * limit_factor)
+        self.missing = MissingReadings(count, self.bin_s, math.log(bins / (1.0 - OF_RATE)) * limit_factor)
         self.log_statistic = np.full(count, -np.inf)
         self._wrong = WrongReadings(fans, self.bin_s, period_s, math.log(bins / OF_RATE))
         self.alarms: dict[int, FanInAlarm] = {}
@@ -176,6 +176,7 @@ class Decision(Saved):
     def begin_again(self, fans: Array) -> None:
         """Forget what was learned of some fans, (fans,) of bool, and end their alarms."""
         self.missing.forget(fans)
+        self._wrong.begin_again(fans)
         for fan in np.flatnonzero(fans).tolist():
             if self.active[fan]:
                 self._end(fan)
@@ -228,7 +229,6 @@ class Decision(Saved):
         if bins * self.bin_s > FORGETS_S:
             self._evidence.since[:] = self.number
             self.log_statistic[:] = -np.inf
-            self.alarms.clear()
 
     def _weigh(self, one: Bin, now: Inputs) -> tuple[Inputs, Array]:
         """Let model and evidence take the readings up; returns what counts, and what the columns of the faults do."""

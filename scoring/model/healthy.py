@@ -15,7 +15,7 @@ With w the speed, w' its rate, both as the twin predicts them, a healthy fan in 
     v           share                what theta does not resolve: it stays while speed and command stay
     u           share                the wandering of the speed: an Ornstein-Uhlenbeck process over seconds
     f           share                what a fault takes: 0, and a random walk while there is an alarm
-    e           rad/s                part of a pulse that a count misses; the next count has it
+    e           rad/s                part of a pulse that a count misses; the next one has it, where it begins there
     x, mean     rad/s                deviation of the rotor at the end of the bin, and its mean over the bin
     q           rad/s                s as the torque balance shows it, which passes the filter of the balance
 
@@ -112,6 +112,8 @@ class HealthyFans(Saved):
         self.noise[:, WANDER] = priors.wander**2 * (1.0 - self.kept[:, WANDER - AIR] ** 2)
         self.noise[:, AIR] = priors.air**2 * (1.0 - self.kept[:, 0] ** 2)
         self._missed = np.square(priors.count * fans.pulse_rad_s) / 12.0
+        self._adjoins = fans.adjoins & (fans.held_s > 0.75 * bin_s)
+        """(fans,) whether what a count misses is what the next one shows: there is none between them"""
         self._of_balance = np.zeros(count)
         """(fans,) variance of the noise of the torque balance, as speed"""
         self.tends[:, SHOWN - ROTOR, COUNT] = -1.0
@@ -188,6 +190,9 @@ class HealthyFans(Saved):
         walked = np.minimum(lags + (p.lag_s**2 * moved)[:, np.newaxis], (2.0 * p.lag_s) ** 2)
         np.maximum(lags, walked, out=lags)
         self._follow(now)
+        covariance[:, COUNT] *= self._adjoins[:, np.newaxis]
+        covariance[:, :, COUNT] *= self._adjoins[:, np.newaxis]
+        covariance[:, COUNT, COUNT] += np.where(self._adjoins, 0.0, self._missed)
         with_states = self.tends @ covariance
         own = with_states @ self.tends.swapaxes(1, 2)
         self._of_balance = np.square(self._fans.balance_noise / self._fans.slope(now.speed_rad_s))
@@ -203,6 +208,7 @@ class HealthyFans(Saved):
     def carry(self, states: Array) -> None:
         """Take (fans, STATES, n) states on to the present bin."""
         states[:, FADING] *= self.kept[:, :, np.newaxis]
+        states[:, COUNT] *= self._adjoins[:, np.newaxis]
         states[:, FOLLOWING] = self.tends.astype(states.dtype, copy=False) @ states
         states[:, COUNT] *= self._holds[:, np.newaxis]
 

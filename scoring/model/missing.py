@@ -17,6 +17,10 @@ NOTHING, LARGEST = -30.0, 60.0
 """limits of the log of the statistic"""
 LEAST_RATIO, LARGEST_SHARE = 2.0, 0.9
 """a loose wire loses at least so many times what a healthy line loses"""
+LONGEST_BURST = 5
+"""readings that a healthy line may lose one after the other: of a dead tacho it learns nothing"""
+OVER_S = 10.0
+"""time for which a healthy line has been likelier until an alarm is over"""
 
 
 class MissingReadings(Saved):
@@ -26,15 +30,17 @@ class MissingReadings(Saved):
     began is not taken for its share.
     """
 
-    KEPT = ("_counts", "_log_terms", "_returned", "_run", "is_active")
+    KEPT = ("_counts", "_log_terms", "_returned", "_returns_s", "_run", "is_active")
 
-    def __init__(self, fans: int, log_limit: float) -> None:
+    def __init__(self, fans: int, bin_s: float, log_limit: float) -> None:
         """Begin without a reading. log_limit: of the statistic."""
-        self._log_limit = log_limit
+        self._bin_s, self._log_limit = bin_s, log_limit
         self._counts = PRIOR.copy()
         self._log_terms = np.full((fans, len(SHARES)), NOTHING)
         self._returned = np.zeros(fans)
         """(fans,) log of how much likelier a healthy line is by the newest readings"""
+        self._returns_s = np.zeros(fans)
+        """(fans,) for how long it has been likelier"""
         self._run = np.zeros(fans)
         """(fans,) readings that are missing one after the other"""
         self.is_active = np.zeros(fans, np.bool_)
@@ -46,24 +52,26 @@ class MissingReadings(Saved):
         gain = missing @ self._log_ratios()
         readings, lost = missing[:, ::2].sum(axis=1), missing[:, 1::2].sum(axis=1)
         self._run = np.where(lost < readings, 0.0, self._run + lost)
-        cleared = self._is_over(gain) if self.is_active.any() else np.zeros(len(missing), np.bool_)
+        known = readings > 0
+        cleared = self._is_over(gain, known) if self.is_active.any() else np.zeros(len(missing), np.bool_)
         self._log_terms = np.minimum(np.logaddexp(self._log_terms, self._begins()) + gain, LARGEST)
         log_statistic = _log_sum(self._log_terms) - math.log(len(SHARES))
         self.is_active = (self.is_active | (log_statistic > self._log_limit)) & ~cleared
         if cleared.any():
-            self._log_terms[cleared], self._returned[cleared] = NOTHING, 0.0
-        back = 1.0 - self._returned / self._log_limit
+            self._log_terms[cleared], self._returned[cleared], self._returns_s[cleared] = NOTHING, 0.0, 0.0
+        back = (1.0 - self._returned / self._log_limit).clip(0.0)
         self.score = np.where(self.is_active, back, np.maximum(log_statistic / self._log_limit, 0.0))
-        self._counts = self._counts + missing[~self.is_active].sum(axis=0)
+        self._counts = self._counts + missing[~self.is_active & (self._run < LONGEST_BURST)].sum(axis=0)
 
     def forget(self, fans: Array) -> None:
         """Begin again for some fans, (fans,) of bool."""
-        self._log_terms[fans], self._returned[fans], self.is_active[fans] = NOTHING, 0.0, False
+        self._log_terms[fans], self.is_active[fans] = NOTHING, False
+        self._returned[fans] = self._returns_s[fans] = self._run[fans] = 0.0
 
     @property
     def share(self) -> Array:
         """(fans,) likeliest share of missing readings."""
-        found: Array = SHARES[self._log_terms.argmax(axis=1)]
+        found: Array = self._shares()[self._log_terms.argmax(axis=1)]
         return found
 
     @property
@@ -77,20 +85,26 @@ class MissingReadings(Saved):
         """(fans, 1) log of the weight of an onset with this bin: none in an alarm."""
         return np.where(self.is_active, -np.inf, 0.0)[:, np.newaxis]
 
-    def _is_over(self, gain: Array) -> Array:
-        """(fans,) whether a line is healthy again."""
+    def _is_over(self, gain: Array, known: Array) -> Array:
+        """(fans,) whether a line is healthy again. known: (fans,) whether there should have been a reading."""
         self._log_terms -= np.where(self.is_active, self._log_terms.max(axis=1), 0.0)[:, np.newaxis]
         back = self._returned - (_log_sum(self._log_terms + gain) - _log_sum(self._log_terms))
         self._returned = np.where(self.is_active, np.maximum(back, 0.0), 0.0)
-        found: Array = self.is_active & (self._returned > self._log_limit)
+        self._returns_s = np.where(self._returned > 0.0, self._returns_s + known * self._bin_s, 0.0)
+        found: Array = self.is_active & (self._returned > self._log_limit) & (self._returns_s >= OVER_S)
         return found
+
+    def _shares(self) -> Array:
+        """(SHARES,) none of them small beside what a healthy line loses."""
+        readings, lost, *_ = self._counts.tolist()
+        return np.maximum(SHARES, min(LEAST_RATIO * lost / readings, LARGEST_SHARE))
 
     def _log_ratios(self) -> Array:
         """(4, SHARES) log of how much likelier each reading is of a loose wire than of a healthy line, as `Bin.missing`
         counts them."""
         readings, lost, missing, lost_again = self._counts.tolist()
         healthy = np.array([[lost / readings], [lost_again / missing]])
-        shares = np.maximum(SHARES, min(LEAST_RATIO * lost / readings, LARGEST_SHARE))
+        shares = self._shares()
         loses, stays = np.log(shares / healthy), np.log((1.0 - shares) / (1.0 - healthy))
         return np.stack((stays[0], loses[0] - stays[0], stays[1], loses[1] - stays[1]))
 

@@ -37,6 +37,8 @@ class Fans:
     """what a pulse more in a count is worth; 0: the tacho does not count"""
     held_s: Array
     """how long a tacho holds a reading"""
+    adjoins: Array
+    """whether each count begins where the one before ended"""
     timing_s: Array
     """standard deviation of the time of a reading"""
     coasts_s: Array

@@ -38,7 +38,8 @@ class WrongReadings(Saved):
         self._holds = fans.held_s > 0.0
         """(fans,) whether a tacho holds its readings, so that they tell one from another"""
         self._log_limit = log_limit
-        self._wrong, self._readings = np.full(count, PRIOR[0]), np.full(count, PRIOR[1])
+        self._wrong, self._readings = np.zeros((2, count))
+        self.begin_again(np.ones(count, np.bool_))
         self._side = np.zeros(count)
         """(fans,) on which side the newest reading is far; 0: it is not"""
         self._long = np.zeros(count)
@@ -85,6 +86,10 @@ class WrongReadings(Saved):
                 waits &= ~agree | (np.arange(len(known))[:, np.newaxis] < began)
         self.agree = (self._side != 0.0) & self._are_enough(agree_at)
         return known & ~waits
+
+    def begin_again(self, fans: Array) -> None:
+        """Forget what the tachos of some fans have shown wrong, (fans,) of bool."""
+        self._wrong[fans], self._readings[fans] = PRIOR
 
     def forget(self) -> None:
         """Nothing agrees with what was read before a gap."""

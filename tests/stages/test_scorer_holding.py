@@ -8,11 +8,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pipeline.runtime.healthy_twin import ScorerConfig
 from schemas.blocks import join
 from schemas.enums import Statistic, Transition
 from schemas.messages import Alarm, Prediction, Raw
+from schemas.standstill import Standstill
 from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
 from stages.resampler import ResamplerConfig, ResamplerCore
@@ -62,18 +64,22 @@ def on_the_grid(missing: Floats) -> Prediction:
     return replace(made, invalid_reason=grid.invalid_reason, reading_missing=grid.reading_missing)
 
 
-def test_lost_lines_of_counting_tachos_are_no_alarm_though_the_grid_holds_the_count_before_them() -> None:
-    counts, fans, lines = Tacho(kind="count", window_s=0.5), 8, 1200
+@pytest.mark.parametrize(
+    ("window_s", "update_s", "line_hz", "lost"), [(0.5, 0.0, 2, 0.1), (0.5, 0.0, 1, 0.0), (1.0, 0.25, 4, 0.0)]
+)
+def test_counts_of_which_some_are_not_seen_or_which_overlap_are_no_alarm(
+    window_s: float, update_s: float, line_hz: int, lost: float
+) -> None:
+    counts, fans, lines = Tacho(kind="count", window_s=window_s, update_s=update_s), 8, 2400
     rng = np.random.default_rng(8)
-    edges = (
-        rng.random(fans)
-        + np.arange(lines + 1)[:, np.newaxis] * (TWIN_SPEED + np.arange(fans)) / counts.resolution_rad_s
-    )
-    arrives = rng.random(lines) > 0.1
-    t_ns = EPOCH_NS + NS_PER_S // 2 * np.flatnonzero(arrives)
-    speed = np.diff(np.floor(edges), axis=0)[arrives] * counts.resolution_rad_s
+    time_s = np.arange(lines)[:, np.newaxis] / line_hz
+    per_s, phase = (TWIN_SPEED + np.arange(fans)) / (counts.resolution_rad_s * window_s), rng.random(fans)
+    counted = np.floor(phase + per_s * time_s) - np.floor(phase + per_s * (time_s - window_s))
+    arrives = rng.random(lines) >= lost
+    t_ns = EPOCH_NS + NS_PER_S // line_hz * np.flatnonzero(arrives)
+    speed = counted[arrives] * counts.resolution_rad_s
     raw = Raw(fans=fans, host_receive_t_ns=t_ns, command=np.full(speed.shape, NEEDED), speed_rad_s=speed)
-    resampler = ResamplerCore(fans, ResamplerConfig(rate_hz=2.0), tachos=(counts,))
+    resampler = ResamplerCore(fans, ResamplerConfig(rate_hz=float(line_hz)), tachos=(counts,))
     grid = join([*resampler.step(raw), *resampler.close()])
     item = prediction_of(grid.speed_rad_s - TWIN_SPEED, grid.valid, period_ns=grid.period_ns)
     item = replace(item, reading_missing=grid.reading_missing, reading_repeated=grid.reading_repeated)
@@ -142,3 +148,59 @@ def test_a_diagnosis_that_says_nothing_new_is_no_message() -> None:
     )
     assert causes and repeats == 0
     assert all(p >= 0.15 for one in causes for _, p in one)
+
+
+STANDSTILL = Standstill(
+    turning_command=20.0, standing_below_rad_s=50.0, off_command=0.0, start_s=1.0, coast_s=4.0, slowing_s=0.5
+)
+
+
+def at_2_hz(missing: NDArray[np.bool_]) -> Prediction:
+    """A healthy fan, of whose raw samples, two a second, these have no reading."""
+    speed = np.where(missing[:, np.newaxis], np.nan, TWIN_SPEED + noise(len(missing), seed=3))
+    t_ns = EPOCH_NS + NS_PER_S // 2 * np.arange(len(missing))
+    raw = Raw(fans=1, host_receive_t_ns=t_ns, command=np.full(speed.shape, NEEDED), speed_rad_s=speed)
+    resampler = ResamplerCore(1, ResamplerConfig(rate_hz=2.0))
+    grid = join([*resampler.step(raw), *resampler.close()])
+    made = prediction_of(grid.speed_rad_s - TWIN_SPEED, grid.valid, period_ns=grid.period_ns)
+    return replace(made, invalid_reason=grid.invalid_reason, reading_missing=grid.reading_missing)
+
+
+def test_a_silence_that_a_loose_wire_makes_now_and_then_is_no_tacho_without_a_signal_and_a_long_one_is() -> None:
+    missing = np.random.default_rng(5).random(800) < 0.35
+    missing[:60], missing[300:310], missing[600:640] = False, True, True
+    _, alarms = feed(core_of(standstill=STANDSTILL), [at_2_hz(missing)])
+    named = [((each.t_ns - EPOCH_NS) / NS_PER_S, each.causes[0].cause) for each in alarms if each.causes]
+    assert {cause for time_s, cause in named if time_s < 300.0} == {"sensor_dropout"}
+    assert "no_tacho" in {cause for time_s, cause in named if 300.0 < time_s < 325.0}
+
+
+def test_an_alarm_is_not_lost_between_the_counts_of_a_slow_tacho() -> None:
+    residual = np.concatenate([noise(200), noise(200) - 60.0])
+    core = core_of(tachos=(Tacho(kind="count", window_s=3.0),))
+    _, alarms = feed(core, [prediction_of(residual, period_ns=NS_PER_S)])
+    transitions = [each.transition for each in alarms]
+    assert Transition.RAISED in transitions
+    assert not {Transition.DATA_LOST, Transition.DATA_RESTORED} & set(transitions)
+
+
+def test_an_alarm_of_missing_readings_goes_stale_two_seconds_into_a_silence_of_its_line() -> None:
+    time_s = np.arange(100 * SECOND) / SECOND
+    item = on_the_grid(np.where(time_s < 60, 0.002, 0.35))
+    core = core_that_knows_its_fan()
+    _, alarms = feed(core, [item])
+    assert alarms[0].transition == Transition.RAISED
+    silent = prediction_of(
+        noise(5 * SECOND), np.zeros((5 * SECOND, 1), np.bool_), first=len(item.t_ns), period_ns=PERIOD_NS
+    )
+    _, alarms = feed(core, [silent])
+    assert [(each.transition, (each.t_ns - int(item.t_ns[-1])) / NS_PER_S < 3.0) for each in alarms] == [
+        (Transition.DATA_LOST, True)
+    ]
+
+
+def test_wear_goes_on_to_be_measured_in_its_own_alarm_so_that_it_can_be_over() -> None:
+    core = core_of(config={"wear_every_s": 10.0})
+    feed(core, [prediction(noise(104 * SECOND))])
+    core.tray.wear.is_over[0] = True
+    assert [each for each, _ in changes(core, prediction(noise(30 * SECOND), first=104 * SECOND))] == list(CHANGES)

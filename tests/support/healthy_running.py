@@ -31,6 +31,7 @@ def made_fans(count: int) -> Fans:
         noise_rad_s=NOISE_RAD_S * each,
         pulse_rad_s=0.0 * each,
         held_s=0.0 * each,
+        adjoins=np.ones(count, np.bool_),
         timing_s=0.0 * each,
         coasts_s=3.0 * each,
         balance_noise=each,

@@ -59,6 +59,7 @@ def twin_of(
         noise_rad_s=each(SIGMA),
         pulse_rad_s=np.array([tacho.resolution_rad_s if tacho.kind == "count" else 0.0 for tacho in of_each]),
         held_s=np.array([tacho.held_s for tacho in of_each]),
+        adjoins=np.array([tacho.window_s == tacho.held_s for tacho in of_each]),
         timing_s=each(0.02),
         coasts_s=each(2.0),
         balance_noise=each(SIGMA_COMMAND),
