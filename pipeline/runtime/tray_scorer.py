@@ -123,7 +123,7 @@ class TrayScorer:
         decision, falls, command = self._decision, self._falls, float(self._seen[3, fan])
         kind = KINDS[self._kind[fan]]
         if self._stands[fan] and kind is not None:
-            fall = falls.of(fan) if kind == Standing.CAME_TO_REST and falls.stands[fan] else None
+            fall = falls.of(fan) if kind == Standing.CAME_TO_REST and falls.is_falling[fan] else None
             return standstill_causes(kind, fall, command)
         if decision.active[fan]:
             return self._causes_of_deviation(fan, command)

@@ -2,8 +2,8 @@
 
 A fan that loses its power coasts; a rotor that is held stops within a reading or two, and a tacho that loses its signal
 reads as if it did. What tells them apart is how long the fan ran on: the integral of the share of its speed that is
-left, in seconds at full speed. It is the area that the rotor turns, with an error of the tacho: a reading is a mean
-over some time, so the first of the fall contains full speed, or is too high to belong to the fall.
+left, in seconds at full speed, which is the area that the rotor turns. A reading is a mean over some time, so the first
+one of the fall contains full speed: only those after it count, which is the area but for what was turned by then.
 
     held rotor    area: exponential, a small share of a coast; some are only braked: any share of one
     lost signal   area: as of a held rotor
@@ -59,8 +59,8 @@ BEGUN = 0.85
 """share of the speed below which a reading belongs to a fall"""
 COAST, COAST_SPREAD = 0.92, 0.25
 """median of a coast until the reading of a fan at rest, of a whole one; and spread of its logarithm"""
-PHASES = 20
-"""number of phases of a reading at which a fall may begin"""
+PHASES, HALVINGS = 20, 20
+"""number of phases of a reading at which a fall may begin, and steps of a bisection"""
 LEAST_HELD_S = 0.02
 LEAST_DENSITY = 1e-3
 """per coast: of a fall that lasts longer than any cause explains"""
@@ -70,11 +70,13 @@ LEAST_DENSITY = 1e-3
 class Fall:
     """How a fan came to rest, by its readings below BEGUN and above rest.
 
-    lasted_s: integral of the share of the expected speed that they show, s; coasts_s: that of a whole healthy coast
-    without power; held_s: how long a reading is held, at least the time between two.
+    lasted_s: integral of the share of the expected speed that they show, s; rest_s: that of all but the first one;
+    coasts_s: that of a whole healthy coast without power; held_s: how long a reading is held, at least the time between
+    two.
     """
 
     lasted_s: float
+    rest_s: float
     coasts_s: float
     held_s: float
 
@@ -102,11 +104,11 @@ def standstill_causes(standing: Standing, fall: Fall | None, command: float = ma
 
 
 def _weighed(priors: Mapping[str, float], fall: Fall) -> dict[str, float]:
-    """Priors times the densities of how long the fall lasted, in coasts. Below HELD all falls are alike."""
-    lasted, tacho = max(fall.lasted_s / fall.coasts_s, HELD), max(fall.held_s, LEAST_HELD_S) / fall.coasts_s
-    at_once = _density(_stopped, HELD, lasted, tacho)
-    braked = _density(_braked, 0.5, lasted, tacho)
-    coasts = _density(_coasted, 1.0, lasted, tacho)
+    """Priors times the densities of the rest of the fall, in coasts. Below HELD all are alike."""
+    rest, tacho = fall.rest_s / fall.coasts_s, max(fall.held_s, LEAST_HELD_S) / fall.coasts_s
+    at_once = _density(_stopped, HELD, rest, tacho)
+    braked = _density(_braked, 0.5, rest, tacho)
+    coasts = _density(_coasted, 1.0, rest, tacho)
     return {
         BLOCKED: priors[BLOCKED] * ((1.0 - BRAKED) * at_once + BRAKED * braked),
         NO_POWER: priors[NO_POWER] * ((1.0 - UNPLUGGED) * coasts + UNPLUGGED * at_once + LEAST_DENSITY),
@@ -114,20 +116,30 @@ def _weighed(priors: Mapping[str, float], fall: Fall) -> dict[str, float]:
     }
 
 
-def _density(area: Callable[[float], float], constant: float, lasted: float, tacho: float) -> float:
-    """Density of how long a fall lasted: by distribution of its area and time constant, over the phases of a reading.
+def _density(area: Callable[[float], float], constant: float, rest: float, tacho: float) -> float:
+    """Density of the rest of a fall: by distribution of its area, over the phases of a reading.
 
-    The first reading of the fall adds full speed before it; where it is too high to belong to the fall, it takes what
-    the rotor turned in it, or until the next is low enough.
+    The first reading of the fall ends within the time of one after the fall begins; where it is too high to belong to
+    the fall, the next is the first. constant: usual time constant of the fall.
     """
-    half, total = 0.5 * tacho / PHASES, 0.0
+    low, high = (0.0, HELD) if rest < HELD else (rest - 0.5 * HELD, rest + 0.5 * HELD)
+    total = 0.0
     for number in range(PHASES):
         phase = (number + 0.5) / PHASES
         turned = -constant * math.expm1(-(1.0 - phase) * tacho / constant)
         belongs = phase + turned / tacho < BEGUN
-        of_area = lasted - phase * tacho if belongs else lasted + max(turned, (1.0 - BEGUN) * constant)
-        total += area(of_area + half) - area(of_area - half)
-    return total / tacho
+        until = (1.0 - phase if belongs else 2.0 - phase) * tacho
+        total += area(_area_with(high, until)) - (area(_area_with(low, until)) if low > 0.0 else 0.0)
+    return total / (PHASES * HELD)
+
+
+def _area_with(rest: float, until: float) -> float:
+    """Area of an exponential fall of which so much is left after some time: area exp(-until / area) = rest."""
+    low, high = rest, rest + 2.0 * until
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if middle * math.exp(-until / middle) < rest else (low, middle)
+    return 0.5 * (low + high)
 
 
 def _stopped(share: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scoring.diagnosis.standstill_causes import Fall
+from scoring.model.onsets import differ
 from scoring.model.operation import Fans, Inputs
 from scoring.model.saved import Saved
 
@@ -17,7 +18,7 @@ FALLING = 0.6
 class Falls(Saved):
     """Follows the fans of one tray from bin to bin."""
 
-    KEPT = ("_lasted_s", "_passed_s", "stands", "is_falling")
+    KEPT = ("_lasted_s", "_rest_s", "_first_rad_s", "_passed_s", "stands", "is_falling")
 
     def __init__(self, fans: Fans, bin_s: float) -> None:
         """Begin with fans that turn."""
@@ -27,6 +28,10 @@ class Falls(Saved):
         """(fans,) since the newest reading"""
         self._lasted_s = np.zeros(count)
         """(fans,) integral of the speed as a share of the expected one, since it fell"""
+        self._rest_s = np.zeros(count)
+        """(fans,) that without the first reading of the fall"""
+        self._first_rad_s = np.full(count, np.nan)
+        """(fans,) that reading, as long as it is shown; NaN: another was since"""
         self.stands = np.zeros(count, np.bool_)
         self.is_falling = np.zeros(count, np.bool_)
 
@@ -36,8 +41,15 @@ class Falls(Saved):
         self._passed_s = self._passed_s + self._bin_s
         expected = now.speed_rad_s - np.where(now.is_balance, now.deviation_rad_s, 0.0)
         share = np.abs(now.newest_rad_s) / np.maximum(expected, 1.0)
-        lasted_s = np.where(share > FALLS, 0.0, self._lasted_s + share * self._passed_s)
-        self._lasted_s = np.where(known, lasted_s, self._lasted_s)
+        turns, begins = share > FALLS, self._lasted_s == 0.0
+        is_first = begins | ~differ(self._first_rad_s, now.newest_rad_s)
+        first_rad_s = np.where(begins, now.newest_rad_s, np.where(is_first, self._first_rad_s, np.nan))
+        is_first &= np.isfinite(first_rad_s)
+        turned_s = np.where(turns, 0.0, share * self._passed_s)
+        rest_s = np.where(turns, 0.0, self._rest_s + np.where(is_first, 0.0, turned_s))
+        lasted_s = np.where(turns, 0.0, self._lasted_s + turned_s)
+        self._lasted_s, self._rest_s = np.where(known, (lasted_s, rest_s), (self._lasted_s, self._rest_s))
+        self._first_rad_s = np.where(known, first_rad_s, self._first_rad_s)
         self._passed_s = np.where(known, 0.0, self._passed_s)
         self.stands = np.where(known, share < STANDS, self.stands)
         self.is_falling = np.where(known, share < FALLING, self.is_falling)
@@ -45,4 +57,4 @@ class Falls(Saved):
     def of(self, fan: int) -> Fall:
         """That of a fan that stands."""
         held_s = max(float(self._fans.held_s[fan]), self._bin_s)
-        return Fall(float(self._lasted_s[fan]), float(self._fans.coasts_s[fan]), held_s)
+        return Fall(float(self._lasted_s[fan]), float(self._rest_s[fan]), float(self._fans.coasts_s[fan]), held_s)

@@ -41,4 +41,5 @@ def test_a_fan_that_comes_to_rest_stands_and_has_run_on_for_as_long_as_its_readi
         assert falls.is_falling[0] == (speed < 0.6 * TWIN_SPEED)
     fall = falls.of(0)
     assert least_s <= fall.lasted_s <= most_s
+    assert fall.rest_s == pytest.approx(max(fall.lasted_s - 0.85 * BIN_S, 0.0), abs=0.1 * BIN_S), "but for one reading"
     assert fall.coasts_s == pytest.approx(COASTS_S)
