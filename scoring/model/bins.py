@@ -24,6 +24,8 @@ FASTEST = 10.0
 """times the top speed: a faster reading is as impossible as this"""
 LARGEST_COMMAND = 1e9
 """a larger command or torque balance is as impossible as this"""
+HAIR = 1e-3
+"""share of a reading: readings that differ by more are two"""
 RANKED_FROM = 4
 """samples of a bin; of fewer none can be said to be wrong"""
 COLUMNS = (
@@ -35,6 +37,7 @@ COLUMNS = (
     "command",
     "balance",
     "counts",
+    "another",
     "missing",
     "after_missing",
     "pair",
@@ -70,8 +73,8 @@ class Bin:
     """their mean; NaN without a reading"""
     newest_rad_s: Array
     """the newest reading; NaN without one"""
-    readings_rad_s: Array
-    """(n, fans) all of them"""
+    another: Array
+    """(n, fans) whether a reading is another than the one before"""
     balances: Array
     """number of samples with a torque balance"""
     balance_command: Array
@@ -99,6 +102,8 @@ class Bins:
         """(n, fans) of the samples of the last block"""
         self._before = np.zeros((2, len(top_rad_s)), np.bool_)
         """(2, fans) of the newest sample: the reading was missing, and there should have been one"""
+        self._newest_rad_s = np.full(len(top_rad_s), np.nan)
+        """(fans,) newest reading; NaN: there was none"""
 
     def take(self, block: Prediction) -> Iterator[Bin]:
         """The bins that end with a sample of a block, or before it."""
@@ -115,8 +120,8 @@ class Bins:
     def snapshot(self) -> tuple[int, dict[str, Array]]:
         """The time of the open bin, ns, 0 for none, and its samples."""
         if not self._parts:
-            return 0, {"before": self._before}
-        return self._number * self._bin_ns, {"before": self._before, **self._open()}
+            return 0, {"before": self._before, "newest": self._newest_rad_s}
+        return self._number * self._bin_ns, {"before": self._before, "newest": self._newest_rad_s, **self._open()}
 
     def restore(self, open_t_ns: int, stored: Mapping[str, Array]) -> None:
         """Continue from a snapshot.
@@ -126,7 +131,7 @@ class Bins:
         """
         if stored["before"].shape != self._before.shape:
             raise ValueError("samples of another number of fans")
-        self._before[...] = stored["before"]
+        self._before[...], self._newest_rad_s[...] = stored["before"], stored["newest"]
         self._number = open_t_ns // self._bin_ns
         self._parts = [{name: stored[name] for name in COLUMNS}] if open_t_ns else []
 
@@ -134,8 +139,9 @@ class Bins:
         return {name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]}
 
     def _columns(self, block: Prediction) -> dict[str, Array]:
-        predicted, reason = block.predicted_speed_rad_s, block.invalid_reason
-        measured = block.measured_speed_rad_s.clip(-FASTEST * self._top, FASTEST * self._top)
+        fastest, reason = FASTEST * self._top, block.invalid_reason
+        measured = block.measured_speed_rad_s.clip(-fastest, fastest)
+        predicted = block.predicted_speed_rad_s.clip(-fastest, fastest)
         nothing = np.zeros(measured.shape)
         missing = reading_missing_of(block) | (reason == NO_SPEED)
         is_repeated, reads = reading_repeated_of(block), among(reason, *READS)
@@ -146,7 +152,9 @@ class Bins:
         return {
             "measured": measured,
             "predicted": predicted,
-            "half_range": block.reading_range_rad_s if len(block.reading_range_rad_s) else nothing,
+            "half_range": np.nan_to_num(block.reading_range_rad_s if len(block.reading_range_rad_s) else nothing).clip(
+                0.0, fastest
+            ),
             "unseen": unseen,
             "unseen_balance": unseen_balance,
             "command": np.nan_to_num(block.command).clip(-LARGEST_COMMAND, LARGEST_COMMAND),
@@ -156,10 +164,19 @@ class Bins:
                 np.nan,
             ),
             "counts": block.valid & np.isfinite(measured) & np.isfinite(predicted) & ~(missing | is_repeated),
+            "another": self._another(measured),
             "missing": missing,
             "after_missing": before[0],
             "pair": reads & before[1] & ~is_repeated,
         }
+
+    def _another(self, measured: Array) -> Array:
+        """(n, fans) whether each reading, NaN where there is none, is another than the one before."""
+        known, readings = np.isfinite(measured), np.concatenate((self._newest_rad_s[np.newaxis], measured))
+        rows = np.where(known, np.arange(1, len(readings))[:, np.newaxis], 0)
+        newest = np.take_along_axis(readings, np.maximum.accumulate(rows, axis=0), axis=0)
+        before, self._newest_rad_s = np.concatenate((readings[:1], newest[:-1])), newest[-1]
+        return known & differ(before, measured)
 
     def _close(self, row: int) -> Bin:
         rows = self._open()
@@ -185,7 +202,7 @@ class Bins:
             predicted_rad_s=np.where(predicted.any(axis=0), mean(rows["predicted"], predicted), speed),
             measured_rad_s=np.where(measured.any(axis=0), speed, np.nan),
             newest_rad_s=newest(rows["measured"], measured),
-            readings_rad_s=rows["measured"],
+            another=rows["another"],
             balances=has_balance.sum(axis=0),
             balance_command=mean(rows["balance"], has_balance),
             half_range_rad_s=mean(rows["half_range"], counts),
@@ -211,6 +228,12 @@ def mean(values: Array, counts: Array) -> Array:
     """(fans,) the mean of those values that count, (n, fans); 0 where none does."""
     total: Array = np.where(counts, values, 0.0).sum(axis=0)
     return total / np.maximum(counts.sum(axis=0), 1)
+
+
+def differ(before_rad_s: Array, newest_rad_s: Array) -> Array:
+    """Whether a tacho has not repeated its reading; not where one of them is missing (NaN)."""
+    found: Array = np.abs(newest_rad_s - before_rad_s) > HAIR * np.maximum(np.abs(newest_rad_s), np.abs(before_rad_s))
+    return found
 
 
 def newest(values: Array, counts: Array) -> Array:

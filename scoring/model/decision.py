@@ -229,6 +229,7 @@ class Decision(Saved):
         if bins * self.bin_s > FORGETS_S:
             self._evidence.since[:] = self.number
             self.log_statistic[:] = -np.inf
+            self.alarms.clear()
 
     def _weigh(self, one: Bin, now: Inputs) -> tuple[Inputs, Array]:
         """Let model and evidence take the readings up; returns what counts, and what the columns of the faults do."""
@@ -268,7 +269,7 @@ class Decision(Saved):
         is_known, is_held = np.isfinite(samples), fans.held_s > 0.0
         # what is not held is judged by the mean of its bin: a fan that vibrates is far on both sides in turn
         distance = np.where(is_known & ~is_held, found.distance_rad_s, samples - expected)
-        counts = self._wrong.counts(distance, std, one.readings_rad_s, learns=~self.active)
+        counts = self._wrong.counts(distance, std, one.another, learns=~self.active)
         return is_known & counts & (~one.wrong | self._wrong.agree)
 
     def _raise(self, fan: int, pushes: Array, speed_rad_s: float) -> None:

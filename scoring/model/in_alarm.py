@@ -18,9 +18,10 @@ from scipy.special import expit
 
 from schemas.messages import Array
 from scoring.diagnosis.cause_words import PossibleCause
+from scoring.model.bins import differ
 from scoring.model.faults import BEFORE_GROWTH, GROWS_S, UNSTEADY, forces
 from scoring.model.healthy import HealthyFans
-from scoring.model.onsets import Evidence, Hypotheses, Sums, differ
+from scoring.model.onsets import Evidence, Hypotheses, Sums
 from scoring.model.operation import Fans, Inputs
 from scoring.model.saved import part, within
 

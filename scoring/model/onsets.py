@@ -26,6 +26,7 @@ import numpy as np
 from scipy.special import erfc
 
 from schemas.messages import Array
+from scoring.model.bins import differ
 from scoring.model.faults import OF_TACHO, STUCK, Fault
 from scoring.model.healthy import CARRIED, FOLLOWING, STATES, HealthyFans, Innovation
 
@@ -34,8 +35,6 @@ LONGEST_S = 900.0
 NEVER = -1
 BATCH = 8
 """bins"""
-HAIR = 1e-3
-"""share of a reading: readings that differ by more are two"""
 FARTHEST, STEPS = 5.0, 256
 """largest argument for which the chance that a size has the sign of its fault is looked up, in standard deviations over
 the root of 2; and steps of the table of its logarithm within one"""
@@ -157,12 +156,6 @@ def log_erfc(values: Array) -> Array:
     place -= before
     below = LOG_ERFC.take(before)
     found: Array = below + place * (LOG_ERFC.take(before + 1) - below)
-    return found
-
-
-def differ(before_rad_s: Array, newest_rad_s: Array) -> Array:
-    """Whether a tacho has not repeated its reading; not where one of them is missing (NaN)."""
-    found: Array = np.abs(newest_rad_s - before_rad_s) > HAIR * np.maximum(np.abs(newest_rad_s), np.abs(before_rad_s))
     return found
 
 

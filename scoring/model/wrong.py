@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.messages import Array
-from scoring.model.onsets import differ
 from scoring.model.operation import Fans
 from scoring.model.saved import Saved
 
@@ -27,7 +26,7 @@ sample more than its time, and the last one has to be seen"""
 class WrongReadings(Saved):
     """Follows the far readings of the fans of one tray."""
 
-    KEPT = ("_wrong", "_readings", "_side", "_long", "_different", "_newest_rad_s", "agree")
+    KEPT = ("_wrong", "_readings", "_side", "_long", "_different", "agree")
 
     def __init__(self, fans: Fans, bin_s: float, period_s: float, log_limit: float) -> None:
         """Begin without a reading. bin_s: within which samples of a reading that is not held count as one; period_s: of
@@ -46,8 +45,6 @@ class WrongReadings(Saved):
         """(fans,) how many samples ago the first far one on this side was, itself included"""
         self._different = np.zeros(count)
         """(fans,) how often the reading was another since, the first one included"""
-        self._newest_rad_s = np.zeros(count)
-        """(fans,) the newest of them"""
         self.agree = np.zeros(count, np.bool_)
         """(fans,) whether the newest reading is far, and enough before it were"""
 
@@ -56,11 +53,12 @@ class WrongReadings(Saved):
         """(fans,) whether the newest reading was far."""
         return self._side != 0.0
 
-    def counts(self, distance_rad_s: Array, std_rad_s: Array, readings_rad_s: Array, *, learns: Array) -> Array:
+    def counts(self, distance_rad_s: Array, std_rad_s: Array, another: Array, *, learns: Array) -> Array:
         """(n, fans) whether each sample of a bin counts.
 
         distance_rad_s: (n, fans) from what is expected, NaN without a reading; std_rad_s: (fans,) of that;
-        readings_rad_s: (n, fans); learns: (fans,) whether what is far is the tacho's, if it is gone soon.
+        another: (n, fans) whether a reading is another than the one before; learns: (fans,) whether what is far is the
+        tacho's, if it is gone soon.
         """
         known = np.isfinite(distance_rad_s)
         with np.errstate(invalid="ignore"):
@@ -77,9 +75,7 @@ class WrongReadings(Saved):
             self._wrong += was_wrong * np.ceil(self._long / self._held)
             self._side, began[ends] = np.where(ends, side[row], self._side), row
             self._long = np.where(ends, 1.0, self._long + 1.0)
-            is_another = known[row] & self._holds & differ(self._newest_rad_s, readings_rad_s[row])
-            self._different = np.where(ends, 1.0, self._different + is_another)
-            self._newest_rad_s = np.where(known[row], readings_rad_s[row], self._newest_rad_s)
+            self._different = np.where(ends, 1.0, self._different + (known[row] & self._holds & another[row]))
             waits[row] = far[row]
             agree = far[row] & self._are_enough(agree_at)
             if agree.any():

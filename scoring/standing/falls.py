@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scoring.diagnosis.standstill_causes import Fall
-from scoring.model.onsets import differ
+from scoring.model.bins import differ
 from scoring.model.operation import Fans, Inputs
 from scoring.model.saved import Saved
 

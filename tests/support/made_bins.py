@@ -42,7 +42,7 @@ def bin_of(number: int, bin_ns: int, fans: int, speed_rad_s: Array | float, **mo
         predicted_rad_s=nothing + speed_rad_s,
         measured_rad_s=np.full(fans, np.nan),
         newest_rad_s=np.full(fans, np.nan),
-        readings_rad_s=np.full((1, fans), np.nan),
+        another=np.zeros((1, fans), np.bool_),
         balances=nothing,
         balance_command=nothing,
         half_range_rad_s=nothing,
@@ -64,7 +64,7 @@ def with_reading(one: Bin, deviation_rad_s: Array) -> Bin:
         deviations_rad_s=deviation_rad_s[np.newaxis],
         measured_rad_s=measured,
         newest_rad_s=measured,
-        readings_rad_s=measured[np.newaxis],
+        another=np.ones((1, len(measured)), np.bool_),
     )
 
 

@@ -91,12 +91,14 @@ def test_far_readings_of_a_counting_tacho_agree_where_they_differ_or_last_longer
     shares: tuple[float, ...], raised_s: float | None
 ) -> None:
     made = MadeFans(counting(twin_of(1).fans), 0.5, moved, seed=5)
-    decision, shown = made.decision(86_400.0), iter(shares)
+    decision, shown = made.decision(86_400.0), iter(zip((1.0, *shares), shares, strict=False))
     assert plays(made, decision, 30.0) == []
 
     def with_far(one: Bin) -> Bin:
-        share = next(shown, None)
-        return one if share is None else with_reading(one, (share - 1.0) * one.predicted_rad_s)
+        before, share = next(shown, (None, None))
+        if share is None:
+            return one
+        return replace(with_reading(one, (share - 1.0) * one.predicted_rad_s), another=np.array([[share != before]]))
 
     raised = [time_s - 30.0 for time_s, _, is_raised in plays(made, decision, 3.0, with_far) if is_raised]
     assert raised == ([] if raised_s is None else [raised_s])
