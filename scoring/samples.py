@@ -32,7 +32,7 @@ def reading_missing_of(prediction: Prediction) -> Array:
 
 
 def reading_repeated_of(prediction: Prediction) -> Array:
-    """(n, fans) of bool: where a reading is that of the sample before, since no other has come."""
+    """(n, fans) of bool: where a reading is that of the sample before, because no raw sample has come in between."""
     return _or_nowhere(prediction.reading_repeated, prediction)
 
 

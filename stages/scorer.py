@@ -123,8 +123,8 @@ class ScorerCore(Core):
         """Continue from a snapshot. Returns the messages that report it.
 
         If it is of another twin, or what was learned of the fans cannot be read, as after an update, only what
-        belongs to operators is restored: shelved, suppressed, out of service, and the requests already answered. Of a
-        learned twin the wear is restored as well.
+        belongs to operators is restored: shelved, suppressed, out of service, and the requests already answered. The
+        wear is restored as well, if it can be read and the twin is the same or a learned one.
         """
         try:
             state = json.loads(snapshot.state_json)

@@ -60,7 +60,7 @@ class Reading:
     without_channel: int = field(default=0, init=False)
     """messages of channels that only damaged chunks declared"""
     _declared: set[int] = field(default_factory=set, init=False)
-    """channels so far"""
+    """ids of all channels declared so far"""
 
     @property
     def damage(self) -> str:
@@ -134,7 +134,7 @@ class Reading:
         return envelopes
 
     def _add_channels_of_summary(self, channels: dict[int, tuple[str, str]]) -> None:
-        """Add the channels that a file without damage at its end declares again there."""
+        """Add the channels that the summary at the end of the file declares again, if there is one."""
         for record in RecordReader(self.path):
             if record.opcode == Opcode.CHANNEL:
                 self.envelopes_in(record.data, channels)

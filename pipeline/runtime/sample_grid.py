@@ -331,8 +331,8 @@ class SampleGrid:
         is_late: Array,
         auxiliary: Array,
     ) -> None:
-        """Append grid samples, at least one. reason: invalid_reason of those without a speed; is_late: (n,) whether the
-        raw sample was there at the grid time before."""
+        """Append grid samples, at least one. reason: invalid_reason of those without a speed; is_late: (n,) whether no
+        raw sample has come since the grid time before."""
         valid = np.isfinite(speed)
         invalid_reason = np.zeros(speed.shape, np.uint8)
         if not all_true(valid):

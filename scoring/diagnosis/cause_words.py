@@ -24,7 +24,7 @@ from scoring.diagnosis.shown_causes import (
 from scoring.diagnosis.steady_fan import OF_BALANCE, SteadyFan
 
 CLEAR = 0.6
-"""probability from which a cause is named first: with less the first one named is wrong too often"""
+"""least probability of a cause that is named first: below it, the first cause is wrong too often"""
 DRIVER_SHARE = 0.5
 """share of the prior of less drive: the other half is a weak supply"""
 NEWS = 0.1

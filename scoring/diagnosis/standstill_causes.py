@@ -134,7 +134,7 @@ def _density(area: Callable[[float], float], constant: float, rest: float, tacho
 
 
 def _area_with(rest: float, until: float) -> float:
-    """Area of an exponential fall of which so much is left after some time: area exp(-until / area) = rest."""
+    """Area of an exponential fall that has `rest` left after `until`: area exp(-until / area) = rest."""
     low, high = rest, rest + 2.0 * until
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)

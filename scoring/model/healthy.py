@@ -15,7 +15,7 @@ With w the speed, w' its rate, both as the twin predicts them, a healthy fan in 
     v           share                what theta does not resolve: it stays while speed and command stay
     u           share                the wandering of the speed: an Ornstein-Uhlenbeck process over seconds
     f           share                what a fault takes: 0, and a random walk while there is an alarm
-    e           rad/s                part of a pulse that a count misses; the next one has it, where it begins there
+    e           rad/s                part of a pulse that a count misses; the next count has it, if it adjoins
     x, mean     rad/s                deviation of the rotor at the end of the bin, and its mean over the bin
     q           rad/s                s as the torque balance shows it, which passes the filter of the balance
 
@@ -113,7 +113,7 @@ class HealthyFans(Saved):
         self.noise[:, AIR] = priors.air**2 * (1.0 - self.kept[:, 0] ** 2)
         self._missed = np.square(priors.count * fans.pulse_rad_s) / 12.0
         self._adjoins = fans.adjoins & (fans.held_s > 0.75 * bin_s)
-        """(fans,) whether what a count misses is what the next one shows: there is none between them"""
+        """(fans,) whether each count begins where the one before ended, and no bin contains two"""
         self._of_balance = np.zeros(count)
         """(fans,) variance of the noise of the torque balance, as speed"""
         self.tends[:, SHOWN - ROTOR, COUNT] = -1.0

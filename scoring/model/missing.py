@@ -18,9 +18,9 @@ NOTHING, LARGEST = -30.0, 60.0
 LEAST_RATIO, LARGEST_SHARE = 2.0, 0.9
 """a loose wire loses at least so many times what a healthy line loses"""
 LONGEST_BURST = 5
-"""readings that a healthy line may lose one after the other: of a dead tacho it learns nothing"""
+"""missing readings in a row from which on nothing is learned of a healthy line: the tacho may be dead"""
 OVER_S = 10.0
-"""time for which a healthy line has been likelier until an alarm is over"""
+"""how long a healthy line must be likelier before an alarm is over"""
 
 
 class MissingReadings(Saved):
@@ -76,7 +76,7 @@ class MissingReadings(Saved):
 
     @property
     def explains_silence(self) -> Array:
-        """(fans,) whether a loose wire loses so many readings one after the other as often as a false alarm comes."""
+        """(fans,) whether a loose wire makes the present silence more often than a false alarm comes."""
         share = self.share
         found: Array = self.is_active & (share < LARGEST_SHARE) & (-np.log(share) * self._run < self._log_limit)
         return found
@@ -95,7 +95,7 @@ class MissingReadings(Saved):
         return found
 
     def _shares(self) -> Array:
-        """(SHARES,) none of them small beside what a healthy line loses."""
+        """(SHARES,) shares that a loose wire loses, each well above that of a healthy line."""
         readings, lost, *_ = self._counts.tolist()
         return np.maximum(SHARES, min(LEAST_RATIO * lost / readings, LARGEST_SHARE))
 
@@ -110,7 +110,7 @@ class MissingReadings(Saved):
 
 
 def _log_sum(logs: Array) -> Array:
-    """(fans,) logarithm of the sums of what (fans, SHARES) are the logarithms of."""
+    """(fans,) logarithm of the sum of exp(logs) over the shares. logs: (fans, SHARES)."""
     largest = logs.max(axis=1)
     found: Array = largest + np.log(np.exp(logs - largest[:, np.newaxis]).sum(axis=1))
     return found

@@ -44,7 +44,7 @@ class WrongReadings(Saved):
         self._long = np.zeros(count)
         """(fans,) how many samples ago the first far one on this side was, itself included"""
         self._different = np.zeros(count)
-        """(fans,) how often the reading was another since, the first one included"""
+        """(fans,) number of different readings since then, the first one included"""
         self.agree = np.zeros(count, np.bool_)
         """(fans,) whether the newest reading is far, and enough before it were"""
 
@@ -92,13 +92,13 @@ class WrongReadings(Saved):
         self._side[:] = 0.0
 
     def _are_enough(self, agree_at: Array) -> Array:
-        """(fans,) whether so many readings have been far by now."""
+        """(fans,) whether at least agree_at readings in a row are far."""
         samples = (agree_at - 1.0) * self._held + ONE_MORE
         found: Array = (self._long >= samples) | (self._different >= agree_at)
         return found
 
     def _agree_at(self) -> Array:
-        """(fans,) number of readings that have to be far, so that they are not wrong."""
+        """(fans,) number of readings in a row that must be far before they count."""
         share = self._wrong / self._readings
         agree = np.ceil((self._log_limit + np.log(2.0)) / (np.log(2.0) - np.log(share)))
         found: Array = np.maximum(agree, FEWEST)

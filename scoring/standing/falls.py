@@ -29,9 +29,9 @@ class Falls(Saved):
         self._lasted_s = np.zeros(count)
         """(fans,) integral of the speed as a share of the expected one, since it fell"""
         self._rest_s = np.zeros(count)
-        """(fans,) that without the first reading of the fall"""
+        """(fans,) the same integral without the first reading of the fall"""
         self._first_rad_s = np.full(count, np.nan)
-        """(fans,) that reading, as long as it is shown; NaN: another was since"""
+        """(fans,) first reading of the fall while the tacho still shows it; NaN after that"""
         self.stands = np.zeros(count, np.bool_)
         self.is_falling = np.zeros(count, np.bool_)
 
