@@ -110,7 +110,7 @@ class Grid:
     current_a: Array = column("samples x fans", np.float32, optional=True)
     temperature_c: Array = column("samples x fans", np.float32, optional=True)
     reading_repeated: Array = column("samples x fans", np.bool_, optional=True)
-    """whether no raw sample has come since the grid sample before, whose reading is held"""
+    """whether a tacho that holds its reading shows that of the grid sample before, as no raw sample has come since"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -40,7 +40,7 @@ class Decided:
     """value of schemas.enums.Severity, where an alarm is active"""
     onset_t_ns: Array
     """when the fault of an active alarm began"""
-    every_ns: int = 0
+    every_ns: int
     """time between two decisions"""
 
 

@@ -237,7 +237,7 @@ class Decision(Saved):
         evidence.begin(now.moved_to_rad_s - now.moves_rad_s2 * self.bin_s)
         largest = self._peak * self._shows
         model.noise[:, FAULT] = np.where(self.active, np.square(WALKS_PER_SQRT_S * largest) * self.bin_s, 0.0)
-        evidence.show(now.newest_rad_s)
+        evidence.show(now.changes)
         model.predict(now)
         now = self.operation.read(one, now, self._counts(one, now))
         found, counts = model.innovation(now), now.readings > 0

@@ -18,7 +18,6 @@ from scipy.special import expit
 
 from schemas.messages import Array
 from scoring.diagnosis.cause_words import PossibleCause
-from scoring.model.bins import differ
 from scoring.model.faults import BEFORE_GROWTH, GROWS_S, UNSTEADY, forces
 from scoring.model.healthy import HealthyFans
 from scoring.model.onsets import Evidence, Hypotheses, Sums
@@ -51,7 +50,6 @@ class FanInAlarm:
         self._log_weight = np.log(evidence.weight[onsets] / np.bincount(which, minlength=len(onsets)))[which]
         self._sums = evidence.sums.of(fan, onsets[which], self._hypotheses.columns)
         self._has_changed = evidence.has_changed[[fan]][:, onsets[which]]
-        self._newest_rad_s = evidence.newest_rad_s[[fan]]
         self._varies = np.zeros((2, 2))
         """squares of distances, in standard deviations, and their number: from a healthy fan since the alarm, and from
         one with its fault lately"""
@@ -67,8 +65,7 @@ class FanInAlarm:
         """Take the reading of a bin up. now: of this fan; square: of its distance, in standard deviations, from what is
         expected with the fault of the alarm."""
         self._ages_s = self._ages_s + bin_s
-        self._has_changed |= differ(self._newest_rad_s, now.newest_rad_s)[:, np.newaxis]
-        self._newest_rad_s = np.where(np.isfinite(now.newest_rad_s), now.newest_rad_s, self._newest_rad_s)
+        self._has_changed |= now.changes[:, np.newaxis]
         self._model.predict(now)
         found = self._model.innovation(now)
         gain = found.with_states * ((now.readings > 0) / found.variance)[:, np.newaxis]
@@ -139,7 +136,6 @@ class FanInAlarm:
             "then_rad_s": self._then_rad_s,
             "log_weight": self._log_weight,
             "has_changed": self._has_changed,
-            "newest_rad_s": self._newest_rad_s,
             "varies": self._varies,
         }
         return {**own, **within("model", self._model.arrays()), **within("sums", self._sums.kept(FIRST))}
@@ -152,7 +148,7 @@ class FanInAlarm:
         """
         self._ends_s, self._ages_s = stored["ends_s"], stored["ages_s"]
         self._then_rad_s, self._log_weight = stored["then_rad_s"], stored["log_weight"]
-        self._has_changed, self._newest_rad_s = stored["has_changed"], stored["newest_rad_s"]
+        self._has_changed = stored["has_changed"]
         self._varies = stored["varies"]
         self._model.restore(part("model", stored))
         self._sums = Sums(1, len(self._ages_s), self._hypotheses.columns, self._hypotheses.pairs)

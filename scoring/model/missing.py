@@ -52,13 +52,14 @@ class MissingReadings(Saved):
         gain = missing @ self._log_ratios()
         readings, lost = missing[:, ::2].sum(axis=1), missing[:, 1::2].sum(axis=1)
         self._run = np.where(lost < readings, 0.0, self._run + lost)
-        known = readings > 0
-        cleared = self._is_over(gain, known) if self.is_active.any() else np.zeros(len(missing), np.bool_)
-        self._log_terms = np.minimum(np.logaddexp(self._log_terms, self._begins()) + gain, LARGEST)
+        cleared = self._is_over(gain, readings > 0) if self.is_active.any() else np.zeros(len(missing), np.bool_)
+        begins = np.where(self.is_active, -np.inf, 0.0)[:, np.newaxis]  # in an alarm there are no more onsets
+        self._log_terms = np.minimum(np.logaddexp(self._log_terms, begins) + gain, LARGEST)
         log_statistic = _log_sum(self._log_terms) - math.log(len(SHARES))
         self.is_active = (self.is_active | (log_statistic > self._log_limit)) & ~cleared
         if cleared.any():
             self._log_terms[cleared], self._returned[cleared], self._returns_s[cleared] = NOTHING, 0.0, 0.0
+        self._log_terms -= np.where(self.is_active, self._log_terms.max(axis=1), 0.0)[:, np.newaxis]
         back = (1.0 - self._returned / self._log_limit).clip(0.0)
         self.score = np.where(self.is_active, back, np.maximum(log_statistic / self._log_limit, 0.0))
         self._counts = self._counts + missing[~self.is_active & (self._run < LONGEST_BURST)].sum(axis=0)
@@ -81,13 +82,8 @@ class MissingReadings(Saved):
         found: Array = self.is_active & (share < LARGEST_SHARE) & (-np.log(share) * self._run < self._log_limit)
         return found
 
-    def _begins(self) -> Array:
-        """(fans, 1) log of the weight of an onset with this bin: none in an alarm."""
-        return np.where(self.is_active, -np.inf, 0.0)[:, np.newaxis]
-
     def _is_over(self, gain: Array, known: Array) -> Array:
         """(fans,) whether a line is healthy again. known: (fans,) whether there should have been a reading."""
-        self._log_terms -= np.where(self.is_active, self._log_terms.max(axis=1), 0.0)[:, np.newaxis]
         back = self._returned - (_log_sum(self._log_terms + gain) - _log_sum(self._log_terms))
         self._returned = np.where(self.is_active, np.maximum(back, 0.0), 0.0)
         self._returns_s = np.where(self._returned > 0.0, self._returns_s + known * self._bin_s, 0.0)

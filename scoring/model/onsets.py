@@ -26,7 +26,6 @@ import numpy as np
 from scipy.special import erfc
 
 from schemas.messages import Array
-from scoring.model.bins import differ
 from scoring.model.faults import OF_TACHO, STUCK, Fault
 from scoring.model.healthy import CARRIED, FOLLOWING, STATES, HealthyFans, Innovation
 
@@ -283,8 +282,7 @@ class Evidence:
         self.then_rad_s = np.zeros((fans, ONSETS))
         """(fans, ONSETS) speed at which they began"""
         self.has_changed = np.zeros((fans, ONSETS), np.bool_)
-        """(fans, ONSETS) whether the reading is another than at the end of the bin of the onset"""
-        self.newest_rad_s = np.full(fans, np.nan)
+        """(fans, ONSETS) whether the reading has changed since the bin of the onset"""
         self.since = np.full(fans, NEVER)
         """(fans,) only onsets after this bin count"""
         self._log_bayes_factors = np.zeros((len(hypotheses.faults), fans, ONSETS), np.float32)
@@ -303,10 +301,9 @@ class Evidence:
         self.then_rad_s[:, slot], self.has_changed[:, slot] = speed_rad_s, False
         self.sums.begin(slot)
 
-    def show(self, newest_rad_s: Array) -> None:
-        """The newest readings of the bin, (fans,), NaN without one."""
-        self.has_changed |= differ(self.newest_rad_s, newest_rad_s)[:, np.newaxis] & (self.began < self.number)
-        self.newest_rad_s = np.where(np.isfinite(newest_rad_s), newest_rad_s, self.newest_rad_s)
+    def show(self, changes: Array) -> None:
+        """Where the tacho has shown another reading within the bin, (fans,)."""
+        self.has_changed |= changes[:, np.newaxis] & (self.began < self.number)
 
     def _place(self) -> int:
         """An unused one, the oldest if it is too old, or the one without which the ages are nearest to geometric."""
@@ -348,7 +345,6 @@ class Evidence:
             "weight": self.weight,
             "then_rad_s": self.then_rad_s[fans],
             "has_changed": self.has_changed[fans],
-            "newest_rad_s": self.newest_rad_s,
             "since": self.since[fans],
             **self.sums.kept(fans),
         }
@@ -364,7 +360,7 @@ class Evidence:
         self._order = np.argsort(self.began, kind="stable").tolist()
         self.since[:] = self.number
         self.since[fans], self.then_rad_s[fans] = stored["since"], stored["then_rad_s"]
-        self.has_changed[fans], self.newest_rad_s = stored["has_changed"], stored["newest_rad_s"].copy()
+        self.has_changed[fans] = stored["has_changed"]
         self.sums.restore(fans, stored)
 
     def log_statistic(self) -> Array:

@@ -97,6 +97,8 @@ class Inputs:
     """whether a reading ends that its tacho holds"""
     ends: Array
     """whether one ends, seen or not"""
+    changes: Array
+    """whether the tacho has shown another reading within the bin"""
     deviation_rad_s: Array
     """distance from the free run; or what it would be at a steady speed by the torque balance"""
     is_balance: Array
@@ -170,6 +172,7 @@ class Operation(Saved):
             readings,
             ends & (self._held[0] + readings > 0.0),
             ends,
+            np.asarray(one.another.any(axis=0)),
             np.where(is_balance, -one.balance_command / slope, one.deviation_rad_s),
             is_balance,
         )

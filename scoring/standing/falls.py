@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from scoring.diagnosis.standstill_causes import Fall
-from scoring.model.bins import differ
 from scoring.model.operation import Fans, Inputs
 from scoring.model.saved import Saved
 
@@ -18,7 +17,7 @@ FALLING = 0.6
 class Falls(Saved):
     """Follows the fans of one tray from bin to bin."""
 
-    KEPT = ("_lasted_s", "_rest_s", "_first_rad_s", "_passed_s", "stands", "is_falling")
+    KEPT = ("_lasted_s", "_rest_s", "_is_first", "_passed_s", "stands", "is_falling")
 
     def __init__(self, fans: Fans, bin_s: float) -> None:
         """Begin with fans that turn."""
@@ -30,8 +29,8 @@ class Falls(Saved):
         """(fans,) integral of the speed as a share of the expected one, since it fell"""
         self._rest_s = np.zeros(count)
         """(fans,) the same integral without the first reading of the fall"""
-        self._first_rad_s = np.full(count, np.nan)
-        """(fans,) first reading of the fall while the tacho still shows it; NaN after that"""
+        self._is_first = np.zeros(count, np.bool_)
+        """(fans,) whether the tacho still shows the first reading of the fall"""
         self.stands = np.zeros(count, np.bool_)
         self.is_falling = np.zeros(count, np.bool_)
 
@@ -41,20 +40,16 @@ class Falls(Saved):
         self._passed_s = self._passed_s + self._bin_s
         expected = now.speed_rad_s - np.where(now.is_balance, now.deviation_rad_s, 0.0)
         share = np.abs(now.newest_rad_s) / np.maximum(expected, 1.0)
-        turns, begins = share > FALLS, self._lasted_s == 0.0
-        is_first = begins | ~differ(self._first_rad_s, now.newest_rad_s)
-        first_rad_s = np.where(begins, now.newest_rad_s, np.where(is_first, self._first_rad_s, np.nan))
-        is_first &= np.isfinite(first_rad_s)
-        turned_s = np.where(turns, 0.0, share * self._passed_s)
-        rest_s = np.where(turns, 0.0, self._rest_s + np.where(is_first, 0.0, turned_s))
-        lasted_s = np.where(turns, 0.0, self._lasted_s + turned_s)
-        self._lasted_s, self._rest_s = np.where(known, (lasted_s, rest_s), (self._lasted_s, self._rest_s))
-        self._first_rad_s = np.where(known, first_rad_s, self._first_rad_s)
+        turned_s = np.where(known, share * self._passed_s, 0.0)
+        self._is_first = (self._is_first & ~now.changes) | (known & (self._lasted_s == 0.0))
+        falls = ~known | (share <= FALLS)
+        self._rest_s = np.where(falls, self._rest_s + np.where(self._is_first, 0.0, turned_s), 0.0)
+        self._lasted_s = np.where(falls, self._lasted_s + turned_s, 0.0)
         self._passed_s = np.where(known, 0.0, self._passed_s)
         self.stands = np.where(known, share < STANDS, self.stands)
         self.is_falling = np.where(known, share < FALLING, self.is_falling)
 
     def of(self, fan: int) -> Fall:
-        """That of a fan that stands."""
+        """The fall of a fan that falls or stands."""
         held_s = max(float(self._fans.held_s[fan]), self._bin_s)
         return Fall(float(self._lasted_s[fan]), float(self._rest_s[fan]), float(self._fans.coasts_s[fan]), held_s)

@@ -73,7 +73,7 @@ def decisions() -> list[Any]:
     rng = np.random.default_rng(4)
     active, judged = rng.random((2, 200, FANS)) > 0.3
     return [
-        Decided(number * STEP_NS, one, two, np.where(two, 1 + number % 2, 0), np.full(FANS, number))
+        Decided(number * STEP_NS, one, two, np.where(two, 1 + number % 2, 0), np.full(FANS, number), STEP_NS)
         for number, (one, two) in enumerate(zip(judged, active, strict=True))
     ]
 

@@ -99,7 +99,7 @@ class MadeFans:
         self.states = own * (root @ self._drawn(FAULT, 1))[:, :, 0]
         """(fans, FAULT) states of the model"""
         self.rotor_rad_s: Array | None = None
-        self._missed = np.zeros(self.count)
+        self._missed, self._newest_rad_s = np.zeros((2, self.count))
         self.number = 0
         self.sizes = np.zeros((self.count, COLUMNS))
         """sizes of the faults of now"""
@@ -142,7 +142,9 @@ class MadeFans:
         deviation = mean + shown - states[:, LATE] * now.moves_rad_s2 + self._missed - missed + white
         is_stuck = (self.sizes[:, STUCK] > 0.0) & (age_s > 0.0)
         deviation = np.where(is_stuck, then_rad_s[:, 0] - one.predicted_rad_s, deviation)
-        return with_reading(one, deviation)
+        one = with_reading(one, deviation)
+        before, self._newest_rad_s = self._newest_rad_s, one.newest_rad_s
+        return replace(one, another=(one.newest_rad_s != before)[np.newaxis])
 
     def _move(self, moved: Array, speed: Array) -> None:
         """Let the states go on by one bin."""

@@ -63,7 +63,7 @@ class AlarmOnRequestScorer(Core):
         active = np.isin(np.arange(FANS), list(self.has_alarm))
         self._raised_t_ns = np.where(active & (self._raised_t_ns > 0), self._raised_t_ns, now_ns * active)
         severity, judged = np.full(FANS, int(Severity.ALARM)), np.ones(FANS, np.bool_)
-        events = self.conditions.update(Decided(now_ns, judged, active, severity, self._raised_t_ns))
+        events = self.conditions.update(Decided(now_ns, judged, active, severity, self._raised_t_ns, 0))
         alarms = [self._alarm(each.fan, each.transition, each.alarm_state, "too slow") for each in events]
         return [one_sample(FANS, *self.not_judged), *alarms]
 

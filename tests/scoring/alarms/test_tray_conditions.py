@@ -33,7 +33,7 @@ def decided(number: int, active: Sequence[int], judged: Sequence[bool]) -> Decid
     """What is decided at the end of a bin, of each fan."""
     t_ns = number * STEP_NS
     return Decided(
-        t_ns, np.array(judged), np.array(active) > 0, np.array(active), np.full(len(active), t_ns - ONSET_NS)
+        t_ns, np.array(judged), np.array(active) > 0, np.array(active), np.full(len(active), t_ns - ONSET_NS), STEP_NS
     )
 
 
