@@ -41,8 +41,7 @@ class Scorer:
             if isinstance(message, Score):
                 scores.append(message.score)
             elif isinstance(message, Alarm):
-                causes = sorted(message.causes, key=lambda one: -one.probability)
-                reported = tuple(one.cause for one in causes)
+                reported = tuple(one.cause for one in message.causes)
                 changes.append(AlarmChange(message.fan, message.t_ns, message.active, reported))
         return MethodOutput(np.concatenate(scores), changes)
 

@@ -154,7 +154,7 @@ def episodes(alarms: list[Alarm]) -> list[Episode]:
     done: list[Episode] = []
     standing: dict[int, Episode] = {}
     for alarm in sorted(alarms, key=lambda one: one.t_ns):
-        cause = max(alarm.causes, key=lambda one: one.probability).cause if alarm.causes else ""
+        cause = alarm.causes[0].cause if alarm.causes else ""  # as people read it: `cannot_tell` before those it lists
         now = standing.get(alarm.fan)
         if alarm.active:
             if now is None:

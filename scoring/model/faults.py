@@ -60,20 +60,23 @@ a course"""
 def forces(fans: Fans, now: Inputs, age_s: Array, then_rad_s: Array, columns: int = COLUMNS) -> Array:
     """(fans, onsets, columns) what each column of size 1 adds to what a fan tends to, rad/s, or to its reading.
 
-    A torque moves the steady speed by itself over the slope of the torque that the fan needs; of a fan that controls
-    its speed by itself drag takes a share of the speed. age_s: (onsets,); then_rad_s: (fans, onsets), the speed at the
+    A torque moves the steady speed by itself over the slope of the torque that the fan needs; a weak drive takes a share
+    of that and of what turns the rotor faster. Of a fan that controls its speed by itself drag takes a share of the
+    speed. age_s: (onsets,); then_rad_s: (fans, onsets), the speed at the
     onset; columns: number of the first ones, which are asked for.
     """
     speed, top = now.speed_rad_s, fans.top_rad_s
     steeper = fans.slope(top) / fans.slope(speed)
     needed = (fans.viscous + fans.drag * speed) * speed + fans.friction
+    rate = np.where(now.is_balance, now.moves_rad_s2, now.rate_rad_s2)  # of a measured speed, but for its noise
+    torque = needed + np.where(fans.has_own_drive, 0.0, np.maximum(fans.inertia * rate, -needed))
     at_top = (fans.viscous + fans.drag * top) * top + fans.friction
     full = top * steeper
     of_fans = np.empty((len(speed), COLUMNS))
     of_drag = np.where(fans.has_own_drive, speed, steeper * speed**2 / top)
     of_fans[:, DRAG] = of_fans[:, DRAG_GROWS] = of_drag
     of_fans[:, FRICTION] = of_fans[:, FRICTION_GROWS] = np.minimum(full, LARGEST_FRICTION * speed)
-    of_fans[:, DRIVE] = full * needed / at_top
+    of_fans[:, DRIVE] = full * torque / at_top
     of_fans[:, SCALE] = np.where(now.is_balance, 0.0, now.moved_to_rad_s)
     of_fans[:, STUCK] = -of_fans[:, SCALE]
     of_fans[:, RISES], of_fans[:, FALLS] = np.minimum(-now.moves_rad_s2, 0.0), np.maximum(-now.moves_rad_s2, 0.0)

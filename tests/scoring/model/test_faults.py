@@ -11,8 +11,10 @@ import pytest
 
 from scoring.diagnosis.shown_causes import CAUSES
 from scoring.model import decision
+from scoring.model.decision import Decision
 from scoring.model.faults import BEFORE_GROWTH, DRIVE, FALLS, FAULTS, RISES, SCALE, Fault
-from tests.support.made_bins import MadeFans, plays
+from scoring.model.priors import Priors
+from tests.support.made_bins import MadeFans, bin_of, plays, with_reading
 from tests.support.scored_blocks import twin_of
 
 OF_TORQUE = [row for row in FAULTS if row.weight > 0.0]
@@ -47,6 +49,28 @@ def test_each_fault_that_is_planted_by_its_own_columns_is_named_first_while_the_
     rows: Sequence[Fault], has_own_drive: bool
 ) -> None:
     assert first_causes(rows, has_own_drive=has_own_drive) == [row.cause for row in rows]
+
+
+def test_what_a_rotor_does_by_its_torque_balance_is_named_while_the_command_steps_every_1_5_s() -> None:
+    causes = ["gain_down", "drag_up", "external_torque"]
+    fans = twin_of(len(causes)).fans
+    deciding = Decision(fans, 100_000_000, 0.1, 100.0 * 86400.0, Priors())
+    top = fans.top_rad_s
+    of_top = (fans.viscous + fans.drag * top) * top + fans.friction
+    gain, drag, brake = (np.array(each) for each in ([0.88, 1.0, 1.0], [1.0, 1.3, 1.0], [0.0, 0.0, 0.05]))
+    rng, healthy, real = np.random.default_rng(3), 0.5 * top, 0.5 * top
+    for number in range(2400):
+        torque = of_top * (0.15 + 0.8 * ((number // 15) % 2))
+        is_faulty = number >= 900
+        for _ in range(20):
+            needed = (fans.viscous + fans.drag * healthy) * healthy + fans.friction
+            healthy = healthy + (torque - needed) / fans.inertia * 0.005
+            own = (fans.viscous + np.where(is_faulty, drag, 1.0) * fans.drag * real) * real + fans.friction
+            driven = np.where(is_faulty, gain * torque - brake * of_top, torque)
+            real = real + (driven - own) / fans.inertia * 0.005
+        one = bin_of(number, 100_000_000, len(causes), healthy, command=torque)
+        deciding.take(with_reading(one, real - healthy + rng.normal(0.0, fans.noise_rad_s)))
+    assert [deciding.alarms[fan].causes()[0].cause for fan in range(len(causes))] == causes
 
 
 def test_a_new_kind_of_fault_is_one_row(monkeypatch: pytest.MonkeyPatch) -> None:
