@@ -60,10 +60,10 @@ a course"""
 def forces(fans: Fans, now: Inputs, age_s: Array, then_rad_s: Array, columns: int = COLUMNS) -> Array:
     """(fans, onsets, columns) what each column of size 1 adds to what a fan tends to, rad/s, or to its reading.
 
-    A torque moves the steady speed by itself over the slope of the torque that the fan needs; a weak drive takes a share
-    of that and of what turns the rotor faster. Of a fan that controls its speed by itself drag takes a share of the
-    speed. age_s: (onsets,); then_rad_s: (fans, onsets), the speed at the
-    onset; columns: number of the first ones, which are asked for.
+    A torque moves the steady speed by itself over the slope of the torque that the fan needs; a weak drive takes a
+    share of that and of what turns the rotor faster. Of a fan that controls its speed by itself drag takes a share of
+    the speed. age_s: (onsets,); then_rad_s: (fans, onsets), the speed at the onset; columns: number of the first ones,
+    which are asked for.
     """
     speed, top = now.speed_rad_s, fans.top_rad_s
     steeper = fans.slope(top) / fans.slope(speed)
