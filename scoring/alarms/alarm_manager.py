@@ -21,6 +21,8 @@ from scoring.diagnosis.shown_causes import is_of_standstill
 
 AGAIN_AFTER_S = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 """times after an alarm was raised at which its causes are looked at again"""
+AT_ONCE_NS = 60 * NS_PER_S
+"""alarms of several fans that begin within this time may have one reason"""
 _OF_FEEDBACK = ("feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
 MAX_REQUESTERS = 64  # the latest whose requests are remembered; docs/reference/alarms.md gives the consequences
 
@@ -232,8 +234,23 @@ class AlarmManager:
         )
         return replace(last, header=Header(), request="", operator_name="", comment="", marked_onset_t_ns=0)
 
+    def _alike(self, alarm: Alarm) -> int:
+        """Number of other fans whose alarms, of the same sign, began at about the same time."""
+        return sum(
+            other.active
+            and fan != alarm.fan
+            and abs(other.onset_t_ns - alarm.onset_t_ns) <= AT_ONCE_NS
+            and max(
+                other.residual_rad_s * alarm.residual_rad_s, other.torque_balance_command * alarm.torque_balance_command
+            )
+            > 0.0
+            for fan, other in self._last_emitted.items()
+        )
+
     def _emit(self, alarm: Alarm, refusal: str = "") -> Alarm:
-        alarm = replace(alarm, message=self._alarm_text.of(alarm, refusal))
+        alike = self._alike(alarm) if alarm.transition == Transition.RAISED else 0
+        is_shared = alike >= max(2, (self._fans - 1) // 2)
+        alarm = replace(alarm, message=self._alarm_text.of(alarm, refusal, alike if is_shared else 0))
         self._last_emitted[alarm.fan] = alarm
         return alarm
 

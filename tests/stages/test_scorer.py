@@ -157,6 +157,20 @@ def test_fans_do_not_affect_one_another() -> None:
         np.testing.assert_array_equal(getattr(beside, name)[:, :2], getattr(healthy, name)[:, :2])
 
 
+@pytest.mark.parametrize(("faulty", "shared"), [((0, 1, 2, 3), 2), ((0, 1), 0), ((0, 1, -3), 0)])
+def test_an_alarm_says_when_most_fans_of_the_tray_have_the_like(faulty: tuple[int, ...], shared: int) -> None:
+    core = learned(core_of(fans=4), fans=4)
+    residual = noise_of(12 * SECOND, 4)
+    for number, fan in enumerate(faulty):
+        since_s = np.arange(len(residual)) / SECOND - 2.0 - number
+        residual[:, abs(fan)] += STEP * (-1) ** (fan < 0) * -np.expm1(-since_s.clip(0.0) / TIME_CONSTANT_S)
+    _, alarms = feed(core, [prediction_of(residual)])
+    raised = [alarm.message for alarm in alarms if alarm.transition == Transition.RAISED]
+    words = [f", like {others} other fans of the tray: see what they share (supply, air)" for others in (2, 3)]
+    assert [sum(each in message for message in raised) for each in words] == [shared // 2, shared // 2]
+    assert len(raised) == len(faulty)
+
+
 @pytest.mark.parametrize(("rate_hz", "within_s"), [(1, 3.0), (2, 3.0), (10, 1.0), (100, 1.0), (400, 1.0)])
 def test_at_any_rate_of_the_grid_a_healthy_fan_raises_nothing_and_a_step_of_ten_per_cent_is_an_alarm(
     rate_hz: int, within_s: float
