@@ -106,11 +106,11 @@ def known_of(twin: TrayTwin, declared_per_day: float | None = None) -> HealthyTw
     calibration = Calibration.model_validate(card.calibration) if card.calibration is not None else None
     declared = calibration.false_alarms_per_day if calibration else FALSE_ALARMS_PER_DAY
     lowest_command = card.standstill.turning_command if card.standstill else 0.0
-    of_fans = zip(balance.viscous.tolist(), balance.drag.tolist(), balance.friction.tolist(), strict=True)
+    columns = (balance.viscous, balance.drag, balance.friction, fans.top_rad_s, fans.has_own_drive)
     return HealthyTwin(
         twin.sha256,
         fans,
-        [SteadyFan(*each, card.top_speed_rad_s, twin.drive is not None) for each in of_fans],
+        [SteadyFan(*each) for each in zip(*(column.tolist() for column in columns), strict=True)],
         twin.tachos,
         Advice(card.command_unit, lowest_command, card.command_range[1] if card.command_range else math.inf),
         card.standstill,

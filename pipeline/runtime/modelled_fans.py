@@ -24,6 +24,7 @@ def modelled_fans(twin: TrayTwin) -> Fans:
     """The fans of a twin's tray."""
     balance, top, drive = twin.balance, twin.card.top_speed_rad_s, twin.card.drive
     at_once = np.array([tacho.kind == "instantaneous" for tacho in twin.tachos])
+    has_own_drive = (drive is not None) | (~at_once & (balance.drag <= 0.0))  # no rotor has such a balance
     pulses = [tacho.resolution_rad_s if tacho.kind == "count" else 0.0 for tacho in twin.tachos]
     of_balance = balance.sigma_command / (balance.viscous + balance.drag * top)
     return Fans(
@@ -42,7 +43,7 @@ def modelled_fans(twin: TrayTwin) -> Fans:
         balance.filter_rate_per_s,
         np.broadcast_to(drive.lowest_command if drive else math.nan, twin.fans).astype(np.float64),
         float(np.ptp(twin.card.command_range)),
-        np.full(twin.fans, drive is not None),
+        has_own_drive,
         ~at_once & (drive is None),
         at_once & (BALANCE_BETTER * of_balance < twin.sigma_rad_s),
     )

@@ -40,7 +40,7 @@ class Falls(Saved):
         self._passed_s = self._passed_s + self._bin_s
         expected = now.speed_rad_s - np.where(now.is_balance, now.deviation_rad_s, 0.0)
         share = np.abs(now.newest_rad_s) / np.maximum(expected, 1.0)
-        turned_s = np.where(known, share * self._passed_s, 0.0)
+        turned_s = np.where(known & ~self.stands, share * self._passed_s, 0.0)  # at rest, what trembles is no fall
         self._is_first = (self._is_first & ~now.changes) | (known & (self._lasted_s == 0.0))
         falls = ~known | (share <= FALLS)
         self._rest_s = np.where(falls, self._rest_s + np.where(self._is_first, 0.0, turned_s), 0.0)
