@@ -256,9 +256,11 @@ class AlarmManager:
 
 
 def _is_news(causes: tuple[Diagnosis, ...], than: tuple[Diagnosis, ...]) -> bool:
-    """Whether causes are worth a message. What a fan does after it stood says less of why it came to rest."""
-    stood = bool(than) and is_of_standstill(than[0])
-    return bool(causes) and not (stood and not is_of_standstill(causes[0])) and says_more(causes, than)
+    """Whether causes are worth a message. What a fan does after it came to rest says less of why than how it did."""
+    if not causes or not than or not is_of_standstill(than[0]):
+        return bool(causes) and says_more(causes, than)
+    is_as_sure = causes[0].cause == than[0].cause or causes[0].probability >= than[0].probability
+    return is_of_standstill(causes[0]) and is_as_sure and says_more(causes, than)
 
 
 def _state_fields(state: AlarmState) -> dict[str, Any]:

@@ -171,6 +171,13 @@ def test_no_power_is_named_as_soon_as_the_fan_comes_to_rest_and_nothing_else_bef
     assert at_rest_s - 0.5 < (named[0].t_ns - EPOCH_NS) / 1e9 < at_rest_s + 0.7
 
 
+def test_a_fan_without_power_that_is_switched_off_and_does_not_start_again_still_has_no_power() -> None:
+    command = commands((80.0, 40.0), (0.0, 10.0), (80.0, 30.0))
+    found = seen(command, speed_of(np.where(np.arange(len(command)) * PERIOD_S < 20.0, 80.0, 0.0)))
+    assert len(found.times(Transition.RAISED)) == 1
+    assert found.alarms[-1].causes[0].cause == "no_power"
+
+
 def test_the_alarm_of_a_fan_that_was_blocked_clears_soon_after_it_turns_at_whatever_speed() -> None:
     command = commands((80.0, 20.0), (80.0, 10.0), (40.0, 60.0))
     speed = speed_of(command)
