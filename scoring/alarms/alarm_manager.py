@@ -238,13 +238,12 @@ class AlarmManager:
         """Number of other fans whose alarms, of the same sign, began at about the same time."""
         return sum(
             other.active
-            and fan != alarm.fan
             and abs(other.onset_t_ns - alarm.onset_t_ns) <= AT_ONCE_NS
             and max(
                 other.residual_rad_s * alarm.residual_rad_s, other.torque_balance_command * alarm.torque_balance_command
             )
             > 0.0
-            for fan, other in self._last_emitted.items()
+            for other in self._last_emitted.values()
         )
 
     def _emit(self, alarm: Alarm, refusal: str = "") -> Alarm:
