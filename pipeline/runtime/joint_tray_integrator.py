@@ -8,7 +8,7 @@ from pipeline.runtime.latest_kept import LatestKept
 from pipeline.runtime.tray_integrator import TrayIntegrator
 from schemas.messages import Grid, Prediction
 from schemas.side_by_side import apart, side_by_side
-from scoring.joint_states import JointStates
+from pipeline.runtime.joint_states import JointStates
 
 MOST_KEPT = 16
 """joint integrators, each for one number of trays: what they hold is small"""

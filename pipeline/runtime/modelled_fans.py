@@ -24,7 +24,8 @@ def modelled_fans(twin: TrayTwin) -> Fans:
     """The fans of a twin's tray."""
     balance, top, drive = twin.balance, twin.card.top_speed_rad_s, twin.card.drive
     at_once = np.array([tacho.kind == "instantaneous" for tacho in twin.tachos])
-    has_own_drive = (drive is not None) | (~at_once & (balance.drag <= 0.0))  # no rotor has such a balance
+    counts = np.array([tacho.kind == "count" for tacho in twin.tachos])
+    has_own_drive = (drive is not None) | (counts & (balance.drag.sum() < 0.0))  # such a balance is that of no fan
     pulses = [tacho.resolution_rad_s if tacho.kind == "count" else 0.0 for tacho in twin.tachos]
     of_balance = balance.sigma_command / (balance.viscous + balance.drag * top)
     return Fans(

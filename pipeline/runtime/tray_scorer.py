@@ -24,7 +24,7 @@ from scoring.alarms.fan_condition import ConditionSettings
 from scoring.alarms.tray_conditions import Decided
 from scoring.diagnosis.advice import KNOWN_SOON, SeenSinceOnset
 from scoring.diagnosis.cause_words import CauseWords, PossibleCause
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE
+from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE, is_of_standstill
 from scoring.diagnosis.standstill_causes import Standing, standstill_causes
 from scoring.model.bins import Bin, Bins, bin_ns_of
 from scoring.model.decision import Decision
@@ -118,10 +118,12 @@ class TrayScorer:
             score=float(np.nan_to_num(self._now.score[fan])),
         )
 
-    def causes(self, fan: int) -> tuple[Diagnosis, ...]:
+    def causes(self, fan: int, known: tuple[Diagnosis, ...] = ()) -> tuple[Diagnosis, ...]:
         """See FanFacts."""
         decision, falls, command = self._decision, self._falls, float(self._seen[3, fan])
         kind = KINDS[self._kind[fan]]
+        if kind == Standing.NOT_STARTED and known and is_of_standstill(known[0]):
+            return known  # how it came to rest says more than that it does not start
         if self._stands[fan] and kind is not None:
             fall = falls.of(fan) if kind == Standing.CAME_TO_REST and falls.is_falling[fan] else None
             return standstill_causes(kind, fall, command)

@@ -46,8 +46,8 @@ class FanFacts(Protocol):
         """What is measured of a fan with an alarm."""
         ...
 
-    def causes(self, fan: int) -> tuple[Diagnosis, ...]:
-        """Causes of its alarm, most probable first."""
+    def causes(self, fan: int, known: tuple[Diagnosis, ...] = ()) -> tuple[Diagnosis, ...]:
+        """Causes of its alarm, most probable first. known: those that the alarm has."""
         ...
 
     @property
@@ -111,7 +111,8 @@ class AlarmManager:
                 self._due_t_ns[fan] = left
         alarms: list[Alarm] = []
         for fan in sorted(due.union(begins)):
-            before, causes = self._next_message(fan), facts.causes(fan)
+            before = self._next_message(fan)
+            causes = facts.causes(fan, before.causes)
             if before.active and not before.stale and now.judged[fan] and _is_news(causes, before.causes):
                 measured = vars(facts.measured(fan))
                 changed = {"t_ns": now.t_ns, "transition": Transition.DIAGNOSED, "causes": causes}
@@ -235,31 +236,33 @@ class AlarmManager:
         return replace(last, header=Header(), request="", operator_name="", comment="", marked_onset_t_ns=0)
 
     def _alike(self, alarm: Alarm) -> int:
-        """Number of other fans whose alarms, of the same sign, began at about the same time."""
-        return sum(
+        """Number of other fans with an alarm of this kind, to the same side and of the same time; 0 if they are few."""
+        found = sum(
             other.active
+            and not other.stale
+            and fan != alarm.fan
+            and other.statistic == alarm.statistic != Statistic.MISSING_READINGS
+            and _is_slower(other) == _is_slower(alarm)
             and abs(other.onset_t_ns - alarm.onset_t_ns) <= AT_ONCE_NS
-            and max(
-                other.residual_rad_s * alarm.residual_rad_s, other.torque_balance_command * alarm.torque_balance_command
-            )
-            > 0.0
-            for other in self._last_emitted.values()
+            for fan, other in self._last_emitted.items()
         )
+        return found if found >= max(2, self._fans // 2) else 0
 
     def _emit(self, alarm: Alarm, refusal: str = "") -> Alarm:
-        alike = self._alike(alarm) if alarm.transition == Transition.RAISED else 0
-        is_shared = alike >= max(2, (self._fans - 1) // 2)
-        alarm = replace(alarm, message=self._alarm_text.of(alarm, refusal, alike if is_shared else 0))
+        is_of_size = alarm.transition in (Transition.RAISED, Transition.SEVERITY)
+        alarm = replace(alarm, message=self._alarm_text.of(alarm, refusal, self._alike(alarm) if is_of_size else 0))
         self._last_emitted[alarm.fan] = alarm
         return alarm
 
 
 def _is_news(causes: tuple[Diagnosis, ...], than: tuple[Diagnosis, ...]) -> bool:
-    """Whether causes are worth a message. What a fan does after it came to rest says less of why than how it did."""
-    if not causes or not than or not is_of_standstill(than[0]):
-        return bool(causes) and says_more(causes, than)
-    is_as_sure = causes[0].cause == than[0].cause or causes[0].probability >= than[0].probability
-    return is_of_standstill(causes[0]) and is_as_sure and says_more(causes, than)
+    """Whether causes are worth a message. What a fan does after it stood says less of why it came to rest."""
+    stood = bool(than) and is_of_standstill(than[0])
+    return bool(causes) and not (stood and not is_of_standstill(causes[0])) and says_more(causes, than)
+
+
+def _is_slower(alarm: Alarm) -> bool:
+    return (alarm.residual_rad_s or -alarm.torque_balance_command) < 0.0
 
 
 def _state_fields(state: AlarmState) -> dict[str, Any]:

@@ -41,16 +41,16 @@ class AlarmText:
         self.units = AlarmUnits(speed_unit, command_unit)
 
     def of(self, alarm: Alarm, refusal: str = "", alike: int = 0) -> str:
-        """The line. refusal: the reason why a request was refused; alike: how many other fans of the tray have such an
-        alarm, if it is most of them."""
+        """The line. refusal: the reason why a request was refused; alike: how many other fans of the tray have a
+        similar alarm, if that is most of them."""
         fan = f"fan {alarm.fan}"
         if alarm.transition == Transition.REFUSED:
             return f"{fan}: refused: {refusal}"
         if alarm.transition == Transition.DIAGNOSED:
             return f"{fan}: {self._cause(alarm)}"
         if alarm.transition in (Transition.RAISED, Transition.SEVERITY):
-            others = f", like {alike} other fans of the tray: see what they share (supply, air)" if alike else ""
-            return f"{fan}: {self._deviation(alarm)}{others}{self._cause_if_known(alarm)}"
+            others = f"; so are {alike} other fans of the tray: see what they share (supply, air)" if alike else ""
+            return f"{fan}: {self._deviation(alarm)}{self._cause_if_known(alarm)}{others}"
         if alarm.transition == Transition.REPUBLISHED:
             return f"{fan}: {_after_restart(alarm)}"
         if alarm.marked_onset_t_ns != alarm.onset_t_ns and alarm.marked_onset_t_ns:

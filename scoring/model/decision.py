@@ -135,7 +135,7 @@ class Decision(Saved):
         for fan in np.flatnonzero(known & ~self.active & is_over_limit).tolist():
             self._raise(fan, pushes[fan], float(now.speed_rad_s[fan]))
         if self.active.any():
-            for fan in np.flatnonzero(was_active & self._is_over(known, self._shares(now, pushes))).tolist():
+            for fan in np.flatnonzero(was_active & self._is_over(known, self._shares(now))).tolist():
                 self._end(fan)
         off = now.deviation_rad_s - self.model.expected_rad_s
         self.deviation_rad_s = np.where(known, off, self.deviation_rad_s)
@@ -303,10 +303,14 @@ class Decision(Saved):
         self._evidence.forget(fan)
         self.log_statistic[fan] = -np.inf
 
-    def _shares(self, now: Inputs, pushes: Array) -> Array:
-        """(fans, faults) share of the present speed that each takes, of a size that does not grow."""
+    def _shares(self, now: Inputs) -> Array:
+        """(fans, faults) share of the present speed that each takes of a fan that does not move, of a size that does
+        not grow."""
+        nothing, speed = np.zeros(len(now.speed_rad_s)), now.speed_rad_s[:, np.newaxis]
+        steady = replace(now, rate_rad_s2=nothing, moves_rad_s2=nothing)
+        pushes = forces(self._fans, steady, np.zeros(1), speed, self._hypotheses.columns)
         first = [BEFORE_GROWTH.get(fault.columns[0], fault.columns[0]) for fault in self._hypotheses.faults]
-        return pushes[:, 0, first] / np.maximum(now.speed_rad_s, SLOWEST_RAD_S)[:, np.newaxis]
+        return pushes[:, 0, first] / np.maximum(speed, SLOWEST_RAD_S)
 
     def _log_odds(self) -> Array:
         """(fans,) log of how much likelier the fault of an alarm is, as large as it was at most and as it shows at this

@@ -68,7 +68,7 @@ def forces(fans: Fans, now: Inputs, age_s: Array, then_rad_s: Array, columns: in
     speed, top = now.speed_rad_s, fans.top_rad_s
     steeper = fans.slope(top) / fans.slope(speed)
     needed = (fans.viscous + fans.drag * speed) * speed + fans.friction
-    rate = np.where(now.is_balance, now.moves_rad_s2, now.rate_rad_s2)  # of a measured speed, but for its noise
+    rate = np.where(now.is_balance, now.moves_rad_s2, now.rate_rad_s2)  # the measured speed is noisy
     torque = needed + np.where(fans.has_own_drive, 0.0, np.maximum(fans.inertia * rate, -needed))
     at_top = (fans.viscous + fans.drag * top) * top + fans.friction
     full = top * steeper

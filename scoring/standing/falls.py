@@ -17,7 +17,7 @@ FALLING = 0.6
 class Falls(Saved):
     """Follows the fans of one tray from bin to bin."""
 
-    KEPT = ("_lasted_s", "_rest_s", "_is_first", "_passed_s", "stands", "is_falling")
+    KEPT = ("_lasted_s", "_rest_s", "_is_first", "_passed_s", "_has_stood", "stands", "is_falling")
 
     def __init__(self, fans: Fans, bin_s: float) -> None:
         """Begin with fans that turn."""
@@ -31,6 +31,8 @@ class Falls(Saved):
         """(fans,) the same integral without the first reading of the fall"""
         self._is_first = np.zeros(count, np.bool_)
         """(fans,) whether the tacho still shows the first reading of the fall"""
+        self._has_stood = np.zeros(count, np.bool_)
+        """(fans,) whether a fan has stood since it fell: what it turns at rest is no part of the fall"""
         self.stands = np.zeros(count, np.bool_)
         self.is_falling = np.zeros(count, np.bool_)
 
@@ -40,12 +42,13 @@ class Falls(Saved):
         self._passed_s = self._passed_s + self._bin_s
         expected = now.speed_rad_s - np.where(now.is_balance, now.deviation_rad_s, 0.0)
         share = np.abs(now.newest_rad_s) / np.maximum(expected, 1.0)
-        turned_s = np.where(known & ~self.stands, share * self._passed_s, 0.0)  # at rest, what trembles is no fall
+        turned_s = np.where(known & ~self._has_stood, share * self._passed_s, 0.0)
         self._is_first = (self._is_first & ~now.changes) | (known & (self._lasted_s == 0.0))
         falls = ~known | (share <= FALLS)
         self._rest_s = np.where(falls, self._rest_s + np.where(self._is_first, 0.0, turned_s), 0.0)
         self._lasted_s = np.where(falls, self._lasted_s + turned_s, 0.0)
         self._passed_s = np.where(known, 0.0, self._passed_s)
+        self._has_stood = falls & (self._has_stood | (known & (share < STANDS)))
         self.stands = np.where(known, share < STANDS, self.stands)
         self.is_falling = np.where(known, share < FALLING, self.is_falling)
 

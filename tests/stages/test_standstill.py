@@ -171,11 +171,27 @@ def test_no_power_is_named_as_soon_as_the_fan_comes_to_rest_and_nothing_else_bef
     assert at_rest_s - 0.5 < (named[0].t_ns - EPOCH_NS) / 1e9 < at_rest_s + 0.7
 
 
-def test_a_fan_without_power_that_is_switched_off_and_does_not_start_again_still_has_no_power() -> None:
-    command = commands((80.0, 40.0), (0.0, 10.0), (80.0, 30.0))
-    found = seen(command, speed_of(np.where(np.arange(len(command)) * PERIOD_S < 20.0, 80.0, 0.0)))
+@pytest.mark.parametrize("cause", ["no_power", "blocked"])
+def test_a_fan_that_is_switched_off_and_does_not_start_again_keeps_the_cause_for_which_it_came_to_rest(
+    cause: str,
+) -> None:
+    command = commands((80.0, 40.0), (0.0, 10.0), (80.0, 60.0))
+    before = np.arange(len(command)) * PERIOD_S < 20.0
+    driven = speed_of(np.where(before, 80.0, 0.0))
+    found = seen(command, driven if cause == "no_power" else np.where(before, driven, 0.0))
     assert len(found.times(Transition.RAISED)) == 1
-    assert found.alarms[-1].causes[0].cause == "no_power"
+    last = found.alarms[-1].causes[0]
+    assert last.cause == cause and last.probability > 0.55 and "has not started" not in last.evidence
+
+
+def test_another_reason_to_stand_within_one_alarm_is_named() -> None:
+    command = commands((80.0, 60.0))
+    driven = speed_of(np.where(np.abs(np.arange(len(command)) * PERIOD_S - 25.0) < 5.0, 0.0, 80.0))
+    driven[round(32.5 / PERIOD_S) :] = 0.0
+    found = seen(command, driven)
+    assert len(found.times(Transition.RAISED)) == 1
+    named = [alarm.causes[0].cause for alarm in found.alarms if alarm.causes and alarm.causes[0].probability < 1.0]
+    assert named[-1] == "blocked" and "no_power" in named
 
 
 def test_the_alarm_of_a_fan_that_was_blocked_clears_soon_after_it_turns_at_whatever_speed() -> None:

@@ -12,14 +12,18 @@ from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from tests.stages.test_twin_integrator import physical_twin
 
 COUNTING = (Tacho(kind="count", pulses=2, window_s=1.0),)
+AVERAGING = (Tacho(kind="average", window_s=1.0),)
 
 
-@pytest.mark.parametrize(("tachos", "expected"), [(COUNTING, [True, False]), (INSTANTANEOUS, [False, False])])
-def test_a_fan_whose_tacho_counts_and_whose_torque_is_that_of_no_rotor_controls_its_speed_by_itself(
-    tachos: tuple[Tacho, ...], expected: list[bool]
+@pytest.mark.parametrize(
+    ("tacho", "drag", "expected"),
+    [(COUNTING, -1e-4, True), (COUNTING, 0.0, False), (INSTANTANEOUS, -1e-4, False), (AVERAGING, -1e-4, False)],
+)
+def test_fans_whose_tachos_count_and_whose_torque_is_that_of_no_fan_control_their_speed_by_themselves(
+    tacho: tuple[Tacho, ...], drag: float, expected: bool
 ) -> None:
     twin = physical_twin(2)
-    balance = replace(twin.balance, viscous=np.full(2, 1.0), drag=np.array([-1e-4, 1e-3]))
-    known = known_of(replace(twin, tachos=tacho_of_each_fan(tachos, 2), balance=balance))
-    assert known.fans.has_own_drive.tolist() == expected
-    assert [fan.has_own_drive for fan in known.steady_fans] == expected
+    balance = replace(twin.balance, viscous=np.full(2, 1.0), drag=np.array([2.0 * drag, -drag]))
+    known = known_of(replace(twin, tachos=tacho_of_each_fan(tacho, 2), balance=balance))
+    assert known.fans.has_own_drive.tolist() == [expected] * 2
+    assert [fan.has_own_drive for fan in known.steady_fans] == [expected] * 2
