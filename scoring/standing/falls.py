@@ -10,6 +10,8 @@ from scoring.model.saved import Saved
 
 STANDS, FALLS = 0.08, 0.85
 """shares of the expected speed: below, a fan stands; above, it has not begun to fall"""
+STAYS = 0.02
+"""share by which readings of a fan that turns slowly, above FALLING, may differ: it does not fall"""
 FALLING = 0.6
 """share of the expected speed: a fan below it may come to rest"""
 
@@ -17,12 +19,14 @@ FALLING = 0.6
 class Falls(Saved):
     """Follows the fans of one tray from bin to bin."""
 
-    KEPT = ("_lasted_s", "_rest_s", "_is_first", "_passed_s", "_has_stood", "stands", "is_falling")
+    KEPT = ("_share", "_lasted_s", "_rest_s", "_is_first", "_passed_s", "_has_stood", "stands", "is_falling")
 
     def __init__(self, fans: Fans, bin_s: float) -> None:
         """Begin with fans that turn."""
         self._fans, self._bin_s = fans, bin_s
         count = len(fans.top_rad_s)
+        self._share = np.zeros(count)
+        """(fans,) newest reading, share of the expected speed"""
         self._passed_s = np.zeros(count)
         """(fans,) since the newest reading"""
         self._lasted_s = np.zeros(count)
@@ -44,7 +48,9 @@ class Falls(Saved):
         share = np.abs(now.newest_rad_s) / np.maximum(expected, 1.0)
         turned_s = np.where(known & ~self._has_stood, share * self._passed_s, 0.0)
         self._is_first = (self._is_first & ~now.changes) | (known & (self._lasted_s == 0.0))
-        falls = ~known | (share <= FALLS)
+        stays = (share > FALLING) & (np.abs(share - self._share) < STAYS * share)
+        falls = ~known | ((share <= FALLS) & ~stays)
+        self._share = np.where(known, share, self._share)
         self._rest_s = np.where(falls, self._rest_s + np.where(self._is_first, 0.0, turned_s), 0.0)
         self._lasted_s = np.where(falls, self._lasted_s + turned_s, 0.0)
         self._passed_s = np.where(known, 0.0, self._passed_s)
