@@ -173,7 +173,7 @@ def check_replay(chain: Chain) -> None:
         verified = json.loads(done.stdout)["verified"]
         assert verified["equal"], verified["differences"]
         assert verified[compared] > (1_000 if paths is recordings else 5)
-        assert verified["alarms_equal"] >= 10
+        assert verified["alarms_equal"] >= 6, "the alarm, and the answers to five requests"
         reasons = verified["not_comparable"]
         assert done.returncode == (3 if reasons else 0), done.stderr
         expected = re.compile(rf"{TRAY}: after .*Z: the recording lacks 1 raw messages that were scored")
