@@ -49,7 +49,9 @@ class AlarmText:
         if alarm.transition == Transition.DIAGNOSED:
             return f"{fan}: {self._cause(alarm)}"
         if alarm.transition in (Transition.RAISED, Transition.SEVERITY):
-            others = f"; so are {alike} other fans of the tray: see what they share (supply, air)" if alike else ""
+            others = (
+                f"; {alike} other fans of the tray have the same: see what they share (supply, air)" if alike else ""
+            )
             return f"{fan}: {self._deviation(alarm)}{self._cause_if_known(alarm)}{others}"
         if alarm.transition == Transition.REPUBLISHED:
             return f"{fan}: {_after_restart(alarm)}"

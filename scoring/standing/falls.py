@@ -11,7 +11,7 @@ from scoring.model.saved import Saved
 STANDS, FALLS = 0.08, 0.85
 """shares of the expected speed: below, a fan stands; above, it has not begun to fall"""
 STAYS = 0.02
-"""share by which readings of a fan that turns slowly, above FALLING, may differ: it does not fall"""
+"""share of a reading: two above FALLING that differ by less are of a fan that turns slowly and does not fall"""
 FALLING = 0.6
 """share of the expected speed: a fan below it may come to rest"""
 

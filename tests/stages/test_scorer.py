@@ -177,7 +177,7 @@ def test_an_alarm_says_when_most_fans_of_the_tray_have_similar_ones(
         residual[:, abs(fan) - 1] += math.copysign(STEP, -fan) * -np.expm1(-since_s.clip(0.0) / TIME_CONSTANT_S)
     _, alarms = feed(core, [prediction_of(residual)])
     raised = [alarm.message for alarm in alarms if alarm.transition == Transition.RAISED]
-    words = "; so are {} other fans of the tray: see what they share (supply, air)"
+    words = "; {} other fans of the tray have the same: see what they share (supply, air)"
     assert [next((n for n in (2, 3) if words.format(n) in each), 0) for each in raised] == said
 
 
