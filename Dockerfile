@@ -4,7 +4,7 @@ WORKDIR /app
 COPY requirements-image.lock ./
 RUN pip install --no-cache-dir --require-hashes -r requirements-image.lock
 COPY pyproject.toml README.md LICENSE ./
-COPY fantwin_client fantwin_client
+COPY fantwin fantwin
 COPY schemas schemas
 COPY scoring scoring
 COPY pipeline pipeline
@@ -13,7 +13,7 @@ COPY simulation simulation
 COPY twin twin
 RUN pip install --no-cache-dir --no-deps . && useradd --create-home --uid 1000 fantwin \
     && mkdir -p /runs /authority /certs/ca \
-    && python -c "from pipeline.config.registry import STAGES; print('router operator', *STAGES)" \
+    && python -c "from fantwin.pipeline.config.registry import STAGES; print('router operator', *STAGES)" \
     | xargs -n 1 | xargs -I{} mkdir -p /certs/{} && chown -R fantwin /runs /authority /certs
 COPY pipeline/demo /demo
 # without this, ONNX Runtime sends usage reports to its maker; caches go where a read-only container may write

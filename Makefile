@@ -22,7 +22,7 @@ BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_t
 	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed stage_memory)
 # compiled modules are kept: hundreds of processes of the tests would each compile them again
 unexport PYTHONDONTWRITEBYTECODE
-SOURCES := fantwin_client schemas scoring pipeline simulation stages twin tests bench
+SOURCES := fantwin schemas scoring pipeline simulation stages twin tests bench
 
 .PHONY: demo test check selftest compose-test bench schema configuration twin lock rerun-bump clean
 .DEFAULT_GOAL := demo
@@ -55,7 +55,7 @@ schema: $(VENV)/.development
 	$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. schemas/fan.proto
 
 configuration: $(VENV)/.development
-	$(BIN)/python -m pipeline.config.reference_page > docs/reference/configuration.md
+	$(BIN)/python -m fantwin.pipeline.config.reference_page > docs/reference/configuration.md
 
 twin: $(VENV)/.development
 	sh pipeline/demo/train_twin.sh $(BIN)/fantwin

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from bench.detection.plant import START_NS
-from pipeline.config.models import Config
-from pipeline.runtime.stage import Context
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.runtime.stage import Context
 
 
 def stage_context(config: Config, stage: str) -> Context:

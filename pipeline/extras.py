@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from pipeline.errors import UserError
+from fantwin.pipeline.errors import UserError
 
 EXTRAS: dict[str, tuple[str, ...]] = {
     "view": ("rerun", "PIL"),

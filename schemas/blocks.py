@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from schemas.fields import Array, columns, other_fields
-from schemas.messages import Message
+from fantwin.schemas.fields import Array, columns, other_fields
+from fantwin.schemas.messages import Message
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 

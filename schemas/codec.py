@@ -18,10 +18,10 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from google.protobuf.message import Message as ProtoMessage
 
-from schemas import fan_pb2
-from schemas.fields import Array, Column, OpenEnum, columns, other_fields, time_column
-from schemas.messages import LARGEST_PERIOD_NS, Message
-from schemas.wire_fields import LENGTH_DELIMITED, WireError, WireField, wire_fields
+from fantwin.schemas import fan_pb2
+from fantwin.schemas.fields import Array, Column, OpenEnum, columns, other_fields, time_column
+from fantwin.schemas.messages import LARGEST_PERIOD_NS, Message
+from fantwin.schemas.wire_fields import LENGTH_DELIMITED, WireError, WireField, wire_fields
 
 _HEADER_KEY = 1 << 3 | LENGTH_DELIMITED  # of the field `header`, in every message
 _BOOLS = b"\0\1"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from schemas.fields import OpenEnum
+from fantwin.schemas.fields import OpenEnum
 
 
 class InvalidReason(OpenEnum):

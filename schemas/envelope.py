@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from schemas.codec import decode, decode_header, encode
-from schemas.messages import Message, newest_t_ns
-from schemas.topics import BY_NAME, topic_of
+from fantwin.schemas.codec import decode, decode_header, encode
+from fantwin.schemas.messages import Message, newest_t_ns
+from fantwin.schemas.topics import BY_NAME, topic_of
 
 
 @dataclass(slots=True)

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from schemas import codec
-from schemas.codec import CodecError, decode
-from schemas.envelope import Envelope
-from schemas.messages import Message
-from schemas.topics import BY_NAME
+from fantwin.schemas import codec
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Message
+from fantwin.schemas.topics import BY_NAME
 
 _Kind = TypeVar("_Kind", bound=Message)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from schemas.enums import StageStatus
-from schemas.header import Header
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
 
 
 @dataclass(frozen=True, kw_only=True)

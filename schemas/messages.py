@@ -12,12 +12,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Statistic, TachoKind, Transition
-from schemas.fields import Array, column, derived, time_column
-from schemas.formats import SNAPSHOT
-from schemas.header import Header
-from schemas.health import Health
-from schemas.tacho import Tacho
+from fantwin.schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Statistic, TachoKind, Transition
+from fantwin.schemas.fields import Array, column, derived, time_column
+from fantwin.schemas.formats import SNAPSHOT
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.tacho import Tacho
 
 LARGEST_PERIOD_NS = 86_400_000_000_000  # a day
 FURTHEST_T_NS = (1 << 62) - LARGEST_PERIOD_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits

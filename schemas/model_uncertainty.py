@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, model_validator
 from pydantic.dataclasses import dataclass
 
-from schemas.fields import Array
+from fantwin.schemas.fields import Array
 
 Table: TypeAlias = tuple[tuple[float, ...], ...]
 

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from schemas.fields import Array, columns
-from schemas.messages import Message
+from fantwin.schemas.fields import Array, columns
+from fantwin.schemas.messages import Message
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 

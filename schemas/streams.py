@@ -14,8 +14,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from schemas.header import InputPosition
-from schemas.health import Health, Input
+from fantwin.schemas.header import InputPosition
+from fantwin.schemas.health import Health, Input
 
 LOSS_PREFIX = "lost_"
 """start of the names of counters that count losses"""

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from schemas.fields import columns, time_column
-from schemas.health import Health
-from schemas.messages import (
+from fantwin.schemas.fields import columns, time_column
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import (
     Alarm,
     Clock,
     Command,

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
-from schemas.formats import TWIN_CARD
-from schemas.model_uncertainty import ModelUncertainty
-from schemas.reference_conditions import ReferenceConditions
-from schemas.standstill import Standstill
-from schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
+from fantwin.schemas.formats import TWIN_CARD
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.schemas.reference_conditions import ReferenceConditions
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 
 CARD_PROPERTY = "fantwin.card"
 GRAPH_INPUTS = ("state", "command", "step_s", "parameters")

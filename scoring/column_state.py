@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from schemas.messages import Array
+from fantwin.schemas.messages import Array
 
 NEVER_NS = -(1 << 62)
 """a time long before all others"""

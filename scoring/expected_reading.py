@@ -15,9 +15,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.messages import Array
-from schemas.tacho import Tacho
-from scoring.column_state import ColumnState
+from fantwin.schemas.messages import Array
+from fantwin.schemas.tacho import Tacho
+from fantwin.scoring.column_state import ColumnState
 
 
 class ExpectedReading:

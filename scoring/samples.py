@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.enums import InvalidReason
-from schemas.messages import Array, Prediction
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Array, Prediction
 
 NO_SPEED = int(InvalidReason.NO_SPEED)
 BALANCE_COUNTS = tuple(map(int, (InvalidReason.NONE, InvalidReason.WARMING_UP, InvalidReason.OUT_OF_RANGE)))

@@ -7,10 +7,10 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from schemas.auxiliary import auxiliary_columns
-from schemas.enums import FanState, InvalidReason, Statistic
-from schemas.messages import Array, Prediction, Score
-from scoring.samples import BALANCE_COUNTS, among
+from fantwin.schemas.auxiliary import auxiliary_columns
+from fantwin.schemas.enums import FanState, InvalidReason, Statistic
+from fantwin.schemas.messages import Array, Prediction, Score
+from fantwin.scoring.samples import BALANCE_COUNTS, among
 
 BAND_SIGMAS = 2.0
 NONE, WARMING_UP = np.uint8(InvalidReason.NONE), np.uint8(InvalidReason.WARMING_UP)

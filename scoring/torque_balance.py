@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from schemas.messages import Array
-from scoring.column_state import ColumnState
+from fantwin.schemas.messages import Array
+from fantwin.scoring.column_state import ColumnState
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.messages import Array, Prediction
-from schemas.model_uncertainty import ModelUncertainty
-from schemas.twin_card import DriveCard
+from fantwin.schemas.messages import Array, Prediction
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.schemas.twin_card import DriveCard
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from simulation.errors import SimulationError
-from simulation.thermostat import Thermostat
+from fantwin.simulation.errors import SimulationError
+from fantwin.simulation.thermostat import Thermostat
 
 Array: TypeAlias = NDArray[np.float64]
 

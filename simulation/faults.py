@@ -26,9 +26,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulation.errors import SimulationError
-from simulation.four_pin import FourPinDamage
-from simulation.plant import Disturbance
+from fantwin.simulation.errors import SimulationError
+from fantwin.simulation.four_pin import FourPinDamage
+from fantwin.simulation.plant import Disturbance
 
 CLOG_S = 180.0
 """the time in which clogging reaches its size"""

@@ -18,7 +18,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from simulation.errors import SimulationError
+from fantwin.simulation.errors import SimulationError
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from simulation.errors import SimulationError
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
+from fantwin.simulation.errors import SimulationError
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -15,13 +15,13 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from simulation.errors import SimulationError
-from simulation.excitation import excitation
-from simulation.fans import DcFans, FanKind, FourPinTray, simulated_fans
-from simulation.faults import Fault, check_schedule, tacho_faults
-from simulation.plant import DeviceClock
-from simulation.surroundings import Surroundings, SurroundingsNow
-from simulation.tacho import TachoSettings, simulated_tacho
+from fantwin.simulation.errors import SimulationError
+from fantwin.simulation.excitation import excitation
+from fantwin.simulation.fans import DcFans, FanKind, FourPinTray, simulated_fans
+from fantwin.simulation.faults import Fault, check_schedule, tacho_faults
+from fantwin.simulation.plant import DeviceClock
+from fantwin.simulation.surroundings import Surroundings, SurroundingsNow
+from fantwin.simulation.tacho import TachoSettings, simulated_tacho
 
 Array: TypeAlias = NDArray[np.float64]
 

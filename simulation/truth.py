@@ -13,8 +13,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from schemas.units import NS_PER_S
-from simulation.tray import SimulatedTray
+from fantwin.schemas.units import NS_PER_S
+from fantwin.simulation.tray import SimulatedTray
 
 
 def truth(tray: SimulatedTray, start_ns: int | None, *, complete: bool, counts: Mapping[str, int]) -> dict[str, Any]:

@@ -20,14 +20,14 @@ from typing import TypeAlias
 
 from pydantic import Field
 
-from pipeline.config.models import TrayConfig
-from pipeline.devices.device_sequence import DeviceSequence
-from pipeline.devices.host_clock import HOST_CLOCK, HostClock
-from pipeline.devices.input_quality import InputQuality
-from pipeline.devices.plausibility import Plausibility
-from pipeline.devices.push_source import PushSource
-from pipeline.devices.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
-from pipeline.devices.sample_source import (
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.devices.device_sequence import DeviceSequence
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK, HostClock
+from fantwin.pipeline.devices.input_quality import InputQuality
+from fantwin.pipeline.devices.plausibility import Plausibility
+from fantwin.pipeline.devices.push_source import PushSource
+from fantwin.pipeline.devices.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
+from fantwin.pipeline.devices.sample_source import (
     LinkUp,
     Reading,
     ReadingBatch,
@@ -35,17 +35,17 @@ from pipeline.devices.sample_source import (
     SampleSource,
     SourceContext,
 )
-from pipeline.devices.source_kinds import build_source
-from pipeline.errors import UserError
-from pipeline.runtime.device_commands import DeviceCommands
-from pipeline.runtime.raw_messages import ReceivedReading, raw_message
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
-from schemas.auxiliary import AUXILIARY
-from schemas.health import AcceptedSamples
-from schemas.messages import Command, PushedSamples, Raw, StatedTacho
-from schemas.tacho import Tacho
-from schemas.topics import most_samples
-from schemas.units import NS_PER_S, RAD_S_PER_UNIT
+from fantwin.pipeline.devices.source_kinds import build_source
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.runtime.device_commands import DeviceCommands
+from fantwin.pipeline.runtime.raw_messages import ReceivedReading, raw_message
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.health import AcceptedSamples
+from fantwin.schemas.messages import Command, PushedSamples, Raw, StatedTacho
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.topics import most_samples
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
 STEP_SHOWN_NS = 60 * NS_PER_S  # how long health says that the host clock was set
 

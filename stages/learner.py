@@ -19,19 +19,19 @@ from functools import partial
 
 from pydantic import Field
 
-from pipeline.errors import UserError
-from pipeline.learning.fan_alarms import FanAlarms
-from pipeline.learning.healthy_history import HealthyHistory, recorded_raws
-from pipeline.learning.learning_process import Learning, LearningProcess
-from pipeline.learning.learning_schedule import LearningSchedule, Work
-from pipeline.learning.ordinary_operation import OrdinaryOperation
-from pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder, overlap
-from pipeline.recordings.dates import format_utc
-from pipeline.recordings.metadata import recording_metadata
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
-from schemas.enums import Action
-from schemas.messages import Message, NewTwin, Raw, Request, Score
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.fan_alarms import FanAlarms
+from fantwin.pipeline.learning.healthy_history import HealthyHistory, recorded_raws
+from fantwin.pipeline.learning.learning_process import Learning, LearningProcess
+from fantwin.pipeline.learning.learning_schedule import LearningSchedule, Work
+from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
+from fantwin.pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder, overlap
+from fantwin.pipeline.recordings.dates import format_utc
+from fantwin.pipeline.recordings.metadata import recording_metadata
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
+from fantwin.schemas.enums import Action
+from fantwin.schemas.messages import Message, NewTwin, Raw, Request, Score
+from fantwin.schemas.units import NS_PER_S
 
 LOOK_NS = NS_PER_S
 """how often the learner looks for what has changed"""

@@ -12,31 +12,31 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
-from pipeline.broker.config import MqttConfig
-from pipeline.broker.fan_states import FanStates, shown_alarm, topics_of
-from pipeline.broker.home_assistant import OFFLINE, ONLINE, HomeAssistant
-from pipeline.broker.json_text import json_text
-from pipeline.broker.link import BrokerLink, Link
-from pipeline.broker.outbox import Outbox, Outgoing
-from pipeline.broker.requests import Requests
-from pipeline.broker.topics import Topics, do_overlap
-from pipeline.broker.transition_queue import TransitionQueue
-from pipeline.devices.broker_client import connection_problems, new_client
-from pipeline.devices.mqtt_config import FAN
-from pipeline.devices.mqtt_config import MqttConfig as MqttSourceConfig
-from pipeline.errors import UserError
-from pipeline.extras import require
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.request_desk import RequestDesk
-from pipeline.presenting.shown import stages_json, transition_json
-from pipeline.presenting.site_core import SiteCore
-from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
-from pipeline.viewing.fleet import Fan
-from schemas.envelope import Envelope
-from schemas.messages import Alarm, Message
-from schemas.topics import ALL_TRAYS
-from schemas.units import NS_PER_S
+from fantwin.pipeline.broker.config import MqttConfig
+from fantwin.pipeline.broker.fan_states import FanStates, shown_alarm, topics_of
+from fantwin.pipeline.broker.home_assistant import OFFLINE, ONLINE, HomeAssistant
+from fantwin.pipeline.broker.json_text import json_text
+from fantwin.pipeline.broker.link import BrokerLink, Link
+from fantwin.pipeline.broker.outbox import Outbox, Outgoing
+from fantwin.pipeline.broker.requests import Requests
+from fantwin.pipeline.broker.topics import Topics, do_overlap
+from fantwin.pipeline.broker.transition_queue import TransitionQueue
+from fantwin.pipeline.devices.broker_client import connection_problems, new_client
+from fantwin.pipeline.devices.mqtt_config import FAN
+from fantwin.pipeline.devices.mqtt_config import MqttConfig as MqttSourceConfig
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.extras import require
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.presenting.request_desk import RequestDesk
+from fantwin.pipeline.presenting.shown import stages_json, transition_json
+from fantwin.pipeline.presenting.site_core import SiteCore
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Alarm, Message
+from fantwin.schemas.topics import ALL_TRAYS
+from fantwin.schemas.units import NS_PER_S
 
 HISTORY = "mqtt-alarms.sqlite"
 SETTLED_AFTER_NS = 2 * NS_PER_S

@@ -12,18 +12,18 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pipeline.config.models import TrayConfig
-from pipeline.notification.alertmanager import AlertSender
-from pipeline.notification.config import NotifierConfig
-from pipeline.notification.notifications import Changes, Notifications
-from pipeline.notification.outbox import Outbox
-from pipeline.notification.sending import Sender
-from pipeline.notification.targets import problems_of, sender_of
-from pipeline.notification.wording import Place
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
-from schemas.messages import Alarm, Message
-from schemas.topics import ALL_TRAYS
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.notification.alertmanager import AlertSender
+from fantwin.pipeline.notification.config import NotifierConfig
+from fantwin.pipeline.notification.notifications import Changes, Notifications
+from fantwin.pipeline.notification.outbox import Outbox
+from fantwin.pipeline.notification.sending import Sender
+from fantwin.pipeline.notification.targets import problems_of, sender_of
+from fantwin.pipeline.notification.wording import Place
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from fantwin.schemas.messages import Alarm, Message
+from fantwin.schemas.topics import ALL_TRAYS
+from fantwin.schemas.units import NS_PER_S
 
 OUTBOX = Path("notifier.sqlite")
 EXPIRY_PERIOD_NS = 60 * NS_PER_S

@@ -12,20 +12,20 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from functools import partial
 from pathlib import Path
 
-from pipeline.errors import refusals
-from pipeline.extras import missing_extra, require
-from pipeline.opcua.conditions import Condition, ConditionBook
-from pipeline.opcua.config import OpcuaConfig
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.request_desk import RequestDesk
-from pipeline.presenting.site_core import SiteCore
-from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import BuiltStage, Context, Stage
-from pipeline.viewing.fleet import Fan
-from schemas.enums import Transition
-from schemas.envelope import Envelope
-from schemas.messages import Alarm, Message
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import refusals
+from fantwin.pipeline.extras import missing_extra, require
+from fantwin.pipeline.opcua.conditions import Condition, ConditionBook
+from fantwin.pipeline.opcua.config import OpcuaConfig
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.presenting.request_desk import RequestDesk
+from fantwin.pipeline.presenting.site_core import SiteCore
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Alarm, Message
+from fantwin.schemas.units import NS_PER_S
 
 SILENCE_PERIOD_NS = NS_PER_S
 HISTORY = Path("opcua-alarms.sqlite")
@@ -107,10 +107,10 @@ class OpcuaCore(SiteCore):
 
 class _Running(Server):
     def __init__(self, context: Context, model: SiteModel, book: ConditionBook, desk: RequestDesk) -> None:
-        from pipeline.opcua.certificate import check_certificate, make_certificate  # noqa: PLC0415  an extra
-        from pipeline.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
-        from pipeline.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
-        from pipeline.presenting.users import Users  # noqa: PLC0415
+        from fantwin.pipeline.opcua.certificate import check_certificate, make_certificate  # noqa: PLC0415  an extra
+        from fantwin.pipeline.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
+        from fantwin.pipeline.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
+        from fantwin.pipeline.presenting.users import Users  # noqa: PLC0415
 
         config: OpcuaConfig = context.config
         if config.certificate and config.key:
@@ -165,8 +165,8 @@ def check(context: Context) -> list[str]:
     """Report a missing extra, a port that another program has taken, and files that cannot be read."""
     if problem := missing_extra("stage opcua", "outputs", "asyncua"):
         return [problem]
-    from pipeline.opcua.certificate import check_certificate, check_port  # noqa: PLC0415  the extra may not be installed
-    from pipeline.presenting.users import read_users  # noqa: PLC0415
+    from fantwin.pipeline.opcua.certificate import check_certificate, check_port  # noqa: PLC0415  the extra may not be installed
+    from fantwin.pipeline.presenting.users import read_users  # noqa: PLC0415
 
     config: OpcuaConfig = context.config
     attempts: list[Callable[[], object]] = []

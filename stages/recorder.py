@@ -18,28 +18,34 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 
-from pipeline.config.registry import RECORDER, STAGES
-from pipeline.recordings.clips.alarm_clips import AlarmClips, tracker_of
-from pipeline.recordings.clips.worker import ClipWorker
-from pipeline.recordings.disk import DiskError
-from pipeline.recordings.disk_room import DiskRoom
-from pipeline.recordings.held_messages import HeldMessages
-from pipeline.recordings.index import PartIndex
-from pipeline.recordings.interference import Interference
-from pipeline.recordings.metadata import recording_metadata
-from pipeline.recordings.open_part import OpenPart, PartsFolder
-from pipeline.recordings.parts import RecordingParts
-from pipeline.recordings.reading import LEFT_OUT_KEY, RecordingError
-from pipeline.recordings.recorded_healths import RecordedHealths
-from pipeline.recordings.recorder_config import CLIPS_SHARE, FLUSH_BYTES, FLUSH_S, RecorderConfig, recorded_topics
-from pipeline.recordings.sequence_ledger import SequenceLedger
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
-from schemas.envelope import Envelope
-from schemas.health import Health
-from schemas.messages import Message
-from schemas.streams import StreamId
-from schemas.topics import TOPICS, tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.registry import RECORDER, STAGES
+from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips, tracker_of
+from fantwin.pipeline.recordings.clips.worker import ClipWorker
+from fantwin.pipeline.recordings.disk import DiskError
+from fantwin.pipeline.recordings.disk_room import DiskRoom
+from fantwin.pipeline.recordings.held_messages import HeldMessages
+from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.interference import Interference
+from fantwin.pipeline.recordings.metadata import recording_metadata
+from fantwin.pipeline.recordings.open_part import OpenPart, PartsFolder
+from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.reading import LEFT_OUT_KEY, RecordingError
+from fantwin.pipeline.recordings.recorded_healths import RecordedHealths
+from fantwin.pipeline.recordings.recorder_config import (
+    CLIPS_SHARE,
+    FLUSH_BYTES,
+    FLUSH_S,
+    RecorderConfig,
+    recorded_topics,
+)
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Message
+from fantwin.schemas.streams import StreamId
+from fantwin.schemas.topics import TOPICS, tray_key
+from fantwin.schemas.units import NS_PER_S
 
 HELD_BYTES = 16 << 20
 """the most bytes of messages kept in memory while nothing can be recorded"""

@@ -31,7 +31,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from pipeline.devices.line_rate import (
+from fantwin.pipeline.devices.line_rate import (
     ENOUGH_SAMPLES,
     LONGEST_WAIT_US,
     MIN_SAMPLES,
@@ -44,11 +44,11 @@ from pipeline.devices.line_rate import (
     is_too_slow,
     leaves_gaps,
 )
-from pipeline.runtime.sample_grid import SampleGrid
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
-from schemas.messages import Grid, Raw, StatedTacho
-from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from schemas.units import NS_PER_S
+from fantwin.pipeline.runtime.sample_grid import SampleGrid
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
+from fantwin.schemas.messages import Grid, Raw, StatedTacho
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
+from fantwin.schemas.units import NS_PER_S
 
 FASTER = 2.0  # a line that sends so many times the samples of its grid has changed
 

@@ -21,23 +21,23 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, healthy_twin
-from pipeline.runtime.judged_share import JudgedShare
-from pipeline.runtime.learned_scorer import LearnedTwinScorer
-from pipeline.runtime.old_samples import OldSamples
-from pipeline.runtime.snapshot_store import Elsewhere, SnapshotStore
-from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError, never
-from pipeline.runtime.tray_scorer import TrayScorer
-from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
-from schemas.blocks import select
-from schemas.enums import Transition
-from schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
-from schemas.topics import ALL_TRAYS
-from schemas.units import NS_PER_S, SpeedUnit
-from scoring.alarms.alarm_text import AlarmText
-from scoring.alarms.unscored_monitor import UnscoredMonitor
-from scoring.model.decision import FORGETS_S
-from scoring.snapshot_times import with_times_moved
+from fantwin.pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, healthy_twin
+from fantwin.pipeline.runtime.judged_share import JudgedShare
+from fantwin.pipeline.runtime.learned_scorer import LearnedTwinScorer
+from fantwin.pipeline.runtime.old_samples import OldSamples
+from fantwin.pipeline.runtime.snapshot_store import Elsewhere, SnapshotStore
+from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError, never
+from fantwin.pipeline.runtime.tray_scorer import TrayScorer
+from fantwin.pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
+from fantwin.schemas.blocks import select
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
+from fantwin.schemas.topics import ALL_TRAYS
+from fantwin.schemas.units import NS_PER_S, SpeedUnit
+from fantwin.scoring.alarms.alarm_text import AlarmText
+from fantwin.scoring.alarms.unscored_monitor import UnscoredMonitor
+from fantwin.scoring.model.decision import FORGETS_S
+from fantwin.scoring.snapshot_times import with_times_moved
 
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
 SNAPSHOT_PERIOD_SAMPLES = 3000  # at least: at slow rates snapshots would be most of a recording

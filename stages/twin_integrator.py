@@ -34,15 +34,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.runtime.joint_tray_integrator import JointTrayIntegrator
-from pipeline.runtime.learned_integrator import LearnedTwinIntegrator
-from pipeline.runtime.old_samples import OldSamples
-from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError
-from pipeline.runtime.tray_integrator import TrayIntegrator, TwinIntegratorConfig
-from pipeline.runtime.twin_file import TwinFile, load_twin
-from schemas.blocks import select
-from schemas.messages import Grid, Message, ModelCard, NewTwin, Prediction
-from schemas.units import NS_PER_S
+from fantwin.pipeline.runtime.joint_tray_integrator import JointTrayIntegrator
+from fantwin.pipeline.runtime.learned_integrator import LearnedTwinIntegrator
+from fantwin.pipeline.runtime.old_samples import OldSamples
+from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError
+from fantwin.pipeline.runtime.tray_integrator import TrayIntegrator, TwinIntegratorConfig
+from fantwin.pipeline.runtime.twin_file import TwinFile, load_twin
+from fantwin.schemas.blocks import select
+from fantwin.schemas.messages import Grid, Message, ModelCard, NewTwin, Prediction
+from fantwin.schemas.units import NS_PER_S
 
 RATE_TOLERANCE = 0.01  # a card holds the measured rate
 

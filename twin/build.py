@@ -9,10 +9,10 @@ from typing import get_args
 
 import numpy as np
 
-from schemas.tacho import INSTANTANEOUS
-from schemas.twin_card import DataCard, TrainingCard, TwinCard
-from twin.errors import TwinError
-from twin.evaluation.accuracy import (
+from fantwin.schemas.tacho import INSTANTANEOUS
+from fantwin.schemas.twin_card import DataCard, TrainingCard, TwinCard
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import (
     Evaluation,
     FigureSums,
     UnseenStd,
@@ -21,24 +21,24 @@ from twin.evaluation.accuracy import (
     free_run_residuals,
     sums_of_model,
 )
-from twin.export.fan_rows import drive_of_fans, fan_rows, measured_as_in_card
-from twin.export.onnx_twin import OnnxTwin
-from twin.finishing import TrainedTwin, finish_twin, unseen_std_of
-from twin.fitting.drive_fit import find_drive
-from twin.fitting.identification import identify
-from twin.fitting.model_fits import FitRequest, Trainer
-from twin.fitting.model_uncertainty import model_uncertainty
-from twin.fitting.reference_choice import behind_a_drive, identify_at_reference
-from twin.fitting.standstill import find_standstill
-from twin.fitting.training import MOST_NETWORKS, Physics
-from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
-from twin.models.model import Model
-from twin.models.network_ode import NetworkOde
-from twin.models.physics import PARAMETER_NAMES
-from twin.networks import ForEachNetwork, one_after_another
-from twin.progress import Progress, unreported, within
-from twin.reference import at_reference
-from twin.runs import Array, Run, common_fans, common_tacho
+from fantwin.twin.export.fan_rows import drive_of_fans, fan_rows, measured_as_in_card
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.finishing import TrainedTwin, finish_twin, unseen_std_of
+from fantwin.twin.fitting.drive_fit import find_drive
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.fitting.model_fits import FitRequest, Trainer
+from fantwin.twin.fitting.model_uncertainty import model_uncertainty
+from fantwin.twin.fitting.reference_choice import behind_a_drive, identify_at_reference
+from fantwin.twin.fitting.standstill import find_standstill
+from fantwin.twin.fitting.training import MOST_NETWORKS, Physics
+from fantwin.twin.kinds import BOTH_INPUTS, ModelKind, find_kind
+from fantwin.twin.models.model import Model
+from fantwin.twin.models.network_ode import NetworkOde
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.networks import ForEachNetwork, one_after_another
+from fantwin.twin.progress import Progress, unreported, within
+from fantwin.twin.reference import at_reference
+from fantwin.twin.runs import Array, Run, common_fans, common_tacho
 
 
 def train_twin(

@@ -6,16 +6,16 @@ from typing import Literal
 
 import numpy as np
 
-from schemas.twin_card import DataCard
-from twin.build import evaluate, train_twin
-from twin.errors import TwinError
-from twin.evaluation.accuracy import Evaluation, evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
-from twin.export.fan_rows import measured_as_in_card
-from twin.finishing import TrainedTwin
-from twin.kinds import KINDS, Variant
-from twin.models.physics import LAG, PARAMETER_NAMES
-from twin.progress import Progress, unreported
-from twin.runs import Run
+from fantwin.schemas.twin_card import DataCard
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import Evaluation, evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
+from fantwin.twin.export.fan_rows import measured_as_in_card
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.kinds import KINDS, Variant
+from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
+from fantwin.twin.progress import Progress, unreported
+from fantwin.twin.runs import Run
 
 Source = Literal["test", "held-out", "training"]
 """Which data a figure is of. test: not used in training. held-out: not fitted, but used to stop training and for

@@ -9,11 +9,11 @@ from typing import Literal
 
 import numpy as np
 
-from schemas.model_uncertainty import ModelUncertainty
-from schemas.reference_conditions import ReferenceConditions
-from schemas.standstill import Standstill
-from schemas.tacho import Tacho
-from schemas.twin_card import (
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.schemas.reference_conditions import ReferenceConditions
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.twin_card import (
     BalanceCard,
     DataCard,
     DriveCard,
@@ -23,8 +23,8 @@ from schemas.twin_card import (
     TwinCard,
     ValidationCard,
 )
-from twin.errors import TwinError
-from twin.evaluation.accuracy import (
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import (
     Evaluation,
     Figures,
     UnseenStd,
@@ -33,18 +33,18 @@ from twin.evaluation.accuracy import (
     residuals_of_readings,
     sums_of_readings,
 )
-from twin.evaluation.reading_range import reading_sigma_rad_s
-from twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
-from twin.export.onnx_export import export_onnx
-from twin.fitting.balance import FILTER_RATE_PER_S
-from twin.fitting.balance_fit import BalanceFit, fit_balance
-from twin.fitting.drive_fit import FoundDrive
-from twin.fitting.identification import Identification
-from twin.models.drive import DRIVE_PARAMETERS
-from twin.models.model import Model
-from twin.models.physics import PARAMETER_NAMES
-from twin.progress import Progress
-from twin.runs import Array, Run
+from fantwin.twin.evaluation.reading_range import reading_sigma_rad_s
+from fantwin.twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
+from fantwin.twin.export.onnx_export import export_onnx
+from fantwin.twin.fitting.balance import FILTER_RATE_PER_S
+from fantwin.twin.fitting.balance_fit import BalanceFit, fit_balance
+from fantwin.twin.fitting.drive_fit import FoundDrive
+from fantwin.twin.fitting.identification import Identification
+from fantwin.twin.models.drive import DRIVE_PARAMETERS
+from fantwin.twin.models.model import Model
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.progress import Progress
+from fantwin.twin.runs import Array, Run
 
 
 @dataclass(frozen=True, eq=False)

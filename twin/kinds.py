@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from twin.errors import TwinError
-from twin.fitting.model_fits import FitRequest, FittedModel, Trainer, fit_narx, fit_network_ode, fit_physical
-from twin.models import hybrid, neural_ode
-from twin.models.hybrid import Hybrid
-from twin.models.narx import Narx
-from twin.models.neural_ode import NeuralOde
-from twin.models.physical import PhysicalModel
+from fantwin.twin.errors import TwinError
+from fantwin.twin.fitting.model_fits import FitRequest, FittedModel, Trainer, fit_narx, fit_network_ode, fit_physical
+from fantwin.twin.models import hybrid, neural_ode
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.narx import Narx
+from fantwin.twin.models.neural_ode import NeuralOde
+from fantwin.twin.models.physical import PhysicalModel
 
 BOTH_INPUTS = ("speed", "command")
 

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from schemas.tacho import Tacho
-from twin.runs import Array, Run
+from fantwin.schemas.tacho import Tacho
+from fantwin.twin.runs import Array, Run
 
 
 class Measurement:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar
 
-from twin.progress import Progress, within
+from fantwin.twin.progress import Progress, within
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

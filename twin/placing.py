@@ -7,21 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.twin_card import DataCard, TrainingCard, TwinCard
-from twin.errors import TwinError
-from twin.export.onnx_twin import OnnxTwin
-from twin.export.stored_model import stored_hybrid
-from twin.finishing import TrainedTwin, finish_twin
-from twin.fitting.drive_fit import FoundDrive
-from twin.fitting.placed_uncertainty import placed_uncertainty
-from twin.fitting.placement import place_fans
-from twin.fitting.standstill import find_standstill
-from twin.models.drive import DRIVE_PARAMETERS
-from twin.models.hybrid import Hybrid
-from twin.models.physics import PARAMETER_NAMES
-from twin.progress import Progress, unreported
-from twin.reference import at_reference
-from twin.runs import Array, Run, common_fans, common_tacho
+from fantwin.schemas.twin_card import DataCard, TrainingCard, TwinCard
+from fantwin.twin.errors import TwinError
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.export.stored_model import stored_hybrid
+from fantwin.twin.finishing import TrainedTwin, finish_twin
+from fantwin.twin.fitting.drive_fit import FoundDrive
+from fantwin.twin.fitting.placed_uncertainty import placed_uncertainty
+from fantwin.twin.fitting.placement import place_fans
+from fantwin.twin.fitting.standstill import find_standstill
+from fantwin.twin.models.drive import DRIVE_PARAMETERS
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.progress import Progress, unreported
+from fantwin.twin.reference import at_reference
+from fantwin.twin.runs import Array, Run, common_fans, common_tacho
 
 
 def place_twin(

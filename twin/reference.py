@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.reference_conditions import ConditionRatios, ReferenceConditions
-from twin.errors import TwinError
-from twin.runs import Array, Run
+from fantwin.schemas.reference_conditions import ConditionRatios, ReferenceConditions
+from fantwin.twin.errors import TwinError
+from fantwin.twin.runs import Array, Run
 
 LEAST_KNOWN = 0.95
 """a quantity is used if it is known in so large a share of the samples of each run and fan"""

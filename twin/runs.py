@@ -11,8 +11,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from twin.errors import TwinError
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
+from fantwin.twin.errors import TwinError
 
 Array = NDArray[np.float64]
 

@@ -46,8 +46,8 @@ from bench.detection.rack_tables import beside, found_faults, hours_in_faults
 from bench.detection.racks import FAULT_KINDS, events, run_of
 from bench.detection.simulated import FANS_SEED, Fleet, stage, trained_fleet, tray_number
 from bench.detection.simulated_tables import Faulty, Sizes, is_large_step, kept_bins
-from schemas.messages import Prediction
-from simulation.plant import tray_of_fans
+from fantwin.schemas.messages import Prediction
+from fantwin.simulation.plant import tray_of_fans
 
 Progress = Callable[[str], None]
 NO_FACTS = Facts(float("nan"), float("nan"))

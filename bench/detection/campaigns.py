@@ -12,7 +12,7 @@ from bench.detection.methods import Calibration, Detector, Log, Method
 from bench.detection.metrics import RaisedAlarm
 from bench.detection.plant import RATE_HZ, Plant
 from bench.detection.simulated import Fleet, PredictionStages, run_name
-from schemas.messages import Array, Prediction
+from fantwin.schemas.messages import Array, Prediction
 
 Progress = Callable[[str], None]
 KEPT_ROWS = 8

@@ -24,7 +24,7 @@ from bench.detection.rack_limits import reports_of
 from bench.detection.rack_recordings import HEALTHY, LEARNING, RackData
 from bench.detection.rack_scoring import DECLARED_PER_DAY, Judged, judged, twin_of
 from bench.printing import JsonOption, progress, show
-from schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S
 
 WITHIN_S = (10.0, 60.0, 300.0)
 """times since the start until which alarms are counted"""

@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 from bench.detection.methods import Method
 from bench.detection.residuals import Moving, balance_sigmas, speed_sigmas
-from schemas.messages import Array, Prediction
+from fantwin.schemas.messages import Array, Prediction
 
 PUBLISHED_BAND = 2.0
 GAUSSIAN_WINDOW_S = 1.0

@@ -18,7 +18,7 @@ from bench.detection.metrics import Event
 from bench.detection.plant import RATE_HZ, START_NS, TRAY_FANS, Faults, Plant, tiled
 from bench.detection.severities import EFFECTS_SIGMA, KINDS, Kind
 from bench.detection.simulated import Fleet, run_name
-from schemas.messages import Array
+from fantwin.schemas.messages import Array
 
 ONSET_WITHIN_S = 30.0
 LASTS_S = 90.0

@@ -50,9 +50,9 @@ from bench.detection.racks import (
     racks,
     run_of,
 )
-from schemas.messages import Array, Raw
-from schemas.units import NS_PER_S
-from simulation.faults import Fault
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.units import NS_PER_S
+from fantwin.simulation.faults import Fault
 
 QUEUED_BLOCKS = 2000
 """that wait for a rack at most: of twenty fans, 0.3 GB"""

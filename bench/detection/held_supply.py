@@ -16,16 +16,16 @@ from dataclasses import replace
 import numpy as np
 
 from bench.detection.tray_run import run_of
-from schemas.reference_conditions import ReferenceConditions
-from schemas.tacho import Tacho
-from simulation.surroundings import Surroundings
-from simulation.tacho import TachoSettings
-from simulation.tray import TraySettings
-from twin.build import evaluate, train_twin
-from twin.finishing import TrainedTwin
-from twin.fitting.identification import identify
-from twin.reference import at_reference, reference_of
-from twin.runs import Run
+from fantwin.schemas.reference_conditions import ReferenceConditions
+from fantwin.schemas.tacho import Tacho
+from fantwin.simulation.surroundings import Surroundings
+from fantwin.simulation.tacho import TachoSettings
+from fantwin.simulation.tray import TraySettings
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.reference import at_reference, reference_of
+from fantwin.twin.runs import Run
 
 FANS, RATE_HZ, FANS_SEED = 3, 10.0, 7
 TACHO = Tacho(kind="count", window_s=1.0, pulses=2)

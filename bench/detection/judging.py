@@ -16,10 +16,10 @@ import numpy as np
 
 from bench.detection.ours import HealthyBins
 from bench.detection.rack_scoring import Episode, episodes
-from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.runtime.stage import Core
-from schemas.messages import Alarm, Array, Prediction, Score
-from schemas.units import NS_PER_S
+from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.pipeline.runtime.stage import Core
+from fantwin.schemas.messages import Alarm, Array, Prediction, Score
+from fantwin.schemas.units import NS_PER_S
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.detection.methods import Method
 from bench.detection.residuals import Moving, balance_sigmas, speed_sigmas
-from schemas.messages import Array, Prediction
+from fantwin.schemas.messages import Array, Prediction
 
 WINDOW_S = 1.0
 ROWS = 16

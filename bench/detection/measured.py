@@ -37,9 +37,9 @@ from bench.detection.metrics import (
     vus_pr,
 )
 from bench.detection.ours import NAME
-from pipeline.cli.main import main as fantwin
-from pipeline.recordings.reading import read_recording
-from schemas.messages import Array, Prediction, Score
+from fantwin.pipeline.cli.main import main as fantwin
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.messages import Array, Prediction, Score
 
 FOLDER = Path(os.environ.get("FANTWIN_DATA", Path(__file__).parents[3] / "shared" / "data")) / "rosa"
 COLUMNS = ("--time", "Time:ms", "--command", "Shaft Control Effort", "--speed", "Actual Speed:rpm")

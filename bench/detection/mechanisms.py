@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from scoring.model.faults import BEFORE_GROWTH
-from scoring.model.healthy import COUNT, FALL, LATE, RISE, SLOW
-from scoring.model.priors import Priors
+from fantwin.scoring.model.faults import BEFORE_GROWTH
+from fantwin.scoring.model.healthy import COUNT, FALL, LATE, RISE, SLOW
+from fantwin.scoring.model.priors import Priors
 
 Change = Callable[[Any], Any]
 NONE = 1e-9
@@ -33,7 +33,7 @@ def _with_priors(**of: float) -> tuple[str, Change]:
     def change(construct: Any) -> Any:
         return lambda model, fans, priors, *times: construct(model, fans, replace(priors, **of), *times)
 
-    return "scoring.model.healthy:HealthyFans.__init__", change
+    return "fantwin.scoring.model.healthy:HealthyFans.__init__", change
 
 
 def _without_balance(inputs: Any) -> Any:
@@ -88,12 +88,12 @@ MECHANISMS: Sequence[Mechanism] = (
     Mechanism(
         "torque-balance",
         "the torque balance in the likelihood: only the speed is compared",
-        (("scoring.model.operation:Operation.inputs", _without_balance),),
+        (("fantwin.scoring.model.operation:Operation.inputs", _without_balance),),
     ),
     Mechanism(
         "counting-error",
         "the counting error as a state: what a count misses is noise, and the next count does not have it",
-        (("scoring.model.healthy:HealthyFans.innovation", _white_counts),),
+        (("fantwin.scoring.model.healthy:HealthyFans.innovation", _white_counts),),
     ),
     Mechanism(
         "local-error",
@@ -105,22 +105,22 @@ MECHANISMS: Sequence[Mechanism] = (
     Mechanism(
         "lags",
         "errors of the time constants, and how late the tacho is",
-        (("scoring.model.healthy:_prior", _without_lags), _with_priors(lag_s=NONE)),
+        (("fantwin.scoring.model.healthy:_prior", _without_lags), _with_priors(lag_s=NONE)),
     ),
     Mechanism(
         "giving-back",
         "giving back at an alarm what the filter has taken of the fault for the fan's own",
-        (("scoring.model.decision:Decision._raise", _nothing_given_back),),
+        (("fantwin.scoring.model.decision:Decision._raise", _nothing_given_back),),
     ),
     Mechanism(
         "agreement",
         "far readings wait until others agree; one that is far from all others of its bin still does not count",
-        (("scoring.model.decision:Decision._counts", _all_but_outliers),),
+        (("fantwin.scoring.model.decision:Decision._counts", _all_but_outliers),),
     ),
-    Mechanism("growth", "faults that grow", (("scoring.model.decision:FAULTS", _without_growth),)),
+    Mechanism("growth", "faults that grow", (("fantwin.scoring.model.decision:FAULTS", _without_growth),)),
     Mechanism(
         "learned-priors",
         "what healthy runs say of the priors: those of a population; the limit is still checked",
-        (("pipeline.replay.offline.calibration_of_twin:learned_priors", lambda _: lambda _runs: Priors()),),
+        (("fantwin.pipeline.replay.offline.calibration_of_twin:learned_priors", lambda _: lambda _runs: Priors()),),
     ),
 )

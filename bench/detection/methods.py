@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from bench.detection.metrics import RaisedAlarm
-from schemas.messages import Array, Prediction
+from fantwin.schemas.messages import Array, Prediction
 
 OFF_DELAY_S = 1.0
 """an alarm of a limit clears after the score has been below the limit for this time"""

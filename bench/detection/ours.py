@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from bench.detection.methods import AlarmChange, MethodOutput
-from pipeline.replay.offline.calibration_of_twin import calibrated
-from pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
-from pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
-from pipeline.runtime.modelled_fans import modelled_fans
-from pipeline.runtime.stage import Core
-from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.messages import Alarm, Array, Prediction, Score
-from scoring.calibration.calibration import Calibration
-from scoring.model.bins import Bin, Bins, bin_ns_of
-from twin.export.card_entries import with_card_entries
+from fantwin.pipeline.replay.offline.calibration_of_twin import calibrated
+from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
+from fantwin.pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
+from fantwin.pipeline.runtime.modelled_fans import modelled_fans
+from fantwin.pipeline.runtime.stage import Core
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.schemas.messages import Alarm, Array, Prediction, Score
+from fantwin.scoring.calibration.calibration import Calibration
+from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
+from fantwin.twin.export.card_entries import with_card_entries
 
 NAME = "fantwin"
 ROOM_BYTES = 1 << 40

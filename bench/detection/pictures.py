@@ -23,20 +23,20 @@ from matplotlib.figure import Figure
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.detection.plant import START_NS
-from pipeline.runtime.healthy_twin import ScorerConfig, known_of
-from pipeline.runtime.tray_integrator import TrayIntegrator, TwinIntegratorConfig
-from pipeline.runtime.tray_scorer import TrayScorer
-from pipeline.runtime.tray_twin import load_tray_twin
-from pipeline.runtime.twin_file import TwinFile
-from pipeline.viewing.band_plot import BESIDE, FAULT, MEASURED, OUTSIDE, TWIN
-from schemas.enums import Transition
-from schemas.messages import Array, Grid
-from schemas.units import NS_PER_S, RAD_S_PER_UNIT
-from scoring.alarms.alarm_text import AlarmText
-from scoring.diagnosis.shown_causes import MIN_PROBABILITY, short_name
-from scoring.model.healthy import FAULT as FAULT_STATE
-from simulation.faults import Fault
-from simulation.tray import SimulatedTray, TraySettings
+from fantwin.pipeline.runtime.healthy_twin import ScorerConfig, known_of
+from fantwin.pipeline.runtime.tray_integrator import TrayIntegrator, TwinIntegratorConfig
+from fantwin.pipeline.runtime.tray_scorer import TrayScorer
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.pipeline.viewing.band_plot import BESIDE, FAULT, MEASURED, OUTSIDE, TWIN
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Array, Grid
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
+from fantwin.scoring.alarms.alarm_text import AlarmText
+from fantwin.scoring.diagnosis.shown_causes import MIN_PROBABILITY, short_name
+from fantwin.scoring.model.healthy import FAULT as FAULT_STATE
+from fantwin.simulation.faults import Fault
+from fantwin.simulation.tray import SimulatedTray, TraySettings
 
 DEMO_TWIN = Path(__file__).parents[2] / "pipeline" / "demo" / "twin.onnx"
 FAN, FANS, SEED = 2, 8, 11

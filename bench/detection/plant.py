@@ -15,10 +15,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from bench.detection.knobs import Knobs
-from schemas.messages import Array, Raw
-from simulation.plant import Disturbance, FanParameters, advance, at_rest
-from simulation.tacho import NoisyTacho
-from simulation.tray import LOOP_GAIN, LOOP_INTEGRAL_GAIN_PER_S
+from fantwin.schemas.messages import Array, Raw
+from fantwin.simulation.plant import Disturbance, FanParameters, advance, at_rest
+from fantwin.simulation.tacho import NoisyTacho
+from fantwin.simulation.tray import LOOP_GAIN, LOOP_INTEGRAL_GAIN_PER_S
 
 RATE_HZ = 100.0
 STEP_NS = 10_000_000

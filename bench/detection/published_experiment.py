@@ -73,7 +73,7 @@ def _rows(name: str, alarms: list[dict[str, Any]], start_ns: int) -> list[dict[s
 
 def _fantwin(*words: object, accept: tuple[int, ...] = (0,)) -> str:
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "pipeline", *map(str, words)], capture_output=True, text=True, check=False
+        [sys.executable, "-P", "-m", "fantwin", *map(str, words)], capture_output=True, text=True, check=False
     )
     if done.returncode not in accept:
         raise SystemExit(f"fantwin {' '.join(map(str, words))}: {done.stderr.strip()}")

@@ -13,9 +13,9 @@ from dataclasses import fields, replace
 import numpy as np
 
 from bench.detection.racks import BLOCK, DAY_S, Ageing, Racks, RackSimulation, lines
-from schemas.messages import Array, Raw
-from simulation.faults import Fault
-from simulation.four_pin import FourPinParameters
+from fantwin.schemas.messages import Array, Raw
+from fantwin.simulation.faults import Fault
+from fantwin.simulation.four_pin import FourPinParameters
 
 WARM_UP_S = 60.0
 """longer than the fans need to follow their commands, and their tachos to count"""

@@ -21,11 +21,11 @@ from scipy.stats import norm
 
 from bench.detection.metrics import Event
 from bench.detection.racks import DAY_S, MISSING_READINGS, SIZES, TACHOS
-from pipeline.recordings.reading import read_recording
-from schemas.messages import Array, Raw
-from schemas.tacho import Tacho
-from schemas.units import NS_PER_S
-from simulation.four_pin import FourPinParameters
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.units import NS_PER_S
+from fantwin.simulation.four_pin import FourPinParameters
 
 WANDER = float(FourPinParameters().wander)
 MOVED = 0.1

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from bench.detection.plant import START_NS
 from bench.detection.racks import DAY_S, TACHOS, Racks, fault_schedule, racks, reports, run_of
-from pipeline.recordings.reading import TACHO_KEY
-from pipeline.recordings.writing import RecordingWriter
-from schemas.header import Header
-from schemas.tacho import tachos_to_json
-from schemas.topics import tray_key
-from simulation.faults import Fault
+from fantwin.pipeline.recordings.reading import TACHO_KEY
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.header import Header
+from fantwin.schemas.tacho import tachos_to_json
+from fantwin.schemas.topics import tray_key
+from fantwin.simulation.faults import Fault
 
 SITE, TRAY, PRODUCER = "bench", "rack", "acquisition"
 METADATA = {

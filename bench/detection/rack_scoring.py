@@ -21,11 +21,11 @@ from bench.detection.competitors import plain_methods
 from bench.detection.methods import Log, Method
 from bench.detection.metrics import RaisedAlarm
 from bench.detection.rack_recordings import RackData
-from pipeline.cli.twins.calibrate import calibrate
-from pipeline.cli.twins.train import train
-from pipeline.replay.offline.replay_input import open_replay_input
-from schemas.enums import InvalidReason
-from schemas.messages import Alarm, Message, Prediction, Score
+from fantwin.pipeline.cli.twins.calibrate import calibrate
+from fantwin.pipeline.cli.twins.train import train
+from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Alarm, Message, Prediction, Score
 
 CANNOT_TELL = "cannot_tell"
 DECLARED_PER_DAY = 1.0

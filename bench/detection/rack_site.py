@@ -21,21 +21,21 @@ from bench.detection.plant import START_NS
 from bench.detection.rack_scoring import Episode, episodes
 from bench.detection.racks import DAY_S, RACK_FANS, TACHOS
 from bench.stage_context import stage_context
-from pipeline.cli.twins.next_version import make_next_version
-from pipeline.config.loading import parse_config
-from pipeline.config.models import Config
-from pipeline.errors import UserError
-from pipeline.learning.healthy_history import HealthyHistory
-from pipeline.learning.ordinary_operation import OrdinaryOperation
-from pipeline.learning.versions import TwinVersions, Version, learning_folder
-from pipeline.recordings.metadata import recording_metadata
-from pipeline.runtime.stage import Core, load_stage
-from schemas.blocks import select
-from schemas.enums import Action
-from schemas.header import Header
-from schemas.messages import Alarm, Raw, Request, Score
-from schemas.units import NS_PER_S
-from stages.learner import LearnerCore
+from fantwin.pipeline.cli.twins.next_version import make_next_version
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.healthy_history import HealthyHistory
+from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
+from fantwin.pipeline.learning.versions import TwinVersions, Version, learning_folder
+from fantwin.pipeline.recordings.metadata import recording_metadata
+from fantwin.pipeline.runtime.stage import Core, load_stage
+from fantwin.schemas.blocks import select
+from fantwin.schemas.enums import Action
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Raw, Request, Score
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.learner import LearnerCore
 
 NOTED_AFTER_D = 0.1
 """so many days after a change that they made themselves, operators commission the fans again"""

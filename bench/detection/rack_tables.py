@@ -16,8 +16,8 @@ from bench.detection.rack_limits import Facts, facts_of_rack
 from bench.detection.rack_recordings import FAULTY, HEALTHY, RackData
 from bench.detection.rack_scoring import DECLARED_PER_DAY, Episode, Judged
 from bench.detection.racks import FAULT_KINDS, events, run_of
-from schemas.units import NS_PER_S
-from simulation.faults import CLOG_S
+from fantwin.schemas.units import NS_PER_S
+from fantwin.simulation.faults import CLOG_S
 
 AFTER_S = 1800.0
 """an alarm of a fan within this time after its fault is one of the fault's end, and not false"""

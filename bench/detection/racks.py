@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 
 from bench.detection.metrics import Event
 from bench.detection.plant import START_NS
-from pipeline.cli.watch.excitation import LEVELS, SHORT_LEVELS, levels_of
-from schemas.messages import Array, Raw
-from schemas.tacho import Tacho
-from schemas.units import NS_PER_S
-from simulation.faults import CLOG_S, Fault, four_pin_damage
-from simulation.four_pin import FourPinFans, FourPinParameters, four_pin_tray
-from simulation.tacho import CountingTacho
-from simulation.thermostat import Thermostat
+from fantwin.pipeline.cli.watch.excitation import LEVELS, SHORT_LEVELS, levels_of
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.units import NS_PER_S
+from fantwin.simulation.faults import CLOG_S, Fault, four_pin_damage
+from fantwin.simulation.four_pin import FourPinFans, FourPinParameters, four_pin_tray
+from fantwin.simulation.tacho import CountingTacho
+from fantwin.simulation.thermostat import Thermostat
 
 TACHOS = tuple(Tacho(kind="count", window_s=window_s) for window_s in (1.0, 1.0, 0.5, 0.5))
 """of the fans of a rack"""

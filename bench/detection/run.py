@@ -36,8 +36,8 @@ from bench.detection.simulated_tables import (
 )
 from bench.detection.without import LIST, UnknownMechanismError, list_mechanisms, mechanism, without
 from bench.printing import JsonOption, progress, show
-from pipeline.errors import UserError
-from scoring.calibration.alarm_rate import daily_interval
+from fantwin.pipeline.errors import UserError
+from fantwin.scoring.calibration.alarm_rate import daily_interval
 
 
 def main(

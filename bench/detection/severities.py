@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.messages import Array
-from simulation.plant import FanParameters, drive
+from fantwin.schemas.messages import Array
+from fantwin.simulation.plant import FanParameters, drive
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ import numpy as np
 
 from bench.detection.knobs import BY_HAND, Knobs
 from bench.detection.plant import RATE_HZ, START_NS, TRAY_FANS, Plant
-from pipeline.config.loading import parse_config
-from pipeline.runtime.stage import Context, Core, load_stage
-from schemas.messages import Array, Grid, Prediction, Raw
-from simulation.plant import FanParameters, tray_of_fans
-from twin.build import train_twin
-from twin.runs import Run
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.runtime.stage import Context, Core, load_stage
+from fantwin.schemas.messages import Array, Grid, Prediction, Raw
+from fantwin.simulation.plant import FanParameters, tray_of_fans
+from fantwin.twin.build import train_twin
+from fantwin.twin.runs import Run
 
 FANS_SEED = 7
 TRAINING_S = 120.0

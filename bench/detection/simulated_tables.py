@@ -28,8 +28,8 @@ from bench.detection.ours import NAME, HealthyBins, Scorer
 from bench.detection.plant import RATE_HZ
 from bench.detection.severities import KINDS
 from bench.detection.simulated import Fleet, stage, trained_fleet, tray_number
-from schemas.messages import Prediction
-from scoring.calibration.calibration import Calibration as TwinCalibration
+from fantwin.schemas.messages import Prediction
+from fantwin.scoring.calibration.calibration import Calibration as TwinCalibration
 
 FITTING_S = 300.0
 LONGEST_BUFFER_S = 2.0

@@ -23,21 +23,21 @@ from typing import Any
 import numpy as np
 
 from bench.detection.tray_run import run_of
-from pipeline.config.loading import parse_config
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.runtime.building import build_parts
-from pipeline.runtime.stage import Context, Core, load_stage
-from schemas.enums import Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Grid, Prediction, Raw
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
-from simulation.faults import Fault
-from simulation.surroundings import Measured, Surroundings
-from simulation.tacho import NoisyTacho, TachoSettings
-from simulation.tray import TraySettings
-from twin.build import evaluate, train_twin
-from twin.runs import Run
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.runtime.building import build_parts
+from fantwin.pipeline.runtime.stage import Context, Core, load_stage
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Grid, Prediction, Raw
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.simulation.faults import Fault
+from fantwin.simulation.surroundings import Measured, Surroundings
+from fantwin.simulation.tacho import NoisyTacho, TachoSettings
+from fantwin.simulation.tray import TraySettings
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.runs import Run
 
 FANS, RATE_HZ, NOISE_RAD_S = 3, 50.0, 4.0
 EPOCH_NS = 1_700_000_000 * NS_PER_S
@@ -106,7 +106,7 @@ def calibrated(twin: Path, healthy: Sequence[Run]) -> Path:
                 writer.add_message(tray_key("bench", "tray", "raw"), raw, int(raw.host_receive_t_ns[-1]))
     output = twin.with_name(f"calibrated-{twin.name}")
     options = ["--false-alarms-per-day", str(PER_DAY), "--extrapolate", "-o", str(output)]
-    words = ["-m", "pipeline", "calibrate", str(twin), *map(str, recordings), *options]
+    words = ["-m", "fantwin", "calibrate", str(twin), *map(str, recordings), *options]
     done = subprocess.run([sys.executable, *words], check=False, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(done.stderr)

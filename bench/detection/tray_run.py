@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from simulation.tray import SimulatedTray, TraySettings
-from twin.runs import Run
+from fantwin.simulation.tray import SimulatedTray, TraySettings
+from fantwin.twin.runs import Run
 
 
 def run_of(settings: TraySettings) -> Run:

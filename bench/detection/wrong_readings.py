@@ -28,12 +28,12 @@ from bench.detection.rack_limits import reports_of
 from bench.detection.rack_recordings import HEALTHY, METADATA, PRODUCER, SITE, TRAY, RackData
 from bench.detection.rack_scoring import DECLARED_PER_DAY, Episode, judged, twin_of
 from bench.printing import JsonOption, progress, show
-from pipeline.recordings.writing import RecordingWriter
-from schemas.blocks import select
-from schemas.header import Header
-from schemas.messages import Array, Raw
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.blocks import select
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 
 LEARNING, TEST_S = "15 minutes", 6 * 3600.0
 RATES_HZ = (1.0, 2.0, 10.0, 100.0)

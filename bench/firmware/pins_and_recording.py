@@ -11,10 +11,10 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from pipeline.recordings.reading import read_recording
-from schemas.enums import Transition
-from schemas.messages import Alarm, Prediction, Raw
-from schemas.units import NS_PER_S, RAD_S_PER_UNIT
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm, Prediction, Raw
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 from tests.support.fan_board import FANS
 from tests.support.pin_trace import read_pin_trace
 

@@ -14,19 +14,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.recordings.order import in_order
-from pipeline.replay.offline.alarm_episodes import Episode, episodes
-from pipeline.replay.offline.offline_pipeline import OfflinePipeline
-from pipeline.replay.offline.plan import undisturbed_plan
-from pipeline.replay.offline.raw_blocks import RawBlocks
-from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
-from schemas.codec import decode
-from schemas.enums import Transition
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Alarm, Message, Raw, Score
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.order import in_order
+from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
+from fantwin.pipeline.replay.offline.offline_pipeline import OfflinePipeline
+from fantwin.pipeline.replay.offline.plan import undisturbed_plan
+from fantwin.pipeline.replay.offline.raw_blocks import RawBlocks
+from fantwin.pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
+from fantwin.schemas.codec import decode
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Message, Raw, Score
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 
 RECORDS_SCORES = '[recorder]\ntopics = ["raw", "score"]\n'
 """section of a configuration: what an outcome is read from"""

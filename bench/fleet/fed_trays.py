@@ -15,17 +15,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.bus.publisher import Publisher
-from pipeline.bus.session import Bus
-from schemas.codec import decode, encode, type_name
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Output
-from schemas.messages import Raw, Score
-from schemas.topics import ALL_TRAYS, BY_NAME, health_key, tray_key
-from schemas.units import NS_PER_S
-from simulation.faults import Fault
-from simulation.tray import SimulatedTray, TraySample, TraySettings
+from fantwin.pipeline.bus.publisher import Publisher
+from fantwin.pipeline.bus.session import Bus
+from fantwin.schemas.codec import decode, encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Output
+from fantwin.schemas.messages import Raw, Score
+from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, health_key, tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.simulation.faults import Fault
+from fantwin.simulation.tray import SimulatedTray, TraySample, TraySettings
 
 SITE, PRODUCER, FANS, RATE_HZ = "fleet", "feed-1", 8, 100
 FAULT_S, PERIOD_S = 6.0, 10.0

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.detection.plant import START_NS
-from pipeline.config.models import TrayConfig
-from pipeline.viewing.fleet import Fan
-from schemas.enums import FanState, Severity, Statistic, Transition
-from schemas.envelope import Envelope
-from schemas.fields import columns
-from schemas.header import Header, InputPosition
-from schemas.messages import Alarm, Array, Score
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.enums import FanState, Severity, Statistic, Transition
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fields import columns
+from fantwin.schemas.header import Header, InputPosition
+from fantwin.schemas.messages import Alarm, Array, Score
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 
 SITE = "hall"
 SIGMA_RAD_S = 2.0

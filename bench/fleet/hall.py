@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.training.published_fan import NOISE_RAD_S, RATE_HZ, rough_fans
-from schemas.header import Header
-from schemas.messages import Array, Raw
-from schemas.units import NS_PER_S
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.units import NS_PER_S
 
 SITE, PRODUCER = "fleet", "feed-1"
 PERIOD_S = 60.0

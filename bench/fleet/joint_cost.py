@@ -23,11 +23,11 @@ from bench.fleet.stage_cost import SITE, calibrated_twin
 from bench.printing import JsonOption, progress, show
 from bench.stage_context import stage_context
 from bench.training.published_fan import RATE_HZ
-from pipeline.config.loading import parse_config
-from pipeline.runtime.building import build_parts
-from pipeline.runtime.joint_step import step_together
-from pipeline.runtime.stage import Core, load_stage
-from schemas.messages import Grid, Message
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.runtime.building import build_parts
+from fantwin.pipeline.runtime.joint_step import step_together
+from fantwin.pipeline.runtime.stage import Core, load_stage
+from fantwin.schemas.messages import Grid, Message
 
 STAGES = ("resampler", "twin_integrator")
 BEGINNING_S = 5.0

@@ -81,7 +81,7 @@ def words_of(command: str, recordings: Sequence[Path], twin: Path, output: Path)
 
 def run(words: Sequence[object]) -> str:
     """What a command prints as JSON, but for times."""
-    command = [sys.executable, "-m", "pipeline", *map(str, words), "--json"]
+    command = [sys.executable, "-m", "fantwin", *map(str, words), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{' '.join(command[2:4])}: {done.stderr}")

@@ -90,7 +90,7 @@ class Process:
         self._log = log.with_suffix(".log")
         with self._output.open("wb") as output, self._log.open("ab") as errors:
             self.process = subprocess.Popen(
-                [*(host.inside if host else ()), sys.executable, "-P", "-m", "pipeline", *map(str, words)],
+                [*(host.inside if host else ()), sys.executable, "-P", "-m", "fantwin", *map(str, words)],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=errors,

@@ -34,16 +34,16 @@ import typer
 from bench.fleet.fleet_scores import SITE, FleetScores
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint
-from pipeline.bus.publisher import Publisher
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.selftest.scratch_site import FANTWIN
-from schemas.codec import encode, type_name
-from schemas.enums import Severity, Transition
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis, Score
-from schemas.topics import BY_NAME, tray_key, tray_of
+from fantwin.pipeline.bus.publisher import Publisher
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.selftest.scratch_site import FANTWIN
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis, Score
+from fantwin.schemas.topics import BY_NAME, tray_key, tray_of
 
 PAGES = (0, 1, 200)
 READY_S = 300.0

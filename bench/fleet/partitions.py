@@ -29,16 +29,16 @@ import typer
 from bench.fleet.fed_outcome import RECORDS_SCORES, Outcome, outcome_of
 from bench.fleet.network_hosts import ALONE, Host, Process, bridge
 from bench.printing import JsonOption, progress, show
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.launch.site_watcher import SiteWatcher, StageView
-from pipeline.recordings.order import in_order
-from pipeline.replay.offline.replay_input import open_replay_input
-from schemas.codec import decode
-from schemas.enums import StageStatus
-from schemas.messages import Raw, Score
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.recordings.order import in_order
+from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.schemas.codec import decode
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.messages import Raw, Score
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 

@@ -29,9 +29,9 @@ import typer
 from bench.fleet.fed_outcome import RECORDS_SCORES, Outcome, outcome_of
 from bench.fleet.fed_trays import BUSY, FREE_RUN_BEGINS_AGAIN_S, SITE, Feed, Load, NewestScores
 from bench.printing import JsonOption, progress, show
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 

@@ -29,19 +29,19 @@ from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import memory_mb
 from bench.stage_context import stage_context
 from bench.training.published_fan import RATE_HZ, rough_run
-from pipeline.cli.twins.calibrate import calibrate
-from pipeline.config.loading import parse_config
-from pipeline.config.models import Config
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.runtime.building import build_parts
-from pipeline.runtime.stage import Core, load_stage
-from schemas.codec import decode, encode
-from schemas.header import Header
-from schemas.messages import Alarm, Grid, Prediction, Raw, Score
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
-from twin.build import train_twin
-from twin.runs import Run
+from fantwin.pipeline.cli.twins.calibrate import calibrate
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.runtime.building import build_parts
+from fantwin.pipeline.runtime.stage import Core, load_stage
+from fantwin.schemas.codec import decode, encode
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Grid, Prediction, Raw, Score
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.twin.build import train_twin
+from fantwin.twin.runs import Run
 
 SITE, TRAY = "fleet", "tray1"
 STAGES = ("resampler", "twin_integrator", "scorer")

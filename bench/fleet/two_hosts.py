@@ -27,10 +27,10 @@ from bench.fleet.fed_outcome import RECORDS_SCORES, Outcome, outcome_of
 from bench.fleet.fed_trays import BUSY, SITE, Feed, Load, NewestScores
 from bench.fleet.network_hosts import ALONE, Host, Process, bridge
 from bench.printing import JsonOption, progress, show
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.launch.site_watcher import SiteWatcher
-from schemas.messages import Raw
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.schemas.messages import Raw
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 

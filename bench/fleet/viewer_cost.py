@@ -28,14 +28,14 @@ import typer
 from bench.detection.plant import START_NS
 from bench.fleet.fleet_scores import SITE, FleetScores
 from bench.printing import JsonOption, progress, show
-from pipeline.runtime.runner import TICK_S
-from pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from pipeline.runtime.stage import Context, Core
-from schemas.envelope import Envelope
-from schemas.messages import Alarm
-from schemas.topics import tray_of
-from schemas.units import NS_PER_S
-from stages.viewer import ViewerConfig, build
+from fantwin.pipeline.runtime.runner import TICK_S
+from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
+from fantwin.pipeline.runtime.stage import Context, Core
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import tray_of
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.viewer import ViewerConfig, build
 
 BLOCKS_S = (0.05, 0.1, 1.0)
 FLEETS = (1_000, 10_000)

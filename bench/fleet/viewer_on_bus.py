@@ -26,19 +26,19 @@ from bench.detection.plant import START_NS
 from bench.fleet.fleet_scores import DELAY_S, SITE, FleetScores
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint
-from pipeline.bus.publisher import Publisher
-from pipeline.bus.session import Bus
-from pipeline.config.loading import parse_config
-from pipeline.config.models import BusConfig, Config
-from pipeline.runtime.runner import Runner
-from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.envelope import Envelope
-from schemas.health import Health
-from schemas.messages import Alarm, Score
-from schemas.topics import BY_NAME, tray_key
-from schemas.units import NS_PER_S
-from stages.viewer import STAGE
+from fantwin.pipeline.bus.publisher import Publisher
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import BusConfig, Config
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm, Score
+from fantwin.schemas.topics import BY_NAME, tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.viewer import STAGE
 
 FLEETS = (1_000, 10_000)
 READY_S = 600.0

@@ -27,17 +27,17 @@ from bench.fleet.stage_cost import calibrated_twin
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint, memory_mb
 from bench.training.published_fan import RATE_HZ
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.runtime.inbox import Inbox, Newest
-from pipeline.runtime.newest_messages import NewestMessages
-from schemas.codec import decode, encode, type_name
-from schemas.enums import Transition
-from schemas.envelope import Envelope
-from schemas.messages import Alarm, Raw, Score
-from schemas.topics import BY_NAME, tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.runtime.inbox import Inbox, Newest
+from fantwin.pipeline.runtime.newest_messages import NewestMessages
+from fantwin.schemas.codec import decode, encode, type_name
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Alarm, Raw, Score
+from fantwin.schemas.topics import BY_NAME, tray_key
+from fantwin.schemas.units import NS_PER_S
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 

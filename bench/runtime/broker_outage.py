@@ -28,14 +28,14 @@ from paho.mqtt.enums import CallbackAPIVersion
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.printing import JsonOption, progress, show
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.launch.site_watcher import SiteWatcher
-from schemas.codec import CodecError, decode, encode, type_name
-from schemas.enums import Action
-from schemas.header import Header
-from schemas.messages import Alarm, Request
-from schemas.topics import BY_NAME, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.schemas.codec import CodecError, decode, encode, type_name
+from fantwin.schemas.enums import Action
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Request
+from fantwin.schemas.topics import BY_NAME, tray_key
 from tests.support.mosquitto import Mosquitto
 from tests.support.running_chain import FANS, SITE, TRAY, Chain, eventually, view_of
 

@@ -32,13 +32,13 @@ from asyncua import Client, ua
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.printing import JsonOption, progress, show
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from schemas.codec import encode, type_name
-from schemas.enums import FanState
-from schemas.header import Header
-from schemas.messages import Alarm, Score
-from schemas.topics import BY_NAME, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Score
+from fantwin.schemas.topics import BY_NAME, tray_key
 from tests.support.notified_alarms import alarm
 from tests.support.running_chain import RunningCommand, eventually
 from tests.support.running_gateway import free_port

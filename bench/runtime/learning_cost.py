@@ -25,15 +25,15 @@ import numpy as np
 from bench.printing import progress
 from bench.runtime.stage_memory import free_endpoint, memory_mb
 from bench.training.published_fan import RATE_HZ, ROUGH_RANGE, published_fan, random_stairs
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.learning.healthy_history import HealthyHistory
-from pipeline.learning.versions import TwinVersions, learning_folder
-from pipeline.selftest.scratch_site import FANTWIN
-from schemas.header import Header
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.learning.healthy_history import HealthyHistory
+from fantwin.pipeline.learning.versions import TwinVersions, learning_folder
+from fantwin.pipeline.selftest.scratch_site import FANTWIN
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
 
 FANS, SITE, TRAY = 8, "site", "tray1"
 HISTORY_S = 600.0

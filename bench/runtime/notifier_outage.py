@@ -22,13 +22,13 @@ import typer
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.printing import JsonOption, progress, show
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.notification.sending import MAY_BE_REPEATED
-from schemas.codec import encode, type_name
-from schemas.messages import Alarm
-from schemas.topics import BY_NAME, tray_key
-from stages.notifier import OUTBOX
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.notification.sending import MAY_BE_REPEATED
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import BY_NAME, tray_key
+from fantwin.stages.notifier import OUTBOX
 from tests.support.message_receivers import MailServer
 from tests.support.notified_alarms import alarm, secret
 from tests.support.running_chain import RunningCommand, eventually

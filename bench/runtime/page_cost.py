@@ -17,17 +17,17 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from pipeline.cli.watch.page_picture import installed_browser
-from pipeline.config.models import TrayConfig
-from pipeline.gateway.config import GatewayConfig
-from pipeline.runtime.stage import Context, Core
-from pipeline.selftest.scratch_site import free_port
-from schemas.enums import FanState
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Score
-from schemas.topics import tray_key
-from stages.gateway import STAGE
+from fantwin.pipeline.cli.watch.page_picture import installed_browser
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.gateway.config import GatewayConfig
+from fantwin.pipeline.runtime.stage import Context, Core
+from fantwin.pipeline.selftest.scratch_site import free_port
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Score
+from fantwin.schemas.topics import tray_key
+from fantwin.stages.gateway import STAGE
 
 SITE, FANS_OF_TRAY = "hall", 50
 MEASURED_S, SETTLING_S = 20.0, 4.0

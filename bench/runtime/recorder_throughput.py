@@ -19,14 +19,14 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
 from bench.printing import JsonOption, progress, show
-from pipeline.recordings.parts import RecordingParts
-from pipeline.recordings.writing import CHUNK_BYTES
-from schemas.codec import encode, proto_type
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Grid, Message, Prediction, Raw, Score, newest_t_ns
-from schemas.topics import topic_of, tray_key
-from stages.recorder import Recorder, RecorderConfig
+from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.writing import CHUNK_BYTES
+from fantwin.schemas.codec import encode, proto_type
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Grid, Message, Prediction, Raw, Score, newest_t_ns
+from fantwin.schemas.topics import topic_of, tray_key
+from fantwin.stages.recorder import Recorder, RecorderConfig
 
 FANS = 8
 STEP_NS = 10_000_000

@@ -27,17 +27,17 @@ from bench.printing import JsonOption, progress, show
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.training.published_fan import RATE_HZ, rough_run
-from pipeline.config.loading import parse_config
-from pipeline.recordings.reading import read_recording
-from pipeline.recordings.recorder_config import FLUSH_BYTES, FLUSH_S, SAMPLES, RecorderConfig
-from pipeline.recordings.writing import RecordingWriter
-from schemas.envelope import Envelope
-from schemas.messages import ScorerSnapshot
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
-from scoring.wear.trend import WearSeries
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.recorder_config import FLUSH_BYTES, FLUSH_S, SAMPLES, RecorderConfig
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import ScorerSnapshot
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.wear.trend import WearSeries
+from fantwin.twin.runs import Run
 from tests.support.killed_site import CHAIN, Stages
-from twin.runs import Run
 
 BLOCKS_S = (0.05, 0.1, 1.0)
 TRAYS = {1: 120.0, 8: 120.0, 64: 120.0, 1024: 20.0}

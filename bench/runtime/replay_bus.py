@@ -20,7 +20,7 @@ from bench.printing import JsonOption, progress, show
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.reading import read_recording
 from tests.support.replay_data import START_NS, STEP_NS, write_raw
 from tests.support.running_chain import Chain, eventually, fantwin
 

@@ -21,12 +21,12 @@ from bench.printing import JsonOption, progress, show
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from pipeline.config.loading import load_config
-from pipeline.recordings.reading import read_recording
-from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.replay.offline.rescoring import rescore
-from schemas.blocks import cut
-from schemas.messages import Raw
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.pipeline.replay.offline.rescoring import rescore
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.messages import Raw
 from tests.support.killed_site import Stages
 from tests.support.running_chain import DEMO, fantwin
 

@@ -19,9 +19,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 
-from pipeline.selftest.scenarios import SCENARIOS
-from pipeline.selftest.scratch_site import STAGES, NotKept, ScratchSite
-from pipeline.selftest.selftest import Row, account, run_scenario
+from fantwin.pipeline.selftest.scenarios import SCENARIOS
+from fantwin.pipeline.selftest.scratch_site import STAGES, NotKept, ScratchSite
+from fantwin.pipeline.selftest.selftest import Row, account, run_scenario
 
 LOSING = {"deleted", "full-disk"}
 SHARED = [scenario for scenario in SCENARIOS if scenario.name not in LOSING]

@@ -69,14 +69,14 @@ import sys, time
 from importlib import import_module
 start = time.perf_counter()
 try:
-    stage_main = import_module("pipeline.cli.watch.run")
+    stage_main = import_module("fantwin.pipeline.cli.watch.run")
 except ImportError:
     stage_main = import_module("pipeline.commands.run")
 try:
-    from pipeline.config.loading import load_config
+    from fantwin.pipeline.config.loading import load_config
     load_config(__import__("pathlib").Path(sys.argv[2]), (), (sys.argv[1],))
 except ImportError:
-    from pipeline.config import load_config
+    from fantwin.pipeline.config import load_config
     load_config(__import__("pathlib").Path(sys.argv[2]))
 import_module(f"stages.{sys.argv[1]}")
 print(time.perf_counter() - start)
@@ -124,7 +124,7 @@ def bare(stage: str, environment: dict[str, str]) -> tuple[float, float, float]:
 def at_rest(stage: str, folder: Path, environment: dict[str, str]) -> tuple[float, float]:
     """RSS and PSS in MB of a stage without input."""
     settings = [f"bus.endpoint='{free_endpoint()}'", f"run_folder='{folder / stage}'", "viewer.serve=false"]
-    command = [sys.executable, "-P", "-m", "pipeline", "run", stage, "-c", str(DEMO), "--until-stdin-closes"]
+    command = [sys.executable, "-P", "-m", "fantwin", "run", stage, "-c", str(DEMO), "--until-stdin-closes"]
     if stage == "acquisition":
         command += ["--tray", "tray1"]
     for setting in settings:

@@ -21,9 +21,9 @@ from bench.printing import JsonOption, progress, show
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from pipeline.bus.router import open_router
-from pipeline.bus.settings import Settings
-from schemas.topics import tray_key
+from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.bus.settings import Settings
+from fantwin.schemas.topics import tray_key
 from tests.support.secured_site import SITE, SecuredSite, free_endpoint
 
 PLAIN, TLS, RULES = "plain", "TLS", "TLS and roles"

@@ -18,10 +18,10 @@ from bench.printing import JsonOption, progress, show
 from bench.training.measured_sets import esc_test
 from bench.training.published_fan import random_stairs
 from bench.training.rough_table import DUTY_RANGE, simulated_plant
-from twin.build import train_twin
-from twin.evaluation.accuracy import compared_readings, evaluation_pieces, free_run_readings
-from twin.finishing import TrainedTwin
-from twin.runs import Run
+from fantwin.twin.build import train_twin
+from fantwin.twin.evaluation.accuracy import compared_readings, evaluation_pieces, free_run_readings
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.runs import Run
 
 SHARE = 0.75
 SECONDS = 80.0

@@ -21,14 +21,14 @@ import typer
 from bench.printing import JsonOption, progress, show
 from bench.training.published_fan import SimulatedRun, random_stairs
 from bench.training.rough_table import DUTY_RANGE, simulated_plant
-from simulation.plant import FanParameters, tray_of_fans
-from twin.build import evaluate, train_twin
-from twin.evaluation.accuracy import Evaluation, sums_of_model
-from twin.finishing import TrainedTwin
-from twin.fitting.placement import TypeOfFans
-from twin.models.physical import physical_parameters
-from twin.placing import place_twin
-from twin.runs import Run
+from fantwin.simulation.plant import FanParameters, tray_of_fans
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.evaluation.accuracy import Evaluation, sums_of_model
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.fitting.placement import TypeOfFans
+from fantwin.twin.models.physical import physical_parameters
+from fantwin.twin.placing import place_twin
+from fantwin.twin.runs import Run
 
 TYPES = {
     "bench fan": FanParameters(),

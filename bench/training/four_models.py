@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from twin.build import evaluate
-from twin.comparison import Contender
-from twin.evaluation.accuracy import Figures
-from twin.runs import Run
+from fantwin.twin.build import evaluate
+from fantwin.twin.comparison import Contender
+from fantwin.twin.evaluation.accuracy import Figures
+from fantwin.twin.runs import Run
 
 NO_FIGURES = Figures(np.inf, np.inf, -np.inf, np.inf, 0.0, 0)
 

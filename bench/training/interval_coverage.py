@@ -24,9 +24,9 @@ from bench.training.published_fan import (
     random_stairs,
     sum_of_sines,
 )
-from simulation.excitation import Chirp, Staircase
-from twin.fitting.identification import identify
-from twin.runs import Array
+from fantwin.simulation.excitation import Chirp, Staircase
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.runs import Array
 
 TRUE = {"J": INERTIA, "alpha": VISCOUS, "C_D": DRAG}
 MUST_COVER = (0.93, 0.97)

@@ -14,7 +14,7 @@ import typer
 from bench.printing import JsonOption, progress, show
 from bench.training.four_models import held_out_figures, trained_in_s
 from bench.training.measured_sets import Split, splits
-from twin.comparison import Contender, all_candidates, contend
+from fantwin.twin.comparison import Contender, all_candidates, contend
 
 
 def main(

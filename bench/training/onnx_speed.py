@@ -29,14 +29,14 @@ from scipy.integrate import solve_ivp
 from bench.printing import JsonOption, progress, show
 from bench.training import race_diffrax, race_torchdiffeq
 from bench.training.published_fan import RATE_HZ, ROUGH_RANGE, random_stairs, rough_run
-from twin.build import train_twin
-from twin.export.onnx_twin import OnnxTwin
-from twin.finishing import TrainedTwin
-from twin.fitting.torch_reference import torch_free_run
-from twin.models.hybrid import Hybrid
-from twin.models.physics import LAG
-from twin.models.right_hand_side import FanEquation
-from twin.runs import Array
+from fantwin.twin.build import train_twin
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.fitting.torch_reference import torch_free_run
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.models.right_hand_side import FanEquation
+from fantwin.twin.runs import Array
 
 STEP_S = 1.0 / RATE_HZ
 FANS = (1, 8, 1_000, 10_000)

@@ -22,8 +22,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from simulation.excitation import Multisine
-from twin.runs import Array, Run
+from fantwin.simulation.excitation import Multisine
+from fantwin.twin.runs import Array, Run
 
 INERTIA, VISCOUS, DRAG = 0.15, 0.012, 0.0025
 NOISE_RAD_S = math.sqrt(10.0)

@@ -24,8 +24,8 @@ from bench.training.published_fan import (
     published_test,
     published_training,
 )
-from twin.comparison import Contender, all_candidates, contend
-from twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.comparison import Contender, all_candidates, contend
+from fantwin.twin.models.physics import PARAMETER_NAMES
 
 # Test RMSE in Peng and Chen, table 2, and what the project asks of ours in multiples of the floor.
 PUBLISHED_RMSE_RAD_S = {

@@ -13,8 +13,8 @@ import numpy as np
 import optax  # pyright: ignore[reportMissingImports]
 
 from bench.training.race_problem import Phase, Problem, TimedEvaluation
-from twin.models.hybrid import Hybrid
-from twin.runs import Array
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.runs import Array
 
 jax.config.update("jax_enable_x64", True)
 

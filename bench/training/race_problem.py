@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
-from twin.fitting.identification import Identification
-from twin.fitting.initial_weights import initial_weights
-from twin.fitting.training import data_scaling
-from twin.models.hybrid import UNITS, Hybrid
-from twin.models.lag import effective_command
-from twin.models.network import TanhNetwork
-from twin.models.physics import LAG
-from twin.runs import Array, Run
+from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
+from fantwin.twin.fitting.identification import Identification
+from fantwin.twin.fitting.initial_weights import initial_weights
+from fantwin.twin.fitting.training import data_scaling
+from fantwin.twin.models.hybrid import UNITS, Hybrid
+from fantwin.twin.models.lag import effective_command
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.runs import Array, Run
 
 EVALUATION_PERIOD_S = 1.0
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import torch
 
 from bench.training.race_problem import Problem, TimedEvaluation
-from twin.fitting.torch_reference import LEARNING_RATE, torch_free_run
-from twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS
-from twin.fitting.trajectories import stretch_samples
+from fantwin.twin.fitting.torch_reference import LEARNING_RATE, torch_free_run
+from fantwin.twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS
+from fantwin.twin.fitting.trajectories import stretch_samples
 
 
 def train(problem: Problem, timed: TimedEvaluation) -> None:

@@ -8,7 +8,7 @@ import torch
 from torchdiffeq import odeint  # pyright: ignore[reportMissingImports]
 
 from bench.training.race_problem import Phase, Problem, TimedEvaluation
-from twin.models.hybrid import Hybrid
+from fantwin.twin.models.hybrid import Hybrid
 
 
 def speeds(

@@ -15,11 +15,11 @@ import typer
 from bench.printing import JsonOption, progress, show
 from bench.training.four_models import held_out_figures, trained_in_s
 from bench.training.published_fan import RATE_HZ, SimulatedRun, random_stairs
-from simulation.excitation import Manual
-from simulation.plant import FanParameters, advance, at_rest
-from simulation.tacho import NoisyTacho
-from twin.comparison import Contender, all_candidates, contend
-from twin.runs import Array, Run
+from fantwin.simulation.excitation import Manual
+from fantwin.simulation.plant import FanParameters, advance, at_rest
+from fantwin.simulation.tacho import NoisyTacho
+from fantwin.twin.comparison import Contender, all_candidates, contend
+from fantwin.twin.runs import Array, Run
 
 DUTY_RANGE = (0.0, 1.0)
 MUST_REACH, MUST_R2, MUST_BE_NEARER = 1.03, 0.999, 5.0

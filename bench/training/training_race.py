@@ -31,10 +31,10 @@ from bench.printing import JsonOption, progress, show
 from bench.training import race_diffrax, race_published, race_torchdiffeq
 from bench.training.published_fan import SimulatedRun, rough_run
 from bench.training.race_problem import Phase, TimedEvaluation, problem
-from twin.build import train_twin
-from twin.finishing import TrainedTwin
-from twin.fitting.identification import Identification, identify
-from twin.fitting.training import Physics
+from fantwin.twin.build import train_twin
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.fitting.identification import Identification, identify
+from fantwin.twin.fitting.training import Physics
 
 TARGET = 1.01
 SECONDS = 80.0

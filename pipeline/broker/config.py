@@ -6,10 +6,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pipeline.config.models import Name
-from pipeline.devices.broker_settings import BrokerSettings
-from pipeline.presenting.request_form import OperatorAction
-from pipeline.runtime.stage import StageConfig
+from fantwin.pipeline.config.models import Name
+from fantwin.pipeline.devices.broker_settings import BrokerSettings
+from fantwin.pipeline.presenting.request_form import OperatorAction
+from fantwin.pipeline.runtime.stage import StageConfig
 
 TopicPrefix = Annotated[str, Field(pattern=r"^[^+#$/\x00-\x1f][^+#\x00-\x1f]*[^+#/\x00-\x1f]$|^[^+#$/\x00-\x1f]$")]
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pipeline.broker.topics import Topics
-from pipeline.presenting.shown import alarm_json
-from pipeline.presenting.site_model import SiteModel, TrayNow
-from pipeline.recordings.dates import format_utc
-from pipeline.viewing.fleet import Fan, FanNow
-from schemas.units import RAD_S_PER_UNIT
-from scoring.alarms.alarm_flags import is_listed
-from scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.pipeline.broker.topics import Topics
+from fantwin.pipeline.presenting.shown import alarm_json
+from fantwin.pipeline.presenting.site_model import SiteModel, TrayNow
+from fantwin.pipeline.recordings.dates import format_utc
+from fantwin.pipeline.viewing.fleet import Fan, FanNow
+from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.scoring.alarms.alarm_flags import is_listed
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 AT_ONCE = ("state", "in_alarm", "judged")
 """what of a state is published at once when it changes"""

@@ -12,12 +12,12 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
-from pipeline.broker.config import MqttConfig
-from pipeline.broker.json_text import json_text
-from pipeline.broker.topics import Topics
-from pipeline.config.models import TrayConfig
-from pipeline.viewing.fleet import Fan
-from schemas.topics import ALL_TRAYS
+from fantwin.pipeline.broker.config import MqttConfig
+from fantwin.pipeline.broker.json_text import json_text
+from fantwin.pipeline.broker.topics import Topics
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.topics import ALL_TRAYS
 
 ACKNOWLEDGE = "acknowledge"
 SITE_DEVICE = "site"

@@ -14,10 +14,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from pipeline.broker.config import MqttConfig
-from pipeline.broker.outbox import Outgoing
-from pipeline.broker.topics import REQUEST
-from pipeline.devices.broker_client import new_client, refusal
+from fantwin.pipeline.broker.config import MqttConfig
+from fantwin.pipeline.broker.outbox import Outgoing
+from fantwin.pipeline.broker.topics import REQUEST
+from fantwin.pipeline.devices.broker_client import new_client, refusal
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client, MQTTMessage

@@ -12,13 +12,13 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
-from pipeline.broker.json_text import json_text
-from pipeline.broker.topics import ALL_FANS, ANSWER, REQUEST, Topics
-from pipeline.config.models import TrayConfig
-from pipeline.presenting.request_desk import ANSWERED_WITHIN_S, RequestDesk
-from pipeline.presenting.request_form import LONGEST_COMMENT, OneLine, RequestForm
-from schemas.enums import Transition
-from schemas.messages import Alarm, Request
+from fantwin.pipeline.broker.json_text import json_text
+from fantwin.pipeline.broker.topics import ALL_FANS, ANSWER, REQUEST, Topics
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.presenting.request_desk import ANSWERED_WITHIN_S, RequestDesk
+from fantwin.pipeline.presenting.request_form import LONGEST_COMMENT, OneLine, RequestForm
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm, Request
 
 LARGEST_REQUEST_BYTES, LONGEST_ID = 4096, 64
 

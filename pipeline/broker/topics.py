@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.viewing.fleet import Fan
-from schemas.topics import ALL_TRAYS
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.topics import ALL_TRAYS
 
 ALL_FANS = "all"
 """in place of the number of a fan, in a request"""

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 
-from pipeline.errors import UserError
-from pipeline.presenting.alarm_store import AlarmStore
-from schemas.messages import Alarm
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.schemas.messages import Alarm
 
 READER = "mqtt"
 

@@ -13,11 +13,11 @@ from typing import Any
 
 import zenoh
 
-from pipeline.bus.kept_messages import kept_key
-from pipeline.bus.recovery import ALL_PRODUCERS, recovery_key
-from pipeline.config.models import Config
-from pipeline.config.roles import Role, roles_of
-from schemas.topics import (
+from fantwin.pipeline.bus.kept_messages import kept_key
+from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, recovery_key
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.roles import Role, roles_of
+from fantwin.schemas.topics import (
     HEALTH,
     ROOT,
     alive_key,

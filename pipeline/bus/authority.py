@@ -24,8 +24,8 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from pipeline.bus.certificates import in_words
-from pipeline.errors import UserError
+from fantwin.pipeline.bus.certificates import in_words
+from fantwin.pipeline.errors import UserError
 
 LONGEST_ROLE = 64
 """characters of a common name"""

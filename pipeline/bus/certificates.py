@@ -17,8 +17,8 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509.oid import NameOID
 
-from pipeline.bus.errors import BusError
-from pipeline.config.models import ROLE_PLACE, SecurityConfig
+from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.config.models import ROLE_PLACE, SecurityConfig
 
 WARN_BEFORE = timedelta(days=30)
 WARN_SHARE = 0.2

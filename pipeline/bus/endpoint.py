@@ -6,8 +6,8 @@ import ipaddress
 import re
 import socket
 
-from pipeline.bus.errors import BusError
-from pipeline.config.models import BETWEEN_ENDPOINTS, BusConfig
+from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.config.models import BETWEEN_ENDPOINTS, BusConfig
 
 _ADDRESS = re.compile(r"(tcp|tls|ws|udp|quic)/(\[[^\]]*\]|[^:/?#]*):(\d+)(?:[?#].*)?")
 _CONNECTING = ("tcp", "tls", "ws")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zenoh
 
-from pipeline.errors import UserError
+from fantwin.pipeline.errors import UserError
 
 
 class BusError(UserError):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from schemas.topics import largest_bytes
+from fantwin.schemas.topics import largest_bytes
 
 _KEPT = "/kept/"
 

@@ -37,7 +37,7 @@ class Meeting:
         """Start the process with these settings. If the system cannot start it, the next call tries again."""
         with suppress(OSError):
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "pipeline.bus.meeting"],
+                [sys.executable, "-P", "-m", "fantwin.pipeline.bus.meeting"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,

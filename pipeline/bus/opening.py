@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from pipeline.bus.access_rules import SiteRoles, access_control
-from pipeline.bus.endpoint import accepts_connections, foreign_program, require_tls_with_security
-from pipeline.bus.errors import BusError, reason
-from pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
-from pipeline.bus.settings import Settings
-from pipeline.config.models import BusConfig
+from fantwin.pipeline.bus.access_rules import SiteRoles, access_control
+from fantwin.pipeline.bus.endpoint import accepts_connections, foreign_program, require_tls_with_security
+from fantwin.pipeline.bus.errors import BusError, reason
+from fantwin.pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
+from fantwin.pipeline.bus.settings import Settings
+from fantwin.pipeline.config.models import BusConfig
 
 if TYPE_CHECKING:
-    from pipeline.bus.certificates import Credentials
+    from fantwin.pipeline.bus.certificates import Credentials
 
 ONE_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 """Of two peers that discover each other, the one with the greater id connects. By default both connect at once, and
@@ -48,7 +48,7 @@ def credentials_of(config: BusConfig, roles: Sequence[str]) -> Credentials | Non
     require_tls_with_security(config)
     if config.security is None:
         return None
-    from pipeline.bus.certificates import checked_credentials  # noqa: PLC0415  takes 0.1 s, which most do without
+    from fantwin.pipeline.bus.certificates import checked_credentials  # noqa: PLC0415  takes 0.1 s, which most do without
 
     return checked_credentials(config.security, roles)
 

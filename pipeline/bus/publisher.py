@@ -9,15 +9,15 @@ from itertools import chain, islice
 
 import zenoh
 
-from pipeline.bus.recovery import (
+from fantwin.pipeline.bus.recovery import (
     LAST_SEQUENCE,
     MOST_RECOVERED_BYTES,
     MOST_RECOVERED_MESSAGES,
     number_in,
     recovery_key,
 )
-from pipeline.bus.spool import Spool
-from schemas.topics import Topic
+from fantwin.pipeline.bus.spool import Spool
+from fantwin.schemas.topics import Topic
 
 KEPT_BYTES = 16 << 20
 """the most a publisher keeps, whatever its history: large messages of a large fleet would fill the memory"""

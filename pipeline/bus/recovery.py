@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import zenoh
 
-from schemas.topics import CATCH_UP_MESSAGES, largest_bytes
+from fantwin.schemas.topics import CATCH_UP_MESSAGES, largest_bytes
 
 MOST_RECOVERED_MESSAGES = 16_384
 MOST_RECOVERED_BYTES = 64 << 20

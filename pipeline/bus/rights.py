@@ -15,10 +15,10 @@ import time
 
 import zenoh
 
-from pipeline.bus.access_rules import Rights, SiteRoles
-from pipeline.bus.link import LEASE_MS
-from pipeline.config.roles import OPERATOR
-from schemas.topics import key_in_words, rights_key
+from fantwin.pipeline.bus.access_rules import Rights, SiteRoles
+from fantwin.pipeline.bus.link import LEASE_MS
+from fantwin.pipeline.config.roles import OPERATOR
+from fantwin.schemas.topics import key_in_words, rights_key
 
 PERIOD_S = 2.0
 """so often a session asks"""

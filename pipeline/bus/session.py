@@ -15,12 +15,12 @@ from typing import Self
 
 import zenoh
 
-from pipeline.bus.access_rules import SiteRoles
-from pipeline.bus.endpoint import endpoint_problem, somebody_listens
-from pipeline.bus.errors import BusError, NoAnswerError
-from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept, kept_key
-from pipeline.bus.meeting import Meeting
-from pipeline.bus.opening import (
+from fantwin.pipeline.bus.access_rules import SiteRoles
+from fantwin.pipeline.bus.endpoint import endpoint_problem, somebody_listens
+from fantwin.pipeline.bus.errors import BusError, NoAnswerError
+from fantwin.pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept, kept_key
+from fantwin.pipeline.bus.meeting import Meeting
+from fantwin.pipeline.bus.opening import (
     MEETING_LIMIT_S,
     ROUTER_RETRY_S,
     answers,
@@ -28,13 +28,13 @@ from pipeline.bus.opening import (
     open_session,
     zenoh_config,
 )
-from pipeline.bus.publisher import KeptBytes, Publisher
-from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
-from pipeline.bus.rights import UNANSWERED_LIMIT_S, OwnRights, granted_rights
-from pipeline.bus.spool import Spool
-from pipeline.config.models import BusConfig, Config
-from pipeline.config.roles import READERS
-from schemas.topics import Topic, key_in_words, largest_bytes
+from fantwin.pipeline.bus.publisher import KeptBytes, Publisher
+from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
+from fantwin.pipeline.bus.rights import UNANSWERED_LIMIT_S, OwnRights, granted_rights
+from fantwin.pipeline.bus.spool import Spool
+from fantwin.pipeline.config.models import BusConfig, Config
+from fantwin.pipeline.config.roles import READERS
+from fantwin.schemas.topics import Topic, key_in_words, largest_bytes
 
 SAID_AFTER_S = 3.0
 """a client that waits so long for its router says so"""

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import zenoh
 
-from pipeline.bus.errors import BusError, reason
+from fantwin.pipeline.bus.errors import BusError, reason
 
 if TYPE_CHECKING:
-    from pipeline.bus.certificates import Credentials
+    from fantwin.pipeline.bus.certificates import Credentials
 
 TLS = "transport/link/tls"
 

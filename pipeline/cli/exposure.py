@@ -9,9 +9,9 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from pipeline.bus.endpoint import is_beyond_loopback
-from pipeline.config.models import BusConfig
-from pipeline.errors import UsageError
+from fantwin.pipeline.bus.endpoint import is_beyond_loopback
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.errors import UsageError
 
 AGAIN_S = 60.0
 InsecureOption: TypeAlias = Annotated[

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.errors import UsageError, UserError
+from fantwin.pipeline.errors import UsageError, UserError
 
 PANELS = {
     "watch": "Watch",
@@ -174,7 +174,7 @@ def _group(
 def _register(names: Iterable[str]) -> None:
     for name in names:
         folder, module = COMMANDS[name][0].split(".")
-        function = getattr(import_module(f"pipeline.cli.{folder}.{module}"), module)
+        function = getattr(import_module(f"fantwin.pipeline.cli.{folder}.{module}"), module)
         app.command(name, rich_help_panel=PANELS[folder])(function)
 
 

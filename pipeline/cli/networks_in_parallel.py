@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, TypeVar
 from joblib import cpu_count
 from threadpoolctl import threadpool_limits
 
-from pipeline.cli.processes import end_processes, in_processes
+from fantwin.pipeline.cli.processes import end_processes, in_processes
 
 if TYPE_CHECKING:
-    from twin.progress import Progress
+    from fantwin.twin.progress import Progress
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -42,7 +42,7 @@ class NetworksInParallel:
         Raises:
             UserError: a process was ended from outside.
         """
-        from twin.networks import one_after_another  # noqa: PLC0415  loaded only when it is needed
+        from fantwin.twin.networks import one_after_another  # noqa: PLC0415  loaded only when it is needed
 
         jobs = min(self._jobs, len(items))
         if jobs == 1:
@@ -60,7 +60,7 @@ class NetworksInParallel:
 
 def _alone(work: Callable[[Item, Progress], Result], item: Item) -> Result:
     """Runs in another process. With several threads linear algebra rounds in another order: there is one everywhere."""
-    from twin.progress import unreported  # noqa: PLC0415
+    from fantwin.twin.progress import unreported  # noqa: PLC0415
 
     with threadpool_limits(1):
         return work(item, unreported)

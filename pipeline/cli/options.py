@@ -8,8 +8,8 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from pipeline.errors import UsageError, UserError
-from schemas.auxiliary import AUXILIARY
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.schemas.auxiliary import AUXILIARY
 
 ConfigOption: TypeAlias = Annotated[Path, typer.Option("-c", "--config", help="Configuration file (TOML).")]
 SetOption: TypeAlias = Annotated[

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import BrokenProcessPool, get_reusable_executor
 
-from pipeline.errors import UserError
+from fantwin.pipeline.errors import UserError
 
 ENDED_FROM_OUTSIDE = "a process that worked on {what} was ended from outside, as the system does if memory is short"
 

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from pipeline.cli.twins.training_data import TrainingData
-    from twin.progress import Progress as ProgressCallback
+    from fantwin.pipeline.cli.twins.training_data import TrainingData
+    from fantwin.twin.progress import Progress as ProgressCallback
 
 LINE_PERIOD_S = 5.0
 EXIT_INTERRUPTED = 130

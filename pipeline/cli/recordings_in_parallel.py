@@ -22,11 +22,11 @@ import typer
 from joblib import cpu_count
 from threadpoolctl import threadpool_limits
 
-from pipeline.cli.processes import ENDED_FROM_OUTSIDE, end_processes, in_processes
-from pipeline.cli.progress import recordings_progress
-from pipeline.errors import UsageError, UserError
-from pipeline.extras import require
-from pipeline.recordings.remote import local_copies
+from fantwin.pipeline.cli.processes import ENDED_FROM_OUTSIDE, end_processes, in_processes
+from fantwin.pipeline.cli.progress import recordings_progress
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.extras import require
+from fantwin.pipeline.recordings.remote import local_copies
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -17,7 +17,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from pipeline.config.models import (
+from fantwin.pipeline.config.models import (
     BusConfig,
     Config,
     ConfigError,
@@ -28,10 +28,10 @@ from pipeline.config.models import (
     TrayConfig,
     nearest,
 )
-from pipeline.config.registry import STAGES
-from pipeline.devices.sample_source import SourceConfig
-from pipeline.devices.source_kinds import SOURCE_KINDS, source_config
-from schemas.formats import CONFIGURATION
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.devices.sample_source import SourceConfig
+from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS, source_config
+from fantwin.schemas.formats import CONFIGURATION
 
 LARGEST_FILE_BYTES = 1 << 20
 LONGEST_OVERRIDE = 1000

@@ -21,14 +21,14 @@ from pydantic import (
     model_validator,
 )
 
-from pipeline.config.registry import STAGES
-from pipeline.devices.sample_source import MOST_FANS, SourceConfig, too_many_fans
-from pipeline.devices.serial_config import MOST_FANS_ON_LINE
-from pipeline.devices.source_kinds import parse_source
-from pipeline.errors import UsageError, UserError
-from schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
-from schemas.topics import RESERVED_TRAY_NAMES
-from schemas.units import SpeedUnit
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.devices.sample_source import MOST_FANS, SourceConfig, too_many_fans
+from fantwin.pipeline.devices.serial_config import MOST_FANS_ON_LINE
+from fantwin.pipeline.devices.source_kinds import parse_source
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
+from fantwin.schemas.topics import RESERVED_TRAY_NAMES
+from fantwin.schemas.units import SpeedUnit
 
 NAME_PATTERN = r"^[A-Za-z0-9_-]+$"
 LONGEST_S = 366 * 86_400

@@ -1,6 +1,6 @@
 """docs/reference/configuration.md: every key of the configuration, from the models that check it.
 
-`python -m pipeline.config.reference_page` writes the page to standard output; `make configuration` writes the file.
+`python -m fantwin.pipeline.config.reference_page` writes the page to standard output, `make configuration` the file.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from pipeline.config.loading import LARGEST_FILE_BYTES, top_level
-from pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, SpoolConfig, TrayConfig
-from pipeline.config.registry import STAGES
-from pipeline.devices.sample_source import SourceConfig
-from pipeline.devices.source_kinds import SOURCE_KINDS
-from schemas.tacho import Tacho
+from fantwin.pipeline.config.loading import LARGEST_FILE_BYTES, top_level
+from fantwin.pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, SpoolConfig, TrayConfig
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.devices.sample_source import SourceConfig
+from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS
+from fantwin.schemas.tacho import Tacho
 
 _INTRODUCTION = f"""# Configuration
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Literal
 
-from schemas.topics import TOPICS
+from fantwin.schemas.topics import TOPICS
 
 
 @dataclass(frozen=True)
@@ -67,16 +67,16 @@ STAGES: dict[str, StageRow] = {
     for row in (
         StageRow(
             "acquisition",
-            "stages.acquisition:STAGE",
+            "fantwin.stages.acquisition:STAGE",
             enabled_by="default",
             scope="tray",
             reads=("command", "reading"),
             writes=("raw",),
         ),
-        StageRow("resampler", "stages.resampler:STAGE", enabled_by="default", reads=("raw",), writes=("grid",)),
+        StageRow("resampler", "fantwin.stages.resampler:STAGE", enabled_by="default", reads=("raw",), writes=("grid",)),
         StageRow(
             LEARNER,
-            "stages.learner:STAGE",
+            "fantwin.stages.learner:STAGE",
             enabled_by="tray without twin",
             may_drop=True,
             reads=("raw", "score", "request"),
@@ -84,7 +84,7 @@ STAGES: dict[str, StageRow] = {
         ),
         StageRow(
             "twin_integrator",
-            "stages.twin_integrator:STAGE",
+            "fantwin.stages.twin_integrator:STAGE",
             enabled_by="default",
             needs_twin=True,
             reads=("grid", "new_twin"),
@@ -92,7 +92,7 @@ STAGES: dict[str, StageRow] = {
         ),
         StageRow(
             "scorer",
-            "stages.scorer:STAGE",
+            "fantwin.stages.scorer:STAGE",
             enabled_by="default",
             needs_twin=True,
             reads=("prediction", "request", "twin"),
@@ -100,7 +100,7 @@ STAGES: dict[str, StageRow] = {
         ),
         StageRow(
             RECORDER,
-            "stages.recorder:STAGE",
+            "fantwin.stages.recorder:STAGE",
             enabled_by="default",
             reads=tuple(topic.name for topic in TOPICS if topic.recorded),
             writes=(),
@@ -108,7 +108,7 @@ STAGES: dict[str, StageRow] = {
         ),
         StageRow(
             "viewer",
-            "stages.viewer:STAGE",
+            "fantwin.stages.viewer:STAGE",
             enabled_by="default",
             extra="view",
             has_common_shards=False,
@@ -118,7 +118,7 @@ STAGES: dict[str, StageRow] = {
         ),
         StageRow(
             GATEWAY,
-            "stages.gateway:STAGE",
+            "fantwin.stages.gateway:STAGE",
             enabled_by="default",
             has_common_shards=False,
             may_drop=True,
@@ -127,7 +127,7 @@ STAGES: dict[str, StageRow] = {
         ),
         StageRow(
             "opcua",
-            "stages.opcua:STAGE",
+            "fantwin.stages.opcua:STAGE",
             has_common_shards=False,
             may_drop=True,
             reads=("score", "alarm", "twin"),
@@ -135,12 +135,12 @@ STAGES: dict[str, StageRow] = {
         ),
         StageRow(
             "mqtt",
-            "stages.mqtt:STAGE",
+            "fantwin.stages.mqtt:STAGE",
             has_common_shards=False,
             may_drop=True,
             reads=("score", "alarm", "health"),
             writes=("request",),
         ),
-        StageRow("notifier", "stages.notifier:STAGE", has_common_shards=False, reads=("alarm",), writes=()),
+        StageRow("notifier", "fantwin.stages.notifier:STAGE", has_common_shards=False, reads=("alarm",), writes=()),
     )
 }

@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from pipeline.config.models import OWN_ROLES, Config
-from pipeline.config.registry import STAGES
-from pipeline.config.shards import Shard, shard_of, shards_of
-from schemas.topics import ALL_TRAYS, BY_NAME, TOPICS, makes_samples_of_samples
+from fantwin.pipeline.config.models import OWN_ROLES, Config
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.shards import Shard, shard_of, shards_of
+from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, TOPICS, makes_samples_of_samples
 
 OPERATOR, VIEWER, SOURCE, REPLAY, ROUTER = OWN_ROLES
 READERS = (VIEWER, OPERATOR)

@@ -13,10 +13,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.config.models import Config
-from pipeline.config.registry import STAGES
-from pipeline.errors import UsageError
-from schemas.topics import ALL_TRAYS
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.errors import UsageError
+from fantwin.schemas.topics import ALL_TRAYS
 
 LONGEST_NAME = 60
 """characters: a name begins files, whose names may have 255 bytes"""

@@ -10,8 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pipeline.config.models import Config, ConfigError
-from pipeline.errors import UserError
+from fantwin.pipeline.config.models import Config, ConfigError
+from fantwin.pipeline.errors import UserError
 
 _HEADER = re.compile(r"^([ \t]*)\[\[[ \t]*tray[ \t]*\]\][^\r\n]*(\r?)$", re.MULTILINE)
 

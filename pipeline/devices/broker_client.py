@@ -7,9 +7,9 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.devices.broker_settings import BrokerSettings
-from pipeline.devices.secret_file import read_secret, secret_of_environment
-from pipeline.errors import UserError
+from fantwin.pipeline.devices.broker_settings import BrokerSettings
+from fantwin.pipeline.devices.secret_file import read_secret, secret_of_environment
+from fantwin.pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client

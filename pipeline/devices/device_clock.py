@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S
 
 UINT32 = 1 << 32
 NS_PER_US = 1_000

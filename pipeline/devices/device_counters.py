@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from schemas.wire import DEVICE_COUNTERS, UINT16, UINT32, DeviceCounters
+from fantwin.schemas.wire import DEVICE_COUNTERS, UINT16, UINT32, DeviceCounters
 
 _WRAPS_FROM_S = UINT32 // 100 - 60
 """an uptime that a device derives from the 32-bit number of its samples, at most 100 a second, wraps a minute later at

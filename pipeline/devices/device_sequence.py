@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
-from pipeline.devices.device_clock import UINT32
-from pipeline.devices.sample_source import Reading
+from fantwin.pipeline.devices.device_clock import UINT32
+from fantwin.pipeline.devices.sample_source import Reading
 
 LARGEST_GAP = 1 << 24
 """Samples; 46 h at 100 Hz. A larger step of the sequence is a restart of the device."""

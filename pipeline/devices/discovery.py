@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.devices.hwmon_chips import chip_of
-from pipeline.devices.hwmon_config import ROOT
-from pipeline.devices.hwmon_tree import ChipFolder, chip_folders, device_words
+from fantwin.pipeline.devices.hwmon_chips import chip_of
+from fantwin.pipeline.devices.hwmon_config import ROOT
+from fantwin.pipeline.devices.hwmon_tree import ChipFolder, chip_folders, device_words
 
 HIGHEST_RPM = 20_000
 _UNKNOWN = "n/a"

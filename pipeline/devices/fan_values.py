@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from pipeline.devices.sample_source import Reading
+from fantwin.pipeline.devices.sample_source import Reading
 
 
 class FanValues:

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S
 
 VARIABLE = "FANTWIN_HOST_CLOCK"
 """environment variable with the offset of the time to go on with"""

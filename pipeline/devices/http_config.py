@@ -7,8 +7,8 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pipeline.devices.host_address import is_of_this_host_only
-from pipeline.devices.sample_source import SourceConfig
+from fantwin.pipeline.devices.host_address import is_of_this_host_only
+from fantwin.pipeline.devices.sample_source import SourceConfig
 
 
 class HttpConfig(SourceConfig, frozen=True):

@@ -14,9 +14,9 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.devices.http_config import HttpConfig
-from pipeline.devices.json_samples import (
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.devices.http_config import HttpConfig
+from fantwin.pipeline.devices.json_samples import (
     LARGEST_BYTES,
     MOST_SAMPLES,
     JsonSamplesError,
@@ -24,9 +24,9 @@ from pipeline.devices.json_samples import (
     batches_of,
     parse_samples,
 )
-from pipeline.devices.receipt_times import ReceiptTimes
-from pipeline.devices.sample_source import LinkDown, LinkUp, ReadingBatch, Rejected, SourceContext, SourceEvent
-from pipeline.devices.secret_file import read_secret
+from fantwin.pipeline.devices.receipt_times import ReceiptTimes
+from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp, ReadingBatch, Rejected, SourceContext, SourceEvent
+from fantwin.pipeline.devices.secret_file import read_secret
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -243,7 +243,7 @@ class HttpSource:
     def _serve_on(self, listening: socket.socket) -> None:
         import uvicorn  # noqa: PLC0415  slow to import
 
-        from pipeline.devices.http_protocol import LimitedProtocol  # noqa: PLC0415
+        from fantwin.pipeline.devices.http_protocol import LimitedProtocol  # noqa: PLC0415
 
         logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
         folder, certificate, key = self._context.folder, self._config.certificate, self._config.key

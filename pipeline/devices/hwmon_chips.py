@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from schemas.tacho import Tacho
+from fantwin.schemas.tacho import Tacho
 
 REVOLUTION_S = 0.05
 """one revolution at 1,200 rpm: chips measure the time of one, and the speed is not known here"""

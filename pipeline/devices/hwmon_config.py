@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pipeline.devices.hwmon_chips import chip_of
-from pipeline.devices.polling import PolledConfig
-from schemas.tacho import Tacho
+from fantwin.pipeline.devices.hwmon_chips import chip_of
+from fantwin.pipeline.devices.polling import PolledConfig
+from fantwin.schemas.tacho import Tacho
 
 ROOT = Path("/sys/class/hwmon")
 

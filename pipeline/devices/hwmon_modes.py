@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from pipeline.devices.hwmon_tree import ChipFolder
+from fantwin.pipeline.devices.hwmon_tree import ChipFolder
 
 
 @dataclass(frozen=True)

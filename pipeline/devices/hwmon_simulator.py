@@ -20,9 +20,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.devices.simulated_device import LATE_S, Device, PlaybackCounts
-from pipeline.errors import UserError
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.devices.simulated_device import LATE_S, Device, PlaybackCounts
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 FULL_SPEED, MANUAL, AUTOMATIC = 0, 1, 2
 HIGHEST_PWM = 255

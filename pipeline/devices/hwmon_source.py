@@ -14,14 +14,14 @@ import math
 import os
 from collections.abc import Sequence
 
-from pipeline.devices.hwmon_chips import chip_of
-from pipeline.devices.hwmon_config import HwmonConfig
-from pipeline.devices.hwmon_modes import FoundModes, FoundPwm
-from pipeline.devices.hwmon_tree import ChipFolder, chip_folders, device_words
-from pipeline.devices.polling import DeviceError, PollingSource
-from pipeline.devices.sample_source import Reading, Rejected, SourceContext
-from pipeline.errors import UserError
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.devices.hwmon_chips import chip_of
+from fantwin.pipeline.devices.hwmon_config import HwmonConfig
+from fantwin.pipeline.devices.hwmon_modes import FoundModes, FoundPwm
+from fantwin.pipeline.devices.hwmon_tree import ChipFolder, chip_folders, device_words
+from fantwin.pipeline.devices.polling import DeviceError, PollingSource
+from fantwin.pipeline.devices.sample_source import Reading, Rejected, SourceContext
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 MANUAL = 1
 """in pwmN_enable"""

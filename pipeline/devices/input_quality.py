@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
-from pipeline.devices.sample_source import Rejected
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.sample_source import Rejected
+from fantwin.schemas.units import NS_PER_S
 
 WINDOW = 100
 """pieces of input from which the quality is computed"""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from schemas.messages import Array
+from fantwin.schemas.messages import Array
 
 NEVER_NS = -(1 << 62)
 

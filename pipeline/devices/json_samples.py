@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from pipeline.devices.device_clock import NS_PER_US, UINT32
-from pipeline.devices.receipt_times import ReceiptTimes
-from pipeline.devices.sample_source import Reading, ReadingBatch, Rejected
-from schemas.auxiliary import AUXILIARY
-from schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.device_clock import NS_PER_US, UINT32
+from fantwin.pipeline.devices.receipt_times import ReceiptTimes
+from fantwin.pipeline.devices.sample_source import Reading, ReadingBatch, Rejected
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS
+from fantwin.schemas.units import NS_PER_S
 
 LARGEST_BYTES = 1 << 20
 """of one text"""

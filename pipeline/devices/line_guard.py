@@ -20,10 +20,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.devices.device_clock import DeviceClock
-from schemas.blocks import cut
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.device_clock import DeviceClock
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
 
 APART_NS = NS_PER_S
 ESTABLISHED_NS = 3 * NS_PER_S // 2  # by which one side must have gone on: longer than a message of acquisition spans

@@ -13,8 +13,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from schemas.messages import Array, Raw
-from schemas.units import NS_PER_S
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.units import NS_PER_S
 
 RATES_HZ = (1, 2, 5, 10, 20, 25, 50, 100)
 """rates of a grid that follows from the line; a faster line gets the last one"""

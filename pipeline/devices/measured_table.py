@@ -22,10 +22,10 @@ from typing import TextIO
 
 import numpy as np
 
-from pipeline.devices.table_columns import DATE_UNIT, NS_PER_UNIT, NumberColumn, TimeColumn
-from pipeline.errors import UsageError, UserError
-from schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Array
-from schemas.units import NS_PER_S, RAD_S_PER_UNIT
+from fantwin.pipeline.devices.table_columns import DATE_UNIT, NS_PER_UNIT, NumberColumn, TimeColumn
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Array
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
 RAD_S_PER_TABLE_UNIT = {**RAD_S_PER_UNIT, "hz": 2 * math.pi, "deg/s": math.pi / 180}
 GAP_IN_MEDIAN_PERIODS = 5.0

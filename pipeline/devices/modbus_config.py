@@ -6,9 +6,9 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, Field, model_validator
 
-from pipeline.devices.polling import PolledConfig
-from schemas.tacho import LONGEST_WINDOW_S, Tacho
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.devices.polling import PolledConfig
+from fantwin.schemas.tacho import LONGEST_WINDOW_S, Tacho
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 RegisterType = Literal["u16", "s16", "u32", "s32", "f32"]
 

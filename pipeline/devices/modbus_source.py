@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.devices.modbus_config import ModbusConfig, ModbusFan, Register
-from pipeline.devices.polling import DeviceError, PollingSource
-from pipeline.devices.sample_source import Reading, SourceContext
-from pipeline.errors import UserError
-from pipeline.extras import require
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.devices.modbus_config import ModbusConfig, ModbusFan, Register
+from fantwin.pipeline.devices.polling import DeviceError, PollingSource
+from fantwin.pipeline.devices.sample_source import Reading, SourceContext
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.extras import require
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 if TYPE_CHECKING:
     from pymodbus.client.base import ModbusBaseSyncClient

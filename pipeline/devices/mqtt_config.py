@@ -6,8 +6,8 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from pipeline.devices.broker_settings import BrokerSettings
-from pipeline.devices.sample_source import SourceConfig
+from fantwin.pipeline.devices.broker_settings import BrokerSettings
+from fantwin.pipeline.devices.sample_source import SourceConfig
 
 FAN = "{fan}"
 """stands for the number of a fan in a topic"""

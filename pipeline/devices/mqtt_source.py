@@ -13,13 +13,13 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from pipeline.devices.broker_client import NOT_REACHED, connection_problems, new_client, refusal
-from pipeline.devices.fan_values import FanValues
-from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.devices.json_samples import JsonSamplesError, batches_of, parse_samples
-from pipeline.devices.mqtt_config import FAN, MqttConfig
-from pipeline.devices.receipt_times import ReceiptTimes
-from pipeline.devices.sample_source import (
+from fantwin.pipeline.devices.broker_client import NOT_REACHED, connection_problems, new_client, refusal
+from fantwin.pipeline.devices.fan_values import FanValues
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.devices.json_samples import JsonSamplesError, batches_of, parse_samples
+from fantwin.pipeline.devices.mqtt_config import FAN, MqttConfig
+from fantwin.pipeline.devices.receipt_times import ReceiptTimes
+from fantwin.pipeline.devices.sample_source import (
     LinkDown,
     LinkUp,
     Reading,
@@ -28,7 +28,7 @@ from pipeline.devices.sample_source import (
     SourceContext,
     SourceEvent,
 )
-from pipeline.extras import require
+from fantwin.pipeline.extras import require
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client, MQTTMessage

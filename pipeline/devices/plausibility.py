@@ -6,10 +6,10 @@ import math
 from collections import Counter
 from dataclasses import replace
 
-from pipeline.devices.device_sequence import DeviceSequence
-from pipeline.devices.input_quality import InputQuality
-from pipeline.devices.sample_source import Reading, ReadingLimits, Rejected
-from schemas.auxiliary import AUXILIARY, AuxiliaryColumn
+from fantwin.pipeline.devices.device_sequence import DeviceSequence
+from fantwin.pipeline.devices.input_quality import InputQuality
+from fantwin.pipeline.devices.sample_source import Reading, ReadingLimits, Rejected
+from fantwin.schemas.auxiliary import AUXILIARY, AuxiliaryColumn
 
 LONGEST_DETAIL = 120
 """characters of what was wrong with a refused piece, which may quote the piece: each health names it"""

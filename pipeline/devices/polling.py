@@ -21,9 +21,17 @@ from typing import Protocol
 
 from pydantic import Field
 
-from pipeline.devices.device_clock import UINT32
-from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceConfig, SourceEvent
+from fantwin.pipeline.devices.device_clock import UINT32
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.devices.sample_source import (
+    LinkDown,
+    LinkUp,
+    Reading,
+    ReadingBatch,
+    Rejected,
+    SourceConfig,
+    SourceEvent,
+)
 
 SLOWEST_S = 1.0
 """between two samples that can be scored (resampler)"""

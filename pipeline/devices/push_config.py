@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from pipeline.devices.sample_source import SourceConfig
+from fantwin.pipeline.devices.sample_source import SourceConfig
 
 
 class PushConfig(SourceConfig, frozen=True):
-    """Samples come from a program that uses `fantwin_client`, or publishes topic `reading` itself."""
+    """Samples come from a program that uses `fantwin.client`, or publishes topic `reading` itself."""
 
     takes_pushed: ClassVar[bool] = True
 

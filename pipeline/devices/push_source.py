@@ -13,13 +13,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.devices.device_clock import NS_PER_US, UINT32
-from pipeline.devices.push_config import PushConfig
-from pipeline.devices.receipt_times import ReceiptTimes
-from pipeline.devices.sample_source import LinkUp, Reading, ReadingBatch, Rejected, SourceContext, SourceEvent
-from schemas.auxiliary import auxiliary_columns
-from schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, PushedSamples
-from schemas.units import NS_PER_S, RAD_S_PER_UNIT
+from fantwin.pipeline.devices.device_clock import NS_PER_US, UINT32
+from fantwin.pipeline.devices.push_config import PushConfig
+from fantwin.pipeline.devices.receipt_times import ReceiptTimes
+from fantwin.pipeline.devices.sample_source import LinkUp, Reading, ReadingBatch, Rejected, SourceContext, SourceEvent
+from fantwin.schemas.auxiliary import auxiliary_columns
+from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, PushedSamples
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
 SILENT_NS = 10 * NS_PER_S
 """a client that has sent nothing for so long gives its place to an earlier one"""

@@ -8,8 +8,8 @@ from urllib.parse import urlsplit
 
 from pydantic import Field, field_validator
 
-from pipeline.devices.polling import SLOWEST_S, PolledConfig
-from schemas.tacho import LONGEST_WINDOW_S, Tacho
+from fantwin.pipeline.devices.polling import SLOWEST_S, PolledConfig
+from fantwin.schemas.tacho import LONGEST_WINDOW_S, Tacho
 
 USER_VARIABLE, PASSWORD_VARIABLE = "FANTWIN_REDFISH_USER", "FANTWIN_REDFISH_PASSWORD"
 

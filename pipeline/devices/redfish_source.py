@@ -13,11 +13,11 @@ import stat
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from pipeline.devices.polling import DeviceError, PollingSource
-from pipeline.devices.redfish_config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
-from pipeline.devices.sample_source import Reading, Rejected, SourceContext
-from pipeline.extras import require
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.devices.polling import DeviceError, PollingSource
+from fantwin.pipeline.devices.redfish_config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
+from fantwin.pipeline.devices.sample_source import Reading, Rejected, SourceContext
+from fantwin.pipeline.extras import require
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 if TYPE_CHECKING:
     from sushy.main import Sushy

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, SampleSource, SourceEvent
+from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, SampleSource, SourceEvent
 
 
 @dataclass(frozen=True, slots=True, eq=False)

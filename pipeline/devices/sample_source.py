@@ -16,7 +16,7 @@ from typing import ClassVar, Protocol, TypeAlias
 
 from pydantic import BaseModel
 
-from schemas.tacho import Tacho
+from fantwin.schemas.tacho import Tacho
 
 MOST_FANS = 1024
 """of a tray: those whose samples come in one reading"""

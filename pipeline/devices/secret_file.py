@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from pipeline.errors import UserError
+from fantwin.pipeline.errors import UserError
 
 OTHERS = 0o077
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from pipeline.devices.sample_source import MOST_FANS, SourceConfig
+from fantwin.pipeline.devices.sample_source import MOST_FANS, SourceConfig
 
 MOST_FANS_ON_LINE = 64
 """that a frame carries: `schemas.wire.MAX_FANS`, which is not imported for reading a configuration"""

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import serial
 
-from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.devices.sample_source import LinkDown, LinkUp
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp
 
 READ_TIMEOUT_S = 0.1
 MOST_READ_BYTES = 1 << 16

@@ -8,8 +8,8 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
-from pipeline.devices.device_counters import DeviceCounterSteps
-from pipeline.devices.sample_source import (
+from fantwin.pipeline.devices.device_counters import DeviceCounterSteps
+from fantwin.pipeline.devices.sample_source import (
     LinkDown,
     LinkUp,
     Reading,
@@ -19,10 +19,10 @@ from pipeline.devices.sample_source import (
     SourceEvent,
     too_many_fans,
 )
-from pipeline.devices.serial_config import SerialConfig
-from pipeline.devices.serial_port import ReceivedBytes, SerialPort
-from pipeline.errors import UserError
-from schemas import wire
+from fantwin.pipeline.devices.serial_config import SerialConfig
+from fantwin.pipeline.devices.serial_port import ReceivedBytes, SerialPort
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas import wire
 
 _HARMLESS = (wire.FaultKind.RESYNC, wire.FaultKind.UNKNOWN_TYPE)
 _REFUSED_SAMPLES = (wire.FaultKind.WRONG_FAN_COUNT, wire.FaultKind.BAD_COMMAND)

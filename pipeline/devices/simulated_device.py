@@ -25,8 +25,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import UserError
-from schemas import wire
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas import wire
 
 LATE_S = 0.02
 """A sample sent this much after its time counts as late."""

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from pipeline.devices.sample_source import SampleSource, SourceConfig, SourceContext
+from fantwin.pipeline.devices.sample_source import SampleSource, SourceConfig, SourceContext
 
 
 class SourceKind(NamedTuple):
@@ -23,25 +23,32 @@ class SourceKind(NamedTuple):
 
 SOURCE_KINDS: dict[str, SourceKind] = {
     "serial": SourceKind(
-        config="pipeline.devices.serial_config:SerialConfig", source="pipeline.devices.serial_source:SerialSource"
+        config="fantwin.pipeline.devices.serial_config:SerialConfig",
+        source="fantwin.pipeline.devices.serial_source:SerialSource",
     ),
     "mqtt": SourceKind(
-        config="pipeline.devices.mqtt_config:MqttConfig", source="pipeline.devices.mqtt_source:MqttSource"
+        config="fantwin.pipeline.devices.mqtt_config:MqttConfig",
+        source="fantwin.pipeline.devices.mqtt_source:MqttSource",
     ),
     "http": SourceKind(
-        config="pipeline.devices.http_config:HttpConfig", source="pipeline.devices.http_source:HttpSource"
+        config="fantwin.pipeline.devices.http_config:HttpConfig",
+        source="fantwin.pipeline.devices.http_source:HttpSource",
     ),
     "push": SourceKind(
-        config="pipeline.devices.push_config:PushConfig", source="pipeline.devices.push_source:PushSource"
+        config="fantwin.pipeline.devices.push_config:PushConfig",
+        source="fantwin.pipeline.devices.push_source:PushSource",
     ),
     "hwmon": SourceKind(
-        config="pipeline.devices.hwmon_config:HwmonConfig", source="pipeline.devices.hwmon_source:HwmonSource"
+        config="fantwin.pipeline.devices.hwmon_config:HwmonConfig",
+        source="fantwin.pipeline.devices.hwmon_source:HwmonSource",
     ),
     "modbus": SourceKind(
-        config="pipeline.devices.modbus_config:ModbusConfig", source="pipeline.devices.modbus_source:ModbusSource"
+        config="fantwin.pipeline.devices.modbus_config:ModbusConfig",
+        source="fantwin.pipeline.devices.modbus_source:ModbusSource",
     ),
     "redfish": SourceKind(
-        config="pipeline.devices.redfish_config:RedfishConfig", source="pipeline.devices.redfish_source:RedfishSource"
+        config="fantwin.pipeline.devices.redfish_config:RedfishConfig",
+        source="fantwin.pipeline.devices.redfish_source:RedfishSource",
     ),
 }
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import UserError
-from schemas.messages import FURTHEST_T_NS, Array
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.messages import FURTHEST_T_NS, Array
+from fantwin.schemas.units import NS_PER_S
 
 NS_PER_UNIT = {"s": NS_PER_S, "ms": 1_000_000, "us": 1_000, "ns": 1}
 DATE_UNIT = "iso"

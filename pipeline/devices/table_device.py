@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.devices.measured_table import Table
-from pipeline.errors import UserError
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.measured_table import Table
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.units import NS_PER_S
 
 
 @dataclass(frozen=True)

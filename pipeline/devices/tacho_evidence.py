@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.tacho import Tacho, tacho_of_each_fan
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 Array = NDArray[np.float64]
 

@@ -18,11 +18,11 @@ from urllib.parse import urlsplit
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 
-from pipeline.gateway.config import GatewayConfig
-from pipeline.gateway.sessions import LoginSessions, Session
-from pipeline.presenting.login_failures import LoginFailures
-from pipeline.presenting.security_log import SecurityLog
-from pipeline.presenting.users import NAME, User, UserRole, Users
+from fantwin.pipeline.gateway.config import GatewayConfig
+from fantwin.pipeline.gateway.sessions import LoginSessions, Session
+from fantwin.pipeline.presenting.login_failures import LoginFailures
+from fantwin.pipeline.presenting.security_log import SecurityLog
+from fantwin.pipeline.presenting.users import NAME, User, UserRole, Users
 
 COOKIE, SECURE_COOKIE = "fantwin", "__Host-fantwin"
 CSRF_HEADER = "X-CSRF-Token"

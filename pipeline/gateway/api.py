@@ -19,18 +19,18 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 
-from pipeline.config.models import TrayConfig
-from pipeline.errors import UserError
-from pipeline.gateway.access import Access, Visitor, address_of, require_own_page, require_token
-from pipeline.gateway.forms import LoginForm
-from pipeline.gateway.live_feed import LiveFeed, encoded
-from pipeline.gateway.metrics import metrics_text
-from pipeline.gateway.shared_answer import SharedAnswer
-from pipeline.presenting.fan_groups import FanGroup
-from pipeline.presenting.fan_history import HISTORY_S
-from pipeline.presenting.request_desk import RequestDesk
-from pipeline.presenting.request_form import RequestForm
-from pipeline.presenting.shown import (
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.gateway.access import Access, Visitor, address_of, require_own_page, require_token
+from fantwin.pipeline.gateway.forms import LoginForm
+from fantwin.pipeline.gateway.live_feed import LiveFeed, encoded
+from fantwin.pipeline.gateway.metrics import metrics_text
+from fantwin.pipeline.gateway.shared_answer import SharedAnswer
+from fantwin.pipeline.presenting.fan_groups import FanGroup
+from fantwin.pipeline.presenting.fan_history import HISTORY_S
+from fantwin.pipeline.presenting.request_desk import RequestDesk
+from fantwin.pipeline.presenting.request_form import RequestForm
+from fantwin.pipeline.presenting.shown import (
     alarms_json,
     clip_json,
     curves_json,
@@ -42,12 +42,12 @@ from pipeline.presenting.shown import (
     stages_json,
     transition_json,
 )
-from pipeline.presenting.site_model import SiteModel
-from pipeline.recordings.clips.clip import Clip, kept_clips
-from pipeline.viewing.fleet import Fan
-from schemas.enums import Transition
-from schemas.messages import Request as OperatorRequest
-from schemas.units import NS_PER_S
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.recordings.clips.clip import Clip, kept_clips
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Request as OperatorRequest
+from fantwin.schemas.units import NS_PER_S
 
 MOST_LISTED = 500
 LARGEST_BODY_BYTES, BODY_WITHIN_S = 16_384, 10.0

@@ -17,10 +17,10 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from pipeline.gateway.api import Api, broken, failed
-from pipeline.gateway.config import GatewayConfig
-from pipeline.gateway.openapi import description
-from pipeline.gateway.shared_answer import COMPRESSION
+from fantwin.pipeline.gateway.api import Api, broken, failed
+from fantwin.pipeline.gateway.config import GatewayConfig
+from fantwin.pipeline.gateway.openapi import description
+from fantwin.pipeline.gateway.shared_answer import COMPRESSION
 
 PAGE = Path(__file__).parent / "page"
 PREFIX = "/api/v1"

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pydantic import Field, field_validator, model_validator
 
-from pipeline.devices.host_address import is_of_this_host_only
-from pipeline.runtime.stage import StageConfig
+from fantwin.pipeline.devices.host_address import is_of_this_host_only
+from fantwin.pipeline.runtime.stage import StageConfig
 
 _OWN_HOSTS = ("localhost", "127.0.0.1", "[::1]")
 

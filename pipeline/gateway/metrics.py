@@ -21,13 +21,13 @@ from prometheus_client.exposition import generate_latest
 from prometheus_client.registry import Collector
 from prometheus_client.utils import floatToGoString
 
-from pipeline.launch.site_state import AT_WORK, StageState, Word
-from pipeline.presenting.fan_history import CURVES
-from pipeline.presenting.site_model import SiteModel
-from schemas.enums import Severity
-from schemas.health import LatencyBucket
-from schemas.units import RAD_S_PER_UNIT
-from scoring.alarms.alarm_flags import is_presented
+from fantwin.pipeline.launch.site_state import AT_WORK, StageState, Word
+from fantwin.pipeline.presenting.fan_history import CURVES
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.health import LatencyBucket
+from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.scoring.alarms.alarm_flags import is_presented
 
 _PER_RPM = RAD_S_PER_UNIT["rpm"]
 _TRAY = ["site", "tray"]

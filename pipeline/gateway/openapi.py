@@ -8,10 +8,10 @@ from typing import Any
 
 from pydantic.json_schema import models_json_schema
 
-from pipeline.gateway.access import CSRF_HEADER
-from pipeline.gateway.forms import LoginForm
-from pipeline.presenting.fan_groups import FanGroup
-from pipeline.presenting.request_form import RequestForm
+from fantwin.pipeline.gateway.access import CSRF_HEADER
+from fantwin.pipeline.gateway.forms import LoginForm
+from fantwin.pipeline.presenting.fan_groups import FanGroup
+from fantwin.pipeline.presenting.request_form import RequestForm
 
 _FORMS = {"/login": LoginForm, "/fans/{tray}/{fan}/requests": RequestForm}
 _QUERY: Mapping[str, Mapping[str, str | list[str]]] = {

@@ -22,8 +22,8 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from pipeline.presenting.login_failures import network_of
-from pipeline.runtime.stage import StageError
+from fantwin.pipeline.presenting.login_failures import network_of
+from fantwin.pipeline.runtime.stage import StageError
 
 STOP_LIMIT_S = 3.0
 MOST_CONNECTIONS = 2000

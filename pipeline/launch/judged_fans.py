@@ -9,20 +9,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import TrayConfig
-from pipeline.config.registry import STAGES
-from pipeline.launch.site_state import StageState, Word
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.runtime.figures import without_figures
-from schemas.codec import CodecError, decode
-from schemas.enums import InvalidReason
-from schemas.fan_numbers import fans_in_words
-from schemas.messages import Alarm, Score
-from schemas.topics import tray_key
-from scoring.alarms.current_alarms import CurrentAlarm
-from scoring.alarms.unscored_monitor import JUDGED_AT_REST, REASONS
-from scoring.alarms.words_now import STARTING, STOPPED, words_now
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.launch.site_state import StageState, Word
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.runtime.figures import without_figures
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.fan_numbers import fans_in_words
+from fantwin.schemas.messages import Alarm, Score
+from fantwin.schemas.topics import tray_key
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.alarms.unscored_monitor import JUDGED_AT_REST, REASONS
+from fantwin.scoring.alarms.words_now import STARTING, STOPPED, words_now
 
 JUDGED_WITHIN_S = 5.0
 """a fan is judged now if it had a valid score, or was stopped or starting, this recently"""

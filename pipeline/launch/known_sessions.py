@@ -6,10 +6,10 @@ its token has gone. Not thread-safe.
 
 from __future__ import annotations
 
-from pipeline.launch.loss_accounting import Launched
-from pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
-from schemas.health import Health
-from schemas.topics import topic_of, tray_of
+from fantwin.pipeline.launch.loss_accounting import Launched
+from fantwin.pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
+from fantwin.schemas.health import Health
+from fantwin.schemas.topics import topic_of, tray_of
 
 _WATCHED_TOPICS = {"alarm", "score", "snapshot"}
 

@@ -10,28 +10,28 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.bus.errors import NoAnswerError
-from pipeline.bus.opening import credentials_of
-from pipeline.bus.session import Bus, join_bus
-from pipeline.config.models import Config
-from pipeline.config.registry import LEARNER, RECORDER, STAGES
-from pipeline.config.roles import role_names, roles_of
-from pipeline.config.shards import own_file
-from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.errors import UserError
-from pipeline.launch.loss_accounting import Launched
-from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
-from pipeline.launch.site_report import RunningProcess, SiteReport
-from pipeline.launch.site_state import site_states
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.launch.stage_notes import note_lines
-from pipeline.launch.watchdog import Watchdog
-from pipeline.recordings.parts import part_files, part_path
-from pipeline.runtime.clock import REPLAY
-from pipeline.runtime.stage import load_stage
-from pipeline.runtime.tray_twin import load_tray_twin, twin_path
-from schemas.enums import StageStatus
-from schemas.topics import ALL_TRAYS, alive_key
+from fantwin.pipeline.bus.errors import NoAnswerError
+from fantwin.pipeline.bus.opening import credentials_of
+from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.registry import LEARNER, RECORDER, STAGES
+from fantwin.pipeline.config.roles import role_names, roles_of
+from fantwin.pipeline.config.shards import own_file
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.launch.loss_accounting import Launched
+from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
+from fantwin.pipeline.launch.site_report import RunningProcess, SiteReport
+from fantwin.pipeline.launch.site_state import site_states
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.launch.stage_notes import note_lines
+from fantwin.pipeline.launch.watchdog import Watchdog
+from fantwin.pipeline.recordings.parts import part_files, part_path
+from fantwin.pipeline.runtime.clock import REPLAY
+from fantwin.pipeline.runtime.stage import load_stage
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin, twin_path
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.topics import ALL_TRAYS, alive_key
 
 _POLL_S = 0.05
 _SEARCH_S = 2.0  # this long after meeting one process, a launcher has discovered all others

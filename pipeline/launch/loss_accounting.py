@@ -23,12 +23,12 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-from pipeline.config.registry import STAGES
-from pipeline.runtime.stage import load_stage
-from schemas.enums import StageStatus
-from schemas.health import Health
-from schemas.streams import StreamId, StreamState, input_streams, output_streams
-from schemas.topics import HEALTH_CHUNK, stage_label
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.runtime.stage import load_stage
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.health import Health
+from fantwin.schemas.streams import StreamId, StreamState, input_streams, output_streams
+from fantwin.schemas.topics import HEALTH_CHUNK, stage_label
 
 Launched: TypeAlias = tuple[str, int]
 """label and process id of a session"""

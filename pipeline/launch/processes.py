@@ -13,12 +13,12 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.config.models import Config
-from pipeline.config.shards import Shard, shards_of
-from pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
-from pipeline.launch.notices import Notices
-from pipeline.runtime.notifier import VARIABLE as NOTIFY_VARIABLE
-from schemas.topics import stage_label
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.shards import Shard, shards_of
+from fantwin.pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
+from fantwin.pipeline.launch.notices import Notices
+from fantwin.pipeline.runtime.notifier import VARIABLE as NOTIFY_VARIABLE
+from fantwin.schemas.topics import stage_label
 
 EXIT_CANNOT_START = 78  # the stage cannot run as configured; one line on stderr says why (EX_CONFIG of sysexits.h)
 
@@ -67,7 +67,7 @@ class Child:
         Raises:
             OSError: the system has no room for another process; nothing is left of it.
         """
-        command = [sys.executable, "-P", "-m", "pipeline", "run", row.stage, "-c", str(config_path), *row.shard.words]
+        command = [sys.executable, "-P", "-m", "fantwin", "run", row.stage, "-c", str(config_path), *row.shard.words]
         for override in overrides:
             command += ["--set", override]
         self.row = row

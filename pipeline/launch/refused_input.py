@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 
-from pipeline.launch.loss_accounting import Launched, label
-from schemas.health import Health
+from fantwin.pipeline.launch.loss_accounting import Launched, label
+from fantwin.schemas.health import Health
 
 WORDS = {
     "refused_of_second": "message{s} from a second process of a stage",

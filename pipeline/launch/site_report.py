@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.launch.site_state import OFF_THE_BUS, WHY_SILENT, StageState, Word
-from pipeline.launch.site_watcher import StageView
-from pipeline.launch.stage_notes import note_lines
-from pipeline.runtime.figures import without_figures
-from pipeline.runtime.latencies import LATENCY_WINDOW_S
-from schemas.enums import Severity
-from schemas.health import Health
-from schemas.units import NS_PER_S
-from scoring.alarms.current_alarms import CurrentAlarm, clock
+from fantwin.pipeline.launch.site_state import OFF_THE_BUS, WHY_SILENT, StageState, Word
+from fantwin.pipeline.launch.site_watcher import StageView
+from fantwin.pipeline.launch.stage_notes import note_lines
+from fantwin.pipeline.runtime.figures import without_figures
+from fantwin.pipeline.runtime.latencies import LATENCY_WINDOW_S
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.health import Health
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock
 
 _ALL = "all stages"
 _NOTE_AFTER_NS = 5 * NS_PER_S

@@ -11,17 +11,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from pipeline.config.registry import STAGES
-from pipeline.launch.loss_accounting import label, trays_of
-from pipeline.launch.processes import StageProcess
-from pipeline.launch.site_watcher import SiteWatcher, StageView
-from pipeline.launch.watchdog import START_LIMIT_S
-from pipeline.runtime.clock import REPLAY
-from schemas.enums import StageStatus
-from schemas.health import Health
-from schemas.streams import input_streams, output_streams
-from schemas.topics import ALL_TRAYS, HEALTH_CHUNK, key_in_words
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.launch.loss_accounting import label, trays_of
+from fantwin.pipeline.launch.processes import StageProcess
+from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.launch.watchdog import START_LIMIT_S
+from fantwin.pipeline.runtime.clock import REPLAY
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.health import Health
+from fantwin.schemas.streams import input_streams, output_streams
+from fantwin.schemas.topics import ALL_TRAYS, HEALTH_CHUNK, key_in_words
+from fantwin.schemas.units import NS_PER_S
 
 SILENT_AFTER_S = 5.0
 """without a health, which every stage sends once a second"""

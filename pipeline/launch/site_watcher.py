@@ -9,22 +9,22 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from itertools import chain
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import NAME_PATTERN
-from pipeline.config.roles import Role, roles_of_stages
-from pipeline.launch.known_sessions import KnownSessions
-from pipeline.launch.loss_accounting import Launched, label, losses
-from pipeline.launch.refused_input import refused, unusable_lines
-from pipeline.launch.watched_alarms import WatchedAlarms
-from pipeline.runtime.believed_outputs import BelievedOutputs
-from pipeline.runtime.lost_sessions import LostSessions
-from pipeline.runtime.sessions import Session, this_host
-from schemas.codec import CodecError, decode
-from schemas.health import Health
-from schemas.messages import Alarm
-from schemas.topics import alive_key, health_key, sessions_key, tray_key
-from schemas.units import NS_PER_S
-from scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import NAME_PATTERN
+from fantwin.pipeline.config.roles import Role, roles_of_stages
+from fantwin.pipeline.launch.known_sessions import KnownSessions
+from fantwin.pipeline.launch.loss_accounting import Launched, label, losses
+from fantwin.pipeline.launch.refused_input import refused, unusable_lines
+from fantwin.pipeline.launch.watched_alarms import WatchedAlarms
+from fantwin.pipeline.runtime.believed_outputs import BelievedOutputs
+from fantwin.pipeline.runtime.lost_sessions import LostSessions
+from fantwin.pipeline.runtime.sessions import Session, this_host
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import alive_key, health_key, sessions_key, tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 MOST_WATCHED_SESSIONS = 1000
 """so many last healths are kept; of more, those heard longest ago are forgotten, those of launched sessions last"""

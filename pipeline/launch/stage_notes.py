@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from pipeline.launch.loss_accounting import label
-from schemas.health import Health
+from fantwin.pipeline.launch.loss_accounting import label
+from fantwin.schemas.health import Health
 
 
 def note_lines(healths: Iterable[Health]) -> list[str]:

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.config.loading import load_config
-from pipeline.config.models import Config
-from pipeline.config.registry import GATEWAY, STAGES
-from pipeline.config.shards import Shard
-from pipeline.extras import missing_extra
-from pipeline.launch.processes import process_list
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.registry import GATEWAY, STAGES
+from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.extras import missing_extra
+from fantwin.pipeline.launch.processes import process_list
 
 _PORTS = 1000
 """number of ports that are tried, from the configured one on"""

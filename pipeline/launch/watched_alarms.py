@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from schemas.messages import Alarm
-from scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence, needed
+from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence, needed
 
 MOST_WATCHED_FANS = 4096
 """whose last alarm is kept. Of more, and beyond WATCHED_BYTES, those of producers that are no stage are forgotten

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.enums import FanState
-from schemas.messages import Array, Score
-from schemas.units import NS_PER_S
-from scoring.samples import among
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.messages import Array, Score
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.samples import among
 
 WITH_ALARM = (FanState.ALARM, FanState.RETURNING)
 WITHOUT_ALARM = (FanState.NORMAL, FanState.SUSPECT)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.learning.history_recordings import (
+from fantwin.pipeline.learning.history_recordings import (
     LONGEST_GAP_NS,
     HistoryProblems,
     HistoryRecording,
@@ -25,10 +25,10 @@ from pipeline.learning.history_recordings import (
     raws_of,
     recordings_in,
 )
-from pipeline.learning.versions import TimeSpan
-from schemas.messages import Array, Raw
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.learning.versions import TimeSpan
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 
 HEALTHY, NEAR_ALARMS = "healthy", "near_alarms"
 NEAR_ALARMS_KEPT_S = 24 * 3600.0

@@ -11,13 +11,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.learning.versions import TimeSpan, overlap
-from pipeline.recordings.reading import RecordingError, read_recording
-from pipeline.recordings.records import ACTIVE_SUFFIX, CORRUPT_DATA_ERRORS, indexed_reader
-from pipeline.recordings.repair import repair_in_place
-from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.learning.versions import TimeSpan, overlap
+from fantwin.pipeline.recordings.reading import RecordingError, read_recording
+from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX, CORRUPT_DATA_ERRORS, indexed_reader
+from fantwin.pipeline.recordings.repair import repair_in_place
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
 
 OPEN_NAME = "open.mcap"
 LEFT_NAMES = "open*.mcap"

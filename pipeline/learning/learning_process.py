@@ -48,7 +48,7 @@ class LearningProcess:
     def __init__(self, config: Path, overrides: Sequence[str], tray: str, log: Path) -> None:
         """log: file for the standard error of the last run."""
         sets = [word for override in overrides for word in ("--set", override)]
-        self._command = [sys.executable, "-P", "-m", "pipeline", "learn", "-c", str(config), "--tray", tray, *sets]
+        self._command = [sys.executable, "-P", "-m", "fantwin", "learn", "-c", str(config), "--tray", tray, *sets]
         self._log = log
         self._child: subprocess.Popen[bytes] | None = None
         self._began_s = 0.0

@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from pipeline.learning.healthy_history import HealthyHistory
-from pipeline.learning.history_recordings import SHORTEST_RECORDING_S
-from pipeline.learning.ordinary_operation import OrdinaryOperation
-from pipeline.learning.versions import VersionList
+from fantwin.pipeline.learning.healthy_history import HealthyHistory
+from fantwin.pipeline.learning.history_recordings import SHORTEST_RECORDING_S
+from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
+from fantwin.pipeline.learning.versions import VersionList
 
 Work: TypeAlias = Literal["version", "check"]
 

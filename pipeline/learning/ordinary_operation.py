@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
 
 RANGES = 10
 """equal parts of the commands of a tray"""

@@ -15,8 +15,8 @@ from typing import Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pipeline.errors import UserError
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.units import NS_PER_S
 
 LIST_NAME = "versions.json"
 Outcome: TypeAlias = Literal["taken", "offered"]

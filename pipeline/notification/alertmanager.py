@@ -19,13 +19,13 @@ from http.client import HTTPException
 from typing import Any
 from urllib.parse import unquote, urlsplit, urlunsplit
 
-from pipeline.errors import UserError
-from pipeline.notification.fan_alarm import FanAlarm
-from pipeline.notification.outbox import FiringKey, Outbox
-from pipeline.notification.sending import FIRST_DELAY_S, LONGEST_DELAY_S, Failure
-from pipeline.notification.wording import Place, describe
-from schemas.enums import Severity
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.notification.fan_alarm import FanAlarm
+from fantwin.pipeline.notification.outbox import FiringKey, Outbox
+from fantwin.pipeline.notification.sending import FIRST_DELAY_S, LONGEST_DELAY_S, Failure
+from fantwin.pipeline.notification.wording import Place, describe
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.units import NS_PER_S
 
 RESEND_S = 60.0
 EXPIRES_S = 5 * RESEND_S

@@ -11,8 +11,8 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import Field, field_validator, model_validator
 
-from pipeline.config.models import Name, Section
-from pipeline.runtime.stage import StageConfig
+from fantwin.pipeline.config.models import Name, Section
+from fantwin.pipeline.runtime.stage import StageConfig
 
 _TIME = re.compile(r"([01][0-9]|2[0-3]):[0-5][0-9]")
 

@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Self
 
-from pipeline.notification.config import TargetConfig
-from pipeline.notification.fan_alarm import FanAlarm
-from schemas.units import NS_PER_S
+from fantwin.pipeline.notification.config import TargetConfig
+from fantwin.pipeline.notification.fan_alarm import FanAlarm
+from fantwin.schemas.units import NS_PER_S
 
 
 class Kind(StrEnum):

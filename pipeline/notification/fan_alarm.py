@@ -6,9 +6,9 @@ import json
 from dataclasses import asdict, dataclass, replace
 from typing import Self
 
-from schemas.enums import Severity, Transition
-from schemas.messages import Alarm
-from scoring.alarms.alarm_flags import is_presented, is_silenced
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.alarm_flags import is_presented, is_silenced
 
 FanName = tuple[str, int]
 """tray and fan"""

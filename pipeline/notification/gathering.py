@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from datetime import datetime, tzinfo
 from typing import Self
 
-from pipeline.notification.config import NotifierConfig, QuietHours
-from pipeline.notification.deciding import Kind
-from pipeline.notification.fan_alarm import FanName
-from schemas.enums import Severity
-from schemas.units import NS_PER_S
+from fantwin.pipeline.notification.config import NotifierConfig, QuietHours
+from fantwin.pipeline.notification.deciding import Kind
+from fantwin.pipeline.notification.fan_alarm import FanName
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.units import NS_PER_S
 
 LONGEST_S = 600.0
 """a message that waits for more fans waits no longer"""

@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from pipeline.notification.config import NotifierConfig, TargetConfig
-from pipeline.notification.deciding import Announced, Event, decide, hears_of
-from pipeline.notification.fan_alarm import FanAlarm, FanName, after, heard_at
-from pipeline.notification.gathering import Gathered, Happened, is_due, is_held, is_within, next_after
-from pipeline.notification.wording import Place, Text, about_fan, about_many
-from schemas.messages import Alarm
-from schemas.units import NS_PER_S
+from fantwin.pipeline.notification.config import NotifierConfig, TargetConfig
+from fantwin.pipeline.notification.deciding import Announced, Event, decide, hears_of
+from fantwin.pipeline.notification.fan_alarm import FanAlarm, FanName, after, heard_at
+from fantwin.pipeline.notification.gathering import Gathered, Happened, is_due, is_held, is_within, next_after
+from fantwin.pipeline.notification.wording import Place, Text, about_fan, about_many
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.units import NS_PER_S
 
 FIRST_LOOK_NS = 10 * NS_PER_S
 """a notifier that has never run hears what happened before: in this time it only learns what the alarms are now"""

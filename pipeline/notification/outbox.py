@@ -14,13 +14,13 @@ from contextlib import suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-from pipeline.errors import UserError
-from pipeline.notification.deciding import Announced, Event
-from pipeline.notification.fan_alarm import FanAlarm
-from pipeline.notification.gathering import Gathered
-from pipeline.notification.notifications import Basket, Changes, Saved
-from pipeline.notification.wording import Level, Text
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.notification.deciding import Announced, Event
+from fantwin.pipeline.notification.fan_alarm import FanAlarm
+from fantwin.pipeline.notification.gathering import Gathered
+from fantwin.pipeline.notification.notifications import Basket, Changes, Saved
+from fantwin.pipeline.notification.wording import Level, Text
+from fantwin.schemas.units import NS_PER_S
 
 MOST_EVENTS = 200_000
 """of those that were decided, the last are remembered"""

@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from pipeline.notification.outbox import Outbox, Waiting
-from pipeline.notification.wording import Text
+from fantwin.pipeline.notification.outbox import Outbox, Waiting
+from fantwin.pipeline.notification.wording import Text
 
 FIRST_DELAY_S, LONGEST_DELAY_S = 1.0, 60.0
 """between attempts: it doubles from the one to the other"""

@@ -6,9 +6,9 @@ import logging
 import re
 from typing import TYPE_CHECKING
 
-from pipeline.errors import UserError
-from pipeline.notification.sending import Failure
-from pipeline.notification.wording import Level, Text
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.notification.sending import Failure
+from fantwin.pipeline.notification.wording import Level, Text
 
 if TYPE_CHECKING:
     from apprise import AppriseAsset, NotifyBase

@@ -6,15 +6,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.devices.secret_file import read_secret, secret_of_environment
-from pipeline.errors import UserError
-from pipeline.extras import require
-from pipeline.notification.alertmanager import Alertmanager, AlertSender, test_alert
-from pipeline.notification.config import NotifierConfig, TargetConfig
-from pipeline.notification.outbox import Outbox
-from pipeline.notification.sending import Failure, Sender
-from pipeline.notification.services import Service
-from pipeline.notification.wording import Place, test_text
+from fantwin.pipeline.devices.secret_file import read_secret, secret_of_environment
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.extras import require
+from fantwin.pipeline.notification.alertmanager import Alertmanager, AlertSender, test_alert
+from fantwin.pipeline.notification.config import NotifierConfig, TargetConfig
+from fantwin.pipeline.notification.outbox import Outbox
+from fantwin.pipeline.notification.sending import Failure, Sender
+from fantwin.pipeline.notification.services import Service
+from fantwin.pipeline.notification.wording import Place, test_text
 
 Resolve = Callable[[Path], Path]
 """A path of the configuration file as one of the file system."""

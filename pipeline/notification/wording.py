@@ -9,13 +9,13 @@ from datetime import datetime, tzinfo
 from enum import StrEnum
 from urllib.parse import quote
 
-from pipeline.notification.deciding import Kind
-from pipeline.notification.fan_alarm import FanAlarm, NamedCause
-from pipeline.notification.gathering import Happened, ranges
-from schemas.enums import Severity
-from schemas.units import NS_PER_S
-from scoring.diagnosis.advice import KNOWN_SOON
-from scoring.diagnosis.shown_causes import (
+from fantwin.pipeline.notification.deciding import Kind
+from fantwin.pipeline.notification.fan_alarm import FanAlarm, NamedCause
+from fantwin.pipeline.notification.gathering import Happened, ranges
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.diagnosis.advice import KNOWN_SOON
+from fantwin.scoring.diagnosis.shown_causes import (
     CANNOT_TELL,
     CAUSES,
     advice,

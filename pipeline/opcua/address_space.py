@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 from asyncua import Node, Server, ua
 
-from pipeline.config.models import TrayConfig
-from pipeline.opcua.conditions import OWN_FIELDS
-from pipeline.opcua.fan_values import VARIABLES
-from pipeline.opcua.identifiers import COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SITE_FOLDER
-from pipeline.opcua.requests import FAN_METHODS
-from pipeline.opcua.site_nodes import SiteNodes, ValueOf
-from pipeline.opcua.templates import standard
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.opcua.conditions import OWN_FIELDS
+from fantwin.pipeline.opcua.fan_values import VARIABLES
+from fantwin.pipeline.opcua.identifiers import COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SITE_FOLDER
+from fantwin.pipeline.opcua.requests import FAN_METHODS
+from fantwin.pipeline.opcua.site_nodes import SiteNodes, ValueOf
+from fantwin.pipeline.opcua.templates import standard
 
 _NOTIFIES = [ua.EventNotifier.SubscribeToEvents, ua.EventNotifier.HistoryRead]
 _FIRST_DECLARATION = 100

@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from pipeline.errors import UserError
+from fantwin.pipeline.errors import UserError
 
 VALID_DAYS = 3650
 KEY_BITS = 2048

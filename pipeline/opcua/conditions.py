@@ -9,15 +9,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from pipeline.opcua.identifiers import FAN_ALARM_TYPE, condition_identifier
-from pipeline.presenting.request_form import LONGEST_SHELVING_S
-from pipeline.viewing.fleet import Fan
-from schemas.enums import Severity, Transition
-from schemas.messages import Alarm
-from scoring.alarms.alarm_flags import is_retained, is_silenced
-from scoring.alarms.current_alarms import CurrentAlarm
-from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
-from scoring.diagnosis.shown_causes import CANNOT_TELL, likely_causes, likely_evidence
+from fantwin.pipeline.opcua.identifiers import FAN_ALARM_TYPE, condition_identifier
+from fantwin.pipeline.presenting.request_form import LONGEST_SHELVING_S
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.alarm_flags import is_retained, is_silenced
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, likely_causes, likely_evidence
 
 SEVERITIES = {Severity.NONE: 1, Severity.WARNING: 500, Severity.ALARM: 900}
 """of Part 5: 401 to 600 is medium, 801 to 1000 high"""

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pydantic import Field, model_validator
 
-from pipeline.devices.host_address import is_of_this_host_only
-from pipeline.runtime.stage import StageConfig
+from fantwin.pipeline.devices.host_address import is_of_this_host_only
+from fantwin.pipeline.runtime.stage import StageConfig
 
 
 class OpcuaConfig(StageConfig):

@@ -9,7 +9,7 @@ from typing import Any
 
 from asyncua import ua
 
-from pipeline.opcua.conditions import OwnNode, StandardNode, Time
+from fantwin.pipeline.opcua.conditions import OwnNode, StandardNode, Time
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 STATUS = {name: ua.StatusCode(ua.UInt32(code)) for name, code in vars(ua.StatusCodes).items() if isinstance(code, int)}

@@ -16,10 +16,10 @@ from asyncua.server.address_space import AddressSpace
 from asyncua.server.internal_subscription import InternalSubscription
 from asyncua.server.monitored_item_service import WhereClauseEvaluator
 
-from pipeline.opcua.conditions import ALL_FIELDS, Condition
-from pipeline.opcua.encoding import variant
-from pipeline.opcua.identifiers import SITE_FOLDER
-from pipeline.viewing.fleet import Fan
+from fantwin.pipeline.opcua.conditions import ALL_FIELDS, Condition
+from fantwin.pipeline.opcua.encoding import variant
+from fantwin.pipeline.opcua.identifiers import SITE_FOLDER
+from fantwin.pipeline.viewing.fleet import Fan
 
 _AT_ONCE = 50
 """events that are delivered before others may do something"""

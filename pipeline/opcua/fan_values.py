@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from pipeline.presenting.fan_history import CURVES
-from pipeline.presenting.site_model import TrayNow
-from pipeline.viewing.fleet import SILENT, Fan, FanNow
-from schemas.enums import InvalidReason
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.presenting.fan_history import CURVES
+from fantwin.pipeline.presenting.site_model import TrayNow
+from fantwin.pipeline.viewing.fleet import SILENT, Fan, FanNow
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 GOOD, SILENT_TRAY, OLD = "Good", "UncertainNoCommunicationLastUsableValue", "UncertainLastUsableValue"
 NONE_YET, NO_VALUE = "BadWaitingForInitialData", "BadNoData"

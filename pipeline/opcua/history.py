@@ -12,13 +12,13 @@ from typing import Any
 from asyncua import ua
 from asyncua.server.history import HistoryStorageInterface
 
-from pipeline.opcua.conditions import past_condition
-from pipeline.opcua.encoding import micros_of, time_of
-from pipeline.opcua.events import SiteEvent, condition_event
-from pipeline.opcua.identifiers import fan_of
-from pipeline.presenting.site_model import SiteModel
-from schemas.enums import Transition
-from schemas.messages import Alarm
+from fantwin.pipeline.opcua.conditions import past_condition
+from fantwin.pipeline.opcua.encoding import micros_of, time_of
+from fantwin.pipeline.opcua.events import SiteEvent, condition_event
+from fantwin.pipeline.opcua.identifiers import fan_of
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm
 
 FIRST_NS, LAST_NS = -(1 << 63), (1 << 63) - 1
 MOST_EVENTS = 10_000

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.fleet import Fan
 
 NAMESPACE = "urn:fantwin:fans"
 SITE_FOLDER, FAN_TYPE, FAN_ALARM_TYPE, COMMISSION, COMMISSION_ARGUMENTS = 1, 2, 3, 4, 5

@@ -16,10 +16,10 @@ from asyncua.crypto.permission_rules import User as LibraryUser
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from pipeline.presenting.login_failures import LoginFailures
-from pipeline.presenting.security_log import SecurityLog
-from pipeline.presenting.users import User, Users
-from pipeline.presenting.users import UserRole as SiteRole
+from fantwin.pipeline.presenting.login_failures import LoginFailures
+from fantwin.pipeline.presenting.security_log import SecurityLog
+from fantwin.pipeline.presenting.users import User, Users
+from fantwin.pipeline.presenting.users import UserRole as SiteRole
 
 
 @dataclass

@@ -14,10 +14,10 @@ from typing import Any
 
 from asyncua import Server, ua
 
-from pipeline.opcua.conditions import ConditionBook, event_id
-from pipeline.opcua.events import EventDelivery
-from pipeline.opcua.identifiers import ALARM, COMMISSION, SHELVING_STATE
-from pipeline.opcua.requests import (
+from fantwin.pipeline.opcua.conditions import ConditionBook, event_id
+from fantwin.pipeline.opcua.events import EventDelivery
+from fantwin.pipeline.opcua.identifiers import ALARM, COMMISSION, SHELVING_STATE
+from fantwin.pipeline.opcua.requests import (
     COMMENT,
     EVENT_ID,
     FAN_METHODS,
@@ -28,15 +28,15 @@ from pipeline.opcua.requests import (
     ConditionMethod,
     status_of,
 )
-from pipeline.opcua.sessions import CURRENT_SESSION
-from pipeline.opcua.site_nodes import SiteNodes
-from pipeline.opcua.templates import method_nodes
-from pipeline.presenting.request_desk import RequestDesk
-from pipeline.presenting.request_form import LONGEST_COMMENT, LONGEST_SHELVING_S, one_line
-from pipeline.presenting.site_model import SiteModel
-from pipeline.viewing.fleet import Fan
-from schemas.enums import Action
-from schemas.messages import Request
+from fantwin.pipeline.opcua.sessions import CURRENT_SESSION
+from fantwin.pipeline.opcua.site_nodes import SiteNodes
+from fantwin.pipeline.opcua.templates import method_nodes
+from fantwin.pipeline.presenting.request_desk import RequestDesk
+from fantwin.pipeline.presenting.request_form import LONGEST_COMMENT, LONGEST_SHELVING_S, one_line
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.enums import Action
+from fantwin.schemas.messages import Request
 
 _SEARCHED = 200
 """transitions of a fan, among which an event is looked for"""

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from schemas.enums import Action, Severity, Transition
-from schemas.messages import Alarm
-from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from fantwin.schemas.enums import Action, Severity, Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
 GOOD = "Good"
 

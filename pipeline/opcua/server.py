@@ -19,20 +19,20 @@ from asyncua import Server, ua
 from asyncua.common.connection import TransportLimits
 from cryptography import x509
 
-from pipeline.config.models import TrayConfig
-from pipeline.opcua.address_space import build_address_space
-from pipeline.opcua.conditions import Condition, ConditionBook
-from pipeline.opcua.events import EventDelivery, system_event
-from pipeline.opcua.history import AlarmHistory
-from pipeline.opcua.identifiers import NAMESPACE
-from pipeline.opcua.log_in import LogIn, Permissions, TrustedClients
-from pipeline.opcua.methods import Methods
-from pipeline.opcua.sessions import SiteServer
-from pipeline.opcua.site_nodes import SiteNode, SiteNodes
-from pipeline.opcua.site_values import SiteValues
-from pipeline.presenting.request_desk import RequestDesk
-from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import StageError
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.opcua.address_space import build_address_space
+from fantwin.pipeline.opcua.conditions import Condition, ConditionBook
+from fantwin.pipeline.opcua.events import EventDelivery, system_event
+from fantwin.pipeline.opcua.history import AlarmHistory
+from fantwin.pipeline.opcua.identifiers import NAMESPACE
+from fantwin.pipeline.opcua.log_in import LogIn, Permissions, TrustedClients
+from fantwin.pipeline.opcua.methods import Methods
+from fantwin.pipeline.opcua.sessions import SiteServer
+from fantwin.pipeline.opcua.site_nodes import SiteNode, SiteNodes
+from fantwin.pipeline.opcua.site_values import SiteValues
+from fantwin.pipeline.presenting.request_desk import RequestDesk
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.runtime.stage import StageError
 
 UPDATE_PERIOD_S = 1.0
 START_LIMIT_S, STOP_LIMIT_S = 120.0, 5.0

@@ -24,8 +24,8 @@ from asyncua.server.internal_session import InternalSession
 from asyncua.server.internal_subscription import InternalSubscription
 from asyncua.server.user_managers import UserManager
 
-from pipeline.opcua.events import WhereClause
-from pipeline.opcua.log_in import LogIn, SessionUser, TrustedClients
+from fantwin.pipeline.opcua.events import WhereClause
+from fantwin.pipeline.opcua.log_in import LogIn, SessionUser, TrustedClients
 
 MOST_CONNECTIONS = 100
 MOST_SUBSCRIPTIONS = 200

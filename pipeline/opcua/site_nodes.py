@@ -12,11 +12,11 @@ from typing import Any
 from asyncua import ua
 from asyncua.server.address_space import AttributeValue, NodeData
 
-from pipeline.config.models import TrayConfig
-from pipeline.opcua.encoding import SharedValue
-from pipeline.opcua.identifiers import SITE_FOLDER, fan_of
-from pipeline.opcua.templates import Template, standard, templates
-from pipeline.viewing.fleet import Fan
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.opcua.encoding import SharedValue
+from fantwin.pipeline.opcua.identifiers import SITE_FOLDER, fan_of
+from fantwin.pipeline.opcua.templates import Template, standard, templates
+from fantwin.pipeline.viewing.fleet import Fan
 
 _KEPT = 512
 """nodes that were asked for last"""

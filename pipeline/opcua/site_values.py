@@ -11,16 +11,16 @@ from typing import Any
 
 from asyncua import ua
 
-from pipeline.opcua.conditions import Condition, ConditionBook
-from pipeline.opcua.encoding import SharedValue, data_value
-from pipeline.opcua.fan_values import GOOD, VARIABLE, FanValues
-from pipeline.opcua.identifiers import ALARM
-from pipeline.opcua.templates import UNIT_RPM
-from pipeline.presenting.site_model import SiteModel
-from pipeline.viewing.fleet import Fan
-from schemas.messages import ModelCard
-from schemas.twin_card import CardError, TwinCard
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.opcua.conditions import Condition, ConditionBook
+from fantwin.pipeline.opcua.encoding import SharedValue, data_value
+from fantwin.pipeline.opcua.fan_values import GOOD, VARIABLE, FanValues
+from fantwin.pipeline.opcua.identifiers import ALARM
+from fantwin.pipeline.opcua.templates import UNIT_RPM
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.messages import ModelCard
+from fantwin.schemas.twin_card import CardError, TwinCard
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 _CACHED = 1024
 _UNSHELVE_TIME = "ShelvingState/UnshelveTime"

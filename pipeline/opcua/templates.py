@@ -11,10 +11,10 @@ from typing import Any
 
 from asyncua import ua
 
-from pipeline.opcua.conditions import ALL_FIELDS, OWN_FIELDS
-from pipeline.opcua.fan_values import VARIABLES, FanVariable
-from pipeline.opcua.identifiers import ALARM, COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SHELVING_STATE
-from pipeline.opcua.requests import METHODS, SHELVING_METHODS, ConditionMethod
+from fantwin.pipeline.opcua.conditions import ALL_FIELDS, OWN_FIELDS
+from fantwin.pipeline.opcua.fan_values import VARIABLES, FanVariable
+from fantwin.pipeline.opcua.identifiers import ALARM, COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SHELVING_STATE
+from fantwin.pipeline.opcua.requests import METHODS, SHELVING_METHODS, ConditionMethod
 
 OBJECT_NOTIFIES = ua.Byte(5)
 """SubscribeToEvents and HistoryRead"""

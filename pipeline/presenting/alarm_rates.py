@@ -10,14 +10,14 @@ from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
 
-from pipeline.errors import UserError
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.judged_time import JudgedStretch
-from schemas.enums import Feedback, Transition
-from schemas.messages import Alarm
-from schemas.units import NS_PER_S
-from scoring.alarms.fan_condition import GIVES_FEEDBACK
-from scoring.calibration.observed_rate import ObservedRate
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.presenting.judged_time import JudgedStretch
+from fantwin.schemas.enums import Feedback, Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
+from fantwin.scoring.calibration.observed_rate import ObservedRate
 
 MOST_KEPT = 200_000
 """alarms, and stretches of judged time; those that are older are deleted"""

@@ -11,9 +11,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import UserError
-from schemas.codec import CodecError, decode, encode
-from schemas.messages import Alarm
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.codec import CodecError, decode, encode
+from fantwin.schemas.messages import Alarm
 
 HISTORY = "alarms.sqlite"
 """the file of the gateway, in the run folder"""

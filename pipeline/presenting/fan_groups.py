@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.viewing.fleet import NORMAL_LEVELS, Fleet, class_names
-from schemas.enums import FanState
-from schemas.messages import Array
-from scoring.alarms.words_now import words_now
+from fantwin.pipeline.viewing.fleet import NORMAL_LEVELS, Fleet, class_names
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.messages import Array
+from fantwin.scoring.alarms.words_now import words_now
 
 
 class FanGroup(StrEnum):

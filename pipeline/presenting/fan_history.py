@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from schemas.messages import Array, Score
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.schemas.messages import Array, Score
+from fantwin.schemas.units import NS_PER_S
 
 HISTORY_S = 3600
 FINE_STEP_S, COARSE_STEP_S = 0.5, 5.0

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.messages import Score
-from schemas.units import NS_PER_S
+from fantwin.schemas.messages import Score
+from fantwin.schemas.units import NS_PER_S
 
 LONGEST_STEP_NS = 5 * NS_PER_S
 """between two scores of a stretch; after a longer pause another one begins"""

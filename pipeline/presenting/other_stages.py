@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from pipeline.config.loading import parse_config
-from pipeline.config.models import Config
-from pipeline.config.registry import RECORDER
-from pipeline.config.shards import own_file, shards_of
-from pipeline.errors import UserError
-from pipeline.runtime.stage import Context
-from pipeline.viewing.loopback import LOOPBACK
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.registry import RECORDER
+from fantwin.pipeline.config.shards import own_file, shards_of
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.runtime.stage import Context
+from fantwin.pipeline.viewing.loopback import LOOPBACK
 
 VIEWER = "viewer"
 

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 
-from schemas.header import Header
-from schemas.messages import Alarm, Request
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Request
 
 ANSWERED_WITHIN_S = 10.0
 MOST_UNDER_WAY = 256

@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from schemas.enums import Action
-from scoring.alarms.fan_condition import GIVES_FEEDBACK
+from fantwin.schemas.enums import Action
+from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
 
 LONGEST_SHELVING_S = 30 * 86400.0
 LONGEST_COMMENT = 500

@@ -9,21 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.launch.site_state import StageState
-from pipeline.presenting.fan_groups import SHOWN_CLASSES, FanGroup
-from pipeline.presenting.fan_history import Curves
-from pipeline.presenting.site_model import SiteModel
-from pipeline.recordings.clips.clip import Clip
-from pipeline.viewing.fleet import Fan, FanNow
-from schemas.enums import Feedback
-from schemas.messages import Alarm, Array, ModelCard
-from schemas.twin_card import CardError, TwinCard
-from schemas.units import RAD_S_PER_UNIT
-from scoring.alarms.alarm_flags import is_listed
-from scoring.alarms.current_alarms import CurrentAlarm
-from scoring.calibration.observed_rate import together
-from scoring.diagnosis.shown_causes import (
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.launch.site_state import StageState
+from fantwin.pipeline.presenting.fan_groups import SHOWN_CLASSES, FanGroup
+from fantwin.pipeline.presenting.fan_history import Curves
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.recordings.clips.clip import Clip
+from fantwin.pipeline.viewing.fleet import Fan, FanNow
+from fantwin.schemas.enums import Feedback
+from fantwin.schemas.messages import Alarm, Array, ModelCard
+from fantwin.schemas.twin_card import CardError, TwinCard
+from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.scoring.alarms.alarm_flags import is_listed
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.calibration.observed_rate import together
+from fantwin.scoring.diagnosis.shown_causes import (
     CANNOT_TELL,
     advice,
     less_likely,

@@ -6,12 +6,12 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 
-from pipeline.presenting.request_desk import RequestDesk
-from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import Core
-from schemas.envelope import Envelope
-from schemas.health import Health
-from schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
+from fantwin.pipeline.presenting.request_desk import RequestDesk
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.runtime.stage import Core
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 
 
 class SiteCore(Core):

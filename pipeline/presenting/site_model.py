@@ -14,27 +14,27 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.config.registry import STAGES
-from pipeline.launch.site_state import StageState, stage_states
-from pipeline.launch.site_watcher import StageView
-from pipeline.launch.watched_alarms import WatchedAlarms
-from pipeline.presenting.alarm_rates import AlarmRates
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.fan_groups import SHOWN_CLASSES, FanGroup, classes_of, counts_of
-from pipeline.presenting.fan_history import COLUMNS, Curves, FanHistory, values_of
-from pipeline.presenting.judged_time import LEARNED, JudgedTime
-from pipeline.viewing.fleet import Fan, FanNow, Fleet
-from pipeline.viewing.fleet_view import last_sample
-from schemas.codec import CodecError, decode_columns, encode
-from schemas.enums import Feedback, StageStatus, Transition
-from schemas.envelope import Envelope
-from schemas.health import Health
-from schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
-from scoring.alarms.current_alarms import CurrentAlarm
-from scoring.alarms.unscored_monitor import JUDGED_AT_REST
-from scoring.calibration.observed_rate import ObservedRate, declared_per_day
-from scoring.wear.recorded_wear import wear_in, wear_rows
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.launch.site_state import StageState, stage_states
+from fantwin.pipeline.launch.site_watcher import StageView
+from fantwin.pipeline.launch.watched_alarms import WatchedAlarms
+from fantwin.pipeline.presenting.alarm_rates import AlarmRates
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.presenting.fan_groups import SHOWN_CLASSES, FanGroup, classes_of, counts_of
+from fantwin.pipeline.presenting.fan_history import COLUMNS, Curves, FanHistory, values_of
+from fantwin.pipeline.presenting.judged_time import LEARNED, JudgedTime
+from fantwin.pipeline.viewing.fleet import Fan, FanNow, Fleet
+from fantwin.pipeline.viewing.fleet_view import last_sample
+from fantwin.schemas.codec import CodecError, decode_columns, encode
+from fantwin.schemas.enums import Feedback, StageStatus, Transition
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.alarms.unscored_monitor import JUDGED_AT_REST
+from fantwin.scoring.calibration.observed_rate import ObservedRate, declared_per_day
+from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
 
 SILENT_AFTER_S = 5.0
 """a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus"""

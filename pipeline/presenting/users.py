@@ -15,7 +15,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import UserError
+from fantwin.pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from argon2 import PasswordHasher

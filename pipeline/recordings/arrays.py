@@ -13,12 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.recordings.order import Seen, in_order
-from pipeline.recordings.reading import RecordingError, read_recording
-from schemas.envelope import Envelope
-from schemas.fields import LARGEST_ENUM_VALUE, Array, OpenEnum, columns, derived_columns, other_fields, time_column
-from schemas.messages import Message
-from schemas.topics import BY_NAME, HEALTH_CHUNK, TOPICS
+from fantwin.pipeline.recordings.order import Seen, in_order
+from fantwin.pipeline.recordings.reading import RecordingError, read_recording
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fields import (
+    LARGEST_ENUM_VALUE,
+    Array,
+    OpenEnum,
+    columns,
+    derived_columns,
+    other_fields,
+    time_column,
+)
+from fantwin.schemas.messages import Message
+from fantwin.schemas.topics import BY_NAME, HEALTH_CHUNK, TOPICS
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, ChunkIndex
 from zstandard import ZstdCompressor
 
-from pipeline.recordings.index import message_indexes
-from pipeline.recordings.records import MESSAGE, RECORD, record_bytes
+from fantwin.pipeline.recordings.index import message_indexes
+from fantwin.pipeline.recordings.records import MESSAGE, RECORD, record_bytes
 
 SLOW_BYTES, SLOW_LEVEL, FAST_LEVEL = 128 << 10, 15, 3
 """A chunk of a slow line is small when it is flushed. Level 15 takes 10 % less than level 3, and 6 ms for 64 KiB."""

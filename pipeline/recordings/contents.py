@@ -12,12 +12,12 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 from mcap.summary import Summary
 
-from pipeline.recordings.disk import is_being_written
-from pipeline.recordings.reading import METADATA_NAME
-from pipeline.recordings.records import CORRUPT_DATA_ERRORS, MESSAGE, chunk_at, indexed_reader, records_in
-from pipeline.recordings.run_recordings import RECORDING_KEY
-from pipeline.recordings.scan import Scan, scan
-from pipeline.recordings.sequence_ledger import (
+from fantwin.pipeline.recordings.disk import is_being_written
+from fantwin.pipeline.recordings.reading import METADATA_NAME
+from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, MESSAGE, chunk_at, indexed_reader, records_in
+from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
+from fantwin.pipeline.recordings.scan import Scan, scan
+from fantwin.pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
     ENDED,
     LEDGER_NAME,
@@ -27,11 +27,11 @@ from pipeline.recordings.sequence_ledger import (
     next_sequences,
     recovered_from_metadata,
 )
-from schemas.codec import CodecError, decode
-from schemas.health import Health
-from schemas.messages import Message, ModelCard
-from schemas.streams import StreamId
-from schemas.topics import topic_of
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Message, ModelCard
+from fantwin.schemas.streams import StreamId
+from fantwin.schemas.topics import topic_of
 
 TRUNCATED = "it is truncated, as after a crash"
 NOT_A_RECORD = "bytes that belong to no intact record"

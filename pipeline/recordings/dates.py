@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S
 
 _FIRST_DATE_NS = 365 * 86_400 * NS_PER_S
 """earlier times are no dates"""

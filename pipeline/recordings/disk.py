@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from pipeline.recordings.records import RecordingError
+from fantwin.pipeline.recordings.records import RecordingError
 
 _COPY_BYTES = 1 << 20
 _MAY_PASS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENODEV, errno.ENXIO, errno.EROFS, errno.ESTALE)

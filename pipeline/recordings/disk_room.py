@@ -15,13 +15,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.recordings.clips.alarm_clips import AlarmClips
-from pipeline.recordings.disk import Disk, DiskError
-from pipeline.recordings.open_part import PartsFolder
-from pipeline.recordings.recorder_config import CLIPS_SHARE, LEAST_PART_S, PARTS_WITHIN_LIMITS, RecorderConfig
-from pipeline.recordings.records import RecordingError
-from pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
+from fantwin.pipeline.recordings.disk import Disk, DiskError
+from fantwin.pipeline.recordings.open_part import PartsFolder
+from fantwin.pipeline.recordings.recorder_config import CLIPS_SHARE, LEAST_PART_S, PARTS_WITHIN_LIMITS, RecorderConfig
+from fantwin.pipeline.recordings.records import RecordingError
+from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
+from fantwin.schemas.units import NS_PER_S
 
 DAY_NS = 86_400 * NS_PER_S
 AGED_S = 3600.0

@@ -19,16 +19,16 @@ import numpy as np
 from mcap.records import ChunkIndex
 from mcap.summary import Summary
 
-from pipeline.recordings.reading import Reading, RecordingError, read_recording
-from pipeline.recordings.records import CORRUPT_DATA_ERRORS, chunk_at, indexed_reader
-from pipeline.recordings.runs import RecordedTray, no_samples, read_runs, recorded_tray, segments_of
-from schemas.codec import CodecError
-from schemas.envelope import Envelope
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.reading import Reading, RecordingError, read_recording
+from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, chunk_at, indexed_reader
+from fantwin.pipeline.recordings.runs import RecordedTray, no_samples, read_runs, recorded_tray, segments_of
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from schemas.messages import Array
+    from fantwin.schemas.messages import Array
 
 CLOCK_MARGIN_S = 90.0
 """read before an excerpt: the sliding window of the device clock, and time to approach its line"""

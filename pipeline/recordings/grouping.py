@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.config.registry import RECORDER, STAGES
-from pipeline.recordings.reading import RecordingMetadata, read_metadata
+from fantwin.pipeline.config.registry import RECORDER, STAGES
+from fantwin.pipeline.recordings.reading import RecordingMetadata, read_metadata
 
 _SHOWING = {row.name for row in STAGES.values() if row.writes in ((), ("request",)) and row.name != RECORDER}
 """stages that present a site and decide nothing"""

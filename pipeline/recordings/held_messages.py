@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 
-from schemas.envelope import Envelope
+from fantwin.schemas.envelope import Envelope
 
 
 class HeldMessages:

@@ -30,9 +30,9 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from pipeline.recordings.disk import AtomicAppendFile
-from pipeline.recordings.records import RECORD, record_bytes
-from pipeline.recordings.sequence_ledger import LEDGER_NAME
+from fantwin.pipeline.recordings.disk import AtomicAppendFile
+from fantwin.pipeline.recordings.records import RECORD, record_bytes
+from fantwin.pipeline.recordings.sequence_ledger import LEDGER_NAME
 
 SHORT_ENDING = record_bytes(DataEnd(0), Footer(0, 0, 0)) + MCAP0_MAGIC
 """The end of a file without a summary: 40 bytes, where a summary may need thousands."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
-from pipeline.recordings.open_part import OpenPart
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.open_part import OpenPart
+from fantwin.schemas.units import NS_PER_S
 
 NEWS_SHOWN_NS = 60 * NS_PER_S
 """how long health reports it"""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
-from pipeline.recordings.reading import RecordingError, read_metadata
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata
 
 RAW = "raw"
 

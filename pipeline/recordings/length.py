@@ -6,9 +6,9 @@ import math
 from itertools import pairwise
 from pathlib import Path
 
-from pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
-from schemas.topics import topic_of
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
+from fantwin.schemas.topics import topic_of
+from fantwin.schemas.units import NS_PER_S
 
 
 def longest_s(path: Path, first_sample_t_ns: int) -> float:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
-from schemas.codec import CodecError
-from schemas.envelope import Envelope
-from schemas.fast_decode import decode_header
-from schemas.health import Health
-from schemas.messages import ModelCard
-from schemas.topics import Topic, topic_of
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fast_decode import decode_header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import ModelCard
+from fantwin.schemas.topics import Topic, topic_of
 
 _PRODUCER_AT = 2  # in a payload, after the header's key and one byte of length: the producer is its first field
 _NOTHING = b"\x00"  # no payload continues so

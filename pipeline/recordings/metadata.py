@@ -6,9 +6,9 @@ import hashlib
 import json
 import logging
 
-from pipeline.recordings.reading import TACHO_KEY
-from pipeline.runtime.stage import Context
-from schemas.tacho import INSTANTANEOUS, tachos_to_json
+from fantwin.pipeline.recordings.reading import TACHO_KEY
+from fantwin.pipeline.runtime.stage import Context
+from fantwin.schemas.tacho import INSTANTANEOUS, tachos_to_json
 
 CONFIGURATION = "configuration.toml"
 _LOG = logging.getLogger(__name__)

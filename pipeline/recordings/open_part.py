@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.recordings.index import PartIndex
-from pipeline.recordings.sequence_ledger import SequenceLedger
-from pipeline.recordings.stored_recordings import Stored, StoredPart
-from schemas.envelope import Envelope
-from schemas.streams import StreamId
+from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
+from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.streams import StreamId
 
 
 class OpenPart(Protocol):

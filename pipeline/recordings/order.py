@@ -6,9 +6,9 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from pathlib import Path
 
-from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.records import whole_number
-from pipeline.recordings.run_recordings import recorded_files
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.pipeline.recordings.records import whole_number
+from fantwin.pipeline.recordings.run_recordings import recorded_files
 
 
 def in_order(parts: Iterable[Path]) -> list[Path]:

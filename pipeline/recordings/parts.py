@@ -13,21 +13,21 @@ from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
-from pipeline.recordings.contents import Contents, contents_of
-from pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
-from pipeline.recordings.rare_messages import last_messages
-from pipeline.recordings.reading import RecordingError, read_metadata
-from pipeline.recordings.records import ACTIVE_SUFFIX, UnreadableError
-from pipeline.recordings.repair import (
+from fantwin.pipeline.recordings.contents import Contents, contents_of
+from fantwin.pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
+from fantwin.pipeline.recordings.rare_messages import last_messages
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata
+from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX, UnreadableError
+from fantwin.pipeline.recordings.repair import (
     ORIGINAL_SUFFIX,
     Recovery,
     free_original_name,
     repair_in_place,
 )
-from pipeline.recordings.run_recordings import RECORDING_KEY
-from pipeline.recordings.sequence_ledger import SequenceLedger
-from pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
-from pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
+from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
+from fantwin.pipeline.recordings.writing import RecordingWriter
 
 PARTS_SEARCHED = 3
 """for the last messages of a topic"""

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from pipeline.recordings.reading import Reading, read_recording
-from pipeline.recordings.records import CORRUPT_DATA_ERRORS, chunk_at, indexed_reader
-from schemas.codec import CodecError
-from schemas.envelope import Envelope
+from fantwin.pipeline.recordings.reading import Reading, read_recording
+from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, chunk_at, indexed_reader
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.envelope import Envelope
 
 
 def rare_messages(path: Path, topic: str) -> list[Envelope]:

@@ -15,8 +15,8 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata
 
-from pipeline.recordings.disk import is_being_written
-from pipeline.recordings.records import (
+from fantwin.pipeline.recordings.disk import is_being_written
+from fantwin.pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,
     MESSAGE,
     METADATA_NAME,
@@ -26,11 +26,11 @@ from pipeline.recordings.records import (
     chunk_data,
     parse,
 )
-from schemas.codec import CodecError
-from schemas.envelope import Envelope
-from schemas.messages import StatedTacho
-from schemas.tacho import INSTANTANEOUS, Tacho, tachos_from_json
-from schemas.topics import topic_of
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import StatedTacho
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tachos_from_json
+from fantwin.schemas.topics import topic_of
 
 __all__ = ["METADATA_NAME", "Reading", "RecordingError", "RecordingMetadata", "read_metadata", "read_recording"]
 

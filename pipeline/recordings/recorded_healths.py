@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.runtime.figures import without_figures
-from schemas.envelope import Envelope
-from schemas.health import Health
-from schemas.units import NS_PER_S
+from fantwin.pipeline.runtime.figures import without_figures
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health
+from fantwin.schemas.units import NS_PER_S
 
 HEALTH_S = 3600
 """longest time without a recorded message of a session"""

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from pydantic import Field, field_validator
 
-from pipeline.config.models import TrayConfig, nearest
-from pipeline.runtime.stage import StageConfig
-from schemas.topics import BY_NAME, TOPICS
+from fantwin.pipeline.config.models import TrayConfig, nearest
+from fantwin.pipeline.runtime.stage import StageConfig
+from fantwin.schemas.topics import BY_NAME, TOPICS
 
 FLUSH_S, FLUSH_BYTES = 1.0, 64 << 10
 """messages in memory are flushed after this time if they are more than this, or if one of them is urgent"""

@@ -29,8 +29,8 @@ from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadat
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
-from pipeline.errors import UserError
-from schemas.formats import RECORDING
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.formats import RECORDING
 
 METADATA_NAME = "fantwin"
 """the metadata record that describes a recording; it follows the header"""

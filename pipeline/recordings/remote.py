@@ -16,9 +16,9 @@ from pathlib import Path, PosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from pipeline.errors import UsageError
-from pipeline.extras import missing_extra
-from pipeline.recordings.records import RecordingError
+from fantwin.pipeline.errors import UsageError
+from fantwin.pipeline.extras import missing_extra
+from fantwin.pipeline.recordings.records import RecordingError
 
 _MAY_BE_SECRET = re.compile(r"://[^/@]*:[^/@]*@|https?://[^/@]*@|\?")
 """a password, a token, or a query, such as a signature"""

@@ -19,10 +19,10 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from pipeline.recordings.contents import NOT_A_RECORD, losses_outside_counts
-from pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused, sync_folder
-from pipeline.recordings.index import SHORT_ENDING, write_ending
-from pipeline.recordings.records import (
+from fantwin.pipeline.recordings.contents import NOT_A_RECORD, losses_outside_counts
+from fantwin.pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused, sync_folder
+from fantwin.pipeline.recordings.index import SHORT_ENDING, write_ending
+from fantwin.pipeline.recordings.records import (
     ACTIVE_SUFFIX,
     MESSAGE,
     RecordingError,
@@ -30,9 +30,9 @@ from pipeline.recordings.records import (
     chunk_data,
     records_in,
 )
-from pipeline.recordings.scan import Scan, scan
-from pipeline.recordings.sequence_ledger import LEDGER_NAME, ledger_metadata
-from pipeline.recordings.writing import CHUNK_BYTES, free_name
+from fantwin.pipeline.recordings.scan import Scan, scan
+from fantwin.pipeline.recordings.sequence_ledger import LEDGER_NAME, ledger_metadata
+from fantwin.pipeline.recordings.writing import CHUNK_BYTES, free_name
 
 ORIGINAL_SUFFIX = ".original"
 _UNFINISHED_SUFFIX = ".recovering"

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
-from pipeline.recordings.records import ACTIVE_SUFFIX
+from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
+from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX
 
 RECORDING_KEY = "recording"
 """in the metadata of what a recorder writes: the name of its first part"""

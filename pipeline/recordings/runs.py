@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.devices.device_clock import DeviceClock
-from pipeline.devices.measured_table import hold_last
-from pipeline.recordings.left_out import left_out_hint
-from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from schemas.auxiliary import AUXILIARY, auxiliary_columns
-from schemas.messages import Array, Raw
-from schemas.tacho import Tacho, tacho_of_each_fan
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.device_clock import DeviceClock
+from fantwin.pipeline.devices.measured_table import hold_last
+from fantwin.pipeline.recordings.left_out import left_out_hint
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.schemas.auxiliary import AUXILIARY, auxiliary_columns
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
+from fantwin.schemas.units import NS_PER_S
 
 MERGED_MESSAGES = 1024
 """so many are kept as one while a recording is read"""

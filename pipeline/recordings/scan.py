@@ -12,10 +12,10 @@ from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Header, Metadat
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-from pipeline.recordings.index import Index, message_indexes
-from pipeline.recordings.message_counts import MessageCounts
-from pipeline.recordings.reading import METADATA_NAME, left_out_of
-from pipeline.recordings.records import (
+from fantwin.pipeline.recordings.index import Index, message_indexes
+from fantwin.pipeline.recordings.message_counts import MessageCounts
+from fantwin.pipeline.recordings.reading import METADATA_NAME, left_out_of
+from fantwin.pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,
     MESSAGE,
     Record,
@@ -26,7 +26,7 @@ from pipeline.recordings.records import (
     parse,
     records_in,
 )
-from pipeline.recordings.sequence_ledger import (
+from fantwin.pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
     ENDED,
     LEDGER_NAME,
@@ -37,7 +37,7 @@ from pipeline.recordings.sequence_ledger import (
     counts_from_metadata,
     recovered_from_metadata,
 )
-from schemas.streams import StreamId
+from fantwin.schemas.streams import StreamId
 
 
 @dataclass

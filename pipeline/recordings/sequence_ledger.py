@@ -9,9 +9,9 @@ import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 
-from schemas.health import Health
-from schemas.streams import StreamId, StreamState, output_streams
-from schemas.topics import HEALTH, topic_of
+from fantwin.schemas.health import Health
+from fantwin.schemas.streams import StreamId, StreamState, output_streams
+from fantwin.schemas.topics import HEALTH, topic_of
 
 LEDGER_NAME = "fantwin.ledger"
 """the metadata record, after the last message, that holds a finished ledger"""

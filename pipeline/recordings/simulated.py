@@ -10,14 +10,14 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from pipeline.devices.simulated_device import Device, DeviceSample, PlaybackCounts
-from pipeline.recordings.reading import TACHO_KEY
-from pipeline.recordings.writing import RecordingWriter
-from schemas.header import Header
-from schemas.messages import Raw
-from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.simulated_device import Device, DeviceSample, PlaybackCounts
+from fantwin.pipeline.recordings.reading import TACHO_KEY
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 
 SITE, TRAY, PRODUCER = "simulated", "tray1", "simulate"
 SAMPLES_PER_MESSAGE = 100

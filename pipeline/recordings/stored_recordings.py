@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.recordings.rare_messages import last_message_ns
-from pipeline.recordings.reading import RecordingError, read_metadata
-from pipeline.recordings.records import ACTIVE_SUFFIX, UnreadableError, whole_number
-from pipeline.recordings.run_recordings import CLIPS, RECORDING_KEY
+from fantwin.pipeline.recordings.rare_messages import last_message_ns
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata
+from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX, UnreadableError, whole_number
+from fantwin.pipeline.recordings.run_recordings import CLIPS, RECORDING_KEY
 
 SUFFIX = ".mcap"
 

@@ -13,10 +13,10 @@ from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from pipeline.recordings.arrays import Block, BlockColumn, block_columns, enum_names
-from schemas.fields import Array, OpenEnum
-from schemas.messages import Message
-from schemas.topics import BY_NAME
+from fantwin.pipeline.recordings.arrays import Block, BlockColumn, block_columns, enum_names
+from fantwin.schemas.fields import Array, OpenEnum
+from fantwin.schemas.messages import Message
+from fantwin.schemas.topics import BY_NAME
 
 Form: TypeAlias = Literal["csv", "parquet"]
 PIECE_ROWS = 65_536

@@ -21,10 +21,10 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from pipeline.recordings.chunk import FillingChunk
-from pipeline.recordings.disk import AtomicAppendFile, Disk, refused, sync_folder
-from pipeline.recordings.index import SHORT_ENDING, Index, PartIndex, write_ending
-from pipeline.recordings.records import (
+from fantwin.pipeline.recordings.chunk import FillingChunk
+from fantwin.pipeline.recordings.disk import AtomicAppendFile, Disk, refused, sync_folder
+from fantwin.pipeline.recordings.index import SHORT_ENDING, Index, PartIndex, write_ending
+from fantwin.pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,
     FORMAT_KEY,
     MADE_BY_KEY,
@@ -35,13 +35,13 @@ from pipeline.recordings.records import (
     record_bytes,
     this_program,
 )
-from pipeline.recordings.sequence_ledger import BEFORE_NAME, SequenceLedger, ledger_metadata
-from schemas.codec import proto_type, type_name
-from schemas.envelope import Envelope
-from schemas.formats import RECORDING
-from schemas.health import Health
-from schemas.messages import Message
-from schemas.topics import HEALTH, topic_of
+from fantwin.pipeline.recordings.sequence_ledger import BEFORE_NAME, SequenceLedger, ledger_metadata
+from fantwin.schemas.codec import proto_type, type_name
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.formats import RECORDING
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Message
+from fantwin.schemas.topics import HEALTH, topic_of
 
 CHUNK_BYTES = 256 * 1024
 """A crash loses what is not in a finished chunk; a reader holds one chunk in memory."""

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.config.loading import parse_config
-from pipeline.config.models import Config
-from pipeline.devices.line_rate import GAP_PERIODS
-from pipeline.recordings.left_out import left_out_hint
-from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_recording
-from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.codec import CodecError
-from schemas.messages import Raw
-from schemas.tacho import INSTANTANEOUS, Tacho
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.devices.line_rate import GAP_PERIODS
+from fantwin.pipeline.recordings.left_out import left_out_hint
+from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_recording
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
+from fantwin.schemas.units import NS_PER_S
 
 _SAMPLED = 500
 """samples of a tray from which the period is measured"""

@@ -6,11 +6,11 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
-from pipeline.config.loading import load_config, parse_config
-from pipeline.config.models import Config
-from pipeline.recordings.metadata import CONFIGURATION
-from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
-from schemas.envelope import Envelope
+from fantwin.pipeline.config.loading import load_config, parse_config
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.recordings.metadata import CONFIGURATION
+from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
+from fantwin.schemas.envelope import Envelope
 
 
 def resolve_config(file: Path, first: Envelope, config: Path | None, overrides: Iterable[str]) -> Config:

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 
-from pipeline.config.registry import STAGES
-from pipeline.runtime.stage import Stage, load_stage
-from schemas.topics import BY_NAME
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.runtime.stage import Stage, load_stage
+from fantwin.schemas.topics import BY_NAME
 
 SOURCE, RESULT = "raw", "score"
 

@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from pipeline.config.roles import Role
-from schemas.health import Health
-from schemas.topics import topic_of, tray_of
+from fantwin.pipeline.config.roles import Role
+from fantwin.schemas.health import Health
+from fantwin.schemas.topics import topic_of, tray_of
 
 
 class BelievedOutputs:

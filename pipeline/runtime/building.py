@@ -6,14 +6,14 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-from pipeline.bus.session import Bus, join_bus
-from pipeline.config.models import Config
-from pipeline.config.roles import role_names
-from pipeline.config.shards import Shard
-from pipeline.runtime.kept_snapshots import KeptSnapshots, keeps_snapshots
-from pipeline.runtime.second_owner import refuse_second
-from pipeline.runtime.sessions import Session
-from pipeline.runtime.stage import BuiltStage, Context, Kept, Stage
+from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.roles import role_names
+from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.runtime.kept_snapshots import KeptSnapshots, keeps_snapshots
+from fantwin.pipeline.runtime.second_owner import refuse_second
+from fantwin.pipeline.runtime.sessions import Session
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Kept, Stage
 
 
 def build_and_join(

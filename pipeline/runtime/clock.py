@@ -16,8 +16,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pipeline.devices.host_clock import HOST_CLOCK
-from schemas.messages import Clock
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.schemas.messages import Clock
 
 REPLAY = "replay"
 """name of the replayer, used like a stage name in health, liveliness token and producer"""

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.fan_numbers import fans_in_words
-from schemas.messages import Array, Grid
-from schemas.reference_conditions import ConditionRatios, ReferenceConditions
-from schemas.units import NS_PER_S
-from scoring.column_state import NEVER_NS, ColumnState
+from fantwin.schemas.fan_numbers import fans_in_words
+from fantwin.schemas.messages import Array, Grid
+from fantwin.schemas.reference_conditions import ConditionRatios, ReferenceConditions
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.column_state import NEVER_NS, ColumnState
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from schemas.fields import Array, time_column
-from schemas.header import InputPosition
-from schemas.messages import Consumed, Message
-from schemas.streams import continues
-from schemas.topics import BY_NAME
-from schemas.units import NS_PER_S
+from fantwin.schemas.fields import Array, time_column
+from fantwin.schemas.header import InputPosition
+from fantwin.schemas.messages import Consumed, Message
+from fantwin.schemas.streams import continues
+from fantwin.schemas.topics import BY_NAME
+from fantwin.schemas.units import NS_PER_S
 
 CONSUMED = "consumed"
 PERIOD_NS = 120 * NS_PER_S

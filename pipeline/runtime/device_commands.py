@@ -7,10 +7,10 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 
-from pipeline.config.models import TrayConfig
-from pipeline.devices.sample_source import SampleSource, within
-from schemas.messages import Command
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.devices.sample_source import SampleSource, within
+from fantwin.schemas.messages import Command
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 REFUSED, LOST, SENT = "refused_commands", "lost_commands", "sent_commands"
 _NOT_SENT = {REFUSED: "refused", LOST: "not taken by the device"}

@@ -13,8 +13,8 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from itertools import accumulate, islice
 
-from schemas.blocks import can_join, samples_of
-from schemas.envelope import Envelope
+from fantwin.schemas.blocks import can_join, samples_of
+from fantwin.schemas.envelope import Envelope
 
 MOST_JOINED_VALUES = 8192
 """samples times fans: beyond that a sample hardly costs less, and health and other trays wait for longer"""

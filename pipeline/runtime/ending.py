@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from pipeline.errors import UserError
+from fantwin.pipeline.errors import UserError
 
 _LEAST_S = 0.05  # a step is given this long even when those before it have used up its time
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.runtime.conditions import Ratios
-from pipeline.runtime.twin_file import TwinFile
-from schemas.messages import Array
-from schemas.units import NS_PER_S
-from scoring.column_state import NEVER_NS, ColumnState
-from scoring.expected_reading import ExpectedReading
+from fantwin.pipeline.runtime.conditions import Ratios
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.column_state import NEVER_NS, ColumnState
+from fantwin.scoring.expected_reading import ExpectedReading
 
 MOST_STEPS = 1000
 """of the twin in a sample: 10 s of a twin that was trained at 100 Hz"""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 
-from pipeline.runtime.latencies import Latencies
-from schemas.enums import StageStatus
-from schemas.health import AcceptedSamples, AwaitedInput, Counter, Health, Input, Note, Output
-from schemas.streams import stage_losses
-from schemas.units import NS_PER_S
+from fantwin.pipeline.runtime.latencies import Latencies
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.health import AcceptedSamples, AwaitedInput, Counter, Health, Input, Note, Output
+from fantwin.schemas.streams import stage_losses
+from fantwin.schemas.units import NS_PER_S
 
 AWAITED_AFTER_NS = 2 * NS_PER_S
 """a stage waits for a main input when it has had nothing of it to process for this long"""

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 
 from pydantic import Field, ValidationError
 
-from pipeline.runtime.modelled_fans import modelled_fans
-from pipeline.runtime.stage import Context, StageConfig, StageError
-from pipeline.runtime.tray_twin import TrayTwin
-from schemas.standstill import Standstill
-from schemas.tacho import Tacho
-from schemas.units import S_PER_DAY
-from scoring.calibration.calibration import Calibration
-from scoring.diagnosis.advice import Advice
-from scoring.diagnosis.steady_fan import SteadyFan
-from scoring.model.operation import Fans
-from scoring.model.priors import Priors
-from scoring.unseen_error import UnseenError
+from fantwin.pipeline.runtime.modelled_fans import modelled_fans
+from fantwin.pipeline.runtime.stage import Context, StageConfig, StageError
+from fantwin.pipeline.runtime.tray_twin import TrayTwin
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.units import S_PER_DAY
+from fantwin.scoring.calibration.calibration import Calibration
+from fantwin.scoring.diagnosis.advice import Advice
+from fantwin.scoring.diagnosis.steady_fan import SteadyFan
+from fantwin.scoring.model.operation import Fans
+from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.unseen_error import UnseenError
 
 FALSE_ALARMS_PER_DAY = 0.03
 """declared, of a fan, where nobody says otherwise: one in a month"""

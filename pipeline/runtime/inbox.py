@@ -7,10 +7,10 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from pipeline.bus.kept_messages import KeptQuery
-from pipeline.bus.recovery import Answer
-from pipeline.runtime.tracked_streams import Request
-from schemas.topics import HEALTH_CHUNK
+from fantwin.pipeline.bus.kept_messages import KeptQuery
+from fantwin.pipeline.bus.recovery import Answer
+from fantwin.pipeline.runtime.tracked_streams import Request
+from fantwin.schemas.topics import HEALTH_CHUNK
 
 INBOX_SIZE = 4096
 INBOX_BYTES = 128 << 20

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.messages import Array
-from scoring.column_state import NEVER_NS, ColumnState
+from fantwin.schemas.messages import Array
+from fantwin.scoring.column_state import NEVER_NS, ColumnState
 
 
 class JointStates:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator, Sequence
 from typing import Any
 
-from pipeline.runtime.stage import Admitted, Core, Joint
-from schemas.messages import Message
+from fantwin.pipeline.runtime.stage import Admitted, Core, Joint
+from fantwin.schemas.messages import Message
 
 MOST_FANS = 512
 """in one pass: with more, a fan costs hardly less"""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pipeline.runtime.joint_states import JointStates
-from pipeline.runtime.latest_kept import LatestKept
-from pipeline.runtime.tray_integrator import TrayIntegrator
-from schemas.messages import Grid, Prediction
-from schemas.side_by_side import apart, side_by_side
+from fantwin.pipeline.runtime.joint_states import JointStates
+from fantwin.pipeline.runtime.latest_kept import LatestKept
+from fantwin.pipeline.runtime.tray_integrator import TrayIntegrator
+from fantwin.schemas.messages import Grid, Prediction
+from fantwin.schemas.side_by_side import apart, side_by_side
 
 MOST_KEPT = 16
 """joint integrators, each for one number of trays: what they hold is small"""

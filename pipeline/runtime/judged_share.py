@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.enums import InvalidReason
-from schemas.messages import Array
-from scoring.alarms.unscored_monitor import REASONS
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Array
+from fantwin.scoring.alarms.unscored_monitor import REASONS
 
 SMALLEST_SHARE = 0.0005  # smaller ones are not named
 

@@ -10,16 +10,16 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from pipeline.bus.errors import NoAnswerError
-from pipeline.bus.kept_messages import KeptQuery
-from pipeline.bus.session import Bus
-from pipeline.config.registry import STAGES
-from pipeline.runtime.second_owner import GOSSIP_S
-from pipeline.runtime.sessions import Session
-from schemas.codec import CodecError, decode
-from schemas.envelope import Envelope
-from schemas.messages import ScorerSnapshot
-from schemas.topics import sessions_key, topic_of, tray_key
+from fantwin.pipeline.bus.errors import NoAnswerError
+from fantwin.pipeline.bus.kept_messages import KeptQuery
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.runtime.second_owner import GOSSIP_S
+from fantwin.pipeline.runtime.sessions import Session
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import ScorerSnapshot
+from fantwin.schemas.topics import sessions_key, topic_of, tray_key
 
 SNAPSHOT = "snapshot"
 KEEPER_LIMIT_S = 60.0

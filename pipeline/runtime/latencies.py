@@ -10,7 +10,7 @@ from itertools import accumulate
 
 import numpy as np
 
-from schemas.health import LatencyBucket
+from fantwin.schemas.health import LatencyBucket
 
 LATENCY_WINDOW_S = 10.0
 """percentiles are those of the outputs of this long"""

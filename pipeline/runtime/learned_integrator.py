@@ -13,13 +13,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.stage import Core, StageError
-from pipeline.runtime.twin_file import TwinFile, learned_twin
-from schemas.auxiliary import auxiliary_columns
-from schemas.blocks import cut, select
-from schemas.enums import InvalidReason
-from schemas.messages import Array, Grid, Message, NewTwin, Prediction
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.stage import Core, StageError
+from fantwin.pipeline.runtime.twin_file import TwinFile, learned_twin
+from fantwin.schemas.auxiliary import auxiliary_columns
+from fantwin.schemas.blocks import cut, select
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Array, Grid, Message, NewTwin, Prediction
 
 BEGINNING = np.iinfo(np.int64).min
 MOST_COMING = 8

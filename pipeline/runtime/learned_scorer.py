@@ -18,15 +18,15 @@ from typing import Protocol
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.judged_share import JudgedShare
-from pipeline.runtime.onnx_metadata import without_metadata
-from pipeline.runtime.snapshot_store import SnapshotStore
-from pipeline.runtime.stage import Core, StageError
-from pipeline.runtime.tray_twin import TrayTwin, tray_twin
-from schemas.blocks import select
-from schemas.messages import Message, ModelCard, Prediction, Request, ScorerSnapshot
-from scoring.score_message import unscored
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.judged_share import JudgedShare
+from fantwin.pipeline.runtime.onnx_metadata import without_metadata
+from fantwin.pipeline.runtime.snapshot_store import SnapshotStore
+from fantwin.pipeline.runtime.stage import Core, StageError
+from fantwin.pipeline.runtime.tray_twin import TrayTwin, tray_twin
+from fantwin.schemas.blocks import select
+from fantwin.schemas.messages import Message, ModelCard, Prediction, Request, ScorerSnapshot
+from fantwin.scoring.score_message import unscored
 
 
 class ScorerOfTwin(Core, Protocol):

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from pipeline.runtime.sessions import MOST_SESSIONS, Session
+from fantwin.pipeline.runtime.sessions import MOST_SESSIONS, Session
 
 APART_S, APART_LIMIT_S = 2.0, 60.0
 """time after a token has disappeared in which a session whose process still runs counts as cut off: earlier, it may be

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from pipeline.runtime.tray_twin import TrayTwin
-from schemas.messages import Array
-from scoring.model.operation import Fans
+from fantwin.pipeline.runtime.tray_twin import TrayTwin
+from fantwin.schemas.messages import Array
+from fantwin.scoring.model.operation import Fans
 
 COUNT_NOISE_RAD_S = 0.8
 """error of a reading that counts pulses, beside what the count misses"""

@@ -12,10 +12,10 @@ import time
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field
 
-from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, RecoveryRequest
-from pipeline.bus.session import Bus
-from pipeline.runtime.inbox import Inbox, Newest
-from schemas.envelope import Envelope
+from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, RecoveryRequest
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.runtime.inbox import Inbox, Newest
+from fantwin.schemas.envelope import Envelope
 
 PERIOD_S = 1.0
 TIMEOUT_S = 4.0

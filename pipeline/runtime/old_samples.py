@@ -6,8 +6,8 @@ the stages before this one were restarted, its input is older than what it has h
 
 from __future__ import annotations
 
-from schemas.messages import Array
-from schemas.units import NS_PER_S
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
 
 REPORTED_AFTER_NS = 10 * NS_PER_S  # of dropped samples one after the other
 

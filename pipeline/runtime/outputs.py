@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-from pipeline.bus.session import Bus
-from pipeline.runtime.consumed import CONSUMED, ConsumedReports
-from pipeline.runtime.stage import Stage, StageError
-from schemas.codec import encode, type_name
-from schemas.header import Header, InputPosition
-from schemas.health import Output
-from schemas.messages import Consumed, Message
-from schemas.topics import BY_NAME, TOPICS, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.runtime.consumed import CONSUMED, ConsumedReports
+from fantwin.pipeline.runtime.stage import Stage, StageError
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.header import Header, InputPosition
+from fantwin.schemas.health import Output
+from fantwin.schemas.messages import Consumed, Message
+from fantwin.schemas.topics import BY_NAME, TOPICS, tray_key
 
 _TOPIC_NAMES = {topic.message: topic.name for topic in TOPICS}
 

@@ -7,8 +7,8 @@ from collections.abc import Set
 from dataclasses import dataclass
 from typing import TypeVar
 
-from pipeline.runtime.inbox import Liveness
-from schemas.health import Health
+from fantwin.pipeline.runtime.inbox import Liveness
+from fantwin.schemas.health import Health
 
 MOST_PEERS = 4096
 """so many sessions are remembered: those heard most recently"""

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.devices.device_clock import UINT32
-from pipeline.devices.sample_source import Reading
-from schemas.auxiliary import AUXILIARY
-from schemas.messages import Array, Raw, StatedTacho
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.devices.device_clock import UINT32
+from fantwin.pipeline.devices.sample_source import Reading
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.messages import Array, Raw, StatedTacho
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,30 +9,39 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence, Set
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import Config
-from pipeline.config.roles import roles_of
-from pipeline.config.shards import Shard
-from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.runtime.believed_outputs import BelievedOutputs
-from pipeline.runtime.clock import REPLAY, StageClock
-from pipeline.runtime.due_messages import DueMessages
-from pipeline.runtime.health import HealthBuilder
-from pipeline.runtime.inbox import FromBus, Inbox, Liveness, Newest, Recovered
-from pipeline.runtime.lost_sessions import LostSessions
-from pipeline.runtime.newest_messages import NewestMessages
-from pipeline.runtime.peers import Peers
-from pipeline.runtime.recovery import Recovery
-from pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from pipeline.runtime.sessions import Sessions, this_host
-from pipeline.runtime.silences import Silences
-from pipeline.runtime.stage import Stage
-from pipeline.runtime.subscriptions import Subscriptions
-from schemas.codec import CodecError
-from schemas.envelope import Envelope
-from schemas.health import Health
-from schemas.messages import Clock
-from schemas.topics import ALL_TRAYS, alive_key, health_key, key_in_words, sessions_key, topic_of, tray_key, tray_of
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.roles import roles_of
+from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.runtime.believed_outputs import BelievedOutputs
+from fantwin.pipeline.runtime.clock import REPLAY, StageClock
+from fantwin.pipeline.runtime.due_messages import DueMessages
+from fantwin.pipeline.runtime.health import HealthBuilder
+from fantwin.pipeline.runtime.inbox import FromBus, Inbox, Liveness, Newest, Recovered
+from fantwin.pipeline.runtime.lost_sessions import LostSessions
+from fantwin.pipeline.runtime.newest_messages import NewestMessages
+from fantwin.pipeline.runtime.peers import Peers
+from fantwin.pipeline.runtime.recovery import Recovery
+from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
+from fantwin.pipeline.runtime.sessions import Sessions, this_host
+from fantwin.pipeline.runtime.silences import Silences
+from fantwin.pipeline.runtime.stage import Stage
+from fantwin.pipeline.runtime.subscriptions import Subscriptions
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Clock
+from fantwin.schemas.topics import (
+    ALL_TRAYS,
+    alive_key,
+    health_key,
+    key_in_words,
+    sessions_key,
+    topic_of,
+    tray_key,
+    tray_of,
+)
 
 MANY_TRAYS = 16
 """in a process that processes several trays in one pass: then it takes messages at its ticks, together"""

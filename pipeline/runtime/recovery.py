@@ -10,12 +10,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, RecoveryRequest
-from pipeline.bus.session import Bus
-from pipeline.runtime.inbox import Inbox, Recovered
-from pipeline.runtime.sequence_tracker import Found
-from pipeline.runtime.tracked_streams import Request
-from schemas.topics import topic_of
+from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, RecoveryRequest
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.runtime.inbox import Inbox, Recovered
+from fantwin.pipeline.runtime.sequence_tracker import Found
+from fantwin.pipeline.runtime.tracked_streams import Request
+from fantwin.schemas.topics import topic_of
 
 MOST_AT_A_TIME = 8
 MOST_QUEUED = 4096

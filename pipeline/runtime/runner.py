@@ -16,34 +16,34 @@ from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import replace
 from itertools import chain
 
-from pipeline.bus.kept_messages import KeptQuery
-from pipeline.bus.spool import Spool
-from pipeline.config.models import Config
-from pipeline.config.registry import STAGES
-from pipeline.config.shards import Shard, chosen_shard
-from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.errors import UserError
-from pipeline.runtime.building import abort, build_and_join
-from pipeline.runtime.clock import StageClock
-from pipeline.runtime.due_messages import DueMessages
-from pipeline.runtime.ending import Ending, Step
-from pipeline.runtime.health import HealthBuilder
-from pipeline.runtime.inbox import INBOX_SIZE, FromBus, FromSource, Inbox, Item
-from pipeline.runtime.kept_snapshots import KeptForOthers
-from pipeline.runtime.notifier import Notifier
-from pipeline.runtime.outputs import Outputs
-from pipeline.runtime.receiving import Receiver
-from pipeline.runtime.sessions import Session, Sessions
-from pipeline.runtime.sources import Sources
-from pipeline.runtime.stage import BuiltStage, Core, Stage
-from pipeline.runtime.steps import Steps
-from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.health import Health, Note
-from schemas.streams import stage_losses
-from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from fantwin.pipeline.bus.kept_messages import KeptQuery
+from fantwin.pipeline.bus.spool import Spool
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.shards import Shard, chosen_shard
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.runtime.building import abort, build_and_join
+from fantwin.pipeline.runtime.clock import StageClock
+from fantwin.pipeline.runtime.due_messages import DueMessages
+from fantwin.pipeline.runtime.ending import Ending, Step
+from fantwin.pipeline.runtime.health import HealthBuilder
+from fantwin.pipeline.runtime.inbox import INBOX_SIZE, FromBus, FromSource, Inbox, Item
+from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers
+from fantwin.pipeline.runtime.notifier import Notifier
+from fantwin.pipeline.runtime.outputs import Outputs
+from fantwin.pipeline.runtime.receiving import Receiver
+from fantwin.pipeline.runtime.sessions import Session, Sessions
+from fantwin.pipeline.runtime.sources import Sources
+from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
+from fantwin.pipeline.runtime.steps import Steps
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Note
+from fantwin.schemas.streams import stage_losses
+from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 TICK_S, EARLY_S = 0.06, 0.02
 """A tick comes so soon after the last one at the latest; after a message, so much earlier: one waking does for both."""

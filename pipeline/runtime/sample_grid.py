@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.devices.device_clock import UINT32, DeviceClock
-from pipeline.devices.device_sequence import LARGEST_GAP
-from pipeline.devices.interpolation import (
+from fantwin.pipeline.devices.device_clock import UINT32, DeviceClock
+from fantwin.pipeline.devices.device_sequence import LARGEST_GAP
+from fantwin.pipeline.devices.interpolation import (
     NEVER_NS,
     LastReadings,
     Samples,
@@ -23,17 +23,17 @@ from pipeline.devices.interpolation import (
     interpolate_auxiliary,
     interpolate_samples,
 )
-from pipeline.devices.line_guard import LineGuard
-from pipeline.devices.line_rate import GridTiming
-from pipeline.runtime.clock import is_of_replay
-from schemas.auxiliary import AUXILIARY, auxiliary_columns
-from schemas.blocks import cut, join
-from schemas.enums import InvalidReason
-from schemas.messages import Array, Grid, Raw
-from schemas.side_by_side import present_columns
-from schemas.tacho import Tacho
-from schemas.topics import most_samples
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.line_guard import LineGuard
+from fantwin.pipeline.devices.line_rate import GridTiming
+from fantwin.pipeline.runtime.clock import is_of_replay
+from fantwin.schemas.auxiliary import AUXILIARY, auxiliary_columns
+from fantwin.schemas.blocks import cut, join
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Array, Grid, Raw
+from fantwin.schemas.side_by_side import present_columns
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.topics import most_samples
+from fantwin.schemas.units import NS_PER_S
 
 LONGEST_TICK_NS = NS_PER_S // 10  # a longer pause between ticks is a host that stalled, not a silent source
 SET_BACK_NS = NS_PER_S  # a new sample this much older than the newest: a replay was restarted

@@ -5,12 +5,12 @@ from __future__ import annotations
 import threading
 import time
 
-from pipeline.bus.session import Bus
-from pipeline.config.registry import STAGES
-from pipeline.runtime.clock import REPLAY
-from pipeline.runtime.sessions import Session, trays_in_words
-from pipeline.runtime.stage import StageError
-from schemas.topics import ALL_TRAYS, alive_key, sessions_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.runtime.clock import REPLAY
+from fantwin.pipeline.runtime.sessions import Session, trays_in_words
+from fantwin.pipeline.runtime.stage import StageError
+from fantwin.schemas.topics import ALL_TRAYS, alive_key, sessions_key
 
 GOSSIP_S = 0.2
 """how long a starting stage waits for further processes after it has met the first: they took 6 ms"""

@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from pipeline.runtime.sessions import Sessions
-from pipeline.runtime.tracked_streams import Request, Stream, TrackedStreams, Waiting
-from schemas.envelope import Envelope
-from schemas.health import Health, Input
-from schemas.streams import MOST_PUBLISHED, StreamId, output_streams
-from schemas.topics import CATCH_UP_MESSAGES
+from fantwin.pipeline.runtime.sessions import Sessions
+from fantwin.pipeline.runtime.tracked_streams import Request, Stream, TrackedStreams, Waiting
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health, Input
+from fantwin.schemas.streams import MOST_PUBLISHED, StreamId, output_streams
+from fantwin.schemas.topics import CATCH_UP_MESSAGES
 
 MOST_HELD_MESSAGES = 4096
 """of one stream"""

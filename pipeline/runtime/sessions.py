@@ -16,9 +16,9 @@ import socket
 from collections.abc import Collection, Iterable, Iterator, Set
 from dataclasses import dataclass
 
-from pipeline.config.shards import Shard
-from schemas.health import Health
-from schemas.topics import SESSION_CHUNK, health_key, session_key, stage_label, topic_of
+from fantwin.pipeline.config.shards import Shard
+from fantwin.schemas.health import Health
+from fantwin.schemas.topics import SESSION_CHUNK, health_key, session_key, stage_label, topic_of
 
 MOST_SESSIONS = 4096
 _BETWEEN_TRAYS = "+"

@@ -22,11 +22,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
-from pipeline.runtime.sessions import Sessions
-from schemas.enums import StageStatus
-from schemas.health import Health
-from schemas.streams import StreamId
-from schemas.units import NS_PER_S
+from fantwin.pipeline.runtime.sessions import Sessions
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.health import Health
+from fantwin.schemas.streams import StreamId
+from fantwin.schemas.units import NS_PER_S
 
 BEGINS_NS = 5 * NS_PER_S
 """this long after its first health that is not STARTING, a session has read what its device had kept"""

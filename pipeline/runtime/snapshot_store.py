@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from pipeline.runtime.stage import StageError
-from schemas.codec import CodecError, decode, encode
-from schemas.formats import SNAPSHOT
-from schemas.messages import ScorerSnapshot
-from schemas.units import NS_PER_S
+from fantwin.pipeline.runtime.stage import StageError
+from fantwin.schemas.codec import CodecError, decode, encode
+from fantwin.schemas.formats import SNAPSHOT
+from fantwin.schemas.messages import ScorerSnapshot
+from fantwin.schemas.units import NS_PER_S
 
 RECENT_NS = 120 * NS_PER_S
 """a file that is no older, two periods of snapshots, is that of the last session, unless somebody knows a newer one"""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from pipeline.runtime.ending import Step
-from pipeline.runtime.inbox import FromSource, Inbox
-from pipeline.runtime.stage import BuiltStage, Core, Source
+from fantwin.pipeline.runtime.ending import Step
+from fantwin.pipeline.runtime.inbox import FromSource, Inbox
+from fantwin.pipeline.runtime.stage import BuiltStage, Core, Source
 
 
 class Sources:

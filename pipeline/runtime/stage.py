@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from pipeline.config.models import Config, Section, TrayConfig
-from pipeline.config.registry import STAGES
-from pipeline.config.shards import own_file
-from pipeline.errors import UserError
-from schemas.envelope import Envelope
-from schemas.health import AcceptedSamples
-from schemas.messages import Message, ScorerSnapshot
-from schemas.topics import ALL_TRAYS, BY_NAME, makes_samples_of_samples
+from fantwin.pipeline.config.models import Config, Section, TrayConfig
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.shards import own_file
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import AcceptedSamples
+from fantwin.schemas.messages import Message, ScorerSnapshot
+from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, makes_samples_of_samples
 
 
 class StageConfig(Section):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.messages import Array
-from schemas.standstill import Standstill
-from schemas.units import NS_PER_S
-from scoring.column_state import NEVER_NS, ColumnState
+from fantwin.schemas.messages import Array
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.column_state import NEVER_NS, ColumnState
 
 START_TIME_CONSTANTS = 5.0  # of a fan that slows down: how long the start kick of its drive lasts
 

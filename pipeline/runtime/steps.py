@@ -7,18 +7,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.runtime.clock import StageClock, is_of_replay
-from pipeline.runtime.health import HealthBuilder
-from pipeline.runtime.joint_step import step_together
-from pipeline.runtime.kept_snapshots import KeptForOthers
-from pipeline.runtime.outputs import Outputs
-from pipeline.runtime.receiving import Receiver
-from pipeline.runtime.sessions import Sessions
-from pipeline.runtime.stage import BuiltStage, Stage
-from schemas.blocks import join
-from schemas.envelope import Envelope
-from schemas.messages import Message, newest_t_ns
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.runtime.clock import StageClock, is_of_replay
+from fantwin.pipeline.runtime.health import HealthBuilder
+from fantwin.pipeline.runtime.joint_step import step_together
+from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers
+from fantwin.pipeline.runtime.outputs import Outputs
+from fantwin.pipeline.runtime.receiving import Receiver
+from fantwin.pipeline.runtime.sessions import Sessions
+from fantwin.pipeline.runtime.stage import BuiltStage, Stage
+from fantwin.schemas.blocks import join
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Message, newest_t_ns
 
 
 @dataclass(frozen=True, eq=False)

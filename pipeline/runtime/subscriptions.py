@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Set
 
-from pipeline.bus.session import Bus
-from schemas.topics import tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.schemas.topics import tray_key
 
 
 class Subscriptions:

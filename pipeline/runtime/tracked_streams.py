@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 
-from pipeline.runtime.sessions import Sessions
-from schemas.envelope import Envelope
-from schemas.health import Input
-from schemas.streams import StreamId, StreamState
-from schemas.topics import HEALTH_CHUNK, health_key
+from fantwin.pipeline.runtime.sessions import Sessions
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Input
+from fantwin.schemas.streams import StreamId, StreamState
+from fantwin.schemas.topics import HEALTH_CHUNK, health_key
 
 MOST_PRODUCERS = 64
 """of one key are remembered. Every `fantwin alarms ack` is a producer of its own."""

@@ -9,11 +9,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from pipeline.bus.session import Bus
-from pipeline.runtime.sessions import Session, Sessions
-from schemas.codec import CodecError, decode
-from schemas.health import Health
-from schemas.topics import alive_key, health_key, sessions_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.runtime.sessions import Session, Sessions
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.health import Health
+from fantwin.schemas.topics import alive_key, health_key, sessions_key
 
 STAGE = "acquisition"
 MOST_SESSIONS = 64

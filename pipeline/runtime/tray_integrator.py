@@ -11,20 +11,20 @@ from itertools import pairwise
 import numpy as np
 from pydantic import Field
 
-from pipeline.runtime.conditions import ConditionTracker, Ratios
-from pipeline.runtime.free_run import FreeRun, FreeRunInputs
-from pipeline.runtime.stage import StageConfig
-from pipeline.runtime.starting_fans import StartingFans
-from pipeline.runtime.twin_file import TwinFile
-from schemas.auxiliary import auxiliary_columns
-from schemas.enums import InvalidReason
-from schemas.messages import Array, Grid, Prediction
-from schemas.side_by_side import present_columns
-from schemas.standstill import Standstill
-from schemas.units import NS_PER_S
-from scoring.column_state import ColumnState
-from scoring.expected_reading import AveragedCommand
-from scoring.torque_balance import BalanceModel, TorqueBalance
+from fantwin.pipeline.runtime.conditions import ConditionTracker, Ratios
+from fantwin.pipeline.runtime.free_run import FreeRun, FreeRunInputs
+from fantwin.pipeline.runtime.stage import StageConfig
+from fantwin.pipeline.runtime.starting_fans import StartingFans
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.schemas.auxiliary import auxiliary_columns
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Array, Grid, Prediction
+from fantwin.schemas.side_by_side import present_columns
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.column_state import ColumnState
+from fantwin.scoring.expected_reading import AveragedCommand
+from fantwin.scoring.torque_balance import BalanceModel, TorqueBalance
 
 LONGEST_BRIDGE = (
     1 << 16

@@ -14,26 +14,26 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
-from schemas.enums import Severity, Statistic
-from schemas.messages import Alarm, Array, Diagnosis, Prediction, Score
-from schemas.units import NS_PER_S
-from scoring.alarms.alarm_manager import AlarmManager, Measured
-from scoring.alarms.alarm_text import AlarmText
-from scoring.alarms.fan_condition import ConditionSettings
-from scoring.alarms.tray_conditions import Decided
-from scoring.diagnosis.advice import KNOWN_SOON, SeenSinceOnset
-from scoring.diagnosis.cause_words import CauseWords, PossibleCause
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE, is_of_standstill
-from scoring.diagnosis.standstill_causes import Standing, standstill_causes
-from scoring.model.bins import Bin, Bins, bin_ns_of
-from scoring.model.decision import Decision
-from scoring.model.saved import as_json, from_json, part, within
-from scoring.samples import IDLE, among, arrived
-from scoring.score_message import ScoreColumns, score_of
-from scoring.standing.against_command import KINDS, AgainstCommand
-from scoring.standing.falls import Falls
-from scoring.wear.wear_monitor import WearMonitor
+from fantwin.pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
+from fantwin.schemas.enums import Severity, Statistic
+from fantwin.schemas.messages import Alarm, Array, Diagnosis, Prediction, Score
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_manager import AlarmManager, Measured
+from fantwin.scoring.alarms.alarm_text import AlarmText
+from fantwin.scoring.alarms.fan_condition import ConditionSettings
+from fantwin.scoring.alarms.tray_conditions import Decided
+from fantwin.scoring.diagnosis.advice import KNOWN_SOON, SeenSinceOnset
+from fantwin.scoring.diagnosis.cause_words import CauseWords, PossibleCause
+from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE, is_of_standstill
+from fantwin.scoring.diagnosis.standstill_causes import Standing, standstill_causes
+from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
+from fantwin.scoring.model.decision import Decision
+from fantwin.scoring.model.saved import as_json, from_json, part, within
+from fantwin.scoring.samples import IDLE, among, arrived
+from fantwin.scoring.score_message import ScoreColumns, score_of
+from fantwin.scoring.standing.against_command import KINDS, AgainstCommand
+from fantwin.scoring.standing.falls import Falls
+from fantwin.scoring.wear.wear_monitor import WearMonitor
 
 NO_READING = KINDS.index(Standing.NO_READING)
 NAMED_AFTER_S, FALLING_S = 3.0, 4.0

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.onnx_metadata import read_onnx_metadata
-from pipeline.runtime.stage import StageError
-from schemas.messages import Array
-from schemas.tacho import Tacho, tacho_of_each_fan
-from schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, DriveCard, TwinCard
-from scoring.unseen_error import UnseenError
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.onnx_metadata import read_onnx_metadata
+from fantwin.pipeline.runtime.stage import StageError
+from fantwin.schemas.messages import Array
+from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
+from fantwin.schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, DriveCard, TwinCard
+from fantwin.scoring.unseen_error import UnseenError
 
 LARGEST_TWIN_BYTES = 64 << 20
 """of a twin's file; the demo's has 28 kB"""

@@ -17,12 +17,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.stage import Context, StageError
-from pipeline.runtime.tray_twin import TrayTwin, for_fans, read_file, tray_twin, twin_path
-from schemas.messages import Array
-from schemas.tacho import Tacho, tacho_of_each_fan
-from schemas.twin_card import GRAPH_INPUTS, GRAPH_OUTPUTS, TwinCard
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.stage import Context, StageError
+from fantwin.pipeline.runtime.tray_twin import TrayTwin, for_fans, read_file, tray_twin, twin_path
+from fantwin.schemas.messages import Array
+from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
+from fantwin.schemas.twin_card import GRAPH_INPUTS, GRAPH_OUTPUTS, TwinCard
 
 Advance: TypeAlias = Callable[[Array, Array, Array], tuple[Array, Array]]
 """(state (fans, n_state), command (n, fans), step_s (n,)) -> (speed_rad_s (n, fans), state (fans, n_state))."""

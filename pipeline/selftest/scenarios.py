@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.selftest.scratch_site import FANS, SITE, STAGES, TRAY, NotKept, ScratchSite
-from schemas.codec import encode, type_name
-from schemas.header import Header
-from schemas.messages import Raw
-from schemas.topics import BY_NAME, tray_key
+from fantwin.pipeline.selftest.scratch_site import FANS, SITE, STAGES, TRAY, NotKept, ScratchSite
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.topics import BY_NAME, tray_key
 
 REPLACED_LIMIT_S = 60.0
 SILENCE = "no raw samples"

@@ -14,18 +14,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from pipeline.bus.session import Bus
-from pipeline.config.loading import load_config
-from pipeline.errors import UserError
-from pipeline.launch.site_watcher import SiteWatcher, StageView
-from pipeline.selftest.line_relay import LineRelay
-from pipeline.selftest.stepped_clock import VARIABLE, set_offset_ns
-from schemas.codec import decode
-from schemas.enums import Transition
-from schemas.messages import Alarm, Score
-from schemas.topics import tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.selftest.line_relay import LineRelay
+from fantwin.pipeline.selftest.stepped_clock import VARIABLE, set_offset_ns
+from fantwin.schemas.codec import decode
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm, Score
+from fantwin.schemas.topics import tray_key
 
-FANTWIN = (sys.executable, "-P", "-m", "pipeline")
+FANTWIN = (sys.executable, "-P", "-m", "fantwin")
 CONFIGURATION = Path(__file__).parents[1] / "demo" / "demo.toml"
 SITE, TRAY, FANS = "demo", "tray1", 8
 STAGES = (f"acquisition/{TRAY}", "resampler", "twin_integrator", "scorer", "recorder")
@@ -62,7 +62,7 @@ class ScratchSite:
 
     def __enter__(self) -> Self:
         set_offset_ns(self._clock_file, 0)
-        code = "from pipeline.selftest import stepped_clock\n\nstepped_clock.install()\n"
+        code = "from fantwin.pipeline.selftest import stepped_clock\n\nstepped_clock.install()\n"
         (self.folder / "sitecustomize.py").write_text(code, encoding="utf-8")
         self.bus = Bus(load_config(CONFIGURATION, self.overrides).bus, listens=False)
         self.watcher = SiteWatcher(self.bus, SITE)

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.selftest.scenarios import SMALL_DISK_BYTES, Scenario
-from pipeline.selftest.scratch_site import NotKept, ScratchSite
+from fantwin.pipeline.selftest.scenarios import SMALL_DISK_BYTES, Scenario
+from fantwin.pipeline.selftest.scratch_site import NotKept, ScratchSite
 
 BACK_LIMIT_S = 60.0
 LOST = 3

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from pipeline.viewing.worst_page import clock_utc
-from schemas.enums import Severity, Statistic, Transition
-from schemas.messages import Alarm
-from scoring.alarms.alarm_text import TRANSITIONS
-from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
-from scoring.diagnosis.shown_causes import CANNOT_TELL, with_share
+from fantwin.pipeline.viewing.worst_page import clock_utc
+from fantwin.schemas.enums import Severity, Statistic, Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.alarm_text import TRANSITIONS
+from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, with_share
 
 LINE_LENGTH = 64
 """a longer line is cut"""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pipeline.viewing.alarm_log import cut, exceeded
-from pipeline.viewing.fleet import Fan
-from pipeline.viewing.stages_page import markdown_literal
-from pipeline.viewing.worst_page import clock_utc
-from schemas.messages import Alarm
-from scoring.alarms.alarm_flags import is_listed, is_silenced
-from scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence, needed
-from scoring.diagnosis.shown_causes import most_probable
+from fantwin.pipeline.viewing.alarm_log import cut, exceeded
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.stages_page import markdown_literal
+from fantwin.pipeline.viewing.worst_page import clock_utc
+from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.alarm_flags import is_listed, is_silenced
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence, needed
+from fantwin.scoring.diagnosis.shown_causes import most_probable
 
 ALARMS_LISTED = 16
 NAME_LENGTH, CAUSE_LENGTH = 24, 40

@@ -21,14 +21,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from pipeline.errors import UserError
-from pipeline.recordings.dates import format_utc, has_date
-from pipeline.recordings.left_out import left_out_hint
-from pipeline.recordings.reading import read_metadata, read_recording
-from pipeline.viewing.trace import Trace, state_changes, trace_of
-from schemas.auxiliary import AUXILIARY, AuxiliaryColumn, axis_range
-from schemas.messages import Array, Score
-from schemas.units import NS_PER_S, SpeedUnit
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.dates import format_utc, has_date
+from fantwin.pipeline.recordings.left_out import left_out_hint
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.pipeline.viewing.trace import Trace, state_changes, trace_of
+from fantwin.schemas.auxiliary import AUXILIARY, AuxiliaryColumn, axis_range
+from fantwin.schemas.messages import Array, Score
+from fantwin.schemas.units import NS_PER_S, SpeedUnit
 
 MAX_PANELS = 12
 PANEL_HEIGHT_IN, BESIDE_HEIGHT_IN, LANE_HEIGHT_IN, WIDTH_IN = 2.3, 0.8, 0.2, 12.0

@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.viewing.trace import SILENT, state_codes, state_name
-from schemas.enums import FanState, Transition
-from schemas.fields import LARGEST_ENUM_VALUE
-from schemas.messages import Alarm, Array, Score
-from scoring.alarms.alarm_flags import is_silenced
-from scoring.alarms.words_now import words_now
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.viewing.trace import SILENT, state_codes, state_name
+from fantwin.schemas.enums import FanState, Transition
+from fantwin.schemas.fields import LARGEST_ENUM_VALUE
+from fantwin.schemas.messages import Alarm, Array, Score
+from fantwin.scoring.alarms.alarm_flags import is_silenced
+from fantwin.scoring.alarms.words_now import words_now
 
 FLEET_COLUMNS = ("state", "invalid_reason", "score")
 """the columns of a score that a fleet is made of"""

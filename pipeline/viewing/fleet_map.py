@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.messages import Array
+from fantwin.schemas.messages import Array
 
 MAP_PX = (1300, 640)
 """about the size of the map in a window of full HD: the layout fits it; a smaller one is scaled down"""

@@ -11,13 +11,13 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.config.models import TrayConfig
-from pipeline.viewing.fleet import FLEET_COLUMNS, Fan, Fleet
-from pipeline.viewing.plot_places import PlotPlaces
-from pipeline.viewing.trace import MEASURED_COLUMNS
-from pipeline.viewing.worst_page import worst_page
-from schemas.messages import Alarm, Array, Score
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.viewing.fleet import FLEET_COLUMNS, Fan, Fleet
+from fantwin.pipeline.viewing.plot_places import PlotPlaces
+from fantwin.pipeline.viewing.trace import MEASURED_COLUMNS
+from fantwin.pipeline.viewing.worst_page import worst_page
+from fantwin.schemas.messages import Alarm, Array, Score
+from fantwin.schemas.units import NS_PER_S
 
 SILENT_AFTER_NS = 5 * NS_PER_S
 """a tray without a score for so long is silent"""

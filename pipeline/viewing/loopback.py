@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 
-from pipeline.runtime.stage import StageError
+from fantwin.pipeline.runtime.stage import StageError
 
 LOOPBACK = "127.0.0.1"
 

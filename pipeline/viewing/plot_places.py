@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.fleet import Fan
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.config.models import TrayConfig
-from pipeline.errors import UserError
-from pipeline.recordings.left_out import left_out_hint
-from pipeline.recordings.order import Seen, in_order
-from pipeline.recordings.reading import RecordingMetadata, read_recording
-from pipeline.recordings.run_recordings import run_metadata
-from pipeline.viewing.view_of_site import ViewOptions, view_of_site
-from schemas.codec import CodecError
-from schemas.envelope import Envelope
-from schemas.units import SpeedUnit
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.left_out import left_out_hint
+from fantwin.pipeline.recordings.order import Seen, in_order
+from fantwin.pipeline.recordings.reading import RecordingMetadata, read_recording
+from fantwin.pipeline.recordings.run_recordings import run_metadata
+from fantwin.pipeline.viewing.view_of_site import ViewOptions, view_of_site
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.units import SpeedUnit
 
 TOPICS = ("score", "alarm", "twin", "health", "snapshot")
 """what the viewer reads"""

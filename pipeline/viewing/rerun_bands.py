@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from pipeline.viewing.fleet import Fan
-from pipeline.viewing.rerun_paths import (
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.rerun_paths import (
     BALANCE,
     SCORE,
     TIMELINE,
@@ -26,11 +26,11 @@ from pipeline.viewing.rerun_paths import (
     place_root,
     state_path,
 )
-from pipeline.viewing.rerun_styles import LINE_WIDTH, balance_style, log_fan_styles, score_style, speed_style
-from pipeline.viewing.trace import NO_SAMPLES, Trace
-from schemas.auxiliary import AUXILIARY
-from schemas.messages import Array
-from schemas.units import SpeedUnit
+from fantwin.pipeline.viewing.rerun_styles import LINE_WIDTH, balance_style, log_fan_styles, score_style, speed_style
+from fantwin.pipeline.viewing.trace import NO_SAMPLES, Trace
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import SpeedUnit
 
 FREE = "free"
 """the state of a place without a fan"""

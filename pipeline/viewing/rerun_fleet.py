@@ -13,14 +13,21 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from pipeline.config.models import TrayConfig
-from pipeline.viewing.fleet import NORMAL_LEVELS, Fan, class_names
-from pipeline.viewing.fleet_map import LABEL_HEIGHT_PX, fleet_map
-from pipeline.viewing.fleet_view import FANS_NAMED, Overview
-from pipeline.viewing.plot_places import FleetPlots
-from pipeline.viewing.rerun_bands import FREE
-from pipeline.viewing.rerun_layout import LINKED, MARGIN_FOR_LEGEND, alarms_view, blueprint, judged_view, log_view
-from pipeline.viewing.rerun_paths import (
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.viewing.fleet import NORMAL_LEVELS, Fan, class_names
+from fantwin.pipeline.viewing.fleet_map import LABEL_HEIGHT_PX, fleet_map
+from fantwin.pipeline.viewing.fleet_view import FANS_NAMED, Overview
+from fantwin.pipeline.viewing.plot_places import FleetPlots
+from fantwin.pipeline.viewing.rerun_bands import FREE
+from fantwin.pipeline.viewing.rerun_layout import (
+    LINKED,
+    MARGIN_FOR_LEGEND,
+    alarms_view,
+    blueprint,
+    judged_view,
+    log_view,
+)
+from fantwin.pipeline.viewing.rerun_paths import (
     BALANCE,
     FLEET_LOG,
     SCORE,
@@ -29,10 +36,10 @@ from pipeline.viewing.rerun_paths import (
     place_beside,
     place_lane,
 )
-from pipeline.viewing.rerun_styles import LINE_WIDTH, RED, STATE_COLORS, UNKNOWN_COLOR, log_state_styles
-from pipeline.viewing.trace import SILENT, state_names
-from schemas.auxiliary import AuxiliaryColumn
-from schemas.messages import Array
+from fantwin.pipeline.viewing.rerun_styles import LINE_WIDTH, RED, STATE_COLORS, UNKNOWN_COLOR, log_state_styles
+from fantwin.pipeline.viewing.trace import SILENT, state_names
+from fantwin.schemas.auxiliary import AuxiliaryColumn
+from fantwin.schemas.messages import Array
 
 MAP = "fleet/map"
 CELLS, BLOCKS, TRAYS = f"{MAP}/cells", f"{MAP}/blocks", f"{MAP}/trays"

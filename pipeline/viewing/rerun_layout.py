@@ -17,7 +17,7 @@ import rerun.blueprint as rrb
 from rerun.blueprint.archetypes import TextLogColumns
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
-from pipeline.viewing.rerun_paths import (
+from fantwin.pipeline.viewing.rerun_paths import (
     ALARMS_PATH,
     BALANCE,
     DAYS,
@@ -38,7 +38,7 @@ from pipeline.viewing.rerun_paths import (
     state_path,
     wear_path,
 )
-from pipeline.viewing.rerun_styles import (
+from fantwin.pipeline.viewing.rerun_styles import (
     LINE_WIDTH,
     balance_style,
     log_fan_styles,
@@ -46,9 +46,9 @@ from pipeline.viewing.rerun_styles import (
     score_style,
     speed_style,
 )
-from pipeline.viewing.trace import state_names
-from schemas.auxiliary import AuxiliaryColumn
-from schemas.units import SpeedUnit
+from fantwin.pipeline.viewing.trace import state_names
+from fantwin.schemas.auxiliary import AuxiliaryColumn
+from fantwin.schemas.units import SpeedUnit
 
 LayoutName = Literal["all", "alarms", "wear"]
 ALARMS_ON_A_PAGE = 4

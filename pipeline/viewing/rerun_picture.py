@@ -26,16 +26,16 @@ from PIL import Image
 from rerun.chunk import Chunk, RrdReader
 from rerun.experimental import View, ViewerClient
 
-from pipeline.errors import UserError
-from pipeline.viewing.plot_places import FleetPlots
-from pipeline.viewing.rerun_fleet import CELLS, MAP, bounds_of
-from pipeline.viewing.rerun_layout import LayoutName, TrayLayout, wear_blueprint
-from pipeline.viewing.rerun_paths import DAYS, TIMELINE, WEAR, place_in
-from pipeline.viewing.rerun_sink import APPLICATION, LOOPBACK, rerun_program
-from pipeline.viewing.site_layout import SiteLayout
-from schemas.auxiliary import AUXILIARY
-from schemas.messages import Array
-from schemas.units import NS_PER_S, SpeedUnit
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.viewing.plot_places import FleetPlots
+from fantwin.pipeline.viewing.rerun_fleet import CELLS, MAP, bounds_of
+from fantwin.pipeline.viewing.rerun_layout import LayoutName, TrayLayout, wear_blueprint
+from fantwin.pipeline.viewing.rerun_paths import DAYS, TIMELINE, WEAR, place_in
+from fantwin.pipeline.viewing.rerun_sink import APPLICATION, LOOPBACK, rerun_program
+from fantwin.pipeline.viewing.site_layout import SiteLayout
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S, SpeedUnit
 
 SIZE = (1920, 1080)
 TOP_BAR_SHARE = 0.035  # of the height; it stays, empty, when it is hidden

@@ -15,25 +15,25 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.stage import StageError
-from pipeline.viewing.alarm_log import LogLine
-from pipeline.viewing.fleet import Fan
-from pipeline.viewing.fleet_view import Overview
-from pipeline.viewing.loopback import LOOPBACK, check_free
-from pipeline.viewing.plot_places import FleetPlots
-from pipeline.viewing.rerun_bands import RerunBands
-from pipeline.viewing.rerun_fleet import RerunFleet
-from pipeline.viewing.rerun_layout import LayoutName, TrayLayout, log_styles
-from pipeline.viewing.rerun_paths import ALARMS_PATH, FLEET_LOG, STAGES_PATH, TIMELINE, log_path
-from pipeline.viewing.rerun_wear import RerunWear
-from pipeline.viewing.site_layout import SiteLayout
-from pipeline.viewing.trace import Trace
-from pipeline.viewing.view_file import ViewFile
-from pipeline.viewing.wear_points import WearPoints
-from schemas.auxiliary import AUXILIARY
-from schemas.messages import Array
-from schemas.units import SpeedUnit
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.stage import StageError
+from fantwin.pipeline.viewing.alarm_log import LogLine
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.fleet_view import Overview
+from fantwin.pipeline.viewing.loopback import LOOPBACK, check_free
+from fantwin.pipeline.viewing.plot_places import FleetPlots
+from fantwin.pipeline.viewing.rerun_bands import RerunBands
+from fantwin.pipeline.viewing.rerun_fleet import RerunFleet
+from fantwin.pipeline.viewing.rerun_layout import LayoutName, TrayLayout, log_styles
+from fantwin.pipeline.viewing.rerun_paths import ALARMS_PATH, FLEET_LOG, STAGES_PATH, TIMELINE, log_path
+from fantwin.pipeline.viewing.rerun_wear import RerunWear
+from fantwin.pipeline.viewing.site_layout import SiteLayout
+from fantwin.pipeline.viewing.trace import Trace
+from fantwin.pipeline.viewing.view_file import ViewFile
+from fantwin.pipeline.viewing.wear_points import WearPoints
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import SpeedUnit
 
 APPLICATION = "fantwin"
 FLUSH_LIMIT_S = 2.0

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import rerun as rr
 
-from pipeline.viewing.rerun_paths import fan_path
-from pipeline.viewing.trace import SILENT
-from schemas.units import SpeedUnit
+from fantwin.pipeline.viewing.rerun_paths import fan_path
+from fantwin.pipeline.viewing.trace import SILENT
+from fantwin.schemas.units import SpeedUnit
 
 LINE_WIDTH = 1.2
 VIOLET = (160, 100, 250)

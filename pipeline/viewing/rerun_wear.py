@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from pipeline.viewing.fleet import Fan
-from pipeline.viewing.rerun_paths import DAYS, wear_path
-from pipeline.viewing.rerun_styles import FAN_COLORS, LINE_WIDTH
-from pipeline.viewing.wear_points import WearPoints
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.rerun_paths import DAYS, wear_path
+from fantwin.pipeline.viewing.rerun_styles import FAN_COLORS, LINE_WIDTH
+from fantwin.pipeline.viewing.wear_points import WearPoints
 
 
 class RerunWear:

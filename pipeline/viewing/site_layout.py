@@ -7,10 +7,16 @@ from dataclasses import dataclass, replace
 
 import rerun.blueprint as rrb
 
-from pipeline.viewing.plot_places import FleetPlots
-from pipeline.viewing.rerun_fleet import fleet_alarms_blueprint, fleet_blueprint
-from pipeline.viewing.rerun_layout import LayoutName, TrayLayout, alarms_blueprint, trays_blueprint, wear_blueprint
-from schemas.auxiliary import AuxiliaryColumn
+from fantwin.pipeline.viewing.plot_places import FleetPlots
+from fantwin.pipeline.viewing.rerun_fleet import fleet_alarms_blueprint, fleet_blueprint
+from fantwin.pipeline.viewing.rerun_layout import (
+    LayoutName,
+    TrayLayout,
+    alarms_blueprint,
+    trays_blueprint,
+    wear_blueprint,
+)
+from fantwin.schemas.auxiliary import AuxiliaryColumn
 
 
 @dataclass(frozen=True)

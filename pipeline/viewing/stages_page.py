@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.enums import StageStatus
-from schemas.health import Health
-from schemas.messages import ModelCard
-from schemas.topics import key_in_words, stage_label
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import ModelCard
+from fantwin.schemas.topics import key_in_words, stage_label
 
 CHANGES_SHOWN = 20
 PROBLEM_LENGTH = 200

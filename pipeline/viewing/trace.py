@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from schemas.auxiliary import AUXILIARY
-from schemas.enums import FanState, InvalidReason
-from schemas.fields import LARGEST_ENUM_VALUE
-from schemas.messages import Array, Score
-from schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.enums import FanState, InvalidReason
+from fantwin.schemas.fields import LARGEST_ENUM_VALUE
+from fantwin.schemas.messages import Array, Score
+from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
 SILENT = "silent"
 """the state of a fan without samples, in words"""

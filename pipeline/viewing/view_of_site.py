@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.stage import StageError
-from pipeline.viewing.fleet import Fan
-from pipeline.viewing.fleet_view import FleetView
-from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
-from pipeline.viewing.rerun_layout import LayoutName
-from pipeline.viewing.rerun_sink import RerunSink
-from pipeline.viewing.viewer_core import ViewerCore
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.stage import StageError
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.fleet_view import FleetView
+from fantwin.pipeline.viewing.plot_places import FleetPlots, PlotPlaces
+from fantwin.pipeline.viewing.rerun_layout import LayoutName
+from fantwin.pipeline.viewing.rerun_sink import RerunSink
+from fantwin.pipeline.viewing.viewer_core import ViewerCore
+from fantwin.schemas.units import NS_PER_S
 
 NO_WEAR = 'viewer.layout = "wear": not with more than {fleet_above} fans (fleet_above); fantwin wear lists the changes'
 

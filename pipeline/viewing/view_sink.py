@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from pipeline.viewing.alarm_log import LogLine
-from pipeline.viewing.fleet import Fan
-from pipeline.viewing.fleet_view import Overview
-from pipeline.viewing.trace import Trace
-from pipeline.viewing.wear_points import WearPoints
-from schemas.messages import Array
-from schemas.units import SpeedUnit
+from fantwin.pipeline.viewing.alarm_log import LogLine
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.fleet_view import Overview
+from fantwin.pipeline.viewing.trace import Trace
+from fantwin.pipeline.viewing.wear_points import WearPoints
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import SpeedUnit
 
 
 class ViewSink(Protocol):

@@ -8,20 +8,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.stage import Core
-from pipeline.viewing.alarm_log import LogLine, log_line
-from pipeline.viewing.alarm_table import AlarmTable
-from pipeline.viewing.fleet import SILENT, Fan
-from pipeline.viewing.fleet_view import COLUMNS, FleetView
-from pipeline.viewing.stages_page import StagesPage
-from pipeline.viewing.trace import MEASURED_COLUMNS, Trace, state_changes, state_name, trace_of, with_holes
-from pipeline.viewing.view_sink import ViewSink
-from pipeline.viewing.wear_points import WearPoints, wear_points
-from schemas.codec import CodecError, decode_columns
-from schemas.envelope import Envelope
-from schemas.health import Health
-from schemas.messages import Alarm, Message, ModelCard, Score, ScorerSnapshot
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.stage import Core
+from fantwin.pipeline.viewing.alarm_log import LogLine, log_line
+from fantwin.pipeline.viewing.alarm_table import AlarmTable
+from fantwin.pipeline.viewing.fleet import SILENT, Fan
+from fantwin.pipeline.viewing.fleet_view import COLUMNS, FleetView
+from fantwin.pipeline.viewing.stages_page import StagesPage
+from fantwin.pipeline.viewing.trace import MEASURED_COLUMNS, Trace, state_changes, state_name, trace_of, with_holes
+from fantwin.pipeline.viewing.view_sink import ViewSink
+from fantwin.pipeline.viewing.wear_points import WearPoints, wear_points
+from fantwin.schemas.codec import CodecError, decode_columns
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm, Message, ModelCard, Score, ScorerSnapshot
 
 FLUSH_PERIOD_NS = 500_000_000
 REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late finds a state at most this old

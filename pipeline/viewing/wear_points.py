@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.messages import Array, ScorerSnapshot
+from fantwin.schemas.messages import Array, ScorerSnapshot
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pipeline.recordings.dates import has_date
-from pipeline.viewing.fleet import Fan, FanNow, Fleet, UnscoredFans
-from pipeline.viewing.stages_page import markdown_literal
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.dates import has_date
+from fantwin.pipeline.viewing.fleet import Fan, FanNow, Fleet, UnscoredFans
+from fantwin.pipeline.viewing.stages_page import markdown_literal
+from fantwin.schemas.units import NS_PER_S
 
 FANS_LISTED = 24
 REASONS_LISTED = 5

@@ -8,7 +8,7 @@ Reference: docs/reference/wire-protocol.md.
 
 from __future__ import annotations
 
-from schemas.wire.frames import (
+from fantwin.schemas.wire.frames import (
     DEVICE_COUNTERS,
     MAX_FANS,
     UINT16,
@@ -22,7 +22,7 @@ from schemas.wire.frames import (
     Sample,
     SetPointFrame,
 )
-from schemas.wire.stream import DELIMITERS, MAX_FRAME_BYTES, Decoder, End, Protocol, encode
+from fantwin.schemas.wire.stream import DELIMITERS, MAX_FRAME_BYTES, Decoder, End, Protocol, encode
 
 __all__ = [
     "DELIMITERS",

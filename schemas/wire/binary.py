@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from cobs import cobs
 
-from schemas.auxiliary import AUXILIARY
-from schemas.wire.frames import (
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.wire.frames import (
     DEVICE_COUNTERS,
     VERSION,
     CommandFrame,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TypeAlias
 
-from schemas.auxiliary import AUXILIARY
+from fantwin.schemas.auxiliary import AUXILIARY
 
 VERSION = 1
 MAX_FANS = 64

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Literal, TypeAlias
 
-from schemas.wire.binary import decode_binary, encode_binary
-from schemas.wire.frames import (
+from fantwin.schemas.wire.binary import decode_binary, encode_binary
+from fantwin.schemas.wire.frames import (
     DEVICE_COUNTERS,
     MAX_FANS,
     UINT16,
@@ -20,7 +20,7 @@ from schemas.wire.frames import (
     Sample,
     SetPointFrame,
 )
-from schemas.wire.text import LETTER, decode_text, encode_text
+from fantwin.schemas.wire.text import LETTER, decode_text, encode_text
 
 Protocol: TypeAlias = Literal["binary", "text"]
 End: TypeAlias = Literal["host", "device"]

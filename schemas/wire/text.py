@@ -10,8 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from schemas.auxiliary import AUXILIARY
-from schemas.wire.frames import UINT32, CommandFrame, FaultKind, Frame, FrameError, Sample, SetPointFrame
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.wire.frames import UINT32, CommandFrame, FaultKind, Frame, FrameError, Sample, SetPointFrame
 
 LETTER = re.compile(rb"[SCP]")  # begins a line and occurs nowhere else, so that a reader can find the next line
 _INTEGER = re.compile(rb"[0-9]{1,10}")

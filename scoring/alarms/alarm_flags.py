@@ -5,8 +5,8 @@ This is the only definition. The scorer's `AlarmState` and the `Alarm` message c
 
 from __future__ import annotations
 
-from schemas.messages import Alarm
-from scoring.alarms.fan_condition import AlarmState
+from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.fan_condition import AlarmState
 
 
 def is_retained(alarm: Alarm | AlarmState) -> bool:

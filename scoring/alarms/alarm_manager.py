@@ -8,16 +8,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from schemas.enums import Feedback, Severity, Statistic, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Array, Diagnosis, Request
-from schemas.units import NS_PER_S
-from scoring.alarms.alarm_flags import is_listed
-from scoring.alarms.alarm_text import AlarmText
-from scoring.alarms.fan_condition import AlarmState, ConditionSettings
-from scoring.alarms.tray_conditions import Decided, TrayConditions
-from scoring.diagnosis.cause_words import says_more
-from scoring.diagnosis.shown_causes import is_of_standstill
+from fantwin.schemas.enums import Feedback, Severity, Statistic, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Array, Diagnosis, Request
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_flags import is_listed
+from fantwin.scoring.alarms.alarm_text import AlarmText
+from fantwin.scoring.alarms.fan_condition import AlarmState, ConditionSettings
+from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
+from fantwin.scoring.diagnosis.cause_words import says_more
+from fantwin.scoring.diagnosis.shown_causes import is_of_standstill
 
 AGAIN_AFTER_S = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 """times after an alarm was raised at which its causes are looked at again"""

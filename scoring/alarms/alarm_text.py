@@ -6,11 +6,11 @@ which says no more than its flags do, is not compared.
 
 from __future__ import annotations
 
-from schemas.enums import Severity, Statistic, Transition
-from schemas.messages import Alarm
-from schemas.units import SpeedUnit
-from scoring.alarms.alarm_units import AlarmUnits
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, STANDSTILL_CAUSES
+from fantwin.schemas.enums import Severity, Statistic, Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.units import SpeedUnit
+from fantwin.scoring.alarms.alarm_units import AlarmUnits
+from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, STANDSTILL_CAUSES
 
 TRANSITIONS = {
     Transition.CLEARED: "back to normal",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from schemas.messages import Alarm
-from schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
 SIGMAS = 2.0
 """half of the interval of a size"""

@@ -15,8 +15,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from schemas.enums import Action, Feedback, Severity, Transition
-from schemas.units import NS_PER_S
+from fantwin.schemas.enums import Action, Feedback, Severity, Transition
+from fantwin.schemas.units import NS_PER_S
 
 UNTIL_IT_CLEARS_T_NS = 2**63 - 1
 """`shelved_until_t_ns` of a one-shot shelving: until the alarm clears or is unshelved."""

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from schemas.enums import Action, Severity, Transition
-from schemas.messages import Array
-from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, AlarmState, ConditionSettings, FanCondition
+from fantwin.schemas.enums import Action, Severity, Transition
+from fantwin.schemas.messages import Array
+from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, AlarmState, ConditionSettings, FanCondition
 
 NEVER_NS = -(1 << 62)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.enums import InvalidReason
-from schemas.fan_numbers import fans_in_words
-from schemas.messages import Array
-from schemas.units import NS_PER_S
-from scoring.samples import IDLE, among
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.fan_numbers import fans_in_words
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.samples import IDLE, among
 
 FIRST_WARM_UP_NS = 60 * NS_PER_S  # a fan that was never scored may warm up for this long before it is reported
 REASONS = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from schemas.enums import FanState, InvalidReason
+from fantwin.schemas.enums import FanState, InvalidReason
 
 RETURNING = "like a healthy fan again (the alarm clears once it stays so for ten seconds)"
 STOPPED, STARTING = "stopped by its command", "starting"

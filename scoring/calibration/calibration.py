@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
 
-from schemas.messages import Array
-from scoring.calibration.alarm_rate import HOURS_PER_DAY, daily_interval
-from scoring.model.priors import Priors
+from fantwin.schemas.messages import Array
+from fantwin.scoring.calibration.alarm_rate import HOURS_PER_DAY, daily_interval
+from fantwin.scoring.model.priors import Priors
 
 SHOWN_BY = 3.0
 EXCEEDED_UNTIL = 0.5

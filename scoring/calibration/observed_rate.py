@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.twin_card import CardError, TwinCard
+from fantwin.schemas.twin_card import CardError, TwinCard
 
 HOURS_PER_DAY = 24.0
 
@@ -38,7 +38,7 @@ class ObservedRate:
 
     def interval_95(self, alarms: int) -> tuple[float, float]:
         """The exact 95 % interval of the rate of independent alarms (Garwood), per fan and day."""
-        from scoring.calibration.alarm_rate import daily_interval  # noqa: PLC0415  scipy takes long to import
+        from fantwin.scoring.calibration.alarm_rate import daily_interval  # noqa: PLC0415  scipy takes long to import
 
         return daily_interval(alarms, self.fan_hours)
 
@@ -86,7 +86,7 @@ def _number(value: float) -> str:
 
 def declared_per_day(card_json: str) -> float | None:
     """The rate that a twin's card declares, false alarms per fan and day; None: it declares none, or cannot be read."""
-    from scoring.calibration.calibration import Calibration  # noqa: PLC0415  scipy, again
+    from fantwin.scoring.calibration.calibration import Calibration  # noqa: PLC0415  scipy, again
 
     try:
         calibration = TwinCard.from_json(card_json).calibration

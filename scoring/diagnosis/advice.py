@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from scoring.diagnosis.steady_fan import SteadyFan
+from fantwin.scoring.diagnosis.steady_fan import SteadyFan
 
 SLOWER, FASTER = 2.0 / 3.0, 4.0 / 3.0
 SURELY_TURNS = 2.0

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from schemas.messages import Diagnosis
-from scoring.diagnosis.advice import Advice, SeenSinceOnset
-from scoring.diagnosis.shown_causes import (
+from fantwin.schemas.messages import Diagnosis
+from fantwin.scoring.diagnosis.advice import Advice, SeenSinceOnset
+from fantwin.scoring.diagnosis.shown_causes import (
     CANNOT_TELL,
     CAUSES,
     GAIN_DOWN,
@@ -21,7 +21,7 @@ from scoring.diagnosis.shown_causes import (
     is_of_standstill,
     short_name,
 )
-from scoring.diagnosis.steady_fan import OF_BALANCE, SteadyFan
+from fantwin.scoring.diagnosis.steady_fan import OF_BALANCE, SteadyFan
 
 CLEAR = 0.6
 """least probability of a cause that is named first: below it, the first cause is wrong too often"""

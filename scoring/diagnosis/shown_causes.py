@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol, TypeVar
 
-from schemas.messages import Diagnosis
+from fantwin.schemas.messages import Diagnosis
 
 MIN_PROBABILITY = 0.15
 """less probable causes are not listed, except the first"""

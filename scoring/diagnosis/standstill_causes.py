@@ -19,8 +19,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from schemas.messages import Diagnosis
-from scoring.diagnosis.shown_causes import (
+from fantwin.schemas.messages import Diagnosis
+from fantwin.scoring.diagnosis.shown_causes import (
     BLOCKED,
     MIN_PROBABILITY,
     NO_POWER,

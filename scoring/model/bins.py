@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.enums import InvalidReason
-from schemas.messages import Array, Prediction
-from schemas.units import NS_PER_S
-from scoring.samples import BALANCE_COUNTS, NO_SPEED, among, reading_missing_of, reading_repeated_of
-from scoring.unseen_error import UnseenError
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Array, Prediction
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.samples import BALANCE_COUNTS, NO_SPEED, among, reading_missing_of, reading_repeated_of
+from fantwin.scoring.unseen_error import UnseenError
 
 SHORTEST_S = 0.1
 WRONG_SHARE = 0.05

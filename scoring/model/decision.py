@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.messages import Array
-from schemas.units import NS_PER_S
-from scoring.model.bins import Bin
-from scoring.model.faults import BEFORE_GROWTH, FAULTS, forces
-from scoring.model.healthy import FAULT, SLOW, SLOWEST_RAD_S, HealthyFans
-from scoring.model.in_alarm import FanInAlarm
-from scoring.model.missing import MissingReadings
-from scoring.model.onsets import Evidence, Hypotheses
-from scoring.model.operation import Fans, Inputs, Operation
-from scoring.model.priors import Priors
-from scoring.model.saved import Saved, part, within
-from scoring.model.wrong import FAR_SIGMAS, WrongReadings
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.model.bins import Bin
+from fantwin.scoring.model.faults import BEFORE_GROWTH, FAULTS, forces
+from fantwin.scoring.model.healthy import FAULT, SLOW, SLOWEST_RAD_S, HealthyFans
+from fantwin.scoring.model.in_alarm import FanInAlarm
+from fantwin.scoring.model.missing import MissingReadings
+from fantwin.scoring.model.onsets import Evidence, Hypotheses
+from fantwin.scoring.model.operation import Fans, Inputs, Operation
+from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.saved import Saved, part, within
+from fantwin.scoring.model.wrong import FAR_SIGMAS, WrongReadings
 
 AGREED_SIGMAS = 8.0
 """the filter of a fan in alarm takes no reading for farther from what is expected"""

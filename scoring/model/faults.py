@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.messages import Array
-from scoring.model.operation import Fans, Inputs
+from fantwin.schemas.messages import Array
+from fantwin.scoring.model.operation import Fans, Inputs
 
 DRAG, DRAG_GROWS, FRICTION, FRICTION_GROWS, DRIVE, SCALE, STUCK, RISES, FALLS = range(9)
 OF_TACHO = slice(SCALE, STUCK + 1)

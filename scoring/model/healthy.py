@@ -36,10 +36,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.messages import Array
-from scoring.model.operation import Fans, Inputs
-from scoring.model.priors import Priors
-from scoring.model.saved import Saved
+from fantwin.schemas.messages import Array
+from fantwin.scoring.model.operation import Fans, Inputs
+from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.saved import Saved
 
 KNOTS = np.array([0.09, 0.14, 0.2, 0.28, 0.38, 0.5, 0.63, 0.77, 0.9, 1.02])
 """shares of the top speed"""

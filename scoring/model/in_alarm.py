@@ -16,13 +16,13 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.special import expit
 
-from schemas.messages import Array
-from scoring.diagnosis.cause_words import PossibleCause
-from scoring.model.faults import BEFORE_GROWTH, GROWS_S, UNSTEADY, forces
-from scoring.model.healthy import HealthyFans
-from scoring.model.onsets import Evidence, Hypotheses, Sums
-from scoring.model.operation import Fans, Inputs
-from scoring.model.saved import part, within
+from fantwin.schemas.messages import Array
+from fantwin.scoring.diagnosis.cause_words import PossibleCause
+from fantwin.scoring.model.faults import BEFORE_GROWTH, GROWS_S, UNSTEADY, forces
+from fantwin.scoring.model.healthy import HealthyFans
+from fantwin.scoring.model.onsets import Evidence, Hypotheses, Sums
+from fantwin.scoring.model.operation import Fans, Inputs
+from fantwin.scoring.model.saved import part, within
 
 ENDS_S = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0, np.inf)
 """times after its onset at which a growth may end, equally probable"""

@@ -20,11 +20,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.messages import Array
-from schemas.units import NS_PER_S
-from scoring.model.bins import Bin
-from scoring.model.operation import Fans, Inputs, Operation
-from scoring.model.priors import Priors
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.model.bins import Bin
+from fantwin.scoring.model.operation import Fans, Inputs, Operation
+from fantwin.scoring.model.priors import Priors
 
 STRETCH_S = 2.0
 NEAR, FAR, FARTHEST = 2, 5, 15

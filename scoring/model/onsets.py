@@ -25,9 +25,9 @@ from itertools import combinations
 import numpy as np
 from scipy.special import erfc
 
-from schemas.messages import Array
-from scoring.model.faults import OF_TACHO, STUCK, Fault
-from scoring.model.healthy import CARRIED, FOLLOWING, STATES, HealthyFans, Innovation
+from fantwin.schemas.messages import Array
+from fantwin.scoring.model.faults import OF_TACHO, STUCK, Fault
+from fantwin.scoring.model.healthy import CARRIED, FOLLOWING, STATES, HealthyFans, Innovation
 
 ONSETS = 20
 LONGEST_S = 900.0

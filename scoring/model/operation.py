@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.messages import Array
-from schemas.units import NS_PER_S
-from scoring.model.bins import Bin
-from scoring.model.saved import Saved
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.model.bins import Bin
+from fantwin.scoring.model.saved import Saved
 
 BACKLASH = 0.01
 """share of the top speed, or of the largest command: less may be what a loop makes of the noise of a tacho"""

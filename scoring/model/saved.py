@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from schemas.messages import Array
+from fantwin.schemas.messages import Array
 
 Kept = Mapping[str, tuple[str, list[int], str]]
 """type, shape and bytes in base64, of each array by name"""

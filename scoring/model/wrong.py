@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.messages import Array
-from scoring.model.operation import Fans
-from scoring.model.saved import Saved
+from fantwin.schemas.messages import Array
+from fantwin.scoring.model.operation import Fans
+from fantwin.scoring.model.saved import Saved
 
 FAR_SIGMAS = 4.5
 """a reading that is farther from what is expected is far"""

@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from schemas.messages import Array, Prediction
-from schemas.standstill import Standstill
-from schemas.tacho import Tacho
-from schemas.units import NS_PER_S
-from scoring.diagnosis.standstill_causes import Standing
-from scoring.model.saved import Saved, part, within
-from scoring.samples import arrived
-from scoring.standing import runs_on, stands_still
-from scoring.standing.durations import Durations
-from scoring.standing.runs_on import RunsOn
-from scoring.standing.stands_still import StandsStill
+from fantwin.schemas.messages import Array, Prediction
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.diagnosis.standstill_causes import Standing
+from fantwin.scoring.model.saved import Saved, part, within
+from fantwin.scoring.samples import arrived
+from fantwin.scoring.standing import runs_on, stands_still
+from fantwin.scoring.standing.durations import Durations
+from fantwin.scoring.standing.runs_on import RunsOn
+from fantwin.scoring.standing.stands_still import StandsStill
 
 CERTAIN = 2.0
 """score of a fan that does not do as commanded"""

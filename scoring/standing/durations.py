@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.messages import Array
+from fantwin.schemas.messages import Array
 
 
 class Durations:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from scoring.diagnosis.standstill_causes import Fall
-from scoring.model.operation import Fans, Inputs
-from scoring.model.saved import Saved
+from fantwin.scoring.diagnosis.standstill_causes import Fall
+from fantwin.scoring.model.operation import Fans, Inputs
+from fantwin.scoring.model.saved import Saved
 
 STANDS, FALLS = 0.08, 0.85
 """shares of the expected speed: below, a fan stands; above, it has not begun to fall"""

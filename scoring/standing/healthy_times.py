@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.messages import Array
-from schemas.standstill import Standstill
+from fantwin.schemas.messages import Array
+from fantwin.schemas.standstill import Standstill
 
 MARGIN = 3.0  # times the longest of healthy runs
 MIN_LAPSE_S = 0.5

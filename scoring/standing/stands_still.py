@@ -12,14 +12,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.messages import Array
-from schemas.standstill import Standstill
-from schemas.tacho import Tacho
-from schemas.units import NS_PER_S
-from scoring.diagnosis.standstill_causes import Standing
-from scoring.model.saved import Saved
-from scoring.standing.durations import Durations
-from scoring.standing.healthy_times import lapse_limit_s, start_limit_s
+from fantwin.schemas.messages import Array
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.diagnosis.standstill_causes import Standing
+from fantwin.scoring.model.saved import Saved
+from fantwin.scoring.standing.durations import Durations
+from fantwin.scoring.standing.healthy_times import lapse_limit_s, start_limit_s
 
 MISSING_S = 2.0  # beyond the reach of the tacho
 UNKNOWN_STARTED_S = 5.0  # beyond the reach: the length of a start, if none was seen

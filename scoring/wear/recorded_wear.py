@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from schemas.messages import ScorerSnapshot
-from scoring.wear.slow_change import LIMIT_SHARE, SlowChange
+from fantwin.schemas.messages import ScorerSnapshot
+from fantwin.scoring.wear.slow_change import LIMIT_SHARE, SlowChange
 
 _SHOWN = ("seen_t_ns", "change", "change_std_error", "beside", "per_day", "days", "reached_t_ns", "unknown_reason")
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S
 
 if TYPE_CHECKING:  # it loads scipy, which a command that shows alarms does not need
-    from scoring.wear.trend import LimitForecast, Trend
+    from fantwin.scoring.wear.trend import LimitForecast, Trend
 
 LIMIT_SHARE = 0.1
 """share of the speed; an alarm is raised where a change has surely reached it"""

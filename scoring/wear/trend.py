@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from schemas.messages import Array
-from schemas.units import NS_PER_S
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
 
 NS_PER_DAY = 86_400 * NS_PER_S
 CAPACITY = 128

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from schemas.messages import Array
-from schemas.units import NS_PER_S
-from scoring.wear.recorded_wear import shown
-from scoring.wear.slow_change import LIMIT_SHARE, SlowChange, limit_ahead, own_change, shared_change
-from scoring.wear.trend import NS_PER_DAY, REACHED, LimitForecast, Point, Trend, WearSeries, forecast_limit
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.wear.recorded_wear import shown
+from fantwin.scoring.wear.slow_change import LIMIT_SHARE, SlowChange, limit_ahead, own_change, shared_change
+from fantwin.scoring.wear.trend import NS_PER_DAY, REACHED, LimitForecast, Point, Trend, WearSeries, forecast_limit
 
 SETTLING_INTERVALS = 6
 """intervals from the first sample by a twin to the first point: the slow states are hardly known before"""

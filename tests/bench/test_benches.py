@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
-from scoring.model.bins import Bins, bin_ns_of
-from scoring.model.decision import Decision
-from scoring.model.priors import Priors
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.model.bins import Bins, bin_ns_of
+from fantwin.scoring.model.decision import Decision
+from fantwin.scoring.model.priors import Priors
 from tests.support.healthy_running import TOP_RAD_S, made_fans, running
 
 ROOT = Path(__file__).parents[2]
-OURS = ("bench", "fantwin_client", "pipeline", "schemas", "scoring", "simulation", "stages", "tests", "twin")
+OURS = ("bench", "fantwin", "tests")
 
 
 def test_every_bench_finds_what_it_imports(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from schemas.topics import BY_NAME
+from fantwin.schemas.topics import BY_NAME
 from tests.support.killed_recorder import Kills, Outcome
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]

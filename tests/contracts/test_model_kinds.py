@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.twin_card import TwinCard
+from fantwin.schemas.twin_card import TwinCard
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.export.onnx_export import export_onnx
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.kinds import KINDS
+from fantwin.twin.runs import Array
 from tests.support import fan_data
 from tests.support.trained_once import TrainedOnce
-from twin.build import evaluate, train_twin
-from twin.export.onnx_export import export_onnx
-from twin.export.onnx_twin import OnnxTwin
-from twin.finishing import TrainedTwin
-from twin.kinds import KINDS
-from twin.runs import Array
 
 MOST_ITERATIONS = 2
 RUN = fan_data.rough_run(1, 6.0, fans=2)

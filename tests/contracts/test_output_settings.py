@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from pydantic import BaseModel
 
-from pipeline.broker.config import MqttConfig
-from pipeline.gateway.config import GatewayConfig
-from pipeline.notification.config import NotifierConfig
-from pipeline.opcua.config import OpcuaConfig
+from fantwin.pipeline.broker.config import MqttConfig
+from fantwin.pipeline.gateway.config import GatewayConfig
+from fantwin.pipeline.notification.config import NotifierConfig
+from fantwin.pipeline.opcua.config import OpcuaConfig
 
 MAIL: dict[str, Any] = {"name": "mail", "url_file": "mail.url"}
 

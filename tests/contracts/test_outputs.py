@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from schemas.enums import FanState, Severity, Transition
-from schemas.header import Header
-from schemas.messages import Alarm
+from fantwin.schemas.enums import FanState, Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm
 from tests.stages.test_gateway import NOW_NS, alarm, score
 from tests.support.outputs import OUTPUTS, Output
 from tests.support.running_chain import eventually
@@ -46,7 +46,7 @@ def kind(request: pytest.FixtureRequest) -> Iterator[str]:
     if request.param == "mqtt" and shutil.which("mosquitto") is None:
         pytest.skip("mosquitto is not installed")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("pipeline.presenting.site_model.SILENT_AFTER_S", 1e9)
+        patched.setattr("fantwin.pipeline.presenting.site_model.SILENT_AFTER_S", 1e9)
         yield request.param
 
 

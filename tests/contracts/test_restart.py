@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.blocks import cut
-from schemas.codec import decode, encode
-from schemas.enums import Action, FanState, Transition
-from schemas.fields import columns
-from schemas.messages import Alarm, Prediction, Score, ScorerSnapshot
-from schemas.standstill import Standstill
-from schemas.tacho import Tacho
-from scoring.alarms.fan_condition import ConditionSettings
-from scoring.alarms.tray_conditions import Decided, TrayConditions
-from scoring.model.saved import as_json, from_json
-from scoring.standing.against_command import AgainstCommand
-from stages.scorer import RESTORE_ERRORS, ScorerCore
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.codec import decode, encode
+from fantwin.schemas.enums import Action, FanState, Transition
+from fantwin.schemas.fields import columns
+from fantwin.schemas.messages import Alarm, Prediction, Score, ScorerSnapshot
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.tacho import Tacho
+from fantwin.scoring.alarms.fan_condition import ConditionSettings
+from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
+from fantwin.scoring.model.saved import as_json, from_json
+from fantwin.scoring.standing.against_command import AgainstCommand
+from fantwin.stages.scorer import RESTORE_ERRORS, ScorerCore
 from tests.support.scored_blocks import STEP_NS, core_of, prediction_of, request_of
 
 FANS, BLOCK = 3, 20

@@ -9,9 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.devices import broker_client, http_source, polling, serial_port
-from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceContext, SourceEvent
-from pipeline.devices.source_kinds import SOURCE_KINDS, build_source, parse_source
+from fantwin.pipeline.devices import broker_client, http_source, polling, serial_port
+from fantwin.pipeline.devices.sample_source import (
+    LinkDown,
+    LinkUp,
+    Reading,
+    ReadingBatch,
+    Rejected,
+    SourceContext,
+    SourceEvent,
+)
+from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS, build_source, parse_source
 from tests.support.running_chain import eventually
 from tests.support.source_worlds import WORLDS, World, speeds_of
 

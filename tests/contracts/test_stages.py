@@ -18,35 +18,35 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from pipeline.broker.config import MqttConfig
-from pipeline.broker.link import Received
-from pipeline.broker.outbox import Outgoing
-from pipeline.broker.topics import Topics
-from pipeline.config.models import TrayConfig
-from pipeline.config.registry import STAGES, StageRow
-from pipeline.notification.config import NotifierConfig
-from pipeline.notification.notifications import Notifications, Saved
-from pipeline.notification.outbox import Outbox
-from pipeline.notification.wording import Place
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.request_desk import RequestDesk
-from pipeline.presenting.site_model import SiteModel
-from pipeline.runtime.stage import Context, Core, Stage, StageConfig, load_stage
-from pipeline.runtime.twin_file import TwinFile
-from pipeline.viewing.fleet import Fan
-from pipeline.viewing.fleet_view import FleetView
-from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
-from pipeline.viewing.viewer_core import ViewerCore
-from schemas.codec import decode, encode
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.health import Health
-from schemas.messages import Alarm, Message, Prediction, Score, ScorerSnapshot
-from schemas.topics import BY_NAME, TOPICS
-from stages.mqtt import MqttCore
-from stages.notifier import NotifierCore
-from stages.resampler import ResamplerConfig, ResamplerCore
-from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
+from fantwin.pipeline.broker.config import MqttConfig
+from fantwin.pipeline.broker.link import Received
+from fantwin.pipeline.broker.outbox import Outgoing
+from fantwin.pipeline.broker.topics import Topics
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.registry import STAGES, StageRow
+from fantwin.pipeline.notification.config import NotifierConfig
+from fantwin.pipeline.notification.notifications import Notifications, Saved
+from fantwin.pipeline.notification.outbox import Outbox
+from fantwin.pipeline.notification.wording import Place
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.presenting.request_desk import RequestDesk
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.runtime.stage import Context, Core, Stage, StageConfig, load_stage
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.fleet_view import FleetView
+from fantwin.pipeline.viewing.plot_places import FleetPlots, PlotPlaces
+from fantwin.pipeline.viewing.viewer_core import ViewerCore
+from fantwin.schemas.codec import decode, encode
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm, Message, Prediction, Score, ScorerSnapshot
+from fantwin.schemas.topics import BY_NAME, TOPICS
+from fantwin.stages.mqtt import MqttCore
+from fantwin.stages.notifier import NotifierCore
+from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
+from fantwin.stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from tests.stages.test_viewer import FakeSink
 from tests.support.message_strategies import any_message
 from tests.support.scored_blocks import core_of, prediction_of

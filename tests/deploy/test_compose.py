@@ -11,8 +11,8 @@ from typing import Any
 
 import yaml
 
-from pipeline.config.loading import load_config
-from pipeline.runtime.stage import load_stage
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.runtime.stage import load_stage
 from tests.support.fantwin_words import parsed
 
 ROOT = Path(__file__).parents[2]

@@ -10,9 +10,9 @@ from typing import Any
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
-from schemas import fan_pb2
-from schemas.codec import type_name
-from schemas.topics import BY_NAME, tray_key
+from fantwin.schemas import fan_pb2
+from fantwin.schemas.codec import type_name
+from fantwin.schemas.topics import BY_NAME, tray_key
 
 LAYOUT = Path(__file__).parents[2] / "deploy" / "foxglove" / "fan.json"
 FUNCTIONS = {"abs", "sqrt"}

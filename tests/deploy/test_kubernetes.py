@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.bus.certificates import of_role
-from pipeline.config.loading import parse_config
-from pipeline.config.registry import STAGES
+from fantwin.pipeline.bus.certificates import of_role
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.registry import STAGES
 from tests.support.fantwin_words import parsed
 
 why = "the chart is not checked: pip install helm-python-sdk kubernetes-validate"

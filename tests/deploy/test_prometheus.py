@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import yaml
 
-from schemas.enums import FanState, StageStatus
-from schemas.fields import columns
-from schemas.header import Header
-from schemas.health import Health, Input, LatencyBucket, Output
-from schemas.messages import Score
+from fantwin.schemas.enums import FanState, StageStatus
+from fantwin.schemas.fields import columns
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Input, LatencyBucket, Output
+from fantwin.schemas.messages import Score
 from tests.stages.test_gateway import alarm, score
 from tests.support.grafana_schema import problems_of
 from tests.support.running_chain import eventually
@@ -93,7 +93,7 @@ def health(stage: str, messages: int, uptime_s: float, latency_s: float = 0.05, 
 @pytest.fixture
 def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningGateway]:
     """What it was last fed with does not grow old, however long Prometheus takes."""
-    for module in ("pipeline.presenting.site_model", "pipeline.launch.site_state"):
+    for module in ("fantwin.pipeline.presenting.site_model", "fantwin.pipeline.launch.site_state"):
         monkeypatch.setattr(f"{module}.SILENT_AFTER_S", math.inf)
     running = RunningGateway(tmp_path, fans=ALL_FANS)
     try:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config.registry import STAGES
-from pipeline.runtime.stage import load_stage
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.runtime.stage import load_stage
 from tests.support.fantwin_words import parsed
 
 UNITS = Path(__file__).parents[2] / "deploy" / "systemd"

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from schemas.units import RAD_S_PER_UNIT
-from schemas.wire import DEVICE_COUNTERS, CommandFrame, DeviceCounters, Sample, SetPointFrame, encode
+from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.schemas.wire import DEVICE_COUNTERS, CommandFrame, DeviceCounters, Sample, SetPointFrame, encode
 from tests.support.fan_board import FANS, FanBoard
 from tests.support.firmware_build import firmware_file, simulator_file
 

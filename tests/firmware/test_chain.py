@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.reading import read_recording
-from schemas.enums import Transition
-from schemas.messages import Alarm, Array, Raw
-from schemas.units import NS_PER_S
-from schemas.wire import CommandFrame, encode
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm, Array, Raw
+from fantwin.schemas.units import NS_PER_S
+from fantwin.schemas.wire import CommandFrame, encode
 from tests.support.fan_board import FANS
 from tests.support.fantwin_command import as_typed
 from tests.support.firmware_build import FIRMWARE, firmware_file, simulator_file

@@ -12,7 +12,7 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.wire import DEVICE_COUNTERS, CommandFrame, Decoder, DeviceCounters, Sample, SetPointFrame, encode
+from fantwin.schemas.wire import DEVICE_COUNTERS, CommandFrame, Decoder, DeviceCounters, Sample, SetPointFrame, encode
 from tests.support.firmware_build import parts_library
 from tests.support.firmware_parts import (
     BAD_CRC,

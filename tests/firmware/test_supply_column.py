@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from simulation.excitation import Multisine, Prbs, Staircase
+from fantwin.simulation.excitation import Multisine, Prbs, Staircase
 from tests.support.board_recordings import import_board, run_board, succeed
 from tests.support.fan_board import FANS
 

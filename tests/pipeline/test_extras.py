@@ -17,14 +17,14 @@ from typing import Any
 
 import pytest
 
-from pipeline import extras
-from pipeline.cli import main as command_line
-from pipeline.extras import EXTRAS, how_to_install
+from fantwin.pipeline import extras
+from fantwin.pipeline.cli import main as command_line
+from fantwin.pipeline.extras import EXTRAS, how_to_install
 from tests.support.running_chain import DEMO
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-PRODUCT = ("fantwin_client", "schemas", "scoring", "pipeline", "simulation", "stages", "twin")
+PRODUCT = ("fantwin", "schemas", "scoring", "pipeline", "simulation", "stages", "twin")
 PARTS = {"h11": "uvicorn", "markupsafe": "jinja2", "pydantic_core": "pydantic"}
 """modules that a package exposes in its own interface, and which come with it"""
 OPTIONAL = {*(module for modules in EXTRAS.values() for module in modules), "torch"}
@@ -62,7 +62,7 @@ def imported() -> dict[str, set[str]]:
                 full = [node.module or ""] if not node.level else []
             else:
                 full = [each.name for each in node.names] if isinstance(node, ast.Import) else []
-            for module in {each.partition(".")[0] for each in full} - {*sys.stdlib_module_names, *PRODUCT}:
+            for module in {each.partition(".")[0] for each in full} - {*sys.stdlib_module_names, "fantwin"}:
                 found.setdefault(module, set()).add(path.relative_to(ROOT).as_posix())
     return found
 
@@ -88,16 +88,16 @@ def test_all_commands_stages_and_sources_load_where_no_extra_is_installed():
 import sys
 from tests.pipeline.test_extras import NotInstalled
 sys.meta_path.insert(0, NotInstalled())
-from pipeline.cli import main
+from fantwin.pipeline.cli import main
 main._register(main.COMMANDS)
-from pipeline.config.registry import STAGES
+from fantwin.pipeline.config.registry import STAGES
 for row in STAGES.values():
     row.load()
-from pipeline.devices.source_kinds import SOURCE_KINDS, _load
+from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS, _load
 for row in SOURCE_KINDS.values():
     _load(row.config), _load(row.source)
-import pipeline.gateway.app, pipeline.gateway.server, pipeline.presenting.users
-import twin.build, twin.comparison, twin.report.assessment, twin.export.onnx_twin
+import fantwin.pipeline.gateway.app, fantwin.pipeline.gateway.server, fantwin.pipeline.presenting.users
+import fantwin.twin.build, fantwin.twin.comparison, fantwin.twin.report.assessment, fantwin.twin.export.onnx_twin
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.blocks import can_join, cut, join, select
-from schemas.codec import decode, encode
-from schemas.fields import columns
-from schemas.header import Header
-from schemas.messages import Command, Grid, Message, Prediction, Raw, Score
+from fantwin.schemas.blocks import can_join, cut, join, select
+from fantwin.schemas.codec import decode, encode
+from fantwin.schemas.fields import columns
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Command, Grid, Message, Prediction, Raw, Score
 from tests.support.message_strategies import any_message, same
 
 OF_SAMPLES = (Raw, Grid, Prediction, Score)

@@ -16,12 +16,12 @@ from mcap.well_known import MessageEncoding
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from schemas import fan_pb2, messages
-from schemas.codec import CodecError, decode, encode, proto_type, type_name
-from schemas.fields import OpenEnum, columns, other_fields
-from schemas.header import Header, InputPosition
-from schemas.health import Counter, Input, Output
-from schemas.messages import Alarm, Command, Diagnosis, Grid, Message, Prediction, Raw, Score
+from fantwin.schemas import fan_pb2, messages
+from fantwin.schemas.codec import CodecError, decode, encode, proto_type, type_name
+from fantwin.schemas.fields import OpenEnum, columns, other_fields
+from fantwin.schemas.header import Header, InputPosition
+from fantwin.schemas.health import Counter, Input, Output
+from fantwin.schemas.messages import Alarm, Command, Diagnosis, Grid, Message, Prediction, Raw, Score
 from tests.support.made_messages import MESSAGE_TYPES
 from tests.support.message_strategies import any_message, same
 

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas import fan_pb2
-from schemas.codec import CodecError, decode, decode_columns, encode
-from schemas.envelope import Envelope
-from schemas.fields import columns, other_fields
-from schemas.header import Header
-from schemas.messages import Grid, Message, Prediction, Raw, Score
+from fantwin.schemas import fan_pb2
+from fantwin.schemas.codec import CodecError, decode, decode_columns, encode
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fields import columns, other_fields
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Grid, Message, Prediction, Raw, Score
 from tests.support.message_strategies import any_message, same
 from tests.support.score_data import made_up_tray
 

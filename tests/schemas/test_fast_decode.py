@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.codec import CodecError, encode
-from schemas.enums import TachoKind
-from schemas.envelope import Envelope
-from schemas.fast_decode import decode_header, decode_together
-from schemas.header import Header, InputPosition
-from schemas.messages import Raw, StatedTacho
+from fantwin.schemas.codec import CodecError, encode
+from fantwin.schemas.enums import TachoKind
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fast_decode import decode_header, decode_together
+from fantwin.schemas.header import Header, InputPosition
+from fantwin.schemas.messages import Raw, StatedTacho
 from tests.support.message_strategies import same
 
 KEY = "fantwin/plant/tray1/raw"

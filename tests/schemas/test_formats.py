@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from schemas.formats import CONFIGURATION, RECORDING, SNAPSHOT, TWIN_CARD, Format
+from fantwin.schemas.formats import CONFIGURATION, RECORDING, SNAPSHOT, TWIN_CARD, Format
 
 FORMATS = pytest.mark.parametrize("kind", [RECORDING, TWIN_CARD, SNAPSHOT, CONFIGURATION], ids=lambda kind: kind.kind)
 

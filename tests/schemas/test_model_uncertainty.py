@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from schemas.model_uncertainty import ModelUncertainty
+from fantwin.schemas.model_uncertainty import ModelUncertainty
 from tests.support.uncertainty_tables import by_speed
 
 STD_RAD_S = ((1.0, 2.0), (3.0, 4.0), (5.0, 10.0))

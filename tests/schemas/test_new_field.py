@@ -22,13 +22,13 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-from pipeline.recordings import read_arrays
-from pipeline.recordings.writing import RecordingWriter
-from schemas import fan_pb2, messages
-from schemas.blocks import cut, join
-from schemas.codec import decode, encode
-from schemas.fields import Array, OpenEnum, column
-from schemas.topics import BY_NAME, tray_key
+from fantwin.pipeline.recordings import read_arrays
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas import fan_pb2, messages
+from fantwin.schemas.blocks import cut, join
+from fantwin.schemas.codec import decode, encode
+from fantwin.schemas.fields import Array, OpenEnum, column
+from fantwin.schemas.topics import BY_NAME, tray_key
 from tests.support.fantwin_command import fantwin
 from tests.support.message_strategies import same
 from tests.support.score_data import made_up_tray

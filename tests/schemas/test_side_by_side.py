@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.codec import encode
-from schemas.messages import Grid
-from schemas.side_by_side import apart, present_columns, side_by_side
+from fantwin.schemas.codec import encode
+from fantwin.schemas.messages import Grid
+from fantwin.schemas.side_by_side import apart, present_columns, side_by_side
 
 
 def grid(first: int, fans: int = 3, samples: int = 4) -> Grid:

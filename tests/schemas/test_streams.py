@@ -5,10 +5,10 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Input, Output
-from schemas.streams import StreamState, input_streams, output_streams, stage_losses
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Input, Output
+from fantwin.schemas.streams import StreamState, input_streams, output_streams, stage_losses
 
 
 def test_skipping_counts_published_messages_that_never_came():

@@ -2,8 +2,8 @@
 
 import pytest
 
-from pipeline.runtime.stage import load_stage
-from schemas.topics import (
+from fantwin.pipeline.runtime.stage import load_stage
+from fantwin.schemas.topics import (
     BY_NAME,
     RESERVED_TRAY_NAMES,
     TOPICS,

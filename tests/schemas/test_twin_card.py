@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
-from pipeline.recordings.reading import read_recording
-from pipeline.runtime.onnx_metadata import read_onnx_metadata
-from schemas.messages import ModelCard
-from schemas.twin_card import CARD_PROPERTY, CardError, TwinCard
+from fantwin import pipeline
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.runtime.onnx_metadata import read_onnx_metadata
+from fantwin.schemas.messages import ModelCard
+from fantwin.schemas.twin_card import CARD_PROPERTY, CardError, TwinCard
+from fantwin.twin.models.physical import PhysicalModel
 from tests.support.twin_files import made_up_card, small_hybrid
-from twin.models.physical import PhysicalModel
 
 DEMO_TWIN = Path(pipeline.__file__).parent / "demo" / "twin.onnx"
 GOLDEN = Path(__file__).parents[1] / "support" / "data" / "golden.mcap"
@@ -56,7 +56,7 @@ def test_the_twin_of_the_demo_and_the_card_in_the_golden_recording_are_read() ->
 
 def test_reading_a_card_loads_no_heavy_library() -> None:
     program = (
-        "import sys; from pathlib import Path; from pipeline.runtime.tray_twin import load_tray_twin; "
+        "import sys; from pathlib import Path; from fantwin.pipeline.runtime.tray_twin import load_tray_twin; "
         f"load_tray_twin(Path({str(DEMO_TWIN)!r})); "
         "print([name for name in ('torch', 'onnx', 'onnxruntime', 'scipy') if name in sys.modules])"
     )

@@ -14,8 +14,8 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.auxiliary import AUXILIARY
-from schemas.wire import (
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.wire import (
     DEVICE_COUNTERS,
     MAX_FRAME_BYTES,
     CommandFrame,

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from schemas.messages import Array
-from schemas.tacho import Tacho
-from scoring.expected_reading import AveragedCommand, ExpectedReading
+from fantwin.schemas.messages import Array
+from fantwin.schemas.tacho import Tacho
+from fantwin.scoring.expected_reading import AveragedCommand, ExpectedReading
 
 PERIOD_S = 0.1
 TACHOS = (

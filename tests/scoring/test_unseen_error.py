@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scoring.unseen_error import UnseenError
+from fantwin.scoring.unseen_error import UnseenError
 from tests.support.scored_blocks import NEEDED, TWIN_SPEED, prediction_of
 from tests.support.uncertainty_tables import by_speed
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from simulation.errors import SimulationError
-from simulation.excitation import PROFILES, Manual, Multisine, Prbs, Staircase, excitation
+from fantwin.simulation.errors import SimulationError
+from fantwin.simulation.excitation import PROFILES, Manual, Multisine, Prbs, Staircase, excitation
 
 TIMES_S = np.arange(0.0, 130.0, 0.05)
 

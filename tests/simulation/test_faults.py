@@ -4,10 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simulation.errors import SimulationError
-from simulation.faults import Fault, check_schedule, disturbance, parse_fault, tacho_faults
-from simulation.tacho import NoisyTacho, TachoSettings
-from simulation.tray import SimulatedTray, TraySettings
+from fantwin.simulation.errors import SimulationError
+from fantwin.simulation.faults import Fault, check_schedule, disturbance, parse_fault, tacho_faults
+from fantwin.simulation.tacho import NoisyTacho, TachoSettings
+from fantwin.simulation.tray import SimulatedTray, TraySettings
 
 QUIET = TraySettings(
     fans=2,

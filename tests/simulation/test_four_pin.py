@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.tacho import Tacho
-from simulation.faults import CLOG_S, four_pin_damage, parse_fault
-from simulation.four_pin import FourPinDamage, FourPinFans, FourPinParameters, four_pin_tray, wanted_speed_rad_s
-from simulation.tacho import TachoSettings
-from simulation.thermostat import STEPS, Thermostat
-from simulation.tray import SimulatedTray, TraySettings
+from fantwin.schemas.tacho import Tacho
+from fantwin.simulation.faults import CLOG_S, four_pin_damage, parse_fault
+from fantwin.simulation.four_pin import FourPinDamage, FourPinFans, FourPinParameters, four_pin_tray, wanted_speed_rad_s
+from fantwin.simulation.tacho import TachoSettings
+from fantwin.simulation.thermostat import STEPS, Thermostat
+from fantwin.simulation.tray import SimulatedTray, TraySettings
 
 FAN = FourPinParameters()
 STEADY = {"sag": 0.0, "wander": 0.0, "air": 0.0}

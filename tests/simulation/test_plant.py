@@ -5,9 +5,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from simulation.errors import SimulationError
-from simulation.fans import FanKind
-from simulation.plant import (
+from fantwin.simulation.errors import SimulationError
+from fantwin.simulation.fans import FanKind
+from fantwin.simulation.plant import (
     DeviceClock,
     Disturbance,
     FanParameters,
@@ -18,8 +18,8 @@ from simulation.plant import (
     fan,
     tray_of_fans,
 )
-from simulation.tacho import NoisyTacho
-from simulation.tray import SimulatedTray, TraySettings
+from fantwin.simulation.tacho import NoisyTacho
+from fantwin.simulation.tray import SimulatedTray, TraySettings
 
 ONE = tray_of_fans(1, seed=0, fan_variation=0.0)
 

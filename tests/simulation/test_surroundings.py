@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simulation.errors import SimulationError
-from simulation.faults import Fault
-from simulation.surroundings import Surroundings
-from simulation.tacho import NoisyTacho, TachoSettings
-from simulation.tray import SimulatedTray, TraySample, TraySettings
+from fantwin.simulation.errors import SimulationError
+from fantwin.simulation.faults import Fault
+from fantwin.simulation.surroundings import Surroundings
+from fantwin.simulation.tacho import NoisyTacho, TachoSettings
+from fantwin.simulation.tray import SimulatedTray, TraySample, TraySettings
 
 ALL = ("supply_voltage_v", "current_a", "temperature_c")
 STILL = TraySettings(

@@ -5,9 +5,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from schemas.tacho import Tacho
-from simulation.errors import SimulationError
-from simulation.tacho import AveragingTacho, CountingTacho, DelayedTacho, PeriodTacho, TachoSettings, simulated_tacho
+from fantwin.schemas.tacho import Tacho
+from fantwin.simulation.errors import SimulationError
+from fantwin.simulation.tacho import (
+    AveragingTacho,
+    CountingTacho,
+    DelayedTacho,
+    PeriodTacho,
+    TachoSettings,
+    simulated_tacho,
+)
 
 STEP_S = 0.01
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-from pipeline.config.models import TrayConfig
-from pipeline.devices.host_clock import HostClock
-from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch
-from pipeline.devices.serial_port import ReceivedBytes
-from schemas.codec import decode
-from schemas.codec import encode as encode_message
-from schemas.messages import Command, Raw
-from schemas.units import NS_PER_S
-from schemas.wire import (
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.devices.host_clock import HostClock
+from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch
+from fantwin.pipeline.devices.serial_port import ReceivedBytes
+from fantwin.schemas.codec import decode
+from fantwin.schemas.codec import encode as encode_message
+from fantwin.schemas.messages import Command, Raw
+from fantwin.schemas.units import NS_PER_S
+from fantwin.schemas.wire import (
     DEVICE_COUNTERS,
     CommandFrame,
     Decoder,
@@ -31,7 +31,7 @@ from schemas.wire import (
     SetPointFrame,
     encode,
 )
-from stages.acquisition import AcquisitionConfig
+from fantwin.stages.acquisition import AcquisitionConfig
 from tests.support.serial_core import FakeLink, SerialCore
 
 S = NS_PER_S

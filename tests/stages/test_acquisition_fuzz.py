@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.config.models import TrayConfig
-from pipeline.devices.sample_source import LinkDown, LinkUp
-from pipeline.devices.serial_config import SerialConfig
-from pipeline.devices.serial_port import ReceivedBytes
-from schemas.messages import Raw
-from schemas.wire import (
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp
+from fantwin.pipeline.devices.serial_config import SerialConfig
+from fantwin.pipeline.devices.serial_port import ReceivedBytes
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.wire import (
     MAX_FRAME_BYTES,
     CommandFrame,
     Decoder,
@@ -26,7 +26,7 @@ from schemas.wire import (
     SetPointFrame,
     encode,
 )
-from stages.acquisition import AcquisitionConfig
+from fantwin.stages.acquisition import AcquisitionConfig
 from tests.support.serial_core import FakeLink, SerialCore
 
 FANS = 2

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.devices.push_source import SILENT_NS, PushSource
-from pipeline.runtime.stage import Context
-from schemas.header import Header
-from schemas.messages import PushedSamples, Raw
-from schemas.units import NS_PER_S
-from stages.acquisition import STAGE, AcquisitionCore
+from fantwin.pipeline.devices.push_source import SILENT_NS, PushSource
+from fantwin.pipeline.runtime.stage import Context
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import PushedSamples, Raw
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.acquisition import STAGE, AcquisitionCore
 from tests.support.running_acquisition import push_config
 
 S = NS_PER_S

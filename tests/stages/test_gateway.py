@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from pipeline.gateway.config import GatewayConfig
-from pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
-from pipeline.recordings.rare_messages import rare_messages
-from schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis, ModelCard, Request, Score, ScorerSnapshot
-from schemas.units import RAD_S_PER_UNIT
-from scoring.wear.recorded_wear import shown
+from fantwin.pipeline.gateway.config import GatewayConfig
+from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
+from fantwin.pipeline.recordings.rare_messages import rare_messages
+from fantwin.schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis, ModelCard, Request, Score, ScorerSnapshot
+from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.scoring.wear.recorded_wear import shown
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_gateway import Client, RunningGateway
@@ -134,7 +134,7 @@ def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(g
     assert client.ask("GET", "/api/v1/fans/nowhere/0")[0] == 404
     described = client.ask("GET", "/api/v1/openapi.json")[1]
     assert {"/api/v1/fans/{tray}/{fan}/requests", "/api/v1/alarms/history"} <= described["paths"].keys()
-    monkeypatch.setattr("pipeline.presenting.site_model.SILENT_AFTER_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.presenting.site_model.SILENT_AFTER_S", 0.0)
     silent = f"/api/v1/fans/{TRAY}/0"
     eventually(lambda: client.ask("GET", silent)[1]["state"] == "silent", "the tray is silent")
     metrics = client.ask("GET", "/metrics")[1]

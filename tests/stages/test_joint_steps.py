@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config.loading import parse_config
-from pipeline.replay.offline.tolerance import differences
-from pipeline.runtime.building import build_parts
-from pipeline.runtime.joint_step import step_together
-from pipeline.runtime.stage import Context, Core, Joint, load_stage
-from schemas.header import Header
-from schemas.messages import Alarm, Grid, Message, Prediction, Raw
-from schemas.units import NS_PER_S
-from simulation.faults import Fault
-from simulation.tray import SimulatedTray, TraySettings
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.replay.offline.tolerance import differences
+from fantwin.pipeline.runtime.building import build_parts
+from fantwin.pipeline.runtime.joint_step import step_together
+from fantwin.pipeline.runtime.stage import Context, Core, Joint, load_stage
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Grid, Message, Prediction, Raw
+from fantwin.schemas.units import NS_PER_S
+from fantwin.simulation.faults import Fault
+from fantwin.simulation.tray import SimulatedTray, TraySettings
 
 EPOCH_NS, SECONDS, BLOCK = 1_700_000_000 * NS_PER_S, 30.0, 25
 TWIN = Path(__file__).parents[2] / "pipeline" / "demo" / "twin.onnx"

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.recordings.reading import read_recording
-from schemas.enums import Transition
-from schemas.messages import Alarm
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm
 from tests.support.killed_site import Site
 
 KILLED_AT = 200

@@ -8,28 +8,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.config.loading import parse_config
-from pipeline.config.models import Config, ConfigError
-from pipeline.devices.sample_blocks import ReadingBlock
-from pipeline.devices.sample_source import (
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import Config, ConfigError
+from fantwin.pipeline.devices.sample_blocks import ReadingBlock
+from fantwin.pipeline.devices.sample_source import (
     MOST_FANS,
     LinkUp,
     Reading,
     ReadingBatch,
 )
-from pipeline.devices.serial_config import MOST_FANS_ON_LINE
-from pipeline.errors import UserError
-from pipeline.runtime.stage import Context, Core, load_stage
-from pipeline.runtime.twin_file import TwinFile
-from schemas import wire
-from schemas.codec import decode, encode
-from schemas.enums import Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Grid, Message, Prediction, Raw, Score
-from schemas.topics import BY_NAME, TOPICS, most_samples
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.serial_config import MOST_FANS_ON_LINE
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.runtime.stage import Context, Core, load_stage
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.schemas import wire
+from fantwin.schemas.codec import decode, encode
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Grid, Message, Prediction, Raw, Score
+from fantwin.schemas.topics import BY_NAME, TOPICS, most_samples
+from fantwin.schemas.units import NS_PER_S
+from fantwin.twin.models.physical import PhysicalModel
 from tests.support.twin_files import write_twin
-from twin.models.physical import PhysicalModel
 
 FANS, FAULTY, SAMPLES, RATE_HZ = 1024, 1000, 500, 100
 CHAIN = ("acquisition", "resampler", "twin_integrator", "scorer")

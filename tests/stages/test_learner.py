@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.learning.versions import Check
-from schemas.enums import Action, FanState
-from schemas.messages import Request
-from schemas.units import NS_PER_S
+from fantwin.pipeline.learning.versions import Check
+from fantwin.schemas.enums import Action, FanState
+from fantwin.schemas.messages import Request
+from fantwin.schemas.units import NS_PER_S
 from tests.pipeline.learning.test_versions import version
 from tests.support.one_learner import START_NS, Learner, raw, restarted
 
@@ -96,7 +96,7 @@ def test_fans_that_were_commissioned_again_are_compared_with_the_twin_within_hou
 def test_between_versions_the_fans_are_checked_against_the_reference_each_healthy_day(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.learning.learning_schedule.CHECK_AFTER_S", 1000.0)
+    monkeypatch.setattr("fantwin.pipeline.learning.learning_schedule.CHECK_AFTER_S", 1000.0)
     learner = Learner(tmp_path)
     learner.run(10_000)
     versions = learner.versions.all()
@@ -137,7 +137,7 @@ def test_while_the_list_of_versions_cannot_be_read_nothing_is_learned_and_the_re
 def test_learning_is_tried_again_when_the_history_grows_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.learning.history_recordings.LONGEST_RECORDING_NS", 200 * NS_PER_S)
+    monkeypatch.setattr("fantwin.pipeline.learning.history_recordings.LONGEST_RECORDING_NS", 200 * NS_PER_S)
     learner = Learner(tmp_path, kept_s=1000.0)
     learner.run(2000)
     learner.learning.fails_with = "a failure"
@@ -154,7 +154,7 @@ def test_learning_is_tried_again_when_the_history_grows_no_more(
 def test_a_version_is_due_at_the_latest_when_as_much_was_added_as_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.learning.history_recordings.LONGEST_RECORDING_NS", 200 * NS_PER_S)
+    monkeypatch.setattr("fantwin.pipeline.learning.history_recordings.LONGEST_RECORDING_NS", 200 * NS_PER_S)
     learner = Learner(tmp_path, kept_s=1000.0)
     learner.run(600)
     made_t_ns = START_NS + learner.now_s * NS_PER_S
@@ -171,7 +171,7 @@ def test_a_version_is_due_at_the_latest_when_as_much_was_added_as_is_kept(
 def test_versions_and_checks_do_not_depend_on_one_another_and_what_failed_is_not_made_at_once_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.learning.learning_schedule.CHECK_AFTER_S", 1000.0)
+    monkeypatch.setattr("fantwin.pipeline.learning.learning_schedule.CHECK_AFTER_S", 1000.0)
     learner = Learner(tmp_path)
     learner.learning.checks_fail_with = "a check failed"
     learner.run(8000)

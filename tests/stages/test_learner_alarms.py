@@ -6,18 +6,18 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.learning.healthy_history import healthy_recordings
-from schemas.enums import Action, FanState
-from schemas.messages import NewTwin, Request
-from schemas.units import NS_PER_S
-from stages.learner import LearnerConfig
+from fantwin.pipeline.learning.healthy_history import healthy_recordings
+from fantwin.schemas.enums import Action, FanState
+from fantwin.schemas.messages import NewTwin, Request
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.learner import LearnerConfig
 from tests.support.one_learner import START_NS, Learner, restarted
 
 
 def test_beside_an_alarm_nothing_is_learned_and_fans_are_checked_each_day(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.learning.learning_schedule.CHECK_AFTER_S", 2 * 3600.0)
+    monkeypatch.setattr("fantwin.pipeline.learning.learning_schedule.CHECK_AFTER_S", 2 * 3600.0)
     learner = Learner(tmp_path)
     learner.run(600)
     before = len(learner.learning.starts)

@@ -9,12 +9,12 @@ from itertools import chain, groupby, islice
 import numpy as np
 import pytest
 
-from schemas.blocks import join
-from schemas.enums import InvalidReason
-from schemas.header import Header
-from schemas.messages import Grid, Raw
-from schemas.units import NS_PER_S
-from stages.resampler import ResamplerConfig, ResamplerCore
+from fantwin.schemas.blocks import join
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Grid, Raw
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 HZ = 100

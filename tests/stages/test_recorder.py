@@ -19,26 +19,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-import stages.recorder
-from pipeline.config.loading import parse_config
-from pipeline.config.models import ConfigError, TrayConfig
-from pipeline.recordings.contents import contents_of
-from pipeline.recordings.disk import DiskError
-from pipeline.recordings.index import PartIndex
-from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.scan import scan
-from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
-from pipeline.recordings.stored_recordings import Stored, StoredPart
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.runtime.stage import Context, StageError
-from schemas.codec import encode
-from schemas.enums import StageStatus
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.health import Health, Input, Output
-from schemas.messages import Message, ModelCard, Raw, ScorerSnapshot
-from schemas.topics import TOPICS, health_key, topic_of, tray_key
-from stages.recorder import STAGE, Recorder, RecorderConfig
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import ConfigError, TrayConfig
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.disk import DiskError
+from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.pipeline.recordings.scan import scan
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
+from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.runtime.stage import Context, StageError
+from fantwin.schemas.codec import encode
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Input, Output
+from fantwin.schemas.messages import Message, ModelCard, Raw, ScorerSnapshot
+from fantwin.schemas.topics import TOPICS, health_key, topic_of, tray_key
+from fantwin.stages.recorder import STAGE, Recorder, RecorderConfig
 from tests.support.message_strategies import any_message, same
 
 SECOND_NS = 1_000_000_000
@@ -390,7 +389,7 @@ def test_the_part_after_a_pause_states_the_gap():
 
 
 def test_a_pause_that_exceeds_memory_loses_the_oldest_messages_and_counts_them(monkeypatch):
-    monkeypatch.setattr(stages.recorder, "HELD_BYTES", 10 * len(encode(raw(100))))
+    monkeypatch.setattr("fantwin.stages.recorder.HELD_BYTES", 10 * len(encode(raw(100))))
     disk = Disk()
     core = recorder(disk)
     record(core, range(100, 103))

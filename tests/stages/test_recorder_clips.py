@@ -9,18 +9,18 @@ from typing import Any
 
 import pytest
 
-from pipeline.recordings.clips.alarm_clips import AlarmClips, tracker_of
-from pipeline.recordings.clips.clip import Clip, clips_in, kept_clips, list_path
-from pipeline.recordings.clips.tracker import ClipTracker, CutResult
-from pipeline.recordings.clips.worker import ClipMaker, ClipWorker
-from pipeline.recordings.index import PartIndex
-from pipeline.recordings.parts import RecordingParts
-from pipeline.recordings.reading import RecordingError, read_recording
-from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import Severity, Transition
-from schemas.header import Header
-from schemas.messages import Alarm
-from stages.recorder import Recorder, RecorderConfig
+from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips, tracker_of
+from fantwin.pipeline.recordings.clips.clip import Clip, clips_in, kept_clips, list_path
+from fantwin.pipeline.recordings.clips.tracker import ClipTracker, CutResult
+from fantwin.pipeline.recordings.clips.worker import ClipMaker, ClipWorker
+from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.reading import RecordingError, read_recording
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm
+from fantwin.stages.recorder import Recorder, RecorderConfig
 from tests.stages.test_recorder import NOW_NS, SECOND_NS, Disk, envelope, old_parts
 from tests.support.clipped_recordings import record
 from tests.support.offline_replay import recorded, recording_of

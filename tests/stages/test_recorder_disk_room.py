@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.recordings.disk_room import DAY_NS, DiskRoom
-from pipeline.recordings.parts import RecordingParts
-from pipeline.recordings.reading import read_recording
-from pipeline.recordings.recorder_config import RecorderConfig
-from pipeline.recordings.sequence_ledger import SequenceLedger
-from pipeline.recordings.stored_recordings import StoredPart
-from stages.recorder import STAGE
+from fantwin.pipeline.recordings.disk_room import DAY_NS, DiskRoom
+from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.recorder_config import RecorderConfig
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
+from fantwin.pipeline.recordings.stored_recordings import StoredPart
+from fantwin.stages.recorder import STAGE
 from tests.stages.test_recorder import NOW_NS, SECOND_NS, Disk, context, envelope, old_parts, raw, recorder
 
 
@@ -91,7 +91,7 @@ def test_a_clock_that_is_years_ahead_costs_a_part_an_hour_and_never_the_last():
 @pytest.fixture
 def sizeless(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every file system reports zeros, as some of FUSE do."""
-    monkeypatch.setattr("pipeline.recordings.disk.os.statvfs", lambda _: os.statvfs_result((0,) * 10))
+    monkeypatch.setattr("fantwin.pipeline.recordings.disk.os.statvfs", lambda _: os.statvfs_result((0,) * 10))
 
 
 @pytest.mark.usefixtures("sizeless")

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from pipeline.recordings.chunk import FillingChunk
-from pipeline.recordings.contents import contents_of
-from pipeline.recordings.index import Index
-from pipeline.recordings.reading import read_metadata, read_recording
-from stages.recorder import STAGE, Recorder
+from fantwin.pipeline.recordings.chunk import FillingChunk
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.index import Index
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.stages.recorder import STAGE, Recorder
 from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, envelope, raw
 
 START_NS = context(Path()).started_t_ns

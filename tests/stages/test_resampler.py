@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from schemas.blocks import join
-from schemas.enums import InvalidReason, TachoKind
-from schemas.header import Header
-from schemas.messages import Grid, Raw, StatedTacho
-from schemas.tacho import Tacho
-from schemas.units import NS_PER_S
-from stages.resampler import ResamplerConfig, ResamplerCore
+from fantwin.schemas.blocks import join
+from fantwin.schemas.enums import InvalidReason, TachoKind
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Grid, Raw, StatedTacho
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 

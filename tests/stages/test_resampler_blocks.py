@@ -12,10 +12,10 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from schemas.blocks import join
-from schemas.header import Header
-from schemas.messages import Grid, Raw
-from stages.resampler import ResamplerConfig, ResamplerCore
+from fantwin.schemas.blocks import join
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Grid, Raw
+from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 from tests.stages.test_resampler import NAN, at, raw
 
 WHAT_HAPPENS = (

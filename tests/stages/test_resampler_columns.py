@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from schemas.blocks import cut, join
-from schemas.messages import Array, Grid, Raw
-from schemas.side_by_side import present_columns
-from stages.resampler import ResamplerCore
+from fantwin.schemas.blocks import cut, join
+from fantwin.schemas.messages import Array, Grid, Raw
+from fantwin.schemas.side_by_side import present_columns
+from fantwin.stages.resampler import ResamplerCore
 from tests.stages.test_resampler import FIXED, NAN, at, raw
 
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.devices.line_rate import RATES_HZ, grid_rate_hz
-from schemas.blocks import join
-from schemas.enums import InvalidReason
-from schemas.header import Header
-from schemas.messages import Array, Grid, Raw
-from schemas.units import NS_PER_S
-from stages.resampler import ResamplerConfig, ResamplerCore
+from fantwin.pipeline.devices.line_rate import RATES_HZ, grid_rate_hz
+from fantwin.schemas.blocks import join
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Array, Grid, Raw
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 CLOCK_START_US = 2**32 - 3_000_000  # it wraps while the rate is being measured

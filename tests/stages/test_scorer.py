@@ -14,16 +14,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.healthy_twin import FALSE_ALARMS_PER_DAY, ScorerConfig
-from pipeline.runtime.stage import Context, StageError
-from schemas.blocks import cut
-from schemas.enums import Action, FanState, InvalidReason, Severity, Statistic, Transition
-from schemas.fields import columns
-from schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot
-from schemas.units import NS_PER_S, S_PER_DAY
-from scoring.unseen_error import UnseenError
-from stages.scorer import NOT_CALIBRATED, STAGE, ScorerCore
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.healthy_twin import FALSE_ALARMS_PER_DAY, ScorerConfig
+from fantwin.pipeline.runtime.stage import Context, StageError
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.enums import Action, FanState, InvalidReason, Severity, Statistic, Transition
+from fantwin.schemas.fields import columns
+from fantwin.schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot
+from fantwin.schemas.units import NS_PER_S, S_PER_DAY
+from fantwin.scoring.unseen_error import UnseenError
+from fantwin.stages.scorer import NOT_CALIBRATED, STAGE, ScorerCore
 from tests.support.scored_blocks import (
     EPOCH_NS,
     SIGMA,

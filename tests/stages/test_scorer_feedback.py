@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.enums import Action, Feedback, Transition
-from schemas.messages import Alarm, Prediction
-from schemas.units import NS_PER_S
-from scoring.alarms.fan_condition import EARLIER_ALARMS
-from stages.scorer import ScorerCore
+from fantwin.schemas.enums import Action, Feedback, Transition
+from fantwin.schemas.messages import Alarm, Prediction
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.fan_condition import EARLIER_ALARMS
+from fantwin.stages.scorer import ScorerCore
 from tests.support.scored_blocks import core_of, feed, prediction_of, request_of, snapshot_of
 
 PERIOD_NS = NS_PER_S

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.runtime.healthy_twin import ScorerConfig
-from schemas.blocks import join
-from schemas.enums import Statistic, Transition
-from schemas.messages import Alarm, Prediction, Raw
-from schemas.standstill import Standstill
-from schemas.tacho import Tacho
-from schemas.units import NS_PER_S
-from stages.resampler import ResamplerConfig, ResamplerCore
-from stages.scorer import ScorerCore
+from fantwin.pipeline.runtime.healthy_twin import ScorerConfig
+from fantwin.schemas.blocks import join
+from fantwin.schemas.enums import Statistic, Transition
+from fantwin.schemas.messages import Alarm, Prediction, Raw
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
+from fantwin.stages.scorer import ScorerCore
 from tests.support.scored_blocks import EPOCH_NS, NEEDED, TWIN_SPEED, Floats, core_of, feed, prediction_of, twin_of
 
 PERIOD_NS = 100_000_000

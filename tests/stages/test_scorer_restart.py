@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.runtime.snapshot_store import SnapshotStore
-from schemas.blocks import cut
-from schemas.enums import Action, FanState, Transition
-from schemas.fields import columns
-from schemas.header import Header
-from schemas.messages import Alarm, Score, ScorerSnapshot
-from schemas.units import NS_PER_S
-from scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
-from scoring.alarms.current_alarms import CurrentAlarm, current_alarms
-from scoring.model.decision import Decision
-from stages.scorer import ScorerCore
+from fantwin.pipeline.runtime.snapshot_store import SnapshotStore
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.enums import Action, FanState, Transition
+from fantwin.schemas.fields import columns
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarms
+from fantwin.scoring.model.decision import Decision
+from fantwin.stages.scorer import ScorerCore
 from tests.stages.test_scorer import eventful_prediction
 from tests.support.scored_blocks import (
     EPOCH_NS,

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.runtime.healthy_twin import ScorerConfig, known_of
-from schemas.blocks import cut
-from schemas.enums import FanState, InvalidReason, Transition
-from schemas.messages import Alarm, Grid, Prediction, Score
-from schemas.reference_conditions import ReferenceConditions
-from schemas.standstill import Standstill
-from scoring.alarms.current_alarms import current_alarms
-from stages.scorer import ScorerCore
+from fantwin.pipeline.runtime.healthy_twin import ScorerConfig, known_of
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.enums import FanState, InvalidReason, Transition
+from fantwin.schemas.messages import Alarm, Grid, Prediction, Score
+from fantwin.schemas.reference_conditions import ReferenceConditions
+from fantwin.schemas.standstill import Standstill
+from fantwin.scoring.alarms.current_alarms import current_alarms
+from fantwin.stages.scorer import ScorerCore
 from tests.stages.test_twin_integrator import core_of, physical_twin, run_freely
 
 EPOCH_NS = 1_700_000_000_000_000_000

@@ -11,22 +11,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.stage import Context
-from pipeline.runtime.twin_file import TwinFile
-from schemas.blocks import cut, join
-from schemas.enums import InvalidReason
-from schemas.header import Header
-from schemas.messages import Grid, ModelCard, Prediction
-from schemas.model_uncertainty import ModelUncertainty
-from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.stage import Context
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.schemas.blocks import cut, join
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Grid, ModelCard, Prediction
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
+from fantwin.stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
+from fantwin.twin.models import physics
+from fantwin.twin.models.integration import step_through
+from fantwin.twin.models.lag import effective_command
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.models.physics import LAG
 from tests.support.twin_files import PARAMETERS, SIGMA_RAD_S, made_up_card, small_hybrid, still_balance, write_twin
-from twin.models import physics
-from twin.models.integration import step_through
-from twin.models.lag import effective_command
-from twin.models.physical import PhysicalModel
-from twin.models.physics import LAG
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

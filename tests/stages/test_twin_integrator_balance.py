@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.blocks import cut
-from schemas.enums import InvalidReason
-from schemas.messages import Grid
-from schemas.twin_card import DriveCard
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Grid
+from fantwin.schemas.twin_card import DriveCard
 from tests.stages.test_twin_integrator import (
     NAN,
     STEP_NS,

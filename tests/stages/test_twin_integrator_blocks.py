@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import pipeline
-from pipeline.runtime.twin_file import TwinFile
-from schemas.enums import InvalidReason
-from schemas.fields import columns
-from schemas.messages import Grid, Prediction
-from stages.twin_integrator import TwinIntegratorCore
+from fantwin import pipeline
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.fields import columns
+from fantwin.schemas.messages import Grid, Prediction
+from fantwin.stages.twin_integrator import TwinIntegratorCore
 from tests.stages.test_twin_integrator import (
     EPOCH_NS,
     NAN,

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.runtime.joint_tray_integrator import JointTrayIntegrator
-from pipeline.runtime.tray_integrator import TwinIntegratorConfig
-from pipeline.runtime.twin_file import TwinFile
-from schemas.blocks import cut, join
-from schemas.enums import InvalidReason
-from schemas.fields import columns
-from schemas.messages import Array, Grid, Prediction
-from schemas.reference_conditions import ReferenceConditions
-from schemas.units import NS_PER_S
-from stages.twin_integrator import TwinIntegratorCore
+from fantwin.pipeline.runtime.joint_tray_integrator import JointTrayIntegrator
+from fantwin.pipeline.runtime.tray_integrator import TwinIntegratorConfig
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.schemas.blocks import cut, join
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.fields import columns
+from fantwin.schemas.messages import Array, Grid, Prediction
+from fantwin.schemas.reference_conditions import ReferenceConditions
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.twin_integrator import TwinIntegratorCore
 from tests.support.twin_files import write_twin
 
 FANS, RATE_HZ = 2, 50

@@ -12,23 +12,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.stage import Context, Core, StageError
-from pipeline.viewing.alarm_log import LogLine
-from pipeline.viewing.fleet import Fan
-from pipeline.viewing.fleet_view import Overview
-from pipeline.viewing.trace import Trace
-from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, PAGE_PERIOD_NS, REPEAT_STATES_NS, SAMPLES_HELD, ViewerCore
-from pipeline.viewing.wear_points import WearPoints
-from schemas.codec import encode
-from schemas.enums import FanState, InvalidReason, StageStatus
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.health import Health
-from schemas.messages import Message, ModelCard, Score
-from schemas.topics import tray_key
-from schemas.units import RAD_S_PER_UNIT, SpeedUnit
-from stages.viewer import ViewerConfig, build, check
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.stage import Context, Core, StageError
+from fantwin.pipeline.viewing.alarm_log import LogLine
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.fleet_view import Overview
+from fantwin.pipeline.viewing.trace import Trace
+from fantwin.pipeline.viewing.viewer_core import (
+    FLUSH_PERIOD_NS,
+    PAGE_PERIOD_NS,
+    REPEAT_STATES_NS,
+    SAMPLES_HELD,
+    ViewerCore,
+)
+from fantwin.pipeline.viewing.wear_points import WearPoints
+from fantwin.schemas.codec import encode
+from fantwin.schemas.enums import FanState, InvalidReason, StageStatus
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Message, ModelCard, Score
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from fantwin.stages.viewer import ViewerConfig, build, check
 from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
 
 LATER_NS = START_NS + 400 * 86_400 * 1_000_000_000  # the host's time while what was recorded at START_NS is replayed

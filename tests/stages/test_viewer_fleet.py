@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.stage import Context, StageError
-from pipeline.viewing.fleet import SILENT, Fan, class_names
-from pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
-from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
-from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
-from schemas.messages import Alarm, Score
-from stages.viewer import ViewerConfig, build, check, topics_read
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.stage import Context, StageError
+from fantwin.pipeline.viewing.fleet import SILENT, Fan, class_names
+from fantwin.pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
+from fantwin.pipeline.viewing.plot_places import FleetPlots, PlotPlaces
+from fantwin.pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
+from fantwin.schemas.messages import Alarm, Score
+from fantwin.stages.viewer import ViewerConfig, build, check, topics_read
 from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
 from tests.support.score_data import START_NS, STEP_NS, made_up_tray
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from simulation.excitation import Excitation
+from fantwin.simulation.excitation import Excitation
 from tests.support.fan_board import FANS, FanBoard
 from tests.support.fantwin_command import fantwin
 from tests.support.firmware_build import firmware_file, simulator_file

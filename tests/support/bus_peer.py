@@ -9,15 +9,15 @@ from __future__ import annotations
 import queue
 import sys
 
-from pipeline.bus.recovery import Answer
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from pipeline.runtime.tracked_streams import Request
-from schemas.codec import decode, encode, type_name
-from schemas.envelope import Envelope
-from schemas.messages import Alarm
-from schemas.topics import BY_NAME, tray_key
+from fantwin.pipeline.bus.recovery import Answer
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
+from fantwin.pipeline.runtime.tracked_streams import Request
+from fantwin.schemas.codec import decode, encode, type_name
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import BY_NAME, tray_key
 from tests.support import made_messages
 
 KEY = tray_key("site", "tray", "alarm")

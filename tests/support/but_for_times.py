@@ -8,7 +8,7 @@ from typing import Any
 
 import onnx
 
-from schemas.twin_card import CARD_PROPERTY
+from fantwin.schemas.twin_card import CARD_PROPERTY
 
 TIMES = {"created", "duration_s", "training_s", "took_s", "times_real_time"}
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.recordings.clips.alarm_clips import AlarmClips
-from pipeline.recordings.clips.clip import Clip, ClipAlarm
-from pipeline.recordings.parts import RecordingParts
-from pipeline.recordings.reading import read_metadata, read_recording
-from schemas.codec import encode
-from schemas.envelope import Envelope
-from schemas.messages import Alarm
-from stages.recorder import Recorder, RecorderConfig
+from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
+from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm
+from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.schemas.codec import encode
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Alarm
+from fantwin.stages.recorder import Recorder, RecorderConfig
 
 S = 1_000_000_000
 

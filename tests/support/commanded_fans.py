@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.learning.healthy_history import HealthyHistory
-from schemas.header import Header
-from schemas.messages import Array, Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.learning.healthy_history import HealthyHistory
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.units import NS_PER_S
 
 START_S = 1_800_000_000
 RATE_HZ = 5.0

@@ -17,7 +17,7 @@ def kill_a_recorder(path: Path, flushed: int) -> None:
 import os, signal, sys
 from pathlib import Path
 from tests.support.written_recordings import RAW_KEY, raw
-from pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.recordings.writing import RecordingWriter
 writer = RecordingWriter(Path(sys.argv[1]), {{}})
 for sequence in range({flushed}):
     writer.add_message(RAW_KEY, raw(sequence), sequence)

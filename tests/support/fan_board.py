@@ -8,7 +8,16 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.wire import DEVICE_COUNTERS, CommandFrame, Decoder, DeviceCounters, Fault, Sample, SetPointFrame, encode
+from fantwin.schemas.wire import (
+    DEVICE_COUNTERS,
+    CommandFrame,
+    Decoder,
+    DeviceCounters,
+    Fault,
+    Sample,
+    SetPointFrame,
+    encode,
+)
 
 FANS = 4
 

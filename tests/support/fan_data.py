@@ -5,8 +5,8 @@ import numpy as np
 
 from bench.training import published_fan
 from bench.training.published_fan import DRAG, INERTIA, NOISE_RAD_S, RATE_HZ, ROUGH_RANGE, VISCOUS
-from schemas.tacho import Tacho
-from twin.runs import Array, Run
+from fantwin.schemas.tacho import Tacho
+from fantwin.twin.runs import Array, Run
 
 __all__ = ["NOISE_RAD_S", "PUBLISHED_PARAMETERS", "RATE_HZ", "counted_run", "published_run", "rough_run", "stairs"]
 

@@ -10,16 +10,16 @@ from unittest.mock import patch
 import typer
 from typer.testing import CliRunner, Result
 
-from pipeline.cli import main as command_line
-from pipeline.cli.main import COMMANDS
-from pipeline.errors import UsageError, UserError
+from fantwin.pipeline.cli import main as command_line
+from fantwin.pipeline.cli.main import COMMANDS
+from fantwin.pipeline.errors import UsageError, UserError
 
 
 def fantwin(name: str, *arguments: object, typed: str | None = None) -> Result:
     """Run a command; the result has its exit code, standard output and exception. typed: what it reads."""
     module, _ = COMMANDS[name]
     app = typer.Typer(pretty_exceptions_enable=False)
-    app.command(name)(getattr(import_module(f"pipeline.cli.{module}"), module.rpartition(".")[2]))
+    app.command(name)(getattr(import_module(f"fantwin.pipeline.cli.{module}"), module.rpartition(".")[2]))
     return CliRunner().invoke(app, [str(argument) for argument in arguments], input=typed)
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from typer.main import get_command
 
-from pipeline.cli import main as command_line
-from pipeline.cli.main import COMMANDS
+from fantwin.pipeline.cli import main as command_line
+from fantwin.pipeline.cli.main import COMMANDS
 
 
 def parsed(words: Sequence[str]) -> dict[str, Any]:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.learning.healthy_history import HealthyHistory
-from schemas.header import Header
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.learning.healthy_history import HealthyHistory
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
 from tests.support.fan_data import published_run
 
 START_S = 1_800_000_000

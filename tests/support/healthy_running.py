@@ -7,10 +7,10 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
-from schemas.enums import InvalidReason
-from schemas.messages import Array, Prediction
-from schemas.units import NS_PER_S
-from scoring.model.operation import Fans
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Array, Prediction
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.model.operation import Fans
 
 RATE_HZ = 10
 TOP_RAD_S = 300.0

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S
+from fantwin.twin.evaluation.resampling import thinned
+from fantwin.twin.runs import Run
 from tests.support.fan_data import published_run
 from tests.support.written_recordings import write_run
-from twin.evaluation.resampling import thinned
-from twin.runs import Run
 
 EPOCH_NS = 1_790_000_000 * NS_PER_S
 FANS = 2

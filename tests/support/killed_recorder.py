@@ -16,10 +16,10 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from pipeline.recordings.contents import Contents, contents_of
-from pipeline.recordings.reading import RecordingError, read_recording
-from pipeline.recordings.scan import Scan, scan
-from schemas.enums import StageStatus
+from fantwin.pipeline.recordings.contents import Contents, contents_of
+from fantwin.pipeline.recordings.reading import RecordingError, read_recording
+from fantwin.pipeline.recordings.scan import Scan, scan
+from fantwin.schemas.enums import StageStatus
 from tests.support.recorder_feed import PRODUCER, SITE, TOPICS
 from tests.support.running_chain import DEADLINE_S, FANTWIN, eventually
 

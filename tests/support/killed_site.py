@@ -15,20 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config.loading import load_config
-from pipeline.config.models import Config
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.runtime.consumed import ConsumedReports
-from pipeline.runtime.stage import Context, Core, load_stage
-from pipeline.runtime.twin_file import TwinFile
-from schemas.blocks import join
-from schemas.enums import Action
-from schemas.header import Header, InputPosition
-from schemas.messages import Array, Consumed, Message, NewTwin, Raw, Request
-from schemas.topics import BY_NAME, TOPICS, tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.runtime.consumed import ConsumedReports
+from fantwin.pipeline.runtime.stage import Context, Core, load_stage
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.schemas.blocks import join
+from fantwin.schemas.enums import Action
+from fantwin.schemas.header import Header, InputPosition
+from fantwin.schemas.messages import Array, Consumed, Message, NewTwin, Raw, Request
+from fantwin.schemas.topics import BY_NAME, TOPICS, tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.twin.models.hybrid import Hybrid
 from tests.support.twin_files import small_hybrid, write_twin
-from twin.models.hybrid import Hybrid
 
 SITE, TRAY, FANS = "plant", "tray1", 3
 CHAIN = ("resampler", "twin_integrator", "scorer")

@@ -10,14 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.messages import Array
-from schemas.units import NS_PER_S
-from scoring.model.bins import Bin
-from scoring.model.decision import Decision
-from scoring.model.faults import COLUMNS, OF_TACHO, STUCK, forces
-from scoring.model.healthy import AGE, AIR, FALL, FAULT, LATE, LOCAL, RISE, SAG, WANDER, HealthyFans, K, hats
-from scoring.model.operation import Fans, Operation
-from scoring.model.priors import Priors
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.model.bins import Bin
+from fantwin.scoring.model.decision import Decision
+from fantwin.scoring.model.faults import COLUMNS, OF_TACHO, STUCK, forces
+from fantwin.scoring.model.healthy import AGE, AIR, FALL, FAULT, LATE, LOCAL, RISE, SAG, WANDER, HealthyFans, K, hats
+from fantwin.scoring.model.operation import Fans, Operation
+from fantwin.scoring.model.priors import Priors
 from tests.support.scored_blocks import EPOCH_NS
 
 PRIORS = Priors()

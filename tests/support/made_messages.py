@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any, get_args
 
-from schemas.enums import Severity, StageStatus
-from schemas.header import Header
-from schemas.health import Health
-from schemas.messages import Alarm, Message
+from fantwin.schemas.enums import Severity, StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm, Message
 
 MESSAGE_TYPES: tuple[type[Message], ...] = get_args(Message)
 """every type of message"""

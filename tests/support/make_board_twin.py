@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from simulation.excitation import Excitation, Multisine, Prbs, Staircase
+from fantwin.simulation.excitation import Excitation, Multisine, Prbs, Staircase
 from tests.support.board_recordings import import_board, run_board, succeed
 from tests.support.fan_board import FANS
 

@@ -21,9 +21,9 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parent)]
 
-from pipeline.recordings.reading import read_metadata, read_recording  # noqa: E402
-from pipeline.recordings.writing import RecordingWriter  # noqa: E402
-from schemas.enums import Action  # noqa: E402
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording  # noqa: E402
+from fantwin.pipeline.recordings.writing import RecordingWriter  # noqa: E402
+from fantwin.schemas.enums import Action  # noqa: E402
 from tests.support.killed_site import Site  # noqa: E402
 from tests.support.running_chain import TRAY, Chain, eventually, fantwin, published, view_of  # noqa: E402
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from schemas.fields import LARGEST_ENUM_VALUE, Column, OpenEnum, columns, other_fields
-from schemas.header import Header, InputPosition
-from schemas.health import AcceptedSamples, AwaitedInput, Counter, Input, LatencyBucket, Note, Output
-from schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Diagnosis, Message, StatedTacho
+from fantwin.schemas.fields import LARGEST_ENUM_VALUE, Column, OpenEnum, columns, other_fields
+from fantwin.schemas.header import Header, InputPosition
+from fantwin.schemas.health import AcceptedSamples, AwaitedInput, Counter, Input, LatencyBucket, Note, Output
+from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Diagnosis, Message, StatedTacho
 
 TIME_NS = st.integers(1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
 PERIOD_NS = st.integers(1, LARGEST_PERIOD_NS)

@@ -18,7 +18,7 @@ from pymodbus.constants import ExcCodes
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from simulation.tray import SimulatedTray
+from fantwin.simulation.tray import SimulatedTray
 
 RPM = 30.0 / np.pi
 SPEED, COMMAND, CURRENT, VOLTAGE, TEMPERATURE, WANTED, REFUSED = 10, 11, 12, 14, 16, 100, 200

@@ -6,14 +6,14 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from pipeline.config.models import TrayConfig
-from pipeline.notification.config import NotifierConfig
-from pipeline.runtime.stage import Context
-from schemas.enums import Severity, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis
-from schemas.units import NS_PER_S
-from stages.notifier import NotifierCore, build
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.notification.config import NotifierConfig
+from fantwin.pipeline.runtime.stage import Context
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.notifier import NotifierCore, build
 
 SITE, TRAY = "hall", "tray1"
 START_NS = 1_790_000_000 * NS_PER_S

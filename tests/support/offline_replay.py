@@ -6,14 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.recordings.reading import read_metadata, read_recording
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.offline.comparison import Comparison
-from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.replay.offline.rescoring import RescoredTray, rescore
-from pipeline.replay.offline.verify import TrayVerifier
-from schemas.header import Header
-from schemas.messages import Alarm, Score
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.offline.comparison import Comparison
+from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.pipeline.replay.offline.rescoring import RescoredTray, rescore
+from fantwin.pipeline.replay.offline.verify import TrayVerifier
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Score
 from tests.support.killed_site import Site
 
 

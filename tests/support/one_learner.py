@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
-from pipeline.learning.ordinary_operation import OrdinaryOperation
-from pipeline.learning.versions import Check, TwinVersions
-from schemas.enums import FanState
-from schemas.messages import Message, NewTwin, Raw, Score
-from schemas.units import NS_PER_S
-from stages.learner import LearnerConfig, LearnerCore
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
+from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
+from fantwin.pipeline.learning.versions import Check, TwinVersions
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.messages import Message, NewTwin, Raw, Score
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.learner import LearnerConfig, LearnerCore
 from tests.pipeline.learning.test_versions import version
 
 START_NS = 1_800_000_000 * NS_PER_S

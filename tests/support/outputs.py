@@ -12,13 +12,13 @@ from typing import Any, ClassVar, Protocol
 from asyncua.client.client import Client as OpcuaClient
 from prometheus_client.parser import text_string_to_metric_families
 
-from pipeline.config.models import TrayConfig
-from pipeline.notification.config import NotifierConfig
-from pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
-from schemas.envelope import Envelope
-from schemas.messages import Message, Score
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.notification.config import NotifierConfig
+from fantwin.pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Message, Score
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 from tests.stages.test_viewer import FakeSink
 from tests.support.message_receivers import HttpReceiver
 from tests.support.mosquitto import Mosquitto, retained_by

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.messages import Array
+from fantwin.schemas.messages import Array
 
 PULSES = 2
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hypothesis import strategies as st
 
-from schemas.enums import Action
+from fantwin.schemas.enums import Action
 from tests.support.killed_site import CHAIN, Site
 
 ASKED = (Action.ACKNOWLEDGE, Action.SHELVE, Action.COMMISSION, Action.OUT_OF_SERVICE)

@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Output
-from schemas.messages import Grid, Message, Prediction, Raw, Score
-from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Output
+from fantwin.schemas.messages import Grid, Message, Prediction, Raw, Score
+from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 SITE, PRODUCER, STAGE = "kills", "feed-1", "feed"
 HEALTH_PERIOD_S = 1.0

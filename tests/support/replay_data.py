@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.recordings.writing import RecordingWriter
-from schemas.header import Header
-from schemas.messages import Raw
-from schemas.topics import tray_key
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.topics import tray_key
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.bus.session import Bus
-from pipeline.config.loading import parse_config
-from pipeline.config.models import BusConfig, Config
-from pipeline.config.shards import chosen_shard
-from pipeline.runtime.runner import Runner
-from schemas.codec import decode
-from schemas.fields import Array
-from schemas.health import Health
-from schemas.messages import Raw
-from schemas.topics import tray_key
-from stages.acquisition import STAGE
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import BusConfig, Config
+from fantwin.pipeline.config.shards import chosen_shard
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.schemas.codec import decode
+from fantwin.schemas.fields import Array
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.topics import tray_key
+from fantwin.stages.acquisition import STAGE
 from tests.support.running_chain import eventually
 
 SITE, TRAY = "plant", "tray1"

@@ -15,10 +15,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.launch.site_watcher import SiteWatcher, StageView
-from pipeline.selftest.scratch_site import FANTWIN
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.selftest.scratch_site import FANTWIN
 
 DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8

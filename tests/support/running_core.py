@@ -8,13 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from pipeline.config.models import TrayConfig
-from pipeline.presenting.site_core import SiteCore
-from pipeline.runtime.stage import Context, Stage
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Alarm, Message, Request, Score
-from schemas.topics import tray_key
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.presenting.site_core import SiteCore
+from fantwin.pipeline.runtime.stage import Context, Stage
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Message, Request, Score
+from fantwin.schemas.topics import tray_key
 
 SITE, TRAY, FANS = "hall", "tray1", 4
 TICK_S = 0.02

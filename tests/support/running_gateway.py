@@ -8,8 +8,8 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from pipeline.gateway.config import GatewayConfig
-from stages.gateway import STAGE, GatewayCore
+from fantwin.pipeline.gateway.config import GatewayConfig
+from fantwin.stages.gateway import STAGE, GatewayCore
 from tests.support.running_core import FANS, Answer, RunningCore
 
 

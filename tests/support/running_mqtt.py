@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pipeline.broker.config import MqttConfig
-from stages.mqtt import STAGE, MqttCore
+from fantwin.pipeline.broker.config import MqttConfig
+from fantwin.stages.mqtt import STAGE, MqttCore
 from tests.support.running_core import FANS, SITE, Answer, RunningCore
 
 ROOT = f"fantwin/{SITE}"

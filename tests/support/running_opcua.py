@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from asyncua.server.internal_server import InternalServer
 
-from pipeline.opcua.config import OpcuaConfig
-from stages.opcua import STAGE, OpcuaCore
+from fantwin.pipeline.opcua.config import OpcuaConfig
+from fantwin.stages.opcua import STAGE, OpcuaCore
 from tests.support.running_core import FANS, Answer, RunningCore
 from tests.support.running_gateway import free_port
 from tests.support.site_users import make_users

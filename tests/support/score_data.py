@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.enums import FanState, InvalidReason, Severity, Statistic, Transition
-from schemas.fields import columns as columns_of
-from schemas.header import Header
-from schemas.messages import Alarm, Score
+from fantwin.schemas.enums import FanState, InvalidReason, Severity, Statistic, Transition
+from fantwin.schemas.fields import columns as columns_of
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Score
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

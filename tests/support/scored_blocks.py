@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
-from pipeline.runtime.snapshot_store import SnapshotStore
-from schemas.enums import Action, InvalidReason
-from schemas.header import Header
-from schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot
-from schemas.standstill import Standstill
-from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from schemas.units import SpeedUnit
-from scoring.diagnosis.advice import Advice
-from scoring.diagnosis.steady_fan import SteadyFan
-from scoring.model.operation import Fans
-from stages.scorer import ScorerCore
+from fantwin.pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
+from fantwin.pipeline.runtime.snapshot_store import SnapshotStore
+from fantwin.schemas.enums import Action, InvalidReason
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
+from fantwin.schemas.units import SpeedUnit
+from fantwin.scoring.diagnosis.advice import Advice
+from fantwin.scoring.diagnosis.steady_fan import SteadyFan
+from fantwin.scoring.model.operation import Fans
+from fantwin.stages.scorer import ScorerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import zenoh
 
-from pipeline.bus.access_rules import SiteRoles
-from pipeline.bus.certificates import Credentials, checked_credentials
-from pipeline.bus.router import open_router
-from pipeline.bus.settings import Settings
-from pipeline.config.loading import parse_config
-from pipeline.config.models import Config
-from schemas.topics import alive_key, rights_key
+from fantwin.pipeline.bus.access_rules import SiteRoles
+from fantwin.pipeline.bus.certificates import Credentials, checked_credentials
+from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.bus.settings import Settings
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import Config
+from fantwin.schemas.topics import alive_key, rights_key
 from tests.support.running_chain import eventually
 from tests.support.site_certificates import SiteCertificates
 

@@ -10,18 +10,18 @@ from typing import Self
 
 import numpy as np
 
-from pipeline.bus.session import Bus
-from pipeline.config.loading import parse_config
-from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.runtime.runner import Runner
-from pipeline.runtime.sessions import Session
-from pipeline.runtime.stage import load_stage
-from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Output
-from schemas.messages import Raw
-from schemas.topics import BY_NAME, health_key, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.sessions import Session
+from fantwin.pipeline.runtime.stage import load_stage
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Output
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.made_messages import health
 from tests.support.running_chain import eventually
 from tests.support.secured_site import SITE, SecuredSite

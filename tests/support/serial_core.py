@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.config.models import TrayConfig
-from pipeline.devices.host_clock import HOST_CLOCK, HostClock
-from pipeline.devices.sample_blocks import SampleBlocks
-from pipeline.devices.sample_source import LinkDown, LinkUp, ReadingBatch, SourceContext
-from pipeline.devices.serial_config import SerialConfig
-from pipeline.devices.serial_port import ReceivedBytes
-from pipeline.devices.serial_source import ByteLink, SerialSource
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
-from stages.acquisition import AcquisitionConfig, AcquisitionCore, Item
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK, HostClock
+from fantwin.pipeline.devices.sample_blocks import SampleBlocks
+from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp, ReadingBatch, SourceContext
+from fantwin.pipeline.devices.serial_config import SerialConfig
+from fantwin.pipeline.devices.serial_port import ReceivedBytes
+from fantwin.pipeline.devices.serial_source import ByteLink, SerialSource
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
+from fantwin.stages.acquisition import AcquisitionConfig, AcquisitionCore, Item
 
 
 class FakeLink:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from pipeline.bus.authority import Authority, write_file, write_pair
-from pipeline.config.models import SecurityConfig
+from fantwin.pipeline.bus.authority import Authority, write_file, write_pair
+from fantwin.pipeline.config.models import SecurityConfig
 
 HOSTS = ("localhost", "127.0.0.1")
 DAY = timedelta(days=1)

@@ -22,12 +22,12 @@ import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 from pymodbus.constants import ExcCodes
 
-from pipeline.devices.push_source import PushSource
-from pipeline.devices.sample_source import SampleSource, SourceEvent
-from schemas.header import Header
-from schemas.messages import PushedSamples
-from schemas.units import RAD_S_PER_UNIT
-from schemas.wire import Sample, encode
+from fantwin.pipeline.devices.push_source import PushSource
+from fantwin.pipeline.devices.sample_source import SampleSource, SourceEvent
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import PushedSamples
+from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.schemas.wire import Sample, encode
 from tests.support.hwmon_trees import add_chip
 from tests.support.modbus_server import modbus_server
 from tests.support.mqtt_broker import MqttBroker, free_port

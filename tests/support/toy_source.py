@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from pipeline.devices.sample_source import LinkUp, Reading, ReadingBatch, SourceConfig, SourceContext, SourceEvent
-from schemas.tacho import Tacho
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.sample_source import (
+    LinkUp,
+    Reading,
+    ReadingBatch,
+    SourceConfig,
+    SourceContext,
+    SourceEvent,
+)
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.units import NS_PER_S
 
 
 class ToyConfig(SourceConfig, frozen=True):

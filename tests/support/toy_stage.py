@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bus.session import Bus
-from pipeline.config.shards import chosen_shard
-from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
-from schemas.codec import decode, encode, type_name
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health
-from schemas.messages import Grid, Message, Raw
-from schemas.topics import BY_NAME, health_key, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.shards import chosen_shard
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
+from fantwin.schemas.codec import decode, encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Grid, Message, Raw
+from fantwin.schemas.topics import BY_NAME, health_key, tray_key
 
 TRAY_A, TRAY_B = "a", "b"
 

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from twin.build import train_twin
-from twin.finishing import TrainedTwin
-from twin.runs import Run
+from fantwin.twin.build import train_twin
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.runs import Run
 
 
 class TrainedOnce:

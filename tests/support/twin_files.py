@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import onnx
 
-from pipeline.runtime.tray_twin import Balance
-from schemas.twin_card import (
+from fantwin.pipeline.runtime.tray_twin import Balance
+from fantwin.schemas.twin_card import (
     CARD_PROPERTY,
     BalanceCard,
     HealthyCard,
@@ -19,13 +19,13 @@ from schemas.twin_card import (
     TwinCard,
     ValidationCard,
 )
-from twin.export.onnx_export import export_onnx
-from twin.fitting.balance import FILTER_RATE_PER_S
-from twin.models.hybrid import Hybrid
-from twin.models.model import Model
-from twin.models.network import Scaling, TanhNetwork
-from twin.models.physical import PhysicalModel
-from twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.export.onnx_export import export_onnx
+from fantwin.twin.fitting.balance import FILTER_RATE_PER_S
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.model import Model
+from fantwin.twin.models.network import Scaling, TanhNetwork
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.models.physics import PARAMETER_NAMES
 
 PARAMETERS = (0.15, 0.12, 0.0005, 0.02)
 """J, alpha, C_D, lag_s of a fan that settles within about a second."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from schemas.model_uncertainty import ModelUncertainty
+from fantwin.schemas.model_uncertainty import ModelUncertainty
 
 
 def by_speed(

@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 
-from schemas.header import Header
-from schemas.messages import Array, ScorerSnapshot
-from scoring.wear.trend import NS_PER_DAY
-from scoring.wear.wear_monitor import WearMonitor
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Array, ScorerSnapshot
+from fantwin.scoring.wear.trend import NS_PER_DAY
+from fantwin.scoring.wear.wear_monitor import WearMonitor
 
 EVERY_S = 1800.0
 PER_DAY = 48

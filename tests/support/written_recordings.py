@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.recordings.reading import read_recording
-from pipeline.recordings.writing import RecordingWriter
-from schemas.header import Header
-from schemas.messages import Alarm, Array, Raw
-from schemas.topics import tray_key
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Array, Raw
+from fantwin.schemas.topics import tray_key
+from fantwin.twin.runs import Run
 from tests.support import made_messages
-from twin.runs import Run
 
 RAW_KEY = tray_key("plant", "tray1", "raw")
 ALARM_KEY = tray_key("plant", "tray1", "alarm")

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli.watch import commission
-from pipeline.config.loading import load_config
-from pipeline.learning import ordinary_operation
-from pipeline.recordings.reading import read_recording
-from pipeline.runtime.tray_twin import load_tray_twin
-from scoring.calibration.calibration import Calibration
+from fantwin.pipeline.cli.watch import commission
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.learning import ordinary_operation
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.scoring.calibration.calibration import Calibration
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import RunningCommand
 

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.recordings.reading import read_recording
-from schemas.codec import decode
-from schemas.messages import Raw
-from schemas.topics import tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.codec import decode
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.topics import tray_key
 from tests.support.fantwin_command import as_typed
 from tests.support.running_chain import (
     DEADLINE_S,

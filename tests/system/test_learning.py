@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.learning.versions import TwinVersions, learning_folder
-from pipeline.recordings.reading import read_recording
-from schemas.enums import InvalidReason
-from schemas.messages import ModelCard, Score
+from fantwin.pipeline.learning.versions import TwinVersions, learning_folder
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import ModelCard, Score
 from tests.support.fantwin_command import fantwin
 from tests.support.healthy_recordings import FANS, add_recording
 from tests.support.running_chain import DEADLINE_S, RunningCommand, eventually

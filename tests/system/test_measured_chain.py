@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.reading import read_recording
-from schemas.enums import InvalidReason
-from schemas.messages import Message, ModelCard, Prediction, Raw, Score
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Message, ModelCard, Prediction, Raw, Score
 from tests.support.fantwin_command import fantwin
 from tests.support.running_chain import DEADLINE_S, RunningCommand
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.recordings.runs import read_runs
+from fantwin.pipeline.recordings.runs import read_runs
 from tests.support.fantwin_command import fantwin
 
 pytestmark = pytest.mark.data

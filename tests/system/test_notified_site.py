@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from schemas.codec import decode, encode, type_name
-from schemas.health import Health
-from schemas.messages import Alarm
-from schemas.topics import BY_NAME, health_key, tray_key
-from stages.notifier import OUTBOX
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.schemas.codec import decode, encode, type_name
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import BY_NAME, health_key, tray_key
+from fantwin.stages.notifier import OUTBOX
 from tests.support.message_receivers import MailServer
 from tests.support.notified_alarms import alarm, cleared, secret
 from tests.support.running_chain import RunningCommand, eventually

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, expect
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from schemas.topics import tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.schemas.topics import tray_key
 from tests.support.page_browser import opened, running_browser
 from tests.support.running_chain import SITE, TRAY, Chain, eventually, view_of
 from tests.support.running_gateway import free_port

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Route, expect
 
-from schemas.enums import Action, FanState, Feedback, Transition
-from schemas.messages import Alarm, Diagnosis, Request
+from fantwin.schemas.enums import Action, FanState, Feedback, Transition
+from fantwin.schemas.messages import Alarm, Diagnosis, Request
 from tests.stages.test_gateway import NOW_NS, alarm, golden_twin, marked, score
 from tests.support.page_browser import DEADLINE_MS, inaccessible, opened, running_browser
 from tests.support.running_chain import eventually
@@ -48,7 +48,7 @@ class Scorer:
 
 @pytest.fixture
 def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningGateway]:
-    monkeypatch.setattr("pipeline.presenting.site_model.SILENT_AFTER_S", 1e9)
+    monkeypatch.setattr("fantwin.pipeline.presenting.site_model.SILENT_AFTER_S", 1e9)
     running = RunningGateway(tmp_path, Scorer(), users=make_users(tmp_path / "users.toml"))
     running.feed(score(), score(1.0, state=FanState.ALARM), alarm())
     try:

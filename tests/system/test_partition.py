@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.bus.link import LEASE_MS
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.recordings.reading import read_recording
-from schemas.enums import Transition
-from schemas.messages import Alarm, Grid
+from fantwin.pipeline.bus.link import LEASE_MS
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm, Grid
 from tests.support.fantwin_command import as_typed
 from tests.support.running_chain import SITE, TRAY, Chain, RunningCommand, eventually, published, view_of
 from tests.support.tcp_relay import TcpRelay

@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.recordings.reading import read_recording
-from pipeline.recordings.writing import RecordingWriter
-from schemas.codec import decode
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health
-from schemas.messages import Clock, Grid, Message, ModelCard
-from schemas.topics import health_key, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.codec import decode
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Clock, Grid, Message, ModelCard
+from fantwin.schemas.topics import health_key, tray_key
 from tests.support.fantwin_command import as_typed
 from tests.support.killed_site import Site as RecordedSite
 from tests.support.replay_data import START_NS, STEP_NS, write_raw

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.bus.session import join_bus
-from pipeline.config.loading import load_config
-from pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.bus.session import join_bus
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
 from tests.support.fantwin_command import as_typed
 from tests.support.running_chain import DEMO, TRAY, Chain, RunningCommand, eventually, received, view_of
 

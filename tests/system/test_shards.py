@@ -16,16 +16,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.bus.publisher import Publisher
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.recordings.reading import read_recording
-from schemas.codec import decode, encode, type_name
-from schemas.enums import Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Score, ScorerSnapshot
-from schemas.topics import BY_NAME, tray_key
+from fantwin.pipeline.bus.publisher import Publisher
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.codec import decode, encode, type_name
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
+from fantwin.schemas.topics import BY_NAME, tray_key
 from tests.support.fantwin_command import as_typed
 from tests.support.running_chain import RunningCommand, eventually
 from tests.support.scored_blocks import EPOCH_NS, STEP_NS, prediction_of

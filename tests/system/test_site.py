@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.recordings.reading import read_recording
-from schemas.enums import Transition
-from schemas.messages import Alarm, Request
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm, Request
 from tests.stages.test_viewer import rows_of
 from tests.support.fantwin_command import as_typed
 from tests.support.offline_replay import without_topics

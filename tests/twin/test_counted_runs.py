@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.tacho import INSTANTANEOUS, Tacho
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.errors import TwinError
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.measurement import measurement_of
+from fantwin.twin.runs import Run
 from tests.support.fan_data import PUBLISHED_PARAMETERS, counted_run
 from tests.support.trained_once import TrainedOnce
-from twin.build import evaluate, train_twin
-from twin.errors import TwinError
-from twin.finishing import TrainedTwin
-from twin.fitting.identification import identify
-from twin.measurement import measurement_of
-from twin.runs import Run
 
 # Not a multiple of the sample period: ages of readings then take all values, as between clocks that drift.
 TACHO = Tacho(kind="count", window_s=0.53)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from schemas.tacho import Tacho
-from scoring.expected_reading import AveragedCommand
-from twin.measurement import Measurement
+from fantwin.schemas.tacho import Tacho
+from fantwin.scoring.expected_reading import AveragedCommand
+from fantwin.twin.measurement import Measurement
 
 SLOW = Tacho(kind="count", window_s=1.0)
 TACHOS = [

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from bench.training import published_fan
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.resampling import thinned
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.placing import place_twin
+from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
 from tests.support.fantwin_command import error_of
 from tests.support.trained_once import TrainedOnce
-from twin.build import evaluate, train_twin
-from twin.errors import TwinError
-from twin.evaluation.resampling import thinned
-from twin.export.onnx_twin import OnnxTwin
-from twin.finishing import TrainedTwin
-from twin.placing import place_twin
-from twin.runs import Array, Run
 
 OWN_S, TEST_S = 20.0, 40.0
 

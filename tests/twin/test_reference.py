@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from bench.detection.tray_run import run_of
-from schemas.reference_conditions import ReferenceConditions
-from simulation.surroundings import Surroundings
-from simulation.tacho import NoisyTacho, TachoSettings
-from simulation.tray import TraySettings
-from twin.build import evaluate, train_twin
-from twin.errors import TwinError
-from twin.evaluation.resampling import resampled
-from twin.fitting.drive_fit import FoundDrive
-from twin.fitting.identification import identify
-from twin.fitting.reference_choice import identify_at_reference
-from twin.models.drive import Drive
-from twin.reference import at_reference, reference_of
-from twin.runs import Run
+from fantwin.schemas.reference_conditions import ReferenceConditions
+from fantwin.simulation.surroundings import Surroundings
+from fantwin.simulation.tacho import NoisyTacho, TachoSettings
+from fantwin.simulation.tray import TraySettings
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.resampling import resampled
+from fantwin.twin.fitting.drive_fit import FoundDrive
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.fitting.reference_choice import identify_at_reference
+from fantwin.twin.models.drive import Drive
+from fantwin.twin.reference import at_reference, reference_of
+from fantwin.twin.runs import Run
 
 NOISE_RAD_S = 2.0
 
@@ -97,7 +97,7 @@ def test_a_twin_behind_a_drive_allows_for_nothing_and_says_so(
     runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drive = FoundDrive(Drive(0.01, 0.3, 1.0), np.array([[0.02, 0.0, 0.5]]))
-    monkeypatch.setattr("twin.build.find_drive", lambda *_: drive)
+    monkeypatch.setattr("fantwin.twin.build.find_drive", lambda *_: drive)
     twin = train_twin([runs[0]], [], "physical", name="drive")
     assert twin.card.conditions is None
     said = "supply voltage and temperature: not used, because these fans control their own speed"

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.tacho import Tacho
-from twin.errors import TwinError
-from twin.runs import Run, common_tacho, starting_speed_rad_s
+from fantwin.schemas.tacho import Tacho
+from fantwin.twin.errors import TwinError
+from fantwin.twin.runs import Run, common_tacho, starting_speed_rad_s
 
 
 def ramp(times: list[float]) -> Run:

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.units import NS_PER_S
-from twin.errors import TwinError
-from twin.measurement import Measurement, measurement_of
-from twin.models.model import TwinModel
-from twin.runs import Array, Run, common_fans, starting_samples, starting_speed_rad_s
+from fantwin.schemas.units import NS_PER_S
+from fantwin.twin.errors import TwinError
+from fantwin.twin.measurement import Measurement, measurement_of
+from fantwin.twin.models.model import TwinModel
+from fantwin.twin.runs import Array, Run, common_fans, starting_samples, starting_speed_rad_s
 
 Flags = NDArray[np.bool_]
 UnseenStd = Callable[[Array, Array], Array]

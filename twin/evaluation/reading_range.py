@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from schemas.standstill import Standstill
-from twin.evaluation.accuracy import compared_readings, free_run_speeds
-from twin.measurement import measurement_of
-from twin.models.model import TwinModel
-from twin.runs import Array, Run
+from fantwin.schemas.standstill import Standstill
+from fantwin.twin.evaluation.accuracy import compared_readings, free_run_speeds
+from fantwin.twin.measurement import measurement_of
+from fantwin.twin.models.model import TwinModel
+from fantwin.twin.runs import Array, Run
 
 SHORT_AGE = 1e-3
 """of a window: an age that hardly differs from none"""

@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.errors import TwinError
-from twin.evaluation.accuracy import evaluation_pieces
-from twin.runs import Array, Run
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import evaluation_pieces
+from fantwin.twin.runs import Array, Run
 
 Grid = float | Literal["irregular"]
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 from scipy.special import chdtrc
 
-from twin.errors import TwinError
-from twin.evaluation.accuracy import healthy_sigma_rad_s, sums_by_fan
-from twin.runs import Array, Run
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import healthy_sigma_rad_s, sums_by_fan
+from fantwin.twin.runs import Array, Run
 
 Spectrum = NDArray[np.complex128]
 

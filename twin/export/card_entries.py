@@ -6,8 +6,8 @@ from typing import Any
 
 import onnx
 
-from schemas.twin_card import CARD_PROPERTY
-from twin.errors import TwinError
+from fantwin.schemas.twin_card import CARD_PROPERTY
+from fantwin.twin.errors import TwinError
 
 
 def with_card_entries(content: bytes, entries: Mapping[str, Any]) -> bytes:

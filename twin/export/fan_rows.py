@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from schemas.twin_card import DriveCard, TwinCard
-from twin.errors import TwinError
-from twin.reference import at_reference
-from twin.runs import Run
+from fantwin.schemas.twin_card import DriveCard, TwinCard
+from fantwin.twin.errors import TwinError
+from fantwin.twin.reference import at_reference
+from fantwin.twin.runs import Run
 
 
 def fan_rows(card: TwinCard, fans: int, fan_numbers: Sequence[int] | None = None) -> list[int]:

@@ -13,9 +13,9 @@ look the same to a reader.
 
 from onnx import checker, helper
 
-from schemas.twin_card import CARD_PROPERTY, TwinCard
-from twin.models.model import Model
-from twin.models.onnx_nodes import double
+from fantwin.schemas.twin_card import CARD_PROPERTY, TwinCard
+from fantwin.twin.models.model import Model
+from fantwin.twin.models.onnx_nodes import double
 
 OPSET = 17
 IR_VERSION = 8

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from schemas.twin_card import CARD_PROPERTY, GRAPH_INPUTS, GRAPH_OUTPUTS, CardError, StateLayout, TwinCard
-from twin.errors import TwinError
-from twin.runs import Array
+from fantwin.schemas.twin_card import CARD_PROPERTY, GRAPH_INPUTS, GRAPH_OUTPUTS, CardError, StateLayout, TwinCard
+from fantwin.twin.errors import TwinError
+from fantwin.twin.runs import Array
 
 
 class OnnxTwin:

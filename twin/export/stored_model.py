@@ -9,12 +9,12 @@ import numpy as np
 import onnx
 from onnx import numpy_helper
 
-from schemas.twin_card import TwinCard
-from twin.errors import TwinError
-from twin.models.drive import Drive
-from twin.models.hybrid import Hybrid
-from twin.models.network import Scaling, TanhNetwork
-from twin.runs import Array
+from fantwin.schemas.twin_card import TwinCard
+from fantwin.twin.errors import TwinError
+from fantwin.twin.models.drive import Drive
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.network import Scaling, TanhNetwork
+from fantwin.twin.runs import Array
 
 UNSCALED = Scaling(0.0, 1.0, 0.0, 1.0, 1.0)
 

@@ -21,11 +21,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from twin.measurement import Measurement
-from twin.models.lag import effective_command
-from twin.models.recursion import linear_recursion
-from twin.runs import Array
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
+from fantwin.twin.measurement import Measurement
+from fantwin.twin.models.lag import effective_command
+from fantwin.twin.models.recursion import linear_recursion
+from fantwin.twin.runs import Array
 
 FILTER_RATE_PER_S = 3.0
 COEFFICIENTS = ("inertia", "viscous", "drag", "friction")

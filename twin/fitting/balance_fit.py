@@ -33,15 +33,15 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import lsq_linear
 
-from schemas.twin_card import BalanceSource
-from twin.errors import TwinError
-from twin.evaluation.resampling import resampled
-from twin.evaluation.residual_analysis import analyse_residual
-from twin.fitting.balance import COEFFICIENTS, FILTER_RATE_PER_S, balance_of, filtered_terms
-from twin.fitting.identification import Identification
-from twin.measurement import measurement_of
-from twin.models.physics import LAG
-from twin.runs import GAP_IN_MEDIAN_PERIODS, Array, Run
+from fantwin.schemas.twin_card import BalanceSource
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.resampling import resampled
+from fantwin.twin.evaluation.residual_analysis import analyse_residual
+from fantwin.twin.fitting.balance import COEFFICIENTS, FILTER_RATE_PER_S, balance_of, filtered_terms
+from fantwin.twin.fitting.identification import Identification
+from fantwin.twin.measurement import measurement_of
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.runs import GAP_IN_MEDIAN_PERIODS, Array, Run
 
 LOWEST_SHARE_OF_TOP = 0.05
 SETTLING_S = 3.0 / FILTER_RATE_PER_S

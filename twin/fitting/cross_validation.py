@@ -12,13 +12,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from twin.errors import TwinError
-from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals
-from twin.fitting.identification import identify
-from twin.fitting.training import GRID_PRIOR_STD, Physics, train_network
-from twin.models.model import NetworkOde
-from twin.progress import Progress, unreported, within
-from twin.runs import Array, Run
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.fitting.training import GRID_PRIOR_STD, Physics, train_network
+from fantwin.twin.models.model import NetworkOde
+from fantwin.twin.progress import Progress, unreported, within
+from fantwin.twin.runs import Array, Run
 
 PRIOR_STDS = (0.1 * GRID_PRIOR_STD, GRID_PRIOR_STD)
 FOLDS = 3

@@ -19,22 +19,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.standstill import Standstill
-from schemas.twin_card import DriveCard
-from twin.errors import TwinError
-from twin.fitting.free_run_fit import ERROR_ROUNDS
-from twin.fitting.free_run_problem import HEAVIER, HUBER_DELTA
-from twin.fitting.identification import Identification
-from twin.fitting.reading_errors import ReadingErrors, reading_errors, robust_scale
-from twin.fitting.trajectories import MAX_SAMPLES, Trajectories, cut_into_trajectories, practical_samples
-from twin.models.drive import DRIVE_PARAMETERS, Drive
-from twin.models.integration import free_run, rk4_step_derivatives
-from twin.models.physical import fitted_unknowns, parameters_by_unknowns, physical_parameters
-from twin.models.physics import LAG, PARAMETER_NAMES
-from twin.models.recursion import linear_recursion
-from twin.models.right_hand_side import FanEquation
-from twin.progress import Progress, unreported
-from twin.runs import Array, Run
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.twin_card import DriveCard
+from fantwin.twin.errors import TwinError
+from fantwin.twin.fitting.free_run_fit import ERROR_ROUNDS
+from fantwin.twin.fitting.free_run_problem import HEAVIER, HUBER_DELTA
+from fantwin.twin.fitting.identification import Identification
+from fantwin.twin.fitting.reading_errors import ReadingErrors, reading_errors, robust_scale
+from fantwin.twin.fitting.trajectories import MAX_SAMPLES, Trajectories, cut_into_trajectories, practical_samples
+from fantwin.twin.models.drive import DRIVE_PARAMETERS, Drive
+from fantwin.twin.models.integration import free_run, rk4_step_derivatives
+from fantwin.twin.models.physical import fitted_unknowns, parameters_by_unknowns, physical_parameters
+from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
+from fantwin.twin.models.recursion import linear_recursion
+from fantwin.twin.models.right_hand_side import FanEquation
+from fantwin.twin.progress import Progress, unreported
+from fantwin.twin.runs import Array, Run
 
 FEWEST_STARTS = 3
 LEAST_GAIN = 0.07

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.evaluation.accuracy import evaluation_pieces
-from twin.fitting.filtering import Basis, filtered_regression
-from twin.fitting.trajectories import MAX_SAMPLES
-from twin.measurement import with_measured_command
-from twin.models.lag import effective_command
-from twin.models.model import OdeModel
-from twin.models.physics import LAG
-from twin.runs import Array, Run
+from fantwin.twin.evaluation.accuracy import evaluation_pieces
+from fantwin.twin.fitting.filtering import Basis, filtered_regression
+from fantwin.twin.fitting.trajectories import MAX_SAMPLES
+from fantwin.twin.measurement import with_measured_command
+from fantwin.twin.models.lag import effective_command
+from fantwin.twin.models.model import OdeModel
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.runs import Array, Run
 
 HELD = 2.0
 """limit of `_relative_std`: a sample below it counts as held"""

@@ -14,8 +14,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from twin.models.recursion import linear_recursion
-from twin.runs import Array
+from fantwin.twin.models.recursion import linear_recursion
+from fantwin.twin.runs import Array
 
 Basis = Callable[[Array, Array], Array]
 """Speed (n,) and command (n,) to the regressors phi (n, P)."""

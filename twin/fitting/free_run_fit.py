@@ -23,11 +23,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.fitting.free_run_problem import OF_STEADY_SPEEDS, Flags, FreeRunProblem, Point, Prior, Unknowns
-from twin.fitting.reading_errors import counts, robust_scale
-from twin.fitting.trajectories import Trajectories
-from twin.models.model import OdeModel
-from twin.runs import Array
+from fantwin.twin.fitting.free_run_problem import OF_STEADY_SPEEDS, Flags, FreeRunProblem, Point, Prior, Unknowns
+from fantwin.twin.fitting.reading_errors import counts, robust_scale
+from fantwin.twin.fitting.trajectories import Trajectories
+from fantwin.twin.models.model import OdeModel
+from fantwin.twin.runs import Array
 
 SCALE_ROUNDS, ERROR_ROUNDS = 2, 4  # with a constant scale, or with what was learned of the errors of readings
 DAMPING_DOWN, DAMPING_UP = 3.0, 4.0

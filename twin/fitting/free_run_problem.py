@@ -6,16 +6,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.fitting.reading_errors import ReadingErrors, counts, reading_errors
-from twin.fitting.trajectories import Trajectories
-from twin.models.integration import WIDE_BATCH, free_run, free_run_sensitivities
-from twin.models.lag import effective_command, effective_command_by_lag
-from twin.models.model import OdeModel
-from twin.models.network import TanhNetwork
-from twin.models.physical import parameters_by_unknowns, physical_parameters
-from twin.models.physics import LAG, PARAMETER_NAMES
-from twin.models.right_hand_side import FanEquation
-from twin.runs import Array
+from fantwin.twin.fitting.reading_errors import ReadingErrors, counts, reading_errors
+from fantwin.twin.fitting.trajectories import Trajectories
+from fantwin.twin.models.integration import WIDE_BATCH, free_run, free_run_sensitivities
+from fantwin.twin.models.lag import effective_command, effective_command_by_lag
+from fantwin.twin.models.model import OdeModel
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.physical import parameters_by_unknowns, physical_parameters
+from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
+from fantwin.twin.models.right_hand_side import FanEquation
+from fantwin.twin.runs import Array
 
 Flags = NDArray[np.bool_]
 

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from twin.models.physics import PARAMETER_NAMES
-from twin.runs import Array, Run
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.runs import Array, Run
 
 J, ALPHA, C_D, LAG_S = (PARAMETER_NAMES.index(name) for name in ("J", "alpha", "C_D", "lag_s"))
 

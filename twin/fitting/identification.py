@@ -28,21 +28,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
-from twin.errors import TwinError
-from twin.fitting.filtering import filtered_regression
-from twin.fitting.free_run_fit import FreeRunFit, fit_free_run
-from twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior, Unknowns
-from twin.fitting.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings, misfit_warnings, short_warnings
-from twin.fitting.reading_errors import counts, robust_scale
-from twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
-from twin.measurement import with_measured_command
-from twin.models import physics
-from twin.models.integration import free_run
-from twin.models.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
-from twin.models.physics import LAG, PARAMETER_NAMES
-from twin.models.right_hand_side import FanEquation
-from twin.progress import Progress, unreported
-from twin.runs import Array, Run, common_fans
+from fantwin.twin.errors import TwinError
+from fantwin.twin.fitting.filtering import filtered_regression
+from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_free_run
+from fantwin.twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior, Unknowns
+from fantwin.twin.fitting.identifiability import (
+    TOP_SPEED_QUANTILE,
+    identifiability_warnings,
+    misfit_warnings,
+    short_warnings,
+)
+from fantwin.twin.fitting.reading_errors import counts, robust_scale
+from fantwin.twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
+from fantwin.twin.measurement import with_measured_command
+from fantwin.twin.models import physics
+from fantwin.twin.models.integration import free_run
+from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
+from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
+from fantwin.twin.models.right_hand_side import FanEquation
+from fantwin.twin.progress import Progress, unreported
+from fantwin.twin.runs import Array, Run, common_fans
 
 LAMBDA_LADDER = 9
 COLUMNS_AT_ONCE = 320  # fans times rungs: fewer cost as much as these, more need more memory

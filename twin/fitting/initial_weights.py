@@ -13,14 +13,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin.fitting.filtering import filtered_regression
-from twin.fitting.identification import Identification
-from twin.measurement import with_measured_command
-from twin.models.lag import effective_command
-from twin.models.model import NetworkOde
-from twin.models.network import TanhNetwork
-from twin.models.physics import LAG
-from twin.runs import Array, Run
+from fantwin.twin.fitting.filtering import filtered_regression
+from fantwin.twin.fitting.identification import Identification
+from fantwin.twin.measurement import with_measured_command
+from fantwin.twin.models.lag import effective_command
+from fantwin.twin.models.model import NetworkOde
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.runs import Array, Run
 
 PLACEMENTS = 24
 STEEPEST_IN_SPEED, STEEPEST_IN_COMMAND = 40.0, 20.0

@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin.models.model import NetworkOde
-from twin.models.network import TanhNetwork
-from twin.models.physics import LAG
-from twin.runs import Array
+from fantwin.twin.models.model import NetworkOde
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.runs import Array
 
 
 def mean_model(trained: Sequence[tuple[NetworkOde, Array]]) -> tuple[NetworkOde, Array]:

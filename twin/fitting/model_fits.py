@@ -6,19 +6,19 @@ from typing import Literal
 
 import numpy as np
 
-from twin.evaluation.accuracy import evaluation_pieces
-from twin.fitting.cross_validation import choose_prior_std
-from twin.fitting.drive_fit import FoundDrive
-from twin.fitting.identification import Identification
-from twin.fitting.initial_weights import initial_weights
-from twin.fitting.narx_training import train_narx
-from twin.fitting.training import GRID_PRIOR_STD, Physics, data_scaling, train_network
-from twin.models.model import Model, NetworkOde, OdeModel
-from twin.models.network import TanhNetwork
-from twin.models.physical import PhysicalModel
-from twin.networks import ForEachNetwork, one_after_another
-from twin.progress import Progress, unreported
-from twin.runs import Array, Run
+from fantwin.twin.evaluation.accuracy import evaluation_pieces
+from fantwin.twin.fitting.cross_validation import choose_prior_std
+from fantwin.twin.fitting.drive_fit import FoundDrive
+from fantwin.twin.fitting.identification import Identification
+from fantwin.twin.fitting.initial_weights import initial_weights
+from fantwin.twin.fitting.narx_training import train_narx
+from fantwin.twin.fitting.training import GRID_PRIOR_STD, Physics, data_scaling, train_network
+from fantwin.twin.models.model import Model, NetworkOde, OdeModel
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.networks import ForEachNetwork, one_after_another
+from fantwin.twin.progress import Progress, unreported
+from fantwin.twin.runs import Array, Run
 
 Trainer = Literal["levenberg-marquardt", "adam"]
 
@@ -111,7 +111,7 @@ def _behind(drive: FoundDrive | None, model: OdeModel, parameters: Array) -> tup
 def _by_adam(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[NetworkOde, Array, int]:
     """The published recipe. The physics stay as identified."""
     # torch is needed by this trainer alone, and takes seconds to import.
-    from twin.fitting.torch_reference import train_adam  # noqa: PLC0415
+    from fantwin.twin.fitting.torch_reference import train_adam  # noqa: PLC0415
 
     found = request.identification
     (theta,) = initial_weights(

@@ -18,17 +18,17 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import cholesky, get_lapack_funcs, solve_triangular
 
-from schemas.model_uncertainty import ModelUncertainty
-from twin.evaluation.accuracy import evaluation_pieces
-from twin.fitting.fan_evidence import FanEvidence, evidence_of_fans
-from twin.fitting.filtering import Basis
-from twin.fitting.identification import Identification
-from twin.fitting.thinning import coarser, thinning_factor
-from twin.fitting.training import data_scaling
-from twin.models.model import OdeModel
-from twin.models.network import Scaling
-from twin.models.physics import acceleration, acceleration_by_speed
-from twin.runs import Array, Run
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.twin.evaluation.accuracy import evaluation_pieces
+from fantwin.twin.fitting.fan_evidence import FanEvidence, evidence_of_fans
+from fantwin.twin.fitting.filtering import Basis
+from fantwin.twin.fitting.identification import Identification
+from fantwin.twin.fitting.thinning import coarser, thinning_factor
+from fantwin.twin.fitting.training import data_scaling
+from fantwin.twin.models.model import OdeModel
+from fantwin.twin.models.network import Scaling
+from fantwin.twin.models.physics import acceleration, acceleration_by_speed
+from fantwin.twin.runs import Array, Run
 
 (dpotri,) = get_lapack_funcs(("potri",), dtype=np.float64)
 

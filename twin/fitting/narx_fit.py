@@ -13,13 +13,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from twin.fitting.free_run_problem import HUBER_DELTA
-from twin.fitting.reading_errors import NORMAL_90_PERCENT
-from twin.models.narx import INPUTS, ORDER, UNITS, Narx, regressor_rows
-from twin.models.network import Scaling
-from twin.models.physics import PARAMETER_NAMES
-from twin.models.recursion import dtbtrs
-from twin.runs import Array, Run, starting_speed_rad_s
+from fantwin.twin.fitting.free_run_problem import HUBER_DELTA
+from fantwin.twin.fitting.reading_errors import NORMAL_90_PERCENT
+from fantwin.twin.models.narx import INPUTS, ORDER, UNITS, Narx, regressor_rows
+from fantwin.twin.models.network import Scaling
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.models.recursion import dtbtrs
+from fantwin.twin.runs import Array, Run, starting_speed_rad_s
 
 TOLERANCE = 1e-3
 FIRST_DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e9

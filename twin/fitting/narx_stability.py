@@ -8,8 +8,8 @@ highest speed of training.
 
 import numpy as np
 
-from twin.models.narx import Narx
-from twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.models.narx import Narx
+from fantwin.twin.models.physics import PARAMETER_NAMES
 
 LEVELS = 16
 # A fan without drive coasts far longer than its time constant at speed.

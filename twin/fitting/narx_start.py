@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.signal import lfilter
 
-from twin.models.narx import INPUTS, ORDER, UNITS, regressor_rows
-from twin.runs import Array
+from fantwin.twin.models.narx import INPUTS, ORDER, UNITS, regressor_rows
+from fantwin.twin.runs import Array
 
 TIME_CONSTANTS_SAMPLES = np.geomspace(0.5, 2000.0, 40)
 # Older samples say less about the next one; a factor of 0.7 per lag leaves about 0.03 for the oldest of ten.

@@ -23,16 +23,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin.errors import TwinError
-from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
-from twin.fitting.narx_fit import OutputErrorFit
-from twin.fitting.narx_stability import forgets_its_start
-from twin.fitting.narx_start import lag_scale, starting_weights
-from twin.models.narx import Narx
-from twin.models.network import Scaling
-from twin.models.physics import PARAMETER_NAMES
-from twin.progress import Progress, unreported
-from twin.runs import STARTING_SAMPLES, Array, Run
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
+from fantwin.twin.fitting.narx_fit import OutputErrorFit
+from fantwin.twin.fitting.narx_stability import forgets_its_start
+from fantwin.twin.fitting.narx_start import lag_scale, starting_weights
+from fantwin.twin.models.narx import Narx
+from fantwin.twin.models.network import Scaling
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.progress import Progress, unreported
+from fantwin.twin.runs import STARTING_SAMPLES, Array, Run
 
 MAX_SAMPLES, DRAWN_STRETCHES = 16_000, 16
 PRIOR_PRECISIONS = (1e5, 1e4, 1e3, 1e2, 1e1, 1e0)

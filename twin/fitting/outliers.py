@@ -12,7 +12,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from twin.runs import Array, Run
+from fantwin.twin.runs import Array, Run
 
 NEIGHBOURS = 11
 LOCAL_DEVIATIONS, TYPICAL_DEVIATIONS = 5.0, 6.0

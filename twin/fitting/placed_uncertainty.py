@@ -9,11 +9,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from schemas.model_uncertainty import ModelUncertainty
-from twin.fitting.model_uncertainty import SETTLING_SPEEDS, Settling, significant
-from twin.models.model import OdeModel
-from twin.models.physical import fitted_unknowns, physical_parameters
-from twin.runs import Array
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.twin.fitting.model_uncertainty import SETTLING_SPEEDS, Settling, significant
+from fantwin.twin.models.model import OdeModel
+from fantwin.twin.models.physical import fitted_unknowns, physical_parameters
+from fantwin.twin.runs import Array
 
 REACH = 1.5
 """how far fans may settle, in top speeds of the type"""

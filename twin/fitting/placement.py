@@ -12,20 +12,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.twin_card import TwinCard
-from twin.errors import TwinError
-from twin.fitting.free_run_fit import FreeRunFit, fit_free_run
-from twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior, Unknowns, sums_by_fan
-from twin.fitting.identification import Identification
-from twin.fitting.reading_errors import counts, robust_scale
-from twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
-from twin.models import physics
-from twin.models.network import TanhNetwork
-from twin.models.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
-from twin.models.physics import LAG, PARAMETER_NAMES
-from twin.models.right_hand_side import FanEquation
-from twin.progress import Progress
-from twin.runs import Array, Run, common_fans
+from fantwin.schemas.twin_card import TwinCard
+from fantwin.twin.errors import TwinError
+from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_free_run
+from fantwin.twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior, Unknowns, sums_by_fan
+from fantwin.twin.fitting.identification import Identification
+from fantwin.twin.fitting.reading_errors import counts, robust_scale
+from fantwin.twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
+from fantwin.twin.models import physics
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
+from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
+from fantwin.twin.models.right_hand_side import FanEquation
+from fantwin.twin.progress import Progress
+from fantwin.twin.runs import Array, Run, common_fans
 
 STRETCH_TIME_CONSTANTS = 10.0
 MAX_ITERATIONS = 60

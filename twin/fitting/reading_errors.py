@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.fitting.trajectories import Trajectories
-from twin.runs import Array
+from fantwin.twin.fitting.trajectories import Trajectories
+from fantwin.twin.runs import Array
 
 NORMAL_90_PERCENT = 1.645
 OUTLIER_SCALES = 3.0

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.auxiliary import TITLES
-from schemas.reference_conditions import ReferenceConditions
-from twin.fitting.identification import Identification, identify
-from twin.progress import Progress, unreported, within
-from twin.reference import at_reference, ratios_of, reference_of
-from twin.runs import Run
+from fantwin.schemas.auxiliary import TITLES
+from fantwin.schemas.reference_conditions import ReferenceConditions
+from fantwin.twin.fitting.identification import Identification, identify
+from fantwin.twin.progress import Progress, unreported, within
+from fantwin.twin.reference import at_reference, ratios_of, reference_of
+from fantwin.twin.runs import Run
 
 LEAST_VARIATION = 0.01
 """a quantity is tested only if the standard deviation of its ratio (of torque, or of density) exceeds this for a fan"""

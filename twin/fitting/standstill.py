@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from schemas.standstill import SLOWED_SHARE, Standstill
-from twin.runs import Array, Run
+from fantwin.schemas.standstill import SLOWED_SHARE, Standstill
+from fantwin.twin.runs import Array, Run
 
 STEADY_S = 5.0
 STOOD_S = 10.0

@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin.fitting.trajectories import stretch_samples
-from twin.runs import Array, Run
+from fantwin.twin.fitting.trajectories import stretch_samples
+from fantwin.twin.runs import Array, Run
 
 ENOUGH_READINGS = 64_000
 """of all fans together: eight fans at 100 Hz for 80 s"""

@@ -9,16 +9,16 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from twin.errors import TwinError
-from twin.evaluation.accuracy import evaluation_pieces
-from twin.fitting.identification import Identification
-from twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS
-from twin.fitting.trajectories import cut_into_trajectories, stretch_samples
-from twin.models.lag import effective_command
-from twin.models.model import NetworkOde
-from twin.models.physics import LAG
-from twin.progress import Progress, unreported
-from twin.runs import Array, Run
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import evaluation_pieces
+from fantwin.twin.fitting.identification import Identification
+from fantwin.twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS
+from fantwin.twin.fitting.trajectories import cut_into_trajectories, stretch_samples
+from fantwin.twin.models.lag import effective_command
+from fantwin.twin.models.model import NetworkOde
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.progress import Progress, unreported
+from fantwin.twin.runs import Array, Run
 
 LEARNING_RATE = 1e-3
 

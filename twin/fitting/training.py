@@ -26,23 +26,23 @@ from typing import Literal
 
 import numpy as np
 
-from twin.evaluation.accuracy import evaluation_pieces
-from twin.fitting.free_run_fit import FreeRunFit, fit_free_run
-from twin.fitting.free_run_problem import NONE_FREE, FreeRunProblem, NetworkPrior, Point, Prior, Unknowns
-from twin.fitting.identification import Identification, inertia_anchor
-from twin.fitting.initial_weights import PLACEMENTS, initial_weights
-from twin.fitting.mean_model import mean_model
-from twin.fitting.reading_errors import counts, robust_scale
-from twin.fitting.thinning import thinning_factor, windows_of
-from twin.fitting.trajectories import MAX_SAMPLES, cut_into_trajectories, practical_samples, stretch_samples
-from twin.models.integration import WIDE_BATCH
-from twin.models.model import NetworkOde
-from twin.models.network import Scaling
-from twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
-from twin.models.physics import LAG, PARAMETER_NAMES
-from twin.networks import ForEachNetwork, one_after_another
-from twin.progress import Progress, unreported
-from twin.runs import Array, Run
+from fantwin.twin.evaluation.accuracy import evaluation_pieces
+from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_free_run
+from fantwin.twin.fitting.free_run_problem import NONE_FREE, FreeRunProblem, NetworkPrior, Point, Prior, Unknowns
+from fantwin.twin.fitting.identification import Identification, inertia_anchor
+from fantwin.twin.fitting.initial_weights import PLACEMENTS, initial_weights
+from fantwin.twin.fitting.mean_model import mean_model
+from fantwin.twin.fitting.reading_errors import counts, robust_scale
+from fantwin.twin.fitting.thinning import thinning_factor, windows_of
+from fantwin.twin.fitting.trajectories import MAX_SAMPLES, cut_into_trajectories, practical_samples, stretch_samples
+from fantwin.twin.models.integration import WIDE_BATCH
+from fantwin.twin.models.model import NetworkOde
+from fantwin.twin.models.network import Scaling
+from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
+from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
+from fantwin.twin.networks import ForEachNetwork, one_after_another
+from fantwin.twin.progress import Progress, unreported
+from fantwin.twin.runs import Array, Run
 
 Physics = Literal["fixed", "refined"]
 

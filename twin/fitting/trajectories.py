@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.tacho import Tacho
-from twin.errors import TwinError
-from twin.measurement import Measurement
-from twin.runs import Array, Run, common_tacho, starting_samples, starting_speed_rad_s
+from fantwin.schemas.tacho import Tacho
+from fantwin.twin.errors import TwinError
+from fantwin.twin.measurement import Measurement
+from fantwin.twin.runs import Array, Run, common_tacho, starting_samples, starting_speed_rad_s
 
 MIN_SAMPLES = 200
 MAX_SAMPLES = 12_000

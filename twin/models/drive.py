@@ -19,10 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.twin_card import StateLayout
-from twin.models.onnx_nodes import Nodes
-from twin.models.physics import PARAMETER_NAMES
-from twin.runs import Array
+from fantwin.schemas.twin_card import StateLayout
+from fantwin.twin.models.onnx_nodes import Nodes
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.runs import Array
 
 DRIVE_PARAMETERS = ("lowest_command", "friction", "kick_command")
 """A fan's own, after those of its physics."""

@@ -17,8 +17,8 @@ from typing import Protocol
 
 import numpy as np
 
-from twin.models.recursion import linear_recursion
-from twin.runs import Array
+from fantwin.twin.models.recursion import linear_recursion
+from fantwin.twin.runs import Array
 
 Acceleration = Callable[[Array, Array], Array]
 

@@ -7,8 +7,8 @@ its whole impulse reaches the rotor. With lag_s = 0 the effective command is the
 
 import numpy as np
 
-from twin.models.recursion import linear_recursion
-from twin.runs import Array
+from fantwin.twin.models.recursion import linear_recursion
+from fantwin.twin.runs import Array
 
 
 def effective_command(command: Array, step_s: Array, lag_s: Array, lagged_before: Array) -> tuple[Array, Array]:

@@ -5,12 +5,12 @@ A kind of model is one class in a file of its own in this package. twin.kinds li
 
 from typing import ClassVar, Protocol, Self
 
-from schemas.twin_card import NetworkCard, StateLayout
-from twin.models.drive import Drive
-from twin.models.network import TanhNetwork
-from twin.models.onnx_nodes import Nodes
-from twin.models.right_hand_side import FanEquation
-from twin.runs import Array
+from fantwin.schemas.twin_card import NetworkCard, StateLayout
+from fantwin.twin.models.drive import Drive
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.onnx_nodes import Nodes
+from fantwin.twin.models.right_hand_side import FanEquation
+from fantwin.twin.runs import Array
 
 
 class TwinModel(Protocol):

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from onnx import helper
 
-from schemas.twin_card import NetworkCard, StateLayout
-from twin.models.network import Scaling
-from twin.models.onnx_nodes import Nodes, double
-from twin.runs import Array
+from fantwin.schemas.twin_card import NetworkCard, StateLayout
+from fantwin.twin.models.network import Scaling
+from fantwin.twin.models.onnx_nodes import Nodes, double
+from fantwin.twin.runs import Array
 
 UNITS = 50
 ORDER = 10

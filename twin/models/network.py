@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.twin_card import NetworkCard
-from twin.errors import TwinError
-from twin.runs import Array
+from fantwin.schemas.twin_card import NetworkCard
+from fantwin.twin.errors import TwinError
+from fantwin.twin.runs import Array
 
 INPUT_CHOICES = (("speed", "command"), ("speed",))
 

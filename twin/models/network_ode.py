@@ -3,13 +3,13 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-from schemas.twin_card import NetworkCard, StateLayout
-from twin.models.drive import DRIVE_LAYOUT, Drive
-from twin.models.network import TanhNetwork
-from twin.models.ode_graph import ode_graph
-from twin.models.onnx_nodes import Nodes
-from twin.models.right_hand_side import ODE_LAYOUT, FanEquation, advance
-from twin.runs import Array
+from fantwin.schemas.twin_card import NetworkCard, StateLayout
+from fantwin.twin.models.drive import DRIVE_LAYOUT, Drive
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.ode_graph import ode_graph
+from fantwin.twin.models.onnx_nodes import Nodes
+from fantwin.twin.models.right_hand_side import ODE_LAYOUT, FanEquation, advance
+from fantwin.twin.runs import Array
 
 
 @dataclass(frozen=True, eq=False)

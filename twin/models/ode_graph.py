@@ -13,10 +13,10 @@ from collections.abc import Callable
 import numpy as np
 from onnx import helper
 
-from twin.models.drive import DRIVE_PARAMETERS, SMALLEST_STEP_S, Drive
-from twin.models.network import TanhNetwork
-from twin.models.onnx_nodes import Nodes, double
-from twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.models.drive import DRIVE_PARAMETERS, SMALLEST_STEP_S, Drive
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.onnx_nodes import Nodes, double
+from fantwin.twin.models.physics import PARAMETER_NAMES
 
 RK4_WEIGHTS = np.array([[1.0, 2.0, 2.0, 1.0]]) / 6.0
 

@@ -10,13 +10,13 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from schemas.twin_card import NetworkCard, StateLayout
-from twin.models.drive import DRIVE_LAYOUT, Drive
-from twin.models.ode_graph import ode_graph
-from twin.models.onnx_nodes import Nodes
-from twin.models.physics import LAG, PARAMETER_NAMES
-from twin.models.right_hand_side import ODE_LAYOUT, FanEquation, advance
-from twin.runs import Array
+from fantwin.schemas.twin_card import NetworkCard, StateLayout
+from fantwin.twin.models.drive import DRIVE_LAYOUT, Drive
+from fantwin.twin.models.ode_graph import ode_graph
+from fantwin.twin.models.onnx_nodes import Nodes
+from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
+from fantwin.twin.models.right_hand_side import ODE_LAYOUT, FanEquation, advance
+from fantwin.twin.runs import Array
 
 
 @dataclass(frozen=True)

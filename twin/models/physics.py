@@ -8,7 +8,7 @@ lag, which is lag_s = 0. `command` here is the effective command, that is after 
 
 import numpy as np
 
-from twin.runs import Array
+from fantwin.twin.runs import Array
 
 PARAMETER_NAMES = ("J", "alpha", "C_D", "lag_s")
 LAG = PARAMETER_NAMES.index("lag_s")

@@ -8,7 +8,7 @@ bidiagonal system of equations, in one call of LAPACK (dtbtrs). Both do the same
 import numpy as np
 from scipy.linalg import get_lapack_funcs
 
-from twin.runs import Array
+from fantwin.twin.runs import Array
 
 (dtbtrs,) = get_lapack_funcs(("tbtrs",), dtype=np.float64)
 

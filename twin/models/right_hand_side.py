@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.twin_card import StateLayout
-from twin.models import physics
-from twin.models.drive import Drive, drive_settings
-from twin.models.integration import free_run
-from twin.models.lag import effective_command
-from twin.models.network import TanhNetwork
-from twin.models.stepping import step_fans
-from twin.runs import Array
+from fantwin.schemas.twin_card import StateLayout
+from fantwin.twin.models import physics
+from fantwin.twin.models.drive import Drive, drive_settings
+from fantwin.twin.models.integration import free_run
+from fantwin.twin.models.lag import effective_command
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.stepping import step_fans
+from fantwin.twin.runs import Array
 
 ODE_LAYOUT = StateLayout(speed=1, command=1)
 """The one command is the lagged one (twin.models.lag)."""

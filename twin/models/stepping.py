@@ -8,9 +8,9 @@ rounding.
 
 import numpy as np
 
-from twin.models.network import TanhNetwork
-from twin.models.physics import LAG
-from twin.runs import Array
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.runs import Array
 
 
 class NetworkTerm:

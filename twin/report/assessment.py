@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from twin.report.content import FanSummary, Parameter, Summary
+from fantwin.twin.report.content import FanSummary, Parameter, Summary
 
 Level = Literal["as declared", "looser than declared", "not followed"]
 

@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from schemas.twin_card import DataCard, DriveCard, TwinCard
-from twin.build import runs_of_twin
-from twin.evaluation.accuracy import Evaluation, Figures, evaluation_pieces
-from twin.evaluation.residual_analysis import ResidualAnalysis, analysis_of
-from twin.export.fan_rows import drive_of_fans, fan_rows
-from twin.export.onnx_twin import OnnxTwin
-from twin.report.recording_sums import Extent, RecordingSums, extent_of, free_run_of_piece
-from twin.report.speed_bins import SpeedBin
-from twin.report.timeline import Timeline, timeline
-from twin.runs import Array, Run
+from fantwin.schemas.twin_card import DataCard, DriveCard, TwinCard
+from fantwin.twin.build import runs_of_twin
+from fantwin.twin.evaluation.accuracy import Evaluation, Figures, evaluation_pieces
+from fantwin.twin.evaluation.residual_analysis import ResidualAnalysis, analysis_of
+from fantwin.twin.export.fan_rows import drive_of_fans, fan_rows
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.report.recording_sums import Extent, RecordingSums, extent_of, free_run_of_piece
+from fantwin.twin.report.speed_bins import SpeedBin
+from fantwin.twin.report.timeline import Timeline, timeline
+from fantwin.twin.runs import Array, Run
 
 
 @dataclass(frozen=True)

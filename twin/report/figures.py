@@ -12,12 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from schemas.auxiliary import AUXILIARY, AuxiliaryColumn, axis_range
-from schemas.model_uncertainty import ModelUncertainty
-from twin.report.content import Content, FanContent
-from twin.report.steady_states import StaticCurve
-from twin.report.timeline import broken_at, kept_samples
-from twin.runs import Array
+from fantwin.schemas.auxiliary import AUXILIARY, AuxiliaryColumn, axis_range
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.twin.report.content import Content, FanContent
+from fantwin.twin.report.steady_states import StaticCurve
+from fantwin.twin.report.timeline import broken_at, kept_samples
+from fantwin.twin.runs import Array
 
 MEASURED, TWIN, BAND, OUTSIDE, COMMAND, GAP = "#454545", "#006e30", "#a6dfb9", "#d62020", "#3b5ba5", "#ebebeb"
 STYLE: dict[Any, Any] = {

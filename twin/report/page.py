@@ -9,14 +9,14 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from schemas.model_uncertainty import ModelUncertainty
-from twin.evaluation.residual_analysis import SIGNIFICANCE
-from twin.kinds import kind_title
-from twin.report import figures
-from twin.report.assessment import AS_DECLARED, LOOSER, Assessment, assess, level_of
-from twin.report.content import Content, FanContent
-from twin.report.record_next import least_known
-from twin.report.steady_states import StaticCurve, static_curve
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.twin.evaluation.residual_analysis import SIGNIFICANCE
+from fantwin.twin.kinds import kind_title
+from fantwin.twin.report import figures
+from fantwin.twin.report.assessment import AS_DECLARED, LOOSER, Assessment, assess, level_of
+from fantwin.twin.report.content import Content, FanContent
+from fantwin.twin.report.record_next import least_known
+from fantwin.twin.report.steady_states import StaticCurve, static_curve
 
 MOST_FANS_DRAWN = 12
 FOUR_DIGITS = ".4g"
@@ -49,7 +49,7 @@ def report_page(content: Content, assessment: Assessment | None = None, alarms: 
     """The page. assessment: by default, that of the content. alarms: what raises one with this twin, in sentences."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"shown": shown, "svg": Markup}
-    template = environment.from_string(files("twin.report").joinpath("page.html").read_text(encoding="utf-8"))
+    template = environment.from_string(files("fantwin.twin.report").joinpath("page.html").read_text(encoding="utf-8"))
     drawn = drawn_fans(content.fans)
     return template.render(
         content=content,

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.model_uncertainty import ModelUncertainty
-from schemas.twin_card import DriveCard
-from twin.report.steady_states import StaticCurve
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.schemas.twin_card import DriveCard
+from fantwin.twin.report.steady_states import StaticCurve
 
 LEAST_RATIO = 1.5
 """to the standard deviation where the twin was trained: more data of the same kind hardly reduce a smaller one"""

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from schemas.twin_card import TwinCard
-from twin.build import RunsOfTwin
-from twin.errors import TwinError
-from twin.evaluation.accuracy import (
+from fantwin.schemas.twin_card import TwinCard
+from fantwin.twin.build import RunsOfTwin
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import (
     FigureSums,
     Flags,
     compared_readings,
@@ -20,9 +20,9 @@ from twin.evaluation.accuracy import (
     figure_sums,
     free_run_readings,
 )
-from twin.evaluation.residual_analysis import ResidualGrid, ResidualSums, residual_grid, residual_sums
-from twin.report.speed_bins import SpeedSums, speed_sums
-from twin.runs import Array, Run
+from fantwin.twin.evaluation.residual_analysis import ResidualGrid, ResidualSums, residual_grid, residual_sums
+from fantwin.twin.report.speed_bins import SpeedSums, speed_sums
+from fantwin.twin.runs import Array, Run
 
 RANGE_TOLERANCE = 0.05
 """of the width of the trained command range; as in production (docs/explanation/deciding.md)"""

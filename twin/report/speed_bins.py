@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.runs import Array
+from fantwin.twin.runs import Array
 
 BINS = 20
 FEWEST = 20

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.models import physics
-from twin.models.model import TwinModel
-from twin.runs import Array, Run
+from fantwin.twin.models import physics
+from fantwin.twin.models.model import TwinModel
+from fantwin.twin.runs import Array, Run
 
 SETTLED = 0.01
 """A fan has settled when the rest of its step is less than this share of its top speed."""

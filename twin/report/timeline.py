@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.runs import Array, Run
+from fantwin.twin.runs import Array, Run
 
 Indices = NDArray[np.int64]
 

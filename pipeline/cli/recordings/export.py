@@ -15,17 +15,17 @@ from typing import Annotated, Any, Self
 import typer
 from rich.console import Console
 
-from pipeline.cli.options import JsonOption
-from pipeline.cli.twins.training_data import make_folder
-from pipeline.errors import UsageError, UserError
-from pipeline.extras import require
-from pipeline.recordings.arrays import Block, read_topics
-from pipeline.recordings.left_out import left_out_hint
-from pipeline.recordings.order import in_order
-from pipeline.recordings.reading import read_recording
-from pipeline.recordings.records import ACTIVE_SUFFIX
-from pipeline.recordings.run_recordings import run_metadata
-from pipeline.recordings.tables import Form, TableFile, open_table
+from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.twins.training_data import make_folder
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.extras import require
+from fantwin.pipeline.recordings.arrays import Block, read_topics
+from fantwin.pipeline.recordings.left_out import left_out_hint
+from fantwin.pipeline.recordings.order import in_order
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX
+from fantwin.pipeline.recordings.run_recordings import run_metadata
+from fantwin.pipeline.recordings.tables import Form, TableFile, open_table
 
 _PART = ".part"
 

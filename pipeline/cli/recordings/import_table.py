@@ -14,26 +14,26 @@ import numpy as np
 import typer
 from pydantic import ValidationError
 
-from pipeline.cli.options import (
+from fantwin.pipeline.cli.options import (
     CurrentOption,
     JsonOption,
     SupplyVoltageOption,
     TemperatureOption,
     auxiliary_options,
 )
-from pipeline.config.models import NAME_PATTERN
-from pipeline.devices.measured_table import Table, read_table
-from pipeline.devices.tacho_evidence import tacho_hints
-from pipeline.errors import UsageError, UserError
-from pipeline.recordings.logs.formats import LogFormat, log_format, open_log
-from pipeline.recordings.logs.samples_of_log import read_samples
-from pipeline.recordings.reading import TACHO_KEY
-from pipeline.recordings.writing import RecordingWriter
-from schemas.header import Header
-from schemas.messages import Array, Raw
-from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan, tachos_to_json
-from schemas.topics import RESERVED_TRAY_NAMES, tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.models import NAME_PATTERN
+from fantwin.pipeline.devices.measured_table import Table, read_table
+from fantwin.pipeline.devices.tacho_evidence import tacho_hints
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.recordings.logs.formats import LogFormat, log_format, open_log
+from fantwin.pipeline.recordings.logs.samples_of_log import read_samples
+from fantwin.pipeline.recordings.reading import TACHO_KEY
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan, tachos_to_json
+from fantwin.schemas.topics import RESERVED_TRAY_NAMES, tray_key
+from fantwin.schemas.units import NS_PER_S
 
 SITE = "imported"
 SAMPLES_PER_MESSAGE = 100

@@ -15,22 +15,22 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.cli.options import JsonOption
-from pipeline.cli.progress import working
-from pipeline.launch.loss_accounting import label, losses
-from pipeline.launch.refused_input import refused, refused_lines
-from pipeline.launch.stage_notes import note_lines, notes_as_json
-from pipeline.recordings.clips.clip import clip_lines
-from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
-from pipeline.recordings.dates import format_clock, format_local
-from pipeline.recordings.metadata import CONFIGURATION
-from pipeline.recordings.reading import left_out_of
-from pipeline.recordings.records import active_path
-from pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
-from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
-from schemas.health import Health
-from schemas.streams import StreamId
-from schemas.units import NS_PER_S
+from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.launch.loss_accounting import label, losses
+from fantwin.pipeline.launch.refused_input import refused, refused_lines
+from fantwin.pipeline.launch.stage_notes import note_lines, notes_as_json
+from fantwin.pipeline.recordings.clips.clip import clip_lines
+from fantwin.pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
+from fantwin.pipeline.recordings.dates import format_clock, format_local
+from fantwin.pipeline.recordings.metadata import CONFIGURATION
+from fantwin.pipeline.recordings.reading import left_out_of
+from fantwin.pipeline.recordings.records import active_path
+from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
+from fantwin.pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
+from fantwin.schemas.health import Health
+from fantwin.schemas.streams import StreamId
+from fantwin.schemas.units import NS_PER_S
 
 _WIDEST = 1000
 """columns of a table; a terminal that is narrower wraps its lines, and every name can be copied and searched for"""

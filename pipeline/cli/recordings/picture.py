@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from pipeline.cli.options import JsonOption, ViewLayout, fan_numbers
-from pipeline.extras import require
+from fantwin.pipeline.cli.options import JsonOption, ViewLayout, fan_numbers
+from fantwin.pipeline.extras import require
 
 
 def picture(
@@ -33,7 +33,7 @@ def picture(
     Example: fantwin picture runs/demo/view.rrd --fans 2,5 --at 25 -o view.png
     """
     require("a picture of a view", "view")
-    from pipeline.viewing.rerun_picture import draw_picture  # noqa: PLC0415  an extra
+    from fantwin.pipeline.viewing.rerun_picture import draw_picture  # noqa: PLC0415  an extra
 
     with Console(stderr=True).status(f"drawing {view_file}"):
         drawn = draw_picture(

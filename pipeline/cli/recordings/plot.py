@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from pipeline.cli.options import JsonOption, fan_numbers
-from pipeline.cli.recordings.with_scores import with_scores
-from pipeline.errors import UsageError
-from pipeline.extras import require
+from fantwin.pipeline.cli.options import JsonOption, fan_numbers
+from fantwin.pipeline.cli.recordings.with_scores import with_scores
+from fantwin.pipeline.errors import UsageError
+from fantwin.pipeline.extras import require
 
 
 def plot(
@@ -38,7 +38,7 @@ def plot(
     Example: fantwin plot runs/demo/recording.mcap --truth runs/demo/truth.json -o bands.png
     """
     require("a plot", "report", "matplotlib")
-    from pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  an extra
+    from fantwin.pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  an extra
 
     if unit not in ("rpm", "rad/s", None):
         raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")

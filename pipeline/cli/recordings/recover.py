@@ -8,14 +8,14 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli.options import JsonOption
-from pipeline.cli.progress import working
-from pipeline.recordings.contents import losses, messages_as_text
-from pipeline.recordings.dates import format_local
-from pipeline.recordings.repair import Recovery
-from pipeline.recordings.repair import recover as recover_file
-from pipeline.recordings.scan import Scan
-from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
+from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.recordings.contents import losses, messages_as_text
+from fantwin.pipeline.recordings.dates import format_local
+from fantwin.pipeline.recordings.repair import Recovery
+from fantwin.pipeline.recordings.repair import recover as recover_file
+from fantwin.pipeline.recordings.scan import Scan
+from fantwin.pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 
 
 def recover(

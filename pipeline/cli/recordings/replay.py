@@ -17,21 +17,21 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from pipeline.cli.options import JsonOption, SetOption
-from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
-from pipeline.errors import UsageError, UserError
-from pipeline.recordings.dates import format_utc
-from pipeline.recordings.left_out import left_out_hint
-from pipeline.recordings.remote import local_copies, matching, recording_path
-from pipeline.replay.live.keyboard import Keys
-from pipeline.replay.live.pace import Pace
-from pipeline.replay.live.player import Progress
-from pipeline.replay.live.publishing import Outcome, publish
-from pipeline.replay.live.recording_playback import RecordingPlayback
-from pipeline.replay.resolve_config import resolve_config
-from pipeline.replay.stage_chain import replay_starts
-from pipeline.runtime.signals import stop_on_signals
-from schemas.topics import TOPICS
+from fantwin.pipeline.cli.options import JsonOption, SetOption
+from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.recordings.dates import format_utc
+from fantwin.pipeline.recordings.left_out import left_out_hint
+from fantwin.pipeline.recordings.remote import local_copies, matching, recording_path
+from fantwin.pipeline.replay.live.keyboard import Keys
+from fantwin.pipeline.replay.live.pace import Pace
+from fantwin.pipeline.replay.live.player import Progress
+from fantwin.pipeline.replay.live.publishing import Outcome, publish
+from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
+from fantwin.pipeline.replay.resolve_config import resolve_config
+from fantwin.pipeline.replay.stage_chain import replay_starts
+from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.schemas.topics import TOPICS
 
 REPLAYED = tuple(topic.name for topic in TOPICS if topic.recorded and not topic.is_of_session)
 """the topics replayed by default"""
@@ -137,8 +137,8 @@ def replay(
     if not 0.0 <= start < min(end, LONGEST_S) or (end > LONGEST_S and not math.isinf(end)):
         raise UsageError("--start and --end: give 0 <= --start < --end, in seconds")
     if offline:
-        from pipeline.cli.recordings.replay_offline import run_offline  # noqa: PLC0415  loads the stages
-        from pipeline.cli.recordings.score_again import Again  # noqa: PLC0415
+        from fantwin.pipeline.cli.recordings.replay_offline import run_offline  # noqa: PLC0415  loads the stages
+        from fantwin.pipeline.cli.recordings.score_again import Again  # noqa: PLC0415
 
         again = Again(config, tuple(overrides or ()), twin, verify, start, end)
         run_offline(files, again, output, RecordingsInParallel(jobs, scheduler, skip_bad), json_output=json_output)

@@ -17,19 +17,19 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.cli.options import make_folder
-from pipeline.cli.progress import interruptible
-from pipeline.cli.recordings.score_again import Again, score_again, together
-from pipeline.cli.recordings_in_parallel import RecordingsInParallel
-from pipeline.errors import UsageError, UserError
-from pipeline.recordings.dates import format_utc, has_date
-from pipeline.recordings.grouping import describe, recordings_of
-from pipeline.recordings.records import active_path
-from pipeline.recordings.run_recordings import recorded_files
-from pipeline.replay.offline.tolerance import RELATIVE
-from schemas.messages import Diagnosis
-from schemas.units import NS_PER_S
-from scoring.diagnosis.shown_causes import most_probable
+from fantwin.pipeline.cli.options import make_folder
+from fantwin.pipeline.cli.progress import interruptible
+from fantwin.pipeline.cli.recordings.score_again import Again, score_again, together
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.recordings.dates import format_utc, has_date
+from fantwin.pipeline.recordings.grouping import describe, recordings_of
+from fantwin.pipeline.recordings.records import active_path
+from fantwin.pipeline.recordings.run_recordings import recorded_files
+from fantwin.pipeline.replay.offline.tolerance import RELATIVE
+from fantwin.schemas.messages import Diagnosis
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.diagnosis.shown_causes import most_probable
 
 EXIT_DIFFERS, EXIT_CANNOT_COMPARE, EXIT_LOST = 1, 2, 3
 _SHOWN = 40

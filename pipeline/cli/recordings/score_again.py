@@ -10,14 +10,14 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from pipeline.cli.progress import show_part
-from pipeline.errors import UserError
-from pipeline.recordings.records import MADE_BY_KEY, this_program
-from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
-from pipeline.replay.offline.comparison import CannotCompareError
-from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
-from pipeline.replay.offline.rescoring import RescoredTray, rescore
-from schemas.units import NS_PER_S
+from fantwin.pipeline.cli.progress import show_part
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.records import MADE_BY_KEY, this_program
+from fantwin.pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
+from fantwin.pipeline.replay.offline.comparison import CannotCompareError
+from fantwin.pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
+from fantwin.pipeline.replay.offline.rescoring import RescoredTray, rescore
+from fantwin.schemas.units import NS_PER_S
 
 SUMS = ("hours", "samples", "lost", "restarts")
 LISTS = ("not_scored", "damage", "other_version")

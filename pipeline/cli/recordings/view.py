@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from pipeline.cli.options import JsonOption, ViewLayout
-from pipeline.cli.recordings.with_scores import with_scores
-from pipeline.errors import UsageError, UserError
-from pipeline.extras import require
+from fantwin.pipeline.cli.options import JsonOption, ViewLayout
+from fantwin.pipeline.cli.recordings.with_scores import with_scores
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.extras import require
 
 
 def view(
@@ -38,8 +38,8 @@ def view(
     Example: fantwin view runs/demo/recording.mcap --layout alarms -o alarms.rrd
     """
     require("a view", "view")
-    from pipeline.viewing.recorded_view import recorded_site, write_view  # noqa: PLC0415  an extra
-    from pipeline.viewing.view_of_site import ViewOptions  # noqa: PLC0415
+    from fantwin.pipeline.viewing.recorded_view import recorded_site, write_view  # noqa: PLC0415  an extra
+    from fantwin.pipeline.viewing.view_of_site import ViewOptions  # noqa: PLC0415
 
     if output.suffix != ".rrd":
         raise UsageError(f"{output}: name a file that ends in .rrd with -o")

@@ -9,11 +9,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from pipeline.cli.options import make_folder
-from pipeline.cli.recordings.score_again import Again, score_again
-from pipeline.errors import UserError
-from pipeline.recordings.left_out import RAW, left_out
-from pipeline.recordings.run_recordings import recorded_files
+from fantwin.pipeline.cli.options import make_folder
+from fantwin.pipeline.cli.recordings.score_again import Again, score_again
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.left_out import RAW, left_out
+from fantwin.pipeline.recordings.run_recordings import recorded_files
 
 
 @dataclass

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from pipeline.cli.simulation.simulated_hwmon import InjectedFaults
-from pipeline.devices.hwmon_simulator import FAULT_FILE, HwmonTree, play_hwmon
-from pipeline.devices.simulated_device import PlaybackCounts, PseudoTerminal, play, wait_for_reader
-from pipeline.devices.table_device import TableDevice
-from pipeline.runtime.signals import stop_on_signals
-from schemas import wire
-from schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from fantwin.pipeline.cli.simulation.simulated_hwmon import InjectedFaults
+from fantwin.pipeline.devices.hwmon_simulator import FAULT_FILE, HwmonTree, play_hwmon
+from fantwin.pipeline.devices.simulated_device import PlaybackCounts, PseudoTerminal, play, wait_for_reader
+from fantwin.pipeline.devices.table_device import TableDevice
+from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.schemas import wire
+from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
 if TYPE_CHECKING:
-    from simulation.tray import SimulatedTray
+    from fantwin.simulation.tray import SimulatedTray
 
 
 def serve_line(

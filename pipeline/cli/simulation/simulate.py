@@ -12,28 +12,28 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pipeline.cli.options import (
+from fantwin.pipeline.cli.options import (
     CurrentOption,
     JsonOption,
     SupplyVoltageOption,
     TemperatureOption,
     auxiliary_options,
 )
-from pipeline.cli.simulation.serving import serve_hwmon, serve_line
-from pipeline.cli.simulation.simulated_hwmon import RATE_HZ, tachos_of
-from pipeline.cli.simulation.simulated_tray import made_tacho, made_tray, measured_columns
-from pipeline.cli.simulation.summary import count_text, save, save_start, summary_of_file, summary_of_tray
-from pipeline.devices.measured_table import read_table
-from pipeline.devices.simulated_device import PlaybackCounts
-from pipeline.devices.table_device import TableDevice
-from pipeline.errors import UsageError, UserError
-from pipeline.recordings.simulated import record
-from schemas import wire
-from schemas.tacho import INSTANTANEOUS
-from schemas.units import SpeedUnit
+from fantwin.pipeline.cli.simulation.serving import serve_hwmon, serve_line
+from fantwin.pipeline.cli.simulation.simulated_hwmon import RATE_HZ, tachos_of
+from fantwin.pipeline.cli.simulation.simulated_tray import made_tacho, made_tray, measured_columns
+from fantwin.pipeline.cli.simulation.summary import count_text, save, save_start, summary_of_file, summary_of_tray
+from fantwin.pipeline.devices.measured_table import read_table
+from fantwin.pipeline.devices.simulated_device import PlaybackCounts
+from fantwin.pipeline.devices.table_device import TableDevice
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.recordings.simulated import record
+from fantwin.schemas import wire
+from fantwin.schemas.tacho import INSTANTANEOUS
+from fantwin.schemas.units import SpeedUnit
 
 if TYPE_CHECKING:
-    from simulation.tray import SimulatedTray
+    from fantwin.simulation.tray import SimulatedTray
 
 _LINE = "Serial line"
 _HWMON = "Fans of a computer instead"

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from pipeline.devices.hwmon_chips import chip_of
-from pipeline.devices.hwmon_simulator import FAULT_FILE
-from schemas.tacho import INSTANTANEOUS, Tacho
+from fantwin.pipeline.devices.hwmon_chips import chip_of
+from fantwin.pipeline.devices.hwmon_simulator import FAULT_FILE
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
 
 if TYPE_CHECKING:
-    from simulation.tray import SimulatedTray
+    from fantwin.simulation.tray import SimulatedTray
 
 RATE_HZ = 20.0
 """at which the files are served"""
@@ -59,8 +59,8 @@ class InjectedFaults:
                 self._begin(line)
 
     def _begin(self, line: str) -> None:
-        from simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
-        from simulation.faults import parse_fault  # noqa: PLC0415
+        from fantwin.simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
+        from fantwin.simulation.faults import parse_fault  # noqa: PLC0415
 
         tray = self._tray
         faults = tray.settings.faults

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from pipeline.errors import UsageError
-from schemas.auxiliary import AUXILIARY
-from schemas.tacho import Tacho
+from fantwin.pipeline.errors import UsageError
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.tacho import Tacho
 
 if TYPE_CHECKING:
-    from simulation.tray import SimulatedTray
+    from fantwin.simulation.tray import SimulatedTray
 
 _TACHO_OPTIONS = {
     "kind": "--tacho",
@@ -55,12 +55,12 @@ def made_tray(
     Raises:
         UsageError: a setting is out of range, or a fault cannot be parsed.
     """
-    from simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
-    from simulation.faults import parse_fault  # noqa: PLC0415
-    from simulation.plant import DeviceClock  # noqa: PLC0415
-    from simulation.surroundings import Surroundings  # noqa: PLC0415
-    from simulation.tacho import NoisyTacho, TachoSettings  # noqa: PLC0415
-    from simulation.tray import SimulatedTray, TraySettings  # noqa: PLC0415
+    from fantwin.simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
+    from fantwin.simulation.faults import parse_fault  # noqa: PLC0415
+    from fantwin.simulation.plant import DeviceClock  # noqa: PLC0415
+    from fantwin.simulation.surroundings import Surroundings  # noqa: PLC0415
+    from fantwin.simulation.tacho import NoisyTacho, TachoSettings  # noqa: PLC0415
+    from fantwin.simulation.tray import SimulatedTray, TraySettings  # noqa: PLC0415
 
     measured = TachoSettings(tachos, NoisyTacho(noise_rad_s), **shares)
     try:

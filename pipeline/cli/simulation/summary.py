@@ -7,12 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.devices.simulated_device import PlaybackCounts
-from pipeline.devices.table_device import TableDevice
-from pipeline.errors import UserError
+from fantwin.pipeline.devices.simulated_device import PlaybackCounts
+from fantwin.pipeline.devices.table_device import TableDevice
+from fantwin.pipeline.errors import UserError
 
 if TYPE_CHECKING:
-    from simulation.tray import SimulatedTray
+    from fantwin.simulation.tray import SimulatedTray
 
 Summary = dict[str, Any]
 
@@ -25,7 +25,7 @@ def _counts(played: PlaybackCounts) -> Summary:
 
 def summary_of_tray(tray: SimulatedTray, played: PlaybackCounts, *, complete: bool) -> Summary:
     """The ground truth of a simulated tray, and how many of its samples were sent, dropped and lost."""
-    from simulation.truth import truth  # noqa: PLC0415
+    from fantwin.simulation.truth import truth  # noqa: PLC0415
 
     return truth(tray, played.start_ns, complete=complete, counts=_counts(played))
 
@@ -48,7 +48,7 @@ def save(path: Path | None, summary: Summary) -> None:
     Raises:
         UserError: it cannot be written.
     """
-    from simulation.truth import write_truth  # noqa: PLC0415
+    from fantwin.simulation.truth import write_truth  # noqa: PLC0415
 
     if path is None:
         return

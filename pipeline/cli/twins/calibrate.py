@@ -14,29 +14,29 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from pipeline.cli.options import JsonOption, SetOption
-from pipeline.cli.progress import interruptible, show_part
-from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
-from pipeline.cli.twins.calibration_check import Check, check_declared_rate
-from pipeline.cli.twins.drops_found import drop_lines, drops_found
-from pipeline.cli.twins.marked_running import marked_running
-from pipeline.cli.twins.outlier_run_check import outlier_warnings
-from pipeline.cli.twins.training_data import FromOption, ToOption, twin_errors
-from pipeline.errors import UsageError, UserError
-from pipeline.recordings.remote import matching, recording_path
-from pipeline.replay.offline.calibration_of_twin import (
+from fantwin.pipeline.cli.options import JsonOption, SetOption
+from fantwin.pipeline.cli.progress import interruptible, show_part
+from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.twins.calibration_check import Check, check_declared_rate
+from fantwin.pipeline.cli.twins.drops_found import drop_lines, drops_found
+from fantwin.pipeline.cli.twins.marked_running import marked_running
+from fantwin.pipeline.cli.twins.outlier_run_check import outlier_warnings
+from fantwin.pipeline.cli.twins.training_data import FromOption, ToOption, twin_errors
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.recordings.remote import matching, recording_path
+from fantwin.pipeline.replay.offline.calibration_of_twin import (
     LARGEST_PER_DAY,
     CalibratedTwin,
     calibrated,
     number_text,
     rate_text,
 )
-from pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
-from pipeline.replay.offline.kept_bins import KeptBins
-from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.units import RAD_S_PER_UNIT
-from scoring.calibration.calibration import Calibration, changed_priors, expected_alarms, needed_fan_hours
-from scoring.model.priors import Priors
+from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
+from fantwin.pipeline.replay.offline.kept_bins import KeptBins
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.scoring.calibration.calibration import Calibration, changed_priors, expected_alarms, needed_fan_hours
+from fantwin.scoring.model.priors import Priors
 
 EXIT_BROKEN = 3
 MOST_KEPT_BYTES = 1 << 30
@@ -242,7 +242,7 @@ def _named_once(recordings: list[Path]) -> None:
 
 def _write(twin: Path, output: Path, calibration: Calibration) -> None:
     with twin_errors():
-        from twin.export.card_entries import with_card_entries  # noqa: PLC0415  the command line loads twin only when needed
+        from fantwin.twin.export.card_entries import with_card_entries  # noqa: PLC0415  the command line loads twin only when needed
 
         content = with_card_entries(twin.read_bytes(), {"calibration": json.loads(calibration.model_dump_json())})
     beside = output.with_name(output.name + ".new")

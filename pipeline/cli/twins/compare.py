@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.cli.options import JsonOption, make_folder
-from pipeline.cli.progress import interruptible, training_progress
-from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
-from pipeline.cli.twins.figures import figures_in, shown
-from pipeline.cli.twins.training_data import (
+from fantwin.pipeline.cli.options import JsonOption, make_folder
+from fantwin.pipeline.cli.progress import interruptible, training_progress
+from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.twins.figures import figures_in, shown
+from fantwin.pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
     Part,
@@ -34,11 +34,11 @@ from pipeline.cli.twins.training_data import (
     read_training_data,
     twin_errors,
 )
-from pipeline.errors import UsageError, UserError
-from pipeline.recordings.remote import matching, recording_path
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.recordings.remote import matching, recording_path
 
 if TYPE_CHECKING:
-    from twin.comparison import Candidate, Contender, Source
+    from fantwin.twin.comparison import Candidate, Contender, Source
 
 SOURCE_HEADER = {"held-out": "held\nout", "test": "test\nrmse"}
 SOURCE_MEANING = {
@@ -104,7 +104,7 @@ def compare(
     not_compared = f"no comparison; the twins that were finished are in {output}" if output else "no comparison"
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible(not_compared), twin_errors():
-        from twin.comparison import best, contend, source_of  # noqa: PLC0415  loads twin only when it is needed
+        from fantwin.twin.comparison import best, contend, source_of  # noqa: PLC0415  loads twin only when it is needed
 
         chosen = _chosen(model)
         part = Part(tray, fans, from_s, to_s, tuple(window_s or ()))
@@ -224,7 +224,7 @@ def table(result: dict[str, Any]) -> Table:
 
 
 def _chosen(names: str | None) -> list[Candidate]:
-    from twin.comparison import all_candidates  # noqa: PLC0415
+    from fantwin.twin.comparison import all_candidates  # noqa: PLC0415
 
     by_name = {candidate.name: candidate for candidate in all_candidates()}
     wanted = list(by_name) if names is None else [name.strip() for name in names.split(",")]

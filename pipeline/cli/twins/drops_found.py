@@ -11,16 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.replay.offline.calibration_of_twin import calibration_in
-from pipeline.replay.offline.healthy_runs import FreeLimit
-from pipeline.runtime.modelled_fans import modelled_fans
-from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
-from schemas.enums import InvalidReason
-from schemas.messages import Array, Prediction
-from schemas.units import NS_PER_S
-from scoring.calibration.calibration import Calibration
-from scoring.model.bins import Bins, bin_ns_of
-from scoring.model.operation import Fans
+from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
+from fantwin.pipeline.replay.offline.healthy_runs import FreeLimit
+from fantwin.pipeline.runtime.modelled_fans import modelled_fans
+from fantwin.pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Array, Prediction
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.calibration.calibration import Calibration
+from fantwin.scoring.model.bins import Bins, bin_ns_of
+from fantwin.scoring.model.operation import Fans
 
 SPEEDS = (0.25, 0.5, 0.75, 1.0)
 """shares of the top speed of training"""

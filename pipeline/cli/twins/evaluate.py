@@ -15,11 +15,11 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.cli.options import JsonOption, fan_numbers
-from pipeline.cli.progress import interruptible
-from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
-from pipeline.cli.twins.figures import figures_in, sentence, shown
-from pipeline.cli.twins.training_data import (
+from fantwin.pipeline.cli.options import JsonOption, fan_numbers
+from fantwin.pipeline.cli.progress import interruptible
+from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
+from fantwin.pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
     Part,
@@ -33,18 +33,18 @@ from pipeline.cli.twins.training_data import (
     report_damage,
     twin_errors,
 )
-from pipeline.errors import UsageError
+from fantwin.pipeline.errors import UsageError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from twin.evaluation.accuracy import Evaluation
-    from twin.evaluation.resampling import Grid
-    from twin.evaluation.residual_analysis import ResidualAnalysis
-    from twin.report.assessment import Assessment
-    from twin.report.content import Summary
-    from twin.report.recording_sums import Extent
+    from fantwin.twin.evaluation.accuracy import Evaluation
+    from fantwin.twin.evaluation.resampling import Grid
+    from fantwin.twin.evaluation.residual_analysis import ResidualAnalysis
+    from fantwin.twin.report.assessment import Assessment
+    from fantwin.twin.report.content import Summary
+    from fantwin.twin.report.recording_sums import Extent
 
 EXPECTED_COVERAGE = math.erf(math.sqrt(2.0))
 """share of a normal distribution within two standard deviations"""
@@ -79,10 +79,10 @@ def evaluate(
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible("nothing was evaluated"), twin_errors(), pool:
         # The command line loads twin only when it is needed.
-        from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
-        from twin.report.assessment import assess  # noqa: PLC0415
-        from twin.report.content import SpeedUnit, summary_of  # noqa: PLC0415
-        from twin.report.recording_sums import common_extent  # noqa: PLC0415
+        from fantwin.twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
+        from fantwin.twin.report.assessment import assess  # noqa: PLC0415
+        from fantwin.twin.report.content import SpeedUnit, summary_of  # noqa: PLC0415
+        from fantwin.twin.report.recording_sums import common_extent  # noqa: PLC0415
 
         loaded = OnnxTwin(twin)
         known = list(pool.map(partial(_known_of, part=part), recordings, "reading"))
@@ -105,7 +105,7 @@ def evaluate(
 
 def _known_of(path: Path, part: Part) -> tuple[TrainingData, Extent]:
     """What must be known of all recordings before one is evaluated; without the samples."""
-    from twin.report.recording_sums import extent_of  # noqa: PLC0415
+    from fantwin.twin.report.recording_sums import extent_of  # noqa: PLC0415
 
     data = read_recording_data(path, part)
     with twin_errors():
@@ -114,10 +114,10 @@ def _known_of(path: Path, part: Part) -> tuple[TrainingData, Extent]:
 
 def _sums_of(path: Path, part: Part, twin: Path, extent: Extent, grids: Sequence[Grid]) -> list[Any]:
     """The RecordingSums of one recording, and its FigureSums on each of the other grids."""
-    from twin.build import evaluation_sums, runs_of_twin  # noqa: PLC0415
-    from twin.evaluation.resampling import on_grid  # noqa: PLC0415
-    from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
-    from twin.report.recording_sums import recording_sums  # noqa: PLC0415
+    from fantwin.twin.build import evaluation_sums, runs_of_twin  # noqa: PLC0415
+    from fantwin.twin.evaluation.resampling import on_grid  # noqa: PLC0415
+    from fantwin.twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
+    from fantwin.twin.report.recording_sums import recording_sums  # noqa: PLC0415
 
     numbers = fan_numbers(part.fans)
     with twin_errors():

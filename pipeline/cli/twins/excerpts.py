@@ -9,8 +9,8 @@ from pathlib import Path
 
 import typer
 
-from pipeline.cli.twins.training_data import TrainingData, joined, training_data_of, twin_errors
-from pipeline.recordings.excerpts import ExcerptReader
+from fantwin.pipeline.cli.twins.training_data import TrainingData, joined, training_data_of, twin_errors
+from fantwin.pipeline.recordings.excerpts import ExcerptReader
 
 MOST_HZ = 100.0
 """samples of faster lines are thinned to at most about this rate, that of the fastest grid by default"""
@@ -50,7 +50,7 @@ def each_excerpt(excerpts: Iterable[Excerpt]) -> Iterator[TrainingData]:
 
 def _thinned(data: TrainingData) -> TrainingData:
     with twin_errors():
-        from twin.evaluation.resampling import thinned  # noqa: PLC0415  the command line loads twin only when it is needed
+        from fantwin.twin.evaluation.resampling import thinned  # noqa: PLC0415  the command line loads twin only when it is needed
 
         runs = [thinned(run, every_of(1.0 / run.median_period_s)) for run in data.runs]
     sources = [replace(source, samples=run.samples) for source, run in zip(data.sources, runs, strict=True)]

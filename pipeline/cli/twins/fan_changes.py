@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.cli.twins.excerpts import Excerpt, each_excerpt
-from pipeline.cli.twins.training_data import TrainingData, twin_errors
+from fantwin.pipeline.cli.twins.excerpts import Excerpt, each_excerpt
+from fantwin.pipeline.cli.twins.training_data import TrainingData, twin_errors
 
 if TYPE_CHECKING:
-    from schemas.messages import Array
+    from fantwin.schemas.messages import Array
 
 MOST_CHANGE = 0.03
 """of the speed of a fan since the reference that counts as healthy: about a seventh of what a blocked inlet or a lost
@@ -27,8 +27,8 @@ def residual_of(twin: Path, data: TrainingData, *, within_range: bool = False) -
     trained on."""
     with twin_errors():
         # The command line loads twin only when it is needed.
-        from twin.build import free_run_of  # noqa: PLC0415
-        from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
+        from fantwin.twin.build import free_run_of  # noqa: PLC0415
+        from fantwin.twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
 
         loaded = OnnxTwin(twin)
         residual, measured, command = free_run_of(loaded, data.runs)

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from twin.evaluation.accuracy import Figures
+    from fantwin.twin.evaluation.accuracy import Figures
 
 FOUR_DIGITS = ".4g"
 UNREASONABLY_LARGE = 1e7

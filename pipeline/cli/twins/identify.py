@@ -11,10 +11,10 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.cli.options import JsonOption
-from pipeline.cli.progress import interruptible, training_progress
-from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
-from pipeline.cli.twins.training_data import (
+from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.progress import interruptible, training_progress
+from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
     IgnoreOption,
@@ -31,9 +31,9 @@ from pipeline.cli.twins.training_data import (
 )
 
 if TYPE_CHECKING:
-    from twin.fitting.identification import Identification
-    from twin.fitting.reference_choice import AtReference
-    from twin.runs import Array
+    from fantwin.twin.fitting.identification import Identification
+    from fantwin.twin.fitting.reference_choice import AtReference
+    from fantwin.twin.runs import Array
 
 UNITS = {
     "J": "command units per rad/s²",
@@ -67,7 +67,7 @@ def identify(
     """
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible("nothing was identified"), twin_errors():
-        from twin.fitting.reference_choice import identify_at_reference  # noqa: PLC0415  loads twin only when it is needed
+        from fantwin.twin.fitting.reference_choice import identify_at_reference  # noqa: PLC0415  loads twin only when it is needed
 
         part = Part(tray, fans, from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
         with pool:
@@ -94,7 +94,7 @@ def as_json(at_reference: AtReference, training_data: TrainingData) -> dict[str,
     Rows and columns of covariance and correlation are in the order of `parameters`; those of a lag that was not found
     are zero, and undefined.
     """
-    from twin.models.physics import PARAMETER_NAMES  # noqa: PLC0415
+    from fantwin.twin.models.physics import PARAMETER_NAMES  # noqa: PLC0415
 
     found, conditions = at_reference.identification, at_reference.conditions
     fans = [

@@ -11,10 +11,10 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.progress import interruptible, working
-from pipeline.cli.twins.next_version import make_next_version
-from pipeline.cli.twins.versions_text import (
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.progress import interruptible, working
+from fantwin.pipeline.cli.twins.next_version import make_next_version
+from fantwin.pipeline.cli.twins.versions_text import (
     NO_REFERENCE,
     check_as_json,
     check_line,
@@ -22,10 +22,10 @@ from pipeline.cli.twins.versions_text import (
     version_as_json,
     version_lines,
 )
-from pipeline.config.loading import load_config
-from pipeline.config.models import Config, TrayConfig
-from pipeline.errors import UsageError, UserError
-from pipeline.learning.versions import TwinVersions, learning_folder
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.learning.versions import TwinVersions, learning_folder
 
 
 def learn(

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.cli.recordings_in_parallel import RecordingsInParallel
-from pipeline.recordings.clips.clip import require_no_clip
-from pipeline.recordings.contents import contents_of
-from pipeline.replay.offline.marked_alarms import LeftOut, MarkedAlarm, alarms_in, marked_alarms
-from schemas.enums import Feedback
-from schemas.messages import Alarm
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.recordings.clips.clip import require_no_clip
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, MarkedAlarm, alarms_in, marked_alarms
+from fantwin.schemas.enums import Feedback
+from fantwin.schemas.messages import Alarm
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pipeline.cli.twins.calibrate import calibrate
-from pipeline.cli.twins.drops_found import drops_found
-from pipeline.cli.twins.excerpts import read_excerpts
-from pipeline.cli.twins.fan_changes import (
+from fantwin.pipeline.cli.twins.calibrate import calibrate
+from fantwin.pipeline.cli.twins.drops_found import drops_found
+from fantwin.pipeline.cli.twins.excerpts import read_excerpts
+from fantwin.pipeline.cli.twins.fan_changes import (
     changed_fans,
     changes_from_list,
     changes_to_list,
@@ -33,21 +33,21 @@ from pipeline.cli.twins.fan_changes import (
     mean_changes,
     residual_of,
 )
-from pipeline.cli.twins.train import fit_twin
-from pipeline.cli.twins.training_data import TrainingData, twin_errors
-from pipeline.cli.twins.version_data import Split, newest_long, newest_recordings, split, spread_parts
-from pipeline.devices.tacho_evidence import tacho_hints
-from pipeline.errors import UserError
-from pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
-from pipeline.learning.history_recordings import HistoryRecording
-from pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList, overlap
-from pipeline.recordings.excerpts import ExcerptReader
-from pipeline.replay.offline.calibration_of_twin import calibration_in
-from pipeline.runtime.tray_twin import load_tray_twin
-from scoring.calibration.calibration import Calibration, needed_fan_hours
+from fantwin.pipeline.cli.twins.train import fit_twin
+from fantwin.pipeline.cli.twins.training_data import TrainingData, twin_errors
+from fantwin.pipeline.cli.twins.version_data import Split, newest_long, newest_recordings, split, spread_parts
+from fantwin.pipeline.devices.tacho_evidence import tacho_hints
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
+from fantwin.pipeline.learning.history_recordings import HistoryRecording
+from fantwin.pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList, overlap
+from fantwin.pipeline.recordings.excerpts import ExcerptReader
+from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.scoring.calibration.calibration import Calibration, needed_fan_hours
 
 if TYPE_CHECKING:
-    from schemas.messages import Array
+    from fantwin.schemas.messages import Array
 
 WANTED_S, MOST_S = 12 * 3600.0, 48 * 3600.0
 """of healthy running that a version is calibrated on, and that is used if the declared rate needs more; an hour takes
@@ -348,7 +348,7 @@ class _Work:
         named, done = self._place / "named.onnx", self._place / "calibrated.onnx"
         with twin_errors():
             # The command line loads twin only when it is needed.
-            from twin.export.card_entries import with_card_entries  # noqa: PLC0415
+            from fantwin.twin.export.card_entries import with_card_entries  # noqa: PLC0415
 
             named.write_bytes(with_card_entries(twin.read_bytes(), {"name": self._name}))
         self._say(f"{self._name}: calibrating on {_hours(sum(each.seconds for each in of))} of healthy running")

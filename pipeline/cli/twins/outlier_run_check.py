@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.replay.offline.calibration_of_twin import CalibratedTwin
-from pipeline.replay.offline.healthy_runs import DecidedRun, LearnedRun
-from scoring.model.priors import Priors
+from fantwin.pipeline.replay.offline.calibration_of_twin import CalibratedTwin
+from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, LearnedRun
+from fantwin.scoring.model.priors import Priors
 
 LEAST_FANS = 4
 """fans, counted over all runs: with fewer the median says little"""

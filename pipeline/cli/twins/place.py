@@ -10,12 +10,12 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.options import JsonOption
-from pipeline.cli.progress import interruptible, training_progress
-from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
-from pipeline.cli.twins.figures import sentence
-from pipeline.cli.twins.train import as_json, balance_sentence
-from pipeline.cli.twins.training_data import (
+from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.progress import interruptible, training_progress
+from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.twins.figures import sentence
+from fantwin.pipeline.cli.twins.train import as_json, balance_sentence
+from fantwin.pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
     Part,
@@ -64,8 +64,8 @@ def place(
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible("no twin was written"), twin_errors():
         # The command line loads twin only when it is needed.
-        from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
-        from twin.placing import place_twin  # noqa: PLC0415
+        from fantwin.twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
+        from fantwin.twin.placing import place_twin  # noqa: PLC0415
 
         OnnxTwin(type_twin)  # what is no twin is said before recordings are read
         check_writable(output, ".onnx")

@@ -9,12 +9,12 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.options import JsonOption, fan_numbers
-from pipeline.cli.progress import working
-from pipeline.cli.recordings_in_parallel import RecordingsInParallel
-from pipeline.cli.twins.drops_found import drop_lines, drops_found
-from pipeline.cli.twins.figures import figures_in, sentence
-from pipeline.cli.twins.training_data import (
+from fantwin.pipeline.cli.options import JsonOption, fan_numbers
+from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.cli.twins.drops_found import drop_lines, drops_found
+from fantwin.pipeline.cli.twins.figures import figures_in, sentence
+from fantwin.pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
     Part,
@@ -26,8 +26,8 @@ from pipeline.cli.twins.training_data import (
     read_training_data,
     twin_errors,
 )
-from pipeline.errors import UserError
-from pipeline.extras import require
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.extras import require
 
 
 def report(
@@ -52,10 +52,10 @@ def report(
     """
     require("a report", "report")
     with twin_errors():
-        from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415  the command line loads twin only when it is needed
-        from twin.report.assessment import assess, level_of  # noqa: PLC0415
-        from twin.report.content import SpeedUnit, report_content  # noqa: PLC0415
-        from twin.report.page import report_page  # noqa: PLC0415
+        from fantwin.twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415  the command line loads twin only when it is needed
+        from fantwin.twin.report.assessment import assess, level_of  # noqa: PLC0415
+        from fantwin.twin.report.content import SpeedUnit, report_content  # noqa: PLC0415
+        from fantwin.twin.report.page import report_page  # noqa: PLC0415
 
         loaded = OnnxTwin(twin)
         check_writable(output, ".html")

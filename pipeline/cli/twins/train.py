@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
-from pipeline.cli.networks_in_parallel import NetworksInParallel
-from pipeline.cli.options import JsonOption
-from pipeline.cli.progress import interruptible, training_progress
-from pipeline.cli.recordings_in_parallel import RecordingsInParallel, SchedulerOption, SkipBadOption
-from pipeline.cli.twins.figures import figures_in, sentence, shown
-from pipeline.cli.twins.training_data import (
+from fantwin.pipeline.cli.networks_in_parallel import NetworksInParallel
+from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.progress import interruptible, training_progress
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
+from fantwin.pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
     IgnoreOption,
@@ -36,13 +36,13 @@ from pipeline.cli.twins.training_data import (
     show_hints,
     twin_errors,
 )
-from pipeline.extras import require_torch
+from fantwin.pipeline.extras import require_torch
 
 if TYPE_CHECKING:
-    from schemas.reference_conditions import ReferenceConditions
-    from twin.finishing import TrainedTwin
-    from twin.networks import ForEachNetwork
-    from twin.progress import Progress
+    from fantwin.schemas.reference_conditions import ReferenceConditions
+    from fantwin.twin.finishing import TrainedTwin
+    from fantwin.twin.networks import ForEachNetwork
+    from fantwin.twin.progress import Progress
 
 
 Trainer: TypeAlias = Literal["levenberg-marquardt", "adam"]
@@ -183,10 +183,10 @@ def fit_twin(
     Raises:
         TwinError: the data do not suffice.
     """
-    from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
-    from twin.kinds import find_kind  # noqa: PLC0415
-    from twin.networks import one_after_another  # noqa: PLC0415
-    from twin.progress import unreported  # noqa: PLC0415
+    from fantwin.twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
+    from fantwin.twin.kinds import find_kind  # noqa: PLC0415
+    from fantwin.twin.networks import one_after_another  # noqa: PLC0415
+    from fantwin.twin.progress import unreported  # noqa: PLC0415
 
     can_average = find_kind(settings.model).averages_networks and settings.trainer == "levenberg-marquardt"
     return train_twin(

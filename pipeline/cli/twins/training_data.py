@@ -14,20 +14,20 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 from pydantic import ValidationError
 
-from pipeline.cli.options import fan_numbers, make_folder
-from pipeline.cli.recordings_in_parallel import RecordingsInParallel
-from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT
-from pipeline.devices.tacho_evidence import tacho_hints
-from pipeline.errors import UsageError, UserError
-from pipeline.recordings.checksum import sha256_of
-from pipeline.recordings.remote import matching, recording_path
-from pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
-from schemas.reference_conditions import HOLD_S
-from schemas.tacho import Tacho
+from fantwin.pipeline.cli.options import fan_numbers, make_folder
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT
+from fantwin.pipeline.devices.tacho_evidence import tacho_hints
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.recordings.checksum import sha256_of
+from fantwin.pipeline.recordings.remote import matching, recording_path
+from fantwin.pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
+from fantwin.schemas.reference_conditions import HOLD_S
+from fantwin.schemas.tacho import Tacho
 
 if TYPE_CHECKING:
-    from schemas.twin_card import DataCard
-    from twin.runs import Run
+    from fantwin.schemas.twin_card import DataCard
+    from fantwin.twin.runs import Run
 
 RecordingsArgument: TypeAlias = Annotated[
     list[Path],
@@ -202,8 +202,8 @@ def training_data_of(found: RecordedTray, fans: str | None = None, windows_s: Se
     Raises:
         UserError: their speed unit is not known.
     """
-    from twin.fitting.outliers import without_outliers  # noqa: PLC0415  the command line loads twin only when it is needed
-    from twin.runs import Run  # noqa: PLC0415
+    from fantwin.twin.fitting.outliers import without_outliers  # noqa: PLC0415  the command line loads twin only when it is needed
+    from fantwin.twin.runs import Run  # noqa: PLC0415
 
     path = found.runs[0].path
     tacho = counting_tachos(windows_s) if windows_s else found.tacho
@@ -288,7 +288,7 @@ def counting_tachos(windows_s: Sequence[float]) -> tuple[Tacho, ...]:
 @contextmanager
 def twin_errors() -> Iterator[None]:
     """Turns errors of the twin package into a UserError of one line."""
-    from twin.errors import TwinError  # noqa: PLC0415
+    from fantwin.twin.errors import TwinError  # noqa: PLC0415
 
     try:
         yield
@@ -298,7 +298,7 @@ def twin_errors() -> Iterator[None]:
 
 def data_cards(data: TrainingData) -> list[DataCard]:
     """One card entry for each file of the training data."""
-    from schemas.twin_card import DataCard  # noqa: PLC0415
+    from fantwin.schemas.twin_card import DataCard  # noqa: PLC0415
 
     samples: dict[Path, int] = {}
     for source in data.sources:

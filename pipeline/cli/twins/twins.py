@@ -8,13 +8,13 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.twins.learn import learning_tray
-from pipeline.cli.twins.versions_text import list_as_json, list_lines
-from pipeline.config.loading import load_config
-from pipeline.errors import UsageError
-from pipeline.learning.versions import TimeSpan, TwinVersions, learning_folder
-from schemas.units import NS_PER_S
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.twins.learn import learning_tray
+from fantwin.pipeline.cli.twins.versions_text import list_as_json, list_lines
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.errors import UsageError
+from fantwin.pipeline.learning.versions import TimeSpan, TwinVersions, learning_folder
+from fantwin.schemas.units import NS_PER_S
 
 CONSEQUENCE = "alarms are discarded and what was learned of the fans begins again, unless only the calibration differs"
 

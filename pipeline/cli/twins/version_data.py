@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.cli.twins.excerpts import MOST_HZ, Excerpt
-from pipeline.cli.twins.windows import Windows, joined, windows_of
-from pipeline.errors import UserError
-from pipeline.learning.history_recordings import HistoryRecording
+from fantwin.pipeline.cli.twins.excerpts import MOST_HZ, Excerpt
+from fantwin.pipeline.cli.twins.windows import Windows, joined, windows_of
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.history_recordings import HistoryRecording
 
 WINDOW_S = 60.0
 """long enough for many time constants of a fan; windows are longer where samples are few"""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from pipeline.learning.versions import Check, Drop, Version, VersionList
-from pipeline.recordings.dates import format_local
+from fantwin.pipeline.learning.versions import Check, Drop, Version, VersionList
+from fantwin.pipeline.recordings.dates import format_local
 
 NO_REFERENCE = (
     "no version was learned from 24 h of healthy running yet: there is no reference to check the fans against"

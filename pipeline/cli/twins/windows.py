@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.cli.twins.excerpts import Excerpt
-from pipeline.errors import UserError
-from pipeline.learning.history_recordings import HistoryRecording
-from pipeline.recordings.excerpts import ExcerptReader
+from fantwin.pipeline.cli.twins.excerpts import Excerpt
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.history_recordings import HistoryRecording
+from fantwin.pipeline.recordings.excerpts import ExcerptReader
 
 if TYPE_CHECKING:
-    from schemas.messages import Array
+    from fantwin.schemas.messages import Array
 
 LOOK_S = 1.0
 """between two commands that are looked at"""

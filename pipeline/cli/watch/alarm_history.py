@@ -12,25 +12,25 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from pipeline.cli.progress import working
-from pipeline.config.models import Config
-from pipeline.config.shards import own_file, shards_of
-from pipeline.errors import UserError
-from pipeline.presenting.alarm_rates import AlarmRates
-from pipeline.presenting.alarm_store import HISTORY
-from pipeline.recordings.clips.clip import require_no_clip
-from pipeline.recordings.dates import format_local
-from pipeline.recordings.rare_messages import rare_messages
-from pipeline.recordings.reading import read_metadata, read_recording
-from pipeline.recordings.run_recordings import recorded_files
-from pipeline.replay.offline.alarm_episodes import Episode, episodes
-from pipeline.replay.offline.marked_alarms import alarms_in
-from schemas.codec import CodecError, decode_columns
-from schemas.enums import Feedback
-from schemas.messages import Alarm, ModelCard, Score
-from schemas.units import NS_PER_S
-from scoring.calibration.observed_rate import ObservedRate, declared_per_day, together
-from scoring.diagnosis.shown_causes import with_share
+from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.shards import own_file, shards_of
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.presenting.alarm_rates import AlarmRates
+from fantwin.pipeline.presenting.alarm_store import HISTORY
+from fantwin.pipeline.recordings.clips.clip import require_no_clip
+from fantwin.pipeline.recordings.dates import format_local
+from fantwin.pipeline.recordings.rare_messages import rare_messages
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.pipeline.recordings.run_recordings import recorded_files
+from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
+from fantwin.pipeline.replay.offline.marked_alarms import alarms_in
+from fantwin.schemas.codec import CodecError, decode_columns
+from fantwin.schemas.enums import Feedback
+from fantwin.schemas.messages import Alarm, ModelCard, Score
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.calibration.observed_rate import ObservedRate, declared_per_day, together
+from fantwin.scoring.diagnosis.shown_causes import with_share
 
 NS_PER_HOUR = 3600 * NS_PER_S
 _STYLES = {"warning": "yellow", "alarm": "bold red"}

@@ -14,24 +14,24 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from pipeline.bus.session import Bus
-from pipeline.cli.watch.live_stages import wait_for_stages
-from pipeline.config.models import Config
-from pipeline.config.roles import roles_of
-from pipeline.launch.judged_fans import JudgedChanges, JudgedFans, Unjudged, as_judged
-from pipeline.launch.processes import process_list
-from pipeline.launch.site_state import site_states
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.launch.stage_notes import note_lines
-from schemas.codec import CodecError, decode
-from schemas.enums import Severity
-from schemas.messages import Alarm, Diagnosis, newest_t_ns
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
-from scoring.alarms.alarm_flags import is_listed, is_presented
-from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
-from scoring.wear.slow_change import is_of_slow_change
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.cli.watch.live_stages import wait_for_stages
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.roles import roles_of
+from fantwin.pipeline.launch.judged_fans import JudgedChanges, JudgedFans, Unjudged, as_judged
+from fantwin.pipeline.launch.processes import process_list
+from fantwin.pipeline.launch.site_state import site_states
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.launch.stage_notes import note_lines
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.messages import Alarm, Diagnosis, newest_t_ns
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_flags import is_listed, is_presented
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms
+from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
+from fantwin.scoring.wear.slow_change import is_of_slow_change
 
 _SCORES_S = 3.0  # a score of every tray arrives in this time
 _POLL_S = 0.02

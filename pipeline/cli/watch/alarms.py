@@ -15,24 +15,24 @@ from typing import Annotated
 
 import typer
 
-from pipeline.bus.session import join_bus
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.watch.alarm_history import show_history
-from pipeline.cli.watch.alarm_list import alone, show_list, word
-from pipeline.cli.watch.live_stages import wait_for_stages
-from pipeline.cli.watch.request import ask
-from pipeline.config.loading import load_config
-from pipeline.config.models import Config
-from pipeline.config.roles import OPERATOR, roles_of
-from pipeline.errors import UsageError, UserError
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.recordings.remote import matching, recording_path
-from pipeline.runtime.signals import stop_on_signals
-from schemas.enums import Action, Transition
-from schemas.messages import Alarm, Request
-from schemas.units import NS_PER_S
-from scoring.alarms.current_alarms import until
-from scoring.alarms.fan_condition import GIVES_FEEDBACK
+from fantwin.pipeline.bus.session import join_bus
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.watch.alarm_history import show_history
+from fantwin.pipeline.cli.watch.alarm_list import alone, show_list, word
+from fantwin.pipeline.cli.watch.live_stages import wait_for_stages
+from fantwin.pipeline.cli.watch.request import ask
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.roles import OPERATOR, roles_of
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.recordings.remote import matching, recording_path
+from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.schemas.enums import Action, Transition
+from fantwin.schemas.messages import Alarm, Request
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.current_alarms import until
+from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
 
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 

@@ -19,13 +19,13 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.bus.authority import LONGEST_ROLE, Authority, is_host, write_file, write_pair
-from pipeline.bus.certificates import Certificate, in_words, of_role, read_certificate
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.loading import load_config
-from pipeline.config.models import ROLE_PLACE, Config, SecurityConfig, nearest
-from pipeline.config.roles import default_roles, roles_of
-from pipeline.errors import UsageError, UserError
+from fantwin.pipeline.bus.authority import LONGEST_ROLE, Authority, is_host, write_file, write_pair
+from fantwin.pipeline.bus.certificates import Certificate, in_words, of_role, read_certificate
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import ROLE_PLACE, Config, SecurityConfig, nearest
+from fantwin.pipeline.config.roles import default_roles, roles_of
+from fantwin.pipeline.errors import UsageError, UserError
 
 _AUTHORITY_DAYS, _DAYS = 3653, 397
 _HERE = ("localhost", "127.0.0.1", "::1")

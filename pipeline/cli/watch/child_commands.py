@@ -17,14 +17,14 @@ from typing import Any, Self
 
 import typer
 
-from pipeline.bus.session import join_bus
-from pipeline.config.models import Config, TrayConfig
-from pipeline.config.registry import RECORDER
-from pipeline.errors import UserError
-from pipeline.selftest.scratch_site import FANTWIN
-from schemas.codec import CodecError, decode
-from schemas.messages import Raw
-from schemas.topics import tray_key
+from fantwin.pipeline.bus.session import join_bus
+from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.config.registry import RECORDER
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.selftest.scratch_site import FANTWIN
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.topics import tray_key
 
 RECORDING_ONLY = (
     *("--set", f"launcher.stages={json.dumps(['acquisition', 'resampler', 'recorder'])}"),

@@ -8,12 +8,18 @@ from typing import Annotated
 
 import typer
 
-from pipeline.bus.session import join_bus
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of, require_commandable, share_note
-from pipeline.config.loading import load_config
-from pipeline.config.roles import OPERATOR
-from pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.bus.session import join_bus
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.watch.commanding import (
+    CommandSender,
+    chosen_tray,
+    command_of,
+    require_commandable,
+    share_note,
+)
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.roles import OPERATOR
+from fantwin.pipeline.runtime.signals import stop_on_signals
 
 
 def command(

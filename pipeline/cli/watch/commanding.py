@@ -11,17 +11,17 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import Config, TrayConfig
-from pipeline.errors import UsageError, UserError
-from pipeline.runtime.device_commands import not_sent, reason_in
-from pipeline.runtime.tray_acquisition import TrayAcquisition
-from schemas.codec import encode, type_name
-from schemas.header import Header
-from schemas.health import Health
-from schemas.messages import Command
-from schemas.topics import BY_NAME, tray_key
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.runtime.device_commands import not_sent, reason_in
+from fantwin.pipeline.runtime.tray_acquisition import TrayAcquisition
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Command
+from fantwin.schemas.topics import BY_NAME, tray_key
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 _T = TypeVar("_T")
 _ANSWER_S = 5.0  # acquisition answers within a quarter of a second, on a busy host within one or two

@@ -13,24 +13,24 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.bus.endpoint import accepts_connections
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.progress import EXIT_INTERRUPTED
-from pipeline.cli.twins.training_data import check_writable
-from pipeline.cli.watch.child_commands import Commands, Stopped
-from pipeline.cli.watch.commanding import require_commandable
-from pipeline.cli.watch.commissioning import Commissioning, Plan, TrayWork
-from pipeline.cli.watch.doctor import running_sessions
-from pipeline.cli.watch.sweep import range_within
-from pipeline.config.loading import load_config
-from pipeline.config.models import Config, TrayConfig
-from pipeline.config.registry import RECORDER, STAGES
-from pipeline.config.twin_entry import with_twin
-from pipeline.errors import UsageError, UserError
-from pipeline.replay.offline.calibration_of_twin import calibration_in
-from pipeline.runtime.signals import stop_on_signals
-from pipeline.runtime.tray_twin import load_tray_twin
-from pipeline.selftest.scratch_site import FANTWIN
+from fantwin.pipeline.bus.endpoint import accepts_connections
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.progress import EXIT_INTERRUPTED
+from fantwin.pipeline.cli.twins.training_data import check_writable
+from fantwin.pipeline.cli.watch.child_commands import Commands, Stopped
+from fantwin.pipeline.cli.watch.commanding import require_commandable
+from fantwin.pipeline.cli.watch.commissioning import Commissioning, Plan, TrayWork
+from fantwin.pipeline.cli.watch.doctor import running_sessions
+from fantwin.pipeline.cli.watch.sweep import range_within
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.config.registry import RECORDER, STAGES
+from fantwin.pipeline.config.twin_entry import with_twin
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
+from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.pipeline.selftest.scratch_site import FANTWIN
 
 EXIT_LOST = 3
 

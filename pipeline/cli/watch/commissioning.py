@@ -8,13 +8,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipeline.cli.recordings_in_parallel import RecordingsInParallel
-from pipeline.cli.twins.training_data import Part, read_training_data
-from pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, RecordingSite, Stopped
-from pipeline.config.models import Config, TrayConfig
-from pipeline.config.twin_entry import write_twin
-from pipeline.errors import UserError
-from pipeline.learning.ordinary_operation import OrdinaryOperation
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.cli.twins.training_data import Part, read_training_data
+from fantwin.pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, RecordingSite, Stopped
+from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.config.twin_entry import write_twin
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 
 SHOWN_EVERY_S = 60.0
 

@@ -21,19 +21,19 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.bus.session import Bus, join_bus
-from pipeline.cli.options import JsonOption
-from pipeline.cli.watch.demo_page import PICTURE, DemoPage
-from pipeline.cli.watch.demo_report import Summary, summarise
-from pipeline.cli.watch.demo_screen import DemoScreen
-from pipeline.config.models import Config
-from pipeline.errors import UserError
-from pipeline.extras import missing_extra
-from pipeline.launch.this_host import load_for_this_host
-from pipeline.runtime.signals import stop_on_signals
-from pipeline.selftest.scratch_site import FANTWIN, free_port
-from schemas.units import NS_PER_S
-from scoring.diagnosis.shown_causes import short_name
+from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.watch.demo_page import PICTURE, DemoPage
+from fantwin.pipeline.cli.watch.demo_report import Summary, summarise
+from fantwin.pipeline.cli.watch.demo_screen import DemoScreen
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.extras import missing_extra
+from fantwin.pipeline.launch.this_host import load_for_this_host
+from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.selftest.scratch_site import FANTWIN, free_port
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.diagnosis.shown_causes import short_name
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
 DURATION_S = 36.0
@@ -220,7 +220,7 @@ def _draw(out: Path, console: Console) -> None:
     if problem := missing_extra("bands.png is left out: it", "report", "matplotlib"):
         console.print(problem, markup=False, soft_wrap=True)
         return
-    from pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  an extra
+    from fantwin.pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  an extra
 
     with console.status("drawing bands.png"):
         plot_recording(sorted(out.glob("recording*.mcap")), out / "bands.png", truth=out / "truth.json")

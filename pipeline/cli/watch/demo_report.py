@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import UserError
-from pipeline.recordings.reading import read_recording
-from schemas.enums import Transition
-from schemas.messages import Alarm, Array, Grid, Raw, Score
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm, Array, Grid, Raw, Score
+from fantwin.schemas.units import NS_PER_S
 
 SETTLING_NS = 5 * NS_PER_S  # an alarm is attributed to a fault until the fan has settled after its end
 

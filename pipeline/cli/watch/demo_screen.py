@@ -7,17 +7,17 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.bus.session import Bus
-from pipeline.cli.watch.status import stage_table
-from pipeline.config.models import Config
-from pipeline.config.roles import roles_of
-from pipeline.launch.judged_fans import JudgedFans
-from pipeline.launch.site_watcher import SiteWatcher
-from schemas.codec import decode
-from schemas.enums import FanState, InvalidReason
-from schemas.messages import Score
-from schemas.topics import tray_key
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.cli.watch.status import stage_table
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.roles import roles_of
+from fantwin.pipeline.launch.judged_fans import JudgedFans
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.schemas.codec import decode
+from fantwin.schemas.enums import FanState, InvalidReason
+from fantwin.schemas.messages import Score
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 _AT_REST = (FanState.STOPPED, FanState.STARTING)
 _STYLES = {FanState.NORMAL: "green", FanState.SUSPECT: "yellow", **dict.fromkeys((FanState.UNKNOWN, *_AT_REST), "dim")}

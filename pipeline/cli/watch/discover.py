@@ -13,10 +13,10 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from pipeline.cli.options import JsonOption
-from pipeline.devices.discovery import Found, discover_hwmon, discover_serial
-from pipeline.devices.hwmon_config import ROOT
-from pipeline.errors import UserError
+from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.devices.discovery import Found, discover_hwmon, discover_serial
+from fantwin.pipeline.devices.hwmon_config import ROOT
+from fantwin.pipeline.errors import UserError
 
 
 def discover(

@@ -17,27 +17,27 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from pipeline.bus.access_rules import SiteRoles
-from pipeline.bus.certificates import of_role
-from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
-from pipeline.bus.errors import BusError, NoAnswerError
-from pipeline.bus.opening import credentials_of
-from pipeline.bus.session import join_bus
-from pipeline.cli.exposure import exposure_problem, is_exposed
-from pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
-from pipeline.cli.watch.line_check import check_line
-from pipeline.config.models import Config, ConfigError
-from pipeline.config.registry import RECORDER, STAGES
-from pipeline.config.roles import READERS, role_names
-from pipeline.errors import UserError
-from pipeline.extras import how_to_install
-from pipeline.launch.processes import process_list
-from pipeline.launch.this_host import load_for_this_host
-from pipeline.recordings.disk_room import usage_of
-from pipeline.runtime.second_owner import GOSSIP_S
-from pipeline.runtime.sessions import Session
-from pipeline.runtime.stage import Context, load_stage
-from schemas.topics import sessions_key
+from fantwin.pipeline.bus.access_rules import SiteRoles
+from fantwin.pipeline.bus.certificates import of_role
+from fantwin.pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
+from fantwin.pipeline.bus.errors import BusError, NoAnswerError
+from fantwin.pipeline.bus.opening import credentials_of
+from fantwin.pipeline.bus.session import join_bus
+from fantwin.pipeline.cli.exposure import exposure_problem, is_exposed
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
+from fantwin.pipeline.cli.watch.line_check import check_line
+from fantwin.pipeline.config.models import Config, ConfigError
+from fantwin.pipeline.config.registry import RECORDER, STAGES
+from fantwin.pipeline.config.roles import READERS, role_names
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.extras import how_to_install
+from fantwin.pipeline.launch.processes import process_list
+from fantwin.pipeline.launch.this_host import load_for_this_host
+from fantwin.pipeline.recordings.disk_room import usage_of
+from fantwin.pipeline.runtime.second_owner import GOSSIP_S
+from fantwin.pipeline.runtime.sessions import Session
+from fantwin.pipeline.runtime.stage import Context, load_stage
+from fantwin.schemas.topics import sessions_key
 
 _NOT_LISTED = {"all", "dev", "bench"}  # a sum of others, or for tests and benches only
 _NOT_GRANTED = "the router does not grant the rights of its role: restart the router with this configuration"

@@ -11,8 +11,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from pipeline.errors import UserError
-from schemas.messages import Array
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.messages import Array
 
 LEVELS = (0.5, 1.0, 0.25, 0.75, 0.0, 0.6, 0.1, 0.9, 0.35, 0.8, 0.2, 0.65, 0.45)
 """of the range, held until the speed has settled"""

@@ -15,18 +15,25 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bus.session import join_bus
-from pipeline.config.models import Config, TrayConfig
-from pipeline.devices.device_clock import UINT32
-from pipeline.devices.line_rate import MAX_SAMPLES, GridTiming, SampleTimes, grid_rate_hz, is_too_slow, leaves_gaps
-from pipeline.devices.tacho_evidence import find_tacho, tacho_hints
-from pipeline.runtime.stage import Context, StageError, load_stage
-from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
-from schemas.codec import CodecError, decode
-from schemas.messages import Array, Raw
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
-from schemas.wire import DEVICE_COUNTERS
+from fantwin.pipeline.bus.session import join_bus
+from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.devices.device_clock import UINT32
+from fantwin.pipeline.devices.line_rate import (
+    MAX_SAMPLES,
+    GridTiming,
+    SampleTimes,
+    grid_rate_hz,
+    is_too_slow,
+    leaves_gaps,
+)
+from fantwin.pipeline.devices.tacho_evidence import find_tacho, tacho_hints
+from fantwin.pipeline.runtime.stage import Context, StageError, load_stage
+from fantwin.pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
+from fantwin.schemas.wire import DEVICE_COUNTERS
 
 FIRST_SAMPLE_S = 6.0
 """a microcontroller restarts when its port is opened, and sends its first sample after some seconds"""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import threading
 import time
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import Config
-from pipeline.errors import UserError
-from pipeline.launch.site_watcher import SiteWatcher
-from schemas.topics import alive_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.schemas.topics import alive_key
 
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time
 _POLL_S = 0.02

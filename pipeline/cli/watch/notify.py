@@ -8,12 +8,12 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.loading import load_config
-from pipeline.errors import UsageError, UserError
-from pipeline.notification.config import NotifierConfig
-from pipeline.notification.targets import send_test
-from pipeline.notification.wording import Place
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.notification.config import NotifierConfig
+from fantwin.pipeline.notification.targets import send_test
+from fantwin.pipeline.notification.wording import Place
 
 
 def notify(

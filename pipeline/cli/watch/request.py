@@ -8,13 +8,13 @@ import threading
 import time
 from dataclasses import replace
 
-from pipeline.bus.session import Bus
-from pipeline.errors import UserError
-from pipeline.launch.site_watcher import SiteWatcher
-from schemas.codec import CodecError, decode, encode, type_name
-from schemas.header import Header
-from schemas.messages import Alarm, Request
-from schemas.topics import BY_NAME, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.schemas.codec import CodecError, decode, encode, type_name
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Request
+from fantwin.schemas.topics import BY_NAME, tray_key
 
 _POLL_S = 0.05
 

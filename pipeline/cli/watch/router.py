@@ -9,16 +9,16 @@ from typing import Annotated
 
 import typer
 
-from pipeline.bus.access_rules import SiteRoles
-from pipeline.bus.opening import credentials_of
-from pipeline.bus.router import open_router
-from pipeline.cli.exposure import InsecureOption, checked_exposure
-from pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
-from pipeline.config.loading import load_config
-from pipeline.config.models import BusConfig, Config
-from pipeline.config.roles import ROUTER
-from pipeline.errors import UsageError
-from pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.bus.access_rules import SiteRoles
+from fantwin.pipeline.bus.opening import credentials_of
+from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.cli.exposure import InsecureOption, checked_exposure
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import BusConfig, Config
+from fantwin.pipeline.config.roles import ROUTER
+from fantwin.pipeline.errors import UsageError
+from fantwin.pipeline.runtime.signals import stop_on_signals
 
 _LOOPBACK = "tcp/127.0.0.1:7447"
 _WARN_AGAIN_S = 86_400.0

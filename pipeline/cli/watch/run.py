@@ -11,23 +11,23 @@ from typing import Annotated
 
 import typer
 
-from pipeline.bus.errors import NoAnswerError
-from pipeline.cli.exposure import InsecureOption, checked_exposure
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.loading import load_config
-from pipeline.config.models import Config
-from pipeline.config.registry import STAGES
-from pipeline.config.shards import Shard, chosen_shard
-from pipeline.errors import UsageError, UserError
-from pipeline.launch.processes import EXIT_CANNOT_START
-from pipeline.runtime.figures import without_figures
-from pipeline.runtime.notifier import starting
-from pipeline.runtime.runner import Runner
-from pipeline.runtime.signals import set_when_stdin_closes, stop_on_signals
-from pipeline.runtime.stage import load_stage
-from schemas.health import Health
-from schemas.streams import LOSS_PREFIX
-from schemas.topics import stage_label
+from fantwin.pipeline.bus.errors import NoAnswerError
+from fantwin.pipeline.cli.exposure import InsecureOption, checked_exposure
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.shards import Shard, chosen_shard
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.launch.processes import EXIT_CANNOT_START
+from fantwin.pipeline.runtime.figures import without_figures
+from fantwin.pipeline.runtime.notifier import starting
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.signals import set_when_stdin_closes, stop_on_signals
+from fantwin.pipeline.runtime.stage import load_stage
+from fantwin.schemas.health import Health
+from fantwin.schemas.streams import LOSS_PREFIX
+from fantwin.schemas.topics import stage_label
 
 
 def run(

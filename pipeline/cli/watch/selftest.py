@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.cli.options import JsonOption
-from pipeline.config.models import nearest
-from pipeline.errors import UsageError, UserError
-from pipeline.selftest.scenarios import SCENARIOS, Scenario
-from pipeline.selftest.selftest import Row, run_scenarios
+from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.config.models import nearest
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.selftest.scenarios import SCENARIOS, Scenario
+from fantwin.pipeline.selftest.selftest import Row, run_scenarios
 
 _STATES = {True: "kept", False: "NOT KEPT", None: "not run"}
 _STYLES = {True: "green", False: "red", None: "yellow"}

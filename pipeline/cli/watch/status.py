@@ -16,28 +16,28 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.bus.session import Bus, join_bus
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.models import Config
-from pipeline.config.registry import STAGES
-from pipeline.config.roles import READERS, role_names, roles_of
-from pipeline.config.shards import chosen_shard
-from pipeline.errors import UsageError, UserError
-from pipeline.launch.judged_fans import JudgedFans, Unjudged, as_judged
-from pipeline.launch.processes import StageProcess, process_list
-from pipeline.launch.refused_input import refused_lines
-from pipeline.launch.site_state import AT_WORK, StageState, Word, site_states
-from pipeline.launch.site_watcher import SiteWatcher, StageView
-from pipeline.launch.stage_notes import note_lines, notes_as_json
-from pipeline.launch.this_host import load_for_any_host
-from pipeline.runtime.signals import stop_on_signals
-from schemas.enums import Severity
-from schemas.streams import LOSS_PREFIX
-from schemas.topics import ALL_TRAYS
-from schemas.units import NS_PER_S
-from scoring.alarms.alarm_flags import is_listed, is_presented
-from scoring.alarms.current_alarms import CurrentAlarm, clock
-from scoring.diagnosis.shown_causes import most_probable
+from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.roles import READERS, role_names, roles_of
+from fantwin.pipeline.config.shards import chosen_shard
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.launch.judged_fans import JudgedFans, Unjudged, as_judged
+from fantwin.pipeline.launch.processes import StageProcess, process_list
+from fantwin.pipeline.launch.refused_input import refused_lines
+from fantwin.pipeline.launch.site_state import AT_WORK, StageState, Word, site_states
+from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.launch.stage_notes import note_lines, notes_as_json
+from fantwin.pipeline.launch.this_host import load_for_any_host
+from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.streams import LOSS_PREFIX
+from fantwin.schemas.topics import ALL_TRAYS
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_flags import is_listed, is_presented
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock
+from fantwin.scoring.diagnosis.shown_causes import most_probable
 
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 _LISTEN_S = 2.5  # two health messages of every stage, which give rates

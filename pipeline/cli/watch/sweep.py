@@ -13,9 +13,9 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from pipeline.bus.session import Bus, join_bus
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.watch.commanding import (
+from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.watch.commanding import (
     CommandSender,
     NotReceivedError,
     chosen_tray,
@@ -23,16 +23,16 @@ from pipeline.cli.watch.commanding import (
     require_commandable,
     require_within_limits,
 )
-from pipeline.cli.watch.excitation import Excitation, Observed, StoppedError
-from pipeline.config.loading import load_config
-from pipeline.config.models import TrayConfig
-from pipeline.config.roles import OPERATOR
-from pipeline.errors import UsageError, UserError
-from pipeline.runtime.signals import stop_on_signals
-from schemas.codec import CodecError, decode
-from schemas.messages import Raw
-from schemas.topics import sweep_key, tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.cli.watch.excitation import Excitation, Observed, StoppedError
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.roles import OPERATOR
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.topics import sweep_key, tray_key
+from fantwin.schemas.units import NS_PER_S
 
 _FIRST_SAMPLE_S = 5.0
 LEAST_SHARE = 0.2

@@ -11,15 +11,15 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.exposure import InsecureOption, checked_exposure
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.shards import chosen_trays
-from pipeline.errors import UserError
-from pipeline.launch.event_log import EventLog
-from pipeline.launch.launcher import Launcher, Outcome
-from pipeline.launch.refused_input import refused_lines
-from pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port
-from pipeline.runtime.signals import ignore_hangup, set_when_stdin_closes, stop_on_signals
+from fantwin.pipeline.cli.exposure import InsecureOption, checked_exposure
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.config.shards import chosen_trays
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.launch.event_log import EventLog
+from fantwin.pipeline.launch.launcher import Launcher, Outcome
+from fantwin.pipeline.launch.refused_input import refused_lines
+from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port
+from fantwin.pipeline.runtime.signals import ignore_hangup, set_when_stdin_closes, stop_on_signals
 
 
 def up(

@@ -11,12 +11,12 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.loading import load_config
-from pipeline.errors import UsageError, UserError
-from pipeline.gateway.config import GatewayConfig
-from pipeline.opcua.config import OpcuaConfig
-from pipeline.presenting.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.gateway.config import GatewayConfig
+from fantwin.pipeline.opcua.config import OpcuaConfig
+from fantwin.pipeline.presenting.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
 
 
 class UserAction(StrEnum):

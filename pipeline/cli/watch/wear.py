@@ -16,23 +16,23 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.bus.session import join_bus
-from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.progress import working
-from pipeline.cli.watch.live_stages import wait_for_stages
-from pipeline.config.loading import load_config
-from pipeline.config.roles import roles_of
-from pipeline.errors import UserError
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.recordings.dates import format_local, has_date
-from pipeline.recordings.reading import read_recording
-from pipeline.runtime.signals import stop_on_signals
-from schemas.codec import CodecError, decode
-from schemas.messages import ScorerSnapshot
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
-from scoring.wear.recorded_wear import wear_in, wear_rows
-from scoring.wear.slow_change import LIMIT_SHARE
+from fantwin.pipeline.bus.session import join_bus
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.cli.watch.live_stages import wait_for_stages
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.roles import roles_of
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.recordings.dates import format_local, has_date
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.messages import ScorerSnapshot
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
+from fantwin.scoring.wear.slow_change import LIMIT_SHARE
 
 NS_PER_DAY = 86_400 * NS_PER_S
 _NEEDED = "a fan has its first point about an hour after commissioning, while it turns without an alarm"

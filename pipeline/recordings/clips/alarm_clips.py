@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from pipeline.recordings.clips.clip import NOT_A_LIST, Clip, clips_in, list_path
-from pipeline.recordings.clips.cutting import LEAD_NS
-from pipeline.recordings.clips.tracker import LONGEST_NS, RETRY_NS, ClipTracker
-from pipeline.recordings.clips.worker import ClipMaker
-from pipeline.recordings.index import PartIndex
-from pipeline.recordings.rare_messages import last_message_ns, rare_messages
-from pipeline.recordings.reading import RecordingError
-from schemas.envelope import Envelope
-from schemas.messages import Alarm
+from fantwin.pipeline.recordings.clips.clip import NOT_A_LIST, Clip, clips_in, list_path
+from fantwin.pipeline.recordings.clips.cutting import LEAD_NS
+from fantwin.pipeline.recordings.clips.tracker import LONGEST_NS, RETRY_NS, ClipTracker
+from fantwin.pipeline.recordings.clips.worker import ClipMaker
+from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.rare_messages import last_message_ns, rare_messages
+from fantwin.pipeline.recordings.reading import RecordingError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Alarm
 
 
 def tracker_of(recording: Path, before_s: float, after_s: float, most_bytes: int, settled_s: float) -> ClipTracker:

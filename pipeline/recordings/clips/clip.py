@@ -9,11 +9,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.recordings.reading import read_metadata
-from pipeline.recordings.records import RecordingError
-from pipeline.recordings.run_recordings import CLIPS
-from schemas.messages import Alarm
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.reading import read_metadata
+from fantwin.pipeline.recordings.records import RecordingError
+from fantwin.pipeline.recordings.run_recordings import CLIPS
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.units import NS_PER_S
 
 CLIP_KEY = "clip"
 """in the metadata of a clip: what `Clip.about` says, as JSON"""

@@ -17,18 +17,18 @@ from datetime import UTC, datetime
 from itertools import takewhile
 from pathlib import Path
 
-from pipeline.recordings.clips.clip import CLIP_KEY, CLIP_SNAPSHOT_KEY, Clip
-from pipeline.recordings.clips.part_chunks import PartChunks, parts_backwards
-from pipeline.recordings.clips.tracker import SET_BACK_NS, CutResult
-from pipeline.recordings.disk import DiskError, is_being_written, refused, sync_folder
-from pipeline.recordings.index import PartIndex
-from pipeline.recordings.reading import TACHO_KEY, RecordingMetadata
-from pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, active_path
-from pipeline.recordings.run_recordings import RECORDING_KEY
-from pipeline.recordings.writing import RecordingWriter
-from schemas.envelope import Envelope
-from schemas.topics import BY_NAME, HEALTH, tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.clips.clip import CLIP_KEY, CLIP_SNAPSHOT_KEY, Clip
+from fantwin.pipeline.recordings.clips.part_chunks import PartChunks, parts_backwards
+from fantwin.pipeline.recordings.clips.tracker import SET_BACK_NS, CutResult
+from fantwin.pipeline.recordings.disk import DiskError, is_being_written, refused, sync_folder
+from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.reading import TACHO_KEY, RecordingMetadata
+from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, active_path
+from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.topics import BY_NAME, HEALTH, tray_key
+from fantwin.schemas.units import NS_PER_S
 
 CLOCK_MARGIN_S = 90.0
 """the sliding window of the device clock, and time to approach its line (pipeline.recordings.excerpts)"""

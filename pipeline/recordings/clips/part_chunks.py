@@ -8,13 +8,19 @@ from pathlib import Path
 
 from mcap.records import ChunkIndex
 
-from pipeline.recordings.index import PartIndex
-from pipeline.recordings.parts import part_files
-from pipeline.recordings.reading import Reading, RecordingMetadata, read_metadata
-from pipeline.recordings.records import ACTIVE_SUFFIX, CORRUPT_DATA_ERRORS, RecordingError, chunk_at, indexed_reader
-from pipeline.recordings.run_recordings import RECORDING_KEY
-from pipeline.recordings.scan import scan
-from schemas.envelope import Envelope
+from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.parts import part_files
+from fantwin.pipeline.recordings.reading import Reading, RecordingMetadata, read_metadata
+from fantwin.pipeline.recordings.records import (
+    ACTIVE_SUFFIX,
+    CORRUPT_DATA_ERRORS,
+    RecordingError,
+    chunk_at,
+    indexed_reader,
+)
+from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
+from fantwin.pipeline.recordings.scan import scan
+from fantwin.schemas.envelope import Envelope
 
 
 class PartChunks:

@@ -10,11 +10,11 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from pipeline.recordings.clips.clip import Clip, ClipAlarm, clip_name
-from schemas.enums import Transition
-from schemas.messages import Alarm
-from schemas.units import NS_PER_S
-from scoring.alarms.alarm_flags import is_silenced
+from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm, clip_name
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_flags import is_silenced
 
 LONGEST_NS = 600 * NS_PER_S
 """of a clip that more and more alarms extend; the next alarm then begins another one"""

@@ -10,12 +10,12 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
 
-from pipeline.recordings.clips.clip import Clip, clip_folder, clips_as_text, list_path
-from pipeline.recordings.clips.cutting import cut_clips, remove_unfinished
-from pipeline.recordings.clips.tracker import CutResult
-from pipeline.recordings.disk import DiskError, refused, sync_folder
-from pipeline.recordings.index import PartIndex
-from pipeline.recordings.records import RecordingError
+from fantwin.pipeline.recordings.clips.clip import Clip, clip_folder, clips_as_text, list_path
+from fantwin.pipeline.recordings.clips.cutting import cut_clips, remove_unfinished
+from fantwin.pipeline.recordings.clips.tracker import CutResult
+from fantwin.pipeline.recordings.disk import DiskError, refused, sync_folder
+from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.records import RecordingError
 
 AT_ONCE = 16
 """clips that are written in one pass over the parts"""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.recordings.logs.log_file import LogError, Series
+from fantwin.pipeline.recordings.logs.log_file import LogError, Series
 
 NS_PER_US = 1000
 HUNDREDS = "eRPM["

@@ -6,8 +6,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.extras import missing_extra
-from pipeline.recordings.logs.log_file import LogError, LogFile
+from fantwin.pipeline.extras import missing_extra
+from fantwin.pipeline.recordings.logs.log_file import LogError, LogFile
 
 _START_BYTES = 64
 
@@ -31,20 +31,20 @@ class LogFormat(NamedTuple):
 
 
 LOG_FORMATS = (
-    LogFormat("ULog", (b"ULog\x01\x12\x35",), "", "pyulog", "pipeline.recordings.logs.ulog:open_ulog"),
+    LogFormat("ULog", (b"ULog\x01\x12\x35",), "", "pyulog", "fantwin.pipeline.recordings.logs.ulog:open_ulog"),
     LogFormat(
         "Betaflight blackbox",
         (b"H Product:Blackbox",),
         "",
         "orangebox",
-        "pipeline.recordings.logs.blackbox:open_blackbox",
+        "fantwin.pipeline.recordings.logs.blackbox:open_blackbox",
     ),
     LogFormat(
         "ROS 2 bag",
         (b"SQLite format 3\0", b"\x89MCAP0\r\n"),
         "metadata.yaml",
         "rosbags",
-        "pipeline.recordings.logs.rosbag:open_rosbag",
+        "fantwin.pipeline.recordings.logs.rosbag:open_rosbag",
     ),
 )
 

@@ -11,9 +11,9 @@ from typing import Protocol
 
 import numpy as np
 
-from pipeline.errors import UserError
-from schemas.messages import Array
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
 
 
 class LogError(UserError):

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.recordings.logs.log_file import LogError, Series
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.logs.log_file import LogError, Series
+from fantwin.schemas.units import NS_PER_S
 
 MOST_ELEMENTS = 1024
 """of an array; a longer one is an image or a cloud and no row of fans"""

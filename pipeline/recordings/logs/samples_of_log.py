@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT, Table, clean_samples
-from pipeline.errors import UsageError
-from pipeline.recordings.logs.log_file import LogError, LogFile, Series
-from schemas.messages import Array
+from fantwin.pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT, Table, clean_samples
+from fantwin.pipeline.errors import UsageError
+from fantwin.pipeline.recordings.logs.log_file import LogError, LogFile, Series
+from fantwin.schemas.messages import Array
 
 ELECTRICAL = "erpm"
 UNITS = (*RAD_S_PER_TABLE_UNIT, ELECTRICAL)

@@ -8,17 +8,17 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
-from pipeline.bus.session import Bus
-from pipeline.config.registry import STAGES
-from pipeline.launch.loss_accounting import label
-from pipeline.launch.site_watcher import SiteWatcher, StageView
-from pipeline.replay.stage_chain import replay_starts
-from pipeline.runtime.clock import REPLAY
-from pipeline.runtime.sessions import Sessions
-from pipeline.runtime.stage import Stage, load_stage
-from schemas.health import Health
-from schemas.streams import StreamId, input_streams, output_streams
-from schemas.topics import ALL_TRAYS, BY_NAME, alive_key, sessions_key, stage_label
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.launch.loss_accounting import label
+from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.replay.stage_chain import replay_starts
+from fantwin.pipeline.runtime.clock import REPLAY
+from fantwin.pipeline.runtime.sessions import Sessions
+from fantwin.pipeline.runtime.stage import Stage, load_stage
+from fantwin.schemas.health import Health
+from fantwin.schemas.streams import StreamId, input_streams, output_streams
+from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, alive_key, sessions_key, stage_label
 
 _POLL_S = 0.02
 _ANY_STAGE_S = 2.0  # to find any stage: one whose first peer has died tries its endpoint every second

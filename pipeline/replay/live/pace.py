@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S
 
 SLOWEST, FASTEST = 1 / 64, 1024.0
 """limits of doubling and halving the rate; faster than FASTEST is only infinite: as fast as possible"""

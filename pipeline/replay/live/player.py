@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from pipeline.replay.live.keyboard import Key
-from pipeline.replay.live.pace import Pace, faster, slower
-from schemas.enums import StageStatus
-from schemas.envelope import Envelope
-from schemas.messages import NewTwin, Raw
-from schemas.topics import BY_NAME, TOPICS
+from fantwin.pipeline.replay.live.keyboard import Key
+from fantwin.pipeline.replay.live.pace import Pace, faster, slower
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import NewTwin, Raw
+from fantwin.schemas.topics import BY_NAME, TOPICS
 
 BEAT_S = 0.05
 HEALTH_PERIOD_S = 1.0

@@ -7,20 +7,20 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from pipeline.bus.session import join_bus
-from pipeline.config.models import Config
-from pipeline.config.roles import REPLAY
-from pipeline.errors import UserError
-from pipeline.replay.live.keyboard import Key
-from pipeline.replay.live.listeners import Listeners, conflict, made_by_stages
-from pipeline.replay.live.pace import Pace
-from pipeline.replay.live.player import Player, Progress, RealTime, Stopped
-from pipeline.replay.live.recording_playback import RecordingPlayback
-from pipeline.replay.live.sender import Sender
-from pipeline.replay.resolve_config import trays_of
-from schemas.enums import StageStatus
-from schemas.topics import BY_NAME
-from schemas.units import NS_PER_S
+from fantwin.pipeline.bus.session import join_bus
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.roles import REPLAY
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.replay.live.keyboard import Key
+from fantwin.pipeline.replay.live.listeners import Listeners, conflict, made_by_stages
+from fantwin.pipeline.replay.live.pace import Pace
+from fantwin.pipeline.replay.live.player import Player, Progress, RealTime, Stopped
+from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
+from fantwin.pipeline.replay.live.sender import Sender
+from fantwin.pipeline.replay.resolve_config import trays_of
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.topics import BY_NAME
+from fantwin.schemas.units import NS_PER_S
 
 
 @dataclass

@@ -14,12 +14,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.recordings.order import Seen
-from pipeline.recordings.rare_messages import rare_messages
-from pipeline.replay.live.sample_times import sample_times
-from schemas.envelope import Envelope
-from schemas.messages import ModelCard, NewTwin
-from schemas.topics import tray_of
+from fantwin.pipeline.recordings.order import Seen
+from fantwin.pipeline.recordings.rare_messages import rare_messages
+from fantwin.pipeline.replay.live.sample_times import sample_times
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import ModelCard, NewTwin
+from fantwin.schemas.topics import tray_of
 
 TWIN, NEW_TWIN = "twin", "new_twin"
 

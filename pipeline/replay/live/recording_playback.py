@@ -11,14 +11,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from pipeline.recordings.grouping import describe, recordings_of
-from pipeline.recordings.order import Seen, in_order
-from pipeline.recordings.reading import RecordingError, read_recording
-from pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
-from pipeline.replay.live.recorded_versions import NEW_TWIN, TWIN, ComingVersions, read_versions
-from pipeline.replay.live.sample_times import sample_times
-from schemas.envelope import Envelope
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.grouping import describe, recordings_of
+from fantwin.pipeline.recordings.order import Seen, in_order
+from fantwin.pipeline.recordings.reading import RecordingError, read_recording
+from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
+from fantwin.pipeline.replay.live.recorded_versions import NEW_TWIN, TWIN, ComingVersions, read_versions
+from fantwin.pipeline.replay.live.sample_times import sample_times
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.units import NS_PER_S
 
 LOOP_GAP_NS = 10_000_000  # between two rounds of a recording without a grid, whose period would say more
 OUT_OF_ORDER_NS = 10 * NS_PER_S

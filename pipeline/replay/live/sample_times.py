@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.messages import Array, Grid, Message, Prediction, Raw, Score
+from fantwin.schemas.messages import Array, Grid, Message, Prediction, Raw, Score
 
 
 def sample_times(message: Message) -> Array:

@@ -8,18 +8,18 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
-from pipeline.bus.publisher import Publisher
-from pipeline.bus.session import Bus
-from pipeline.errors import UserError
-from pipeline.runtime.clock import REPLAY
-from pipeline.runtime.health import HealthBuilder
-from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.health import Output
-from schemas.messages import Clock, Message
-from schemas.topics import ALL_TRAYS, BY_NAME, alive_key, health_key, tray_key, tray_of
+from fantwin.pipeline.bus.publisher import Publisher
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.runtime.clock import REPLAY
+from fantwin.pipeline.runtime.health import HealthBuilder
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Output
+from fantwin.schemas.messages import Clock, Message
+from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, alive_key, health_key, tray_key, tray_of
 
 
 class Sender:

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from schemas.enums import Feedback
-from schemas.messages import Alarm, Diagnosis
-from scoring.alarms.fan_condition import GIVES_FEEDBACK
+from fantwin.schemas.enums import Feedback
+from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
 
 _GIVES = dict(GIVES_FEEDBACK.values())
 _Name = tuple[str, int, int]

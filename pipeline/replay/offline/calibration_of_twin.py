@@ -8,11 +8,11 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from pipeline.errors import UserError
-from pipeline.replay.offline.healthy_runs import DecidedRun, FreeLimit, HealthyRuns, LearnedRun, Limit
-from pipeline.runtime.tray_twin import TrayTwin
-from scoring.calibration.alarm_rate import HOURS_PER_DAY, daily_interval
-from scoring.calibration.calibration import (
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, FreeLimit, HealthyRuns, LearnedRun, Limit
+from fantwin.pipeline.runtime.tray_twin import TrayTwin
+from fantwin.scoring.calibration.alarm_rate import HOURS_PER_DAY, daily_interval
+from fantwin.scoring.calibration.calibration import (
     Calibration,
     expected_alarms,
     is_exceeded,
@@ -21,7 +21,7 @@ from scoring.calibration.calibration import (
     raised_limit,
     supports,
 )
-from scoring.model.learned import learned_priors
+from fantwin.scoring.model.learned import learned_priors
 
 LARGEST_PER_DAY = 8640.0
 """that can be declared"""

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pipeline.replay.offline.plan import BEGINNING, Span, TrayPlan, undisturbed_plan
-from pipeline.replay.stage_chain import StageChain
-from schemas.messages import ModelCard, Request, ScorerSnapshot
-from schemas.streams import continues
+from fantwin.pipeline.replay.offline.plan import BEGINNING, Span, TrayPlan, undisturbed_plan
+from fantwin.pipeline.replay.stage_chain import StageChain
+from fantwin.schemas.messages import ModelCard, Request, ScorerSnapshot
+from fantwin.schemas.streams import continues
 
 NO_PREDICTIONS = (
     "an alarm clip without predictions cannot be compared: replay it without --verify to raise its alarms again"

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from schemas.enums import Transition
-from schemas.messages import Alarm
-from schemas.units import NS_PER_S
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.units import NS_PER_S
 
 OF_EVIDENCE = frozenset({"score", "statistic", "state", "expected_residual_rad_s", "expected_balance_command"})
 """columns of scores that may differ"""

@@ -11,14 +11,14 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-from pipeline.recordings.dates import format_utc
-from pipeline.replay.offline.comparison import Comparison
-from pipeline.replay.offline.plan import Limit, Session
-from pipeline.replay.offline.tolerance import Apart, differences
-from schemas.codec import CodecError
-from schemas.envelope import Envelope
-from schemas.messages import ScorerSnapshot
-from scoring.model.saved import from_json
+from fantwin.pipeline.recordings.dates import format_utc
+from fantwin.pipeline.replay.offline.comparison import Comparison
+from fantwin.pipeline.replay.offline.plan import Limit, Session
+from fantwin.pipeline.replay.offline.tolerance import Apart, differences
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import ScorerSnapshot
+from fantwin.scoring.model.saved import from_json
 
 
 class SnapshotVerifier:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from pipeline.errors import UserError
-from pipeline.recordings.dates import format_utc
-from pipeline.replay.offline.plan import BEGINNING, Limit
-from pipeline.replay.offline.tolerance import Apart
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.dates import format_utc
+from fantwin.pipeline.replay.offline.plan import BEGINNING, Limit
+from fantwin.pipeline.replay.offline.tolerance import Apart
 
 MAX_NAMED = 5
 """differences that are described"""

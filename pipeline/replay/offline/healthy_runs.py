@@ -12,23 +12,23 @@ from itertools import chain
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from pipeline.config.models import TrayConfig
-from pipeline.errors import UserError
-from pipeline.recordings.checksum import sha256_of
-from pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
-from pipeline.replay.offline.marked_alarms import LeftOut, concerning, without
-from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
-from pipeline.runtime.modelled_fans import modelled_fans
-from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.codec import CodecError
-from schemas.messages import Prediction
-from schemas.units import NS_PER_S
-from scoring.calibration.calibration import Excursions
-from scoring.model.bins import Bin, Bins, bin_ns_of
-from scoring.model.decision import Decision
-from scoring.model.learned import HealthyRun, RunSums
-from scoring.model.operation import Fans
-from scoring.model.priors import Priors
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.checksum import sha256_of
+from fantwin.pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
+from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, concerning, without
+from fantwin.pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
+from fantwin.pipeline.runtime.modelled_fans import modelled_fans
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.messages import Prediction
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.calibration.calibration import Excursions
+from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
+from fantwin.scoring.model.decision import Decision
+from fantwin.scoring.model.learned import HealthyRun, RunSums
+from fantwin.scoring.model.operation import Fans
+from fantwin.scoring.model.priors import Priors
 
 REPORTED_EVERY_S = 5.0
 """of the time that the work takes"""

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from schemas.messages import Array
-from schemas.units import SpeedUnit
-from scoring.model.bins import Bin
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import SpeedUnit
+from fantwin.scoring.model.bins import Bin
 
 AT_ONCE = 1000
 """bins that are read and written at a time"""

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.recordings.dates import format_local, has_date
-from pipeline.recordings.rare_messages import rare_messages
-from pipeline.replay.offline.alarm_episodes import Episode, episodes
-from schemas.enums import Feedback, InvalidReason
-from schemas.messages import Alarm, Prediction
-from schemas.units import NS_PER_S
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.recordings.dates import format_local, has_date
+from fantwin.pipeline.recordings.rare_messages import rare_messages
+from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
+from fantwin.schemas.enums import Feedback, InvalidReason
+from fantwin.schemas.messages import Alarm, Prediction
+from fantwin.schemas.units import NS_PER_S
 
 BEFORE_ALARM_NS = 600 * NS_PER_S
 """a fault begins before its alarm: so long before the onset is left out, too, as a learner holds back"""

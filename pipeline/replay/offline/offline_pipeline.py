@@ -16,18 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.replay.offline.plan import BEGINNING, RAW_MISSING, Limit, Session, TrayPlan, limit_through
-from pipeline.replay.offline.raw_blocks import RawBlocks
-from pipeline.replay.offline.sample_stream import SampleStream
-from pipeline.replay.stage_chain import StageChain
-from pipeline.runtime.stage import Context, Core, Stage
-from schemas.blocks import cut
-from schemas.envelope import Envelope
-from schemas.fast_decode import decode_header
-from schemas.header import Header
-from schemas.messages import Message, NewTwin, Prediction, Request, ScorerSnapshot
-from schemas.messages import newest_t_ns as message_t_ns
-from schemas.topics import BY_NAME
+from fantwin.pipeline.replay.offline.plan import BEGINNING, RAW_MISSING, Limit, Session, TrayPlan, limit_through
+from fantwin.pipeline.replay.offline.raw_blocks import RawBlocks
+from fantwin.pipeline.replay.offline.sample_stream import SampleStream
+from fantwin.pipeline.replay.stage_chain import StageChain
+from fantwin.pipeline.runtime.stage import Context, Core, Stage
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fast_decode import decode_header
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Message, NewTwin, Prediction, Request, ScorerSnapshot
+from fantwin.schemas.messages import newest_t_ns as message_t_ns
+from fantwin.schemas.topics import BY_NAME
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import UserError
-from pipeline.recordings.metadata import recording_metadata
-from pipeline.recordings.records import active_path
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.offline.replay_input import ReplayInput
-from schemas.blocks import cut
-from schemas.header import Header
-from schemas.messages import Grid, Message, Prediction, Raw, Request, Score, newest_t_ns
-from schemas.topics import TOPICS, tray_key
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.metadata import recording_metadata
+from fantwin.pipeline.recordings.records import active_path
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.offline.replay_input import ReplayInput
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Grid, Message, Prediction, Raw, Request, Score, newest_t_ns
+from fantwin.schemas.topics import TOPICS, tray_key
 
 MESSAGE_SAMPLES = 100
 """samples a message: few, for a player that steps by messages and for a file that is truncated"""

@@ -12,9 +12,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from pipeline.replay.stage_chain import StageChain
-from schemas.header import InputPosition
-from schemas.messages import ModelCard, Request, ScorerSnapshot
+from fantwin.pipeline.replay.stage_chain import StageChain
+from fantwin.schemas.header import InputPosition
+from fantwin.schemas.messages import ModelCard, Request, ScorerSnapshot
 
 BEGINNING = -(2**63)
 RAW_MISSING = "{raw_missing}"

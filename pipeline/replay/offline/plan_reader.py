@@ -9,14 +9,24 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple
 
-from pipeline.replay.offline.plan import BEGINNING, Session, Span, TrayPlan
-from pipeline.replay.stage_chain import StageChain
-from schemas.codec import CodecError
-from schemas.envelope import Envelope
-from schemas.fast_decode import decode_header
-from schemas.header import InputPosition
-from schemas.messages import Alarm, Consumed, Grid, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
-from schemas.streams import continues
+from fantwin.pipeline.replay.offline.plan import BEGINNING, Session, Span, TrayPlan
+from fantwin.pipeline.replay.stage_chain import StageChain
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fast_decode import decode_header
+from fantwin.schemas.header import InputPosition
+from fantwin.schemas.messages import (
+    Alarm,
+    Consumed,
+    Grid,
+    Message,
+    ModelCard,
+    Prediction,
+    Request,
+    Score,
+    ScorerSnapshot,
+)
+from fantwin.schemas.streams import continues
 
 _NEVER_REACHED = "raw messages never reached {}, and the recording does not say which"
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from pipeline.replay.offline.plan import Session, Span
-from schemas.blocks import cut
-from schemas.envelope import Envelope
-from schemas.fast_decode import decode_header, decode_together
-from schemas.messages import Message, Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.replay.offline.plan import Session, Span
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fast_decode import decode_header, decode_together
+from fantwin.schemas.messages import Message, Raw
+from fantwin.schemas.units import NS_PER_S
 
 MOST_MESSAGES = 512
 """that a stage is given at once"""

@@ -9,27 +9,27 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pipeline.config.loading import load_config
-from pipeline.config.models import Config, TrayConfig
-from pipeline.recordings.clips.clip import CLIP_SNAPSHOT_KEY
-from pipeline.recordings.grouping import deciding_overrides
-from pipeline.recordings.metadata import CONFIGURATION
-from pipeline.recordings.order import in_order
-from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
-from pipeline.recordings.run_recordings import run_metadata
-from pipeline.replay.default_config import default_config, first_raw
-from pipeline.replay.offline.clip_plan import NO_PREDICTIONS, plan_from_snapshot, plan_with_recorded_inputs
-from pipeline.replay.offline.offline_pipeline import OfflinePipeline
-from pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
-from pipeline.replay.offline.plan_reader import PlanReader
-from pipeline.replay.offline.raw_blocks import RawBlocks
-from pipeline.replay.resolve_config import attached_config
-from pipeline.replay.stage_chain import StageChain, decision_chain
-from pipeline.runtime.clock import is_of_replay
-from pipeline.runtime.consumed import CONSUMED
-from pipeline.runtime.stage import Context
-from schemas.envelope import Envelope
-from schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.recordings.clips.clip import CLIP_SNAPSHOT_KEY
+from fantwin.pipeline.recordings.grouping import deciding_overrides
+from fantwin.pipeline.recordings.metadata import CONFIGURATION
+from fantwin.pipeline.recordings.order import in_order
+from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
+from fantwin.pipeline.recordings.run_recordings import run_metadata
+from fantwin.pipeline.replay.default_config import default_config, first_raw
+from fantwin.pipeline.replay.offline.clip_plan import NO_PREDICTIONS, plan_from_snapshot, plan_with_recorded_inputs
+from fantwin.pipeline.replay.offline.offline_pipeline import OfflinePipeline
+from fantwin.pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
+from fantwin.pipeline.replay.offline.plan_reader import PlanReader
+from fantwin.pipeline.replay.offline.raw_blocks import RawBlocks
+from fantwin.pipeline.replay.resolve_config import attached_config
+from fantwin.pipeline.replay.stage_chain import StageChain, decision_chain
+from fantwin.pipeline.runtime.clock import is_of_replay
+from fantwin.pipeline.runtime.consumed import CONSUMED
+from fantwin.pipeline.runtime.stage import Context
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 
 
 @dataclass

@@ -10,19 +10,19 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import UserError
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.offline.comparison import CannotCompareError, Comparison
-from pipeline.replay.offline.output_recording import TrayOutput, output_writer
-from pipeline.replay.offline.plan import RAW_MISSING, TrayPlan, undisturbed_plan
-from pipeline.replay.offline.replay_input import ReplayInput
-from pipeline.replay.offline.verify import TrayVerifier
-from schemas.codec import CodecError
-from schemas.enums import InvalidReason
-from schemas.header import Header
-from schemas.messages import Alarm, Message, Score, ScorerSnapshot
-from schemas.streams import LOSS_PREFIX
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.offline.comparison import CannotCompareError, Comparison
+from fantwin.pipeline.replay.offline.output_recording import TrayOutput, output_writer
+from fantwin.pipeline.replay.offline.plan import RAW_MISSING, TrayPlan, undisturbed_plan
+from fantwin.pipeline.replay.offline.replay_input import ReplayInput
+from fantwin.pipeline.replay.offline.verify import TrayVerifier
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Message, Score, ScorerSnapshot
+from fantwin.schemas.streams import LOSS_PREFIX
+from fantwin.schemas.units import NS_PER_S
 
 Progress = Callable[[str, int], None]
 """Called with the tray, and the time of the newest scored sample in ns since the epoch."""

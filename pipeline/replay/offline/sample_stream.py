@@ -8,9 +8,9 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from pipeline.replay.offline.plan import Span
-from schemas.blocks import cut
-from schemas.messages import Grid, Prediction, Score
+from fantwin.pipeline.replay.offline.plan import Span
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.messages import Grid, Prediction, Score
 
 Samples = TypeVar("Samples", bound=Grid | Prediction | Score)
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from schemas.messages import Array
+from fantwin.schemas.messages import Array
 
 RELATIVE = 1e-6
 """share of the larger of both numbers: eight units in the last digit of a recorded score"""

@@ -12,18 +12,18 @@ from dataclasses import asdict
 
 import numpy as np
 
-from pipeline.recordings.dates import format_utc
-from pipeline.replay.offline.clip_tolerance import LACKS_EVIDENCE, OF_EVIDENCE, may_be_alone, nearest
-from pipeline.replay.offline.compare_snapshots import SnapshotVerifier
-from pipeline.replay.offline.comparison import Comparison
-from pipeline.replay.offline.plan import Limit, Session
-from pipeline.replay.offline.tolerance import Apart, differences, shares
-from schemas.blocks import cut
-from schemas.enums import Transition
-from schemas.envelope import Envelope
-from schemas.fast_decode import decode_header, decode_together
-from schemas.fields import columns
-from schemas.messages import Alarm, Array, Score, ScorerSnapshot
+from fantwin.pipeline.recordings.dates import format_utc
+from fantwin.pipeline.replay.offline.clip_tolerance import LACKS_EVIDENCE, OF_EVIDENCE, may_be_alone, nearest
+from fantwin.pipeline.replay.offline.compare_snapshots import SnapshotVerifier
+from fantwin.pipeline.replay.offline.comparison import Comparison
+from fantwin.pipeline.replay.offline.plan import Limit, Session
+from fantwin.pipeline.replay.offline.tolerance import Apart, differences, shares
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fast_decode import decode_header, decode_together
+from fantwin.schemas.fields import columns
+from fantwin.schemas.messages import Alarm, Array, Score, ScorerSnapshot
 
 SCORE, SNAPSHOT = "score", "snapshot"
 AT_A_LIMIT = (

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config.loading import load_config
+from fantwin.pipeline.config.loading import load_config
 from tests.support import compose_site as site
 from tests.support.fantwin_command import fantwin
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.broker.config import MqttConfig
-from pipeline.broker.home_assistant import HomeAssistant
-from pipeline.broker.topics import Topics
-from pipeline.config.models import TrayConfig
+from fantwin.pipeline.broker.config import MqttConfig
+from fantwin.pipeline.broker.home_assistant import HomeAssistant
+from fantwin.pipeline.broker.topics import Topics
+from fantwin.pipeline.config.models import TrayConfig
 
 TRAYS = (TrayConfig(name="tray1", fans=2, speed_unit="rpm"), TrayConfig(name="tray-2", fans=3, speed_unit="rad/s"))
 TOPIC = re.compile(r"homeassistant/device/([a-zA-Z0-9_-]+)/([a-zA-Z0-9_-]+)/config")

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.broker.fan_states import FanStates
-from pipeline.broker.outbox import MOST_ANSWERS, Outbox, Outgoing
-from pipeline.broker.topics import do_overlap
-from pipeline.broker.transition_queue import TransitionQueue
-from pipeline.config.models import TrayConfig
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.site_model import SiteModel
-from schemas.enums import FanState
-from schemas.envelope import Envelope
-from schemas.messages import Score
-from schemas.topics import tray_key
+from fantwin.pipeline.broker.fan_states import FanStates
+from fantwin.pipeline.broker.outbox import MOST_ANSWERS, Outbox, Outgoing
+from fantwin.pipeline.broker.topics import do_overlap
+from fantwin.pipeline.broker.transition_queue import TransitionQueue
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Score
+from fantwin.schemas.topics import tray_key
 from tests.stages.test_gateway import alarm, score
 from tests.support.running_core import FANS, SITE, TRAY
 

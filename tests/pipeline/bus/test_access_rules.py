@@ -12,11 +12,11 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from pipeline.bus.kept_messages import kept_key
-from pipeline.bus.recovery import recovery_key
-from pipeline.config.registry import STAGES
-from pipeline.runtime.stage import load_stage
-from schemas.topics import (
+from fantwin.pipeline.bus.kept_messages import kept_key
+from fantwin.pipeline.bus.recovery import recovery_key
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.runtime.stage import load_stage
+from fantwin.schemas.topics import (
     TOPICS,
     alive_key,
     health_key,

@@ -8,11 +8,11 @@ from contextlib import closing
 
 import pytest
 
-from pipeline.bus.errors import BusError
-from pipeline.bus.link import LEASE_MS
-from pipeline.bus.router import open_router
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
+from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.bus.link import LEASE_MS
+from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
 from tests.support.running_chain import eventually
 from tests.support.tcp_relay import TcpRelay
 

@@ -17,20 +17,20 @@ import numpy as np
 import pytest
 import zenoh
 
-from pipeline.bus.access_rules import SiteRoles
-from pipeline.bus.errors import BusError
-from pipeline.bus.router import open_router
-from pipeline.bus.session import Bus, join_bus
-from pipeline.config.loading import parse_config
-from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.recordings.reading import read_recording
-from pipeline.runtime.sessions import Session
-from schemas.codec import decode, encode
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Output
-from schemas.messages import Grid
-from schemas.topics import BY_NAME, health_key, tray_key
+from fantwin.pipeline.bus.access_rules import SiteRoles
+from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.runtime.sessions import Session
+from fantwin.schemas.codec import decode, encode
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Output
+from fantwin.schemas.messages import Grid
+from fantwin.schemas.topics import BY_NAME, health_key, tray_key
 from tests.support import made_messages
 from tests.support.flooding_client import NOISE
 from tests.support.running_chain import RunningCommand, eventually

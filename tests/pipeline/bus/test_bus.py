@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from pipeline.bus.errors import BusError
-from pipeline.bus.publisher import KEPT_BYTES
-from pipeline.bus.recovery import recovery_key
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from schemas.codec import type_name
-from schemas.messages import Alarm
-from schemas.topics import BY_NAME, alive_key, tray_key
+from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.bus.publisher import KEPT_BYTES
+from fantwin.pipeline.bus.recovery import recovery_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.schemas.codec import type_name
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import BY_NAME, alive_key, tray_key
 from tests.support.bus_peer import KEY, TOPIC
 from tests.support.running_chain import eventually
 

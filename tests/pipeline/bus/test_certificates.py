@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.bus.authority import CLOCK_SKEW, Authority
-from pipeline.bus.certificates import Credentials, checked_credentials, read_certificate
-from pipeline.bus.errors import BusError
-from pipeline.bus.opening import zenoh_config
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
+from fantwin.pipeline.bus.authority import CLOCK_SKEW, Authority
+from fantwin.pipeline.bus.certificates import Credentials, checked_credentials, read_certificate
+from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.bus.opening import zenoh_config
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
 from tests.support.site_certificates import DAY, SiteCertificates
 
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.bus.dead_links import UNACKNOWLEDGED_MS, limit_connections
-from pipeline.bus.link import LEASE_MS
-from pipeline.bus.opening import zenoh_config
-from pipeline.bus.router import open_router
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
+from fantwin.pipeline.bus.dead_links import UNACKNOWLEDGED_MS, limit_connections
+from fantwin.pipeline.bus.link import LEASE_MS
+from fantwin.pipeline.bus.opening import zenoh_config
+from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
 from tests.support.running_chain import eventually
 
 pytestmark = pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system has no such limit")

@@ -9,11 +9,11 @@ from contextlib import closing
 
 import pytest
 
-from pipeline.bus.endpoint import accepts_connections, endpoint_problem, somebody_listens
-from pipeline.bus.errors import BusError
-from pipeline.bus.router import open_router
-from pipeline.bus.session import Bus, join_bus
-from pipeline.config.models import BusConfig
+from fantwin.pipeline.bus.endpoint import accepts_connections, endpoint_problem, somebody_listens
+from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.config.models import BusConfig
 from tests.support.secured_site import SecuredSite, free_endpoint
 from tests.support.tcp_relay import TcpRelay
 
@@ -51,7 +51,7 @@ def test_row_15_other_endpoints_are_left_to_zenoh(endpoint):
 
 @pytest.mark.parametrize(("mode", "stop"), [("peer", None), ("client", threading.Event())])
 def test_row_15_a_foreign_program_at_the_endpoint_is_one_line(foreign, monkeypatch, mode, stop):
-    monkeypatch.setattr("pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
     with pytest.raises(BusError) as refused:
         Bus(BusConfig(mode=mode, endpoint=foreign), stop)
     assert str(refused.value) == (
@@ -62,7 +62,7 @@ def test_row_15_a_foreign_program_at_the_endpoint_is_one_line(foreign, monkeypat
 
 @pytest.mark.parametrize("mode", ["peer", "client"])
 def test_row_15_tls_on_one_side_only_is_one_line_that_says_so(tmp_path, monkeypatch, foreign, mode):
-    monkeypatch.setattr("pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
     with SecuredSite(tmp_path, free_endpoint()).running() as site, pytest.raises(BusError) as refused:
         Bus(BusConfig(mode=mode, endpoint=site.endpoint.replace("tls/", "tcp/")))
     assert "the program that listens there takes TLS only: give this configuration" in str(refused.value)
@@ -80,7 +80,7 @@ def test_row_15_a_command_tries_again_where_a_router_is_just_starting(endpoint, 
             relay.heal()
             return accepts_connections(asked)
 
-        monkeypatch.setattr("pipeline.bus.opening.accepts_connections", is_asked)
+        monkeypatch.setattr("fantwin.pipeline.bus.opening.accepts_connections", is_asked)
         with Bus(BusConfig(mode="client", endpoint=relay.endpoint)) as bus:
             assert bus.alive("fantwin/**") == set()
 

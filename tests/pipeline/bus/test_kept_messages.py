@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from queue import SimpleQueue
 
-from pipeline.bus import publisher as publisher_module
-from pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
-from pipeline.bus.recovery import Answer
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from schemas.topics import BY_NAME, CATCH_UP_MESSAGES, tray_key
+from fantwin.pipeline.bus import publisher as publisher_module
+from fantwin.pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
+from fantwin.pipeline.bus.recovery import Answer
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.schemas.topics import BY_NAME, CATCH_UP_MESSAGES, tray_key
 from tests.support.running_chain import eventually
 
 LOST_S, RATE_HZ = 30, 100

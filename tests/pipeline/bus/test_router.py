@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.bus.errors import BusError
-from pipeline.bus.router import open_router
-from pipeline.bus.session import Bus, join_bus
-from pipeline.config.loading import load_config
-from pipeline.config.models import BusConfig
-from schemas.topics import BY_NAME, tray_key
+from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.schemas.topics import BY_NAME, tray_key
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO, RunningCommand, eventually
 
@@ -63,7 +63,7 @@ def test_two_clients_hear_each_other_through_the_router(endpoint, started):
 
 
 def test_a_client_that_waits_for_its_router_says_so(endpoint, monkeypatch):
-    monkeypatch.setattr("pipeline.bus.session.SAID_AFTER_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.bus.session.SAID_AFTER_S", 0.0)
     said: queue.Queue[str] = queue.Queue()
     stop = threading.Event()
 
@@ -119,8 +119,8 @@ def catches_interrupts(process_id: int) -> bool:
 
 LISTENS = """
 import sys, threading
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
 bus = Bus(BusConfig(mode="client", endpoint=sys.argv[1]), threading.Event())
 bus.subscribe(sys.argv[2], lambda _key, payload: print("heard", flush=True))
 sys.stdin.read()

@@ -9,13 +9,13 @@ from queue import SimpleQueue
 
 import pytest
 
-from pipeline.bus import publisher as publisher_module
-from pipeline.bus import spool as spool_module
-from pipeline.bus.recovery import Answer
-from pipeline.bus.session import Bus
-from pipeline.bus.spool import Spool, SpooledStream
-from pipeline.config.models import BusConfig
-from schemas.topics import BY_NAME, tray_key
+from fantwin.pipeline.bus import publisher as publisher_module
+from fantwin.pipeline.bus import spool as spool_module
+from fantwin.pipeline.bus.recovery import Answer
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.bus.spool import Spool, SpooledStream
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.schemas.topics import BY_NAME, tray_key
 from tests.support.running_chain import eventually
 from tests.support.small_disk import SIZE_BYTES
 

@@ -11,12 +11,12 @@ from dataclasses import replace
 import pytest
 from pydantic import ValidationError
 
-from pipeline.bus.access_rules import SiteRoles
-from pipeline.bus.errors import BusError
-from pipeline.bus.router import open_router
-from pipeline.bus.session import Bus, join_bus
-from pipeline.config.models import BusConfig
-from schemas.topics import BY_NAME, alive_key, tray_key
+from fantwin.pipeline.bus.access_rules import SiteRoles
+from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.schemas.topics import BY_NAME, alive_key, tray_key
 from tests.support.running_chain import RunningCommand, eventually
 from tests.support.secured_site import SITE, SecuredSite, free_endpoint, put
 

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.cli.main import expand_variadic
-from pipeline.presenting.alarm_rates import AlarmRates
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.judged_time import JudgedStretch
-from pipeline.recordings.clips.clip import CLIP_KEY
-from pipeline.recordings.rare_messages import rare_messages
-from pipeline.recordings.reading import read_recording
-from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import Feedback, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Score
-from schemas.topics import tray_key
+from fantwin.pipeline.cli.main import expand_variadic
+from fantwin.pipeline.presenting.alarm_rates import AlarmRates
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.presenting.judged_time import JudgedStretch
+from fantwin.pipeline.recordings.clips.clip import CLIP_KEY
+from fantwin.pipeline.recordings.rare_messages import rare_messages
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.enums import Feedback, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Score
+from fantwin.schemas.topics import tray_key
 from tests.support.fantwin_command import fantwin
 from tests.support.running_chain import DEMO
 

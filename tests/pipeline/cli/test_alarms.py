@@ -16,22 +16,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.bus.session import Bus
-from pipeline.cli.watch.alarm_list import alarm_lines
-from pipeline.cli.watch.alarms import OperatorAction
-from pipeline.config.loading import load_config
-from pipeline.runtime.healthy_twin import ScorerConfig
-from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import BuiltStage, Core, Stage
-from schemas.codec import decode, encode, type_name
-from schemas.enums import Action, InvalidReason, Severity, StageStatus, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis, Message, Request
-from schemas.topics import BY_NAME, tray_key
-from scoring.alarms.current_alarms import CurrentAlarm, clock
-from scoring.alarms.fan_condition import AlarmState, ConditionSettings
-from scoring.alarms.tray_conditions import Decided, TrayConditions
-from scoring.wear.slow_change import own_change, shared_change
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.cli.watch.alarm_list import alarm_lines
+from fantwin.pipeline.cli.watch.alarms import OperatorAction
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.runtime.healthy_twin import ScorerConfig
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
+from fantwin.schemas.codec import decode, encode, type_name
+from fantwin.schemas.enums import Action, InvalidReason, Severity, StageStatus, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis, Message, Request
+from fantwin.schemas.topics import BY_NAME, tray_key
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock
+from fantwin.scoring.alarms.fan_condition import AlarmState, ConditionSettings
+from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
+from fantwin.scoring.wear.slow_change import own_change, shared_change
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
 from tests.support.score_data import one_sample
@@ -161,7 +161,7 @@ class Site:
 
 @pytest.fixture
 def site(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
-    monkeypatch.setattr("pipeline.runtime.runner.HEALTH_PERIOD_S", 0.05)  # every command waits for the next one
+    monkeypatch.setattr("fantwin.pipeline.runtime.runner.HEALTH_PERIOD_S", 0.05)  # every command waits for the next one
     site = Site(endpoint)
     yield site
     site.end()
@@ -313,7 +313,7 @@ def test_row_10_an_answer_of_a_stranger_is_none_and_a_scorer_that_does_not_answe
 
 @pytest.mark.parametrize("words", [(), ("ack", TRAY, 3)], ids=["list", "ack"])
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, monkeypatch):
-    monkeypatch.setattr("pipeline.cli.watch.live_stages._DISCOVERY_S", 0.3)
+    monkeypatch.setattr("fantwin.pipeline.cli.watch.live_stages._DISCOVERY_S", 0.3)
     error = error_of("alarms", *words, "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
     assert f"alarms unknown: no scorer of site '{SITE}' answers at {endpoint}" in error
 

@@ -12,20 +12,20 @@ from typing import Any
 import onnx
 import pytest
 
-from pipeline.cli.main import expand_variadic
-from pipeline.cli.twins.calibration_check import Check
-from pipeline.recordings.reading import read_recording
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.offline.calibration_of_twin import calibration_in, number_text
-from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.header import Header
-from schemas.messages import Raw
-from schemas.topics import tray_key
-from scoring.calibration.calibration import Calibration
+from fantwin.pipeline.cli.main import expand_variadic
+from fantwin.pipeline.cli.twins.calibration_check import Check
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in, number_text
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.topics import tray_key
+from fantwin.scoring.calibration.calibration import Calibration
+from fantwin.twin.export.card_entries import with_card_entries
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.healthy_site import FANS, PER_DAY, recorded
 from tests.support.twin_files import write_twin
-from twin.export.card_entries import with_card_entries
 
 RATE = ("--false-alarms-per-day", PER_DAY)
 

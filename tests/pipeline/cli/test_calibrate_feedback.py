@@ -10,20 +10,20 @@ from typing import Any
 
 import pytest
 
-from pipeline.cli.main import expand_variadic
-from pipeline.cli.recordings_in_parallel import RecordingsInParallel
-from pipeline.cli.twins.calibration_check import check_declared_rate
-from pipeline.cli.twins.marked_running import marked_running
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.offline.marked_alarms import LeftOut, alarms_in, concerning, marked_alarms
-from schemas.enums import Action, Severity, Transition
-from schemas.header import Header
-from schemas.messages import Alarm
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
-from scoring.alarms.fan_condition import GIVES_FEEDBACK
-from scoring.model.priors import Priors
+from fantwin.pipeline.cli.main import expand_variadic
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.cli.twins.calibration_check import check_declared_rate
+from fantwin.pipeline.cli.twins.marked_running import marked_running
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, alarms_in, concerning, marked_alarms
+from fantwin.schemas.enums import Action, Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
+from fantwin.scoring.model.priors import Priors
 from tests.support.fantwin_command import fantwin
 from tests.support.healthy_site import FAULT_S, PER_DAY, recorded, start_ns
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from pipeline.bus.certificates import checked_credentials
-from pipeline.cli import main as command_line
-from pipeline.config.loading import load_config
-from pipeline.config.roles import roles_of
-from pipeline.errors import UserError
+from fantwin.pipeline.bus.certificates import checked_credentials
+from fantwin.pipeline.cli import main as command_line
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.roles import roles_of
+from fantwin.pipeline.errors import UserError
 from tests.support.site_certificates import SiteCertificates
 
 CONFIG = """

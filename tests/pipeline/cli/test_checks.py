@@ -7,11 +7,11 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from pipeline.config.models import TrayConfig
-from pipeline.devices.sample_blocks import SampleBlocks
-from pipeline.devices.serial_source import SerialSource
-from pipeline.runtime.stage import Context
-from stages import acquisition, recorder, viewer
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.devices.sample_blocks import SampleBlocks
+from fantwin.pipeline.devices.serial_source import SerialSource
+from fantwin.pipeline.runtime.stage import Context
+from fantwin.stages import acquisition, recorder, viewer
 
 
 def context(folder: Path, config: Any, **tray: Any) -> Context:

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.twins import next_version
-from pipeline.cli.twins.fan_changes import changes_to_list, mean_changes
-from pipeline.cli.twins.next_version import make_next_version
-from pipeline.cli.twins.version_data import spread_parts
-from pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
-from pipeline.learning.versions import Check, TwinVersions
-from schemas.header import Header
-from schemas.messages import Array, Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.cli.twins import next_version
+from fantwin.pipeline.cli.twins.fan_changes import changes_to_list, mean_changes
+from fantwin.pipeline.cli.twins.next_version import make_next_version
+from fantwin.pipeline.cli.twins.version_data import spread_parts
+from fantwin.pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
+from fantwin.pipeline.learning.versions import Check, TwinVersions
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.units import NS_PER_S
+from fantwin.twin.models.physical import PhysicalModel
 from tests.pipeline.learning.test_versions import version
 from tests.support.commanded_fans import GAIN, RATE_HZ, START_S, moving
 from tests.support.twin_files import write_twin
-from twin.models.physical import PhysicalModel
 
 
 class OfferError(Exception):
@@ -33,7 +33,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def offer(_work: object, changed: str) -> None:
         raise OfferError(changed)
 
-    monkeypatch.setattr("pipeline.learning.versions.REFERENCE_S", 60.0)
+    monkeypatch.setattr("fantwin.pipeline.learning.versions.REFERENCE_S", 60.0)
     monkeypatch.setattr(next_version, "CHECKED_S", 400.0)
     monkeypatch.setattr(next_version, "LEAST_CHECKED_S", 90.0)
     monkeypatch.setattr(next_version._Work, "offered", offer)

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
-from pipeline.bus.publisher import Publisher
-from pipeline.bus.session import Bus
-from pipeline.cli.watch.commanding import CommandSender, command_of, share_note, why_not_sent
-from pipeline.config.models import BusConfig, TrayConfig
-from pipeline.devices.sample_source import SourceContext
-from pipeline.devices.serial_config import SerialConfig
-from pipeline.devices.source_kinds import build_source
-from pipeline.runtime.device_commands import DeviceCommands
-from pipeline.runtime.sessions import Session
-from schemas.codec import encode, type_name
-from schemas.health import Counter, Health, Note
-from schemas.topics import BY_NAME, alive_key, health_key
+from fantwin.pipeline.bus.publisher import Publisher
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.cli.watch.commanding import CommandSender, command_of, share_note, why_not_sent
+from fantwin.pipeline.config.models import BusConfig, TrayConfig
+from fantwin.pipeline.devices.sample_source import SourceContext
+from fantwin.pipeline.devices.serial_config import SerialConfig
+from fantwin.pipeline.devices.source_kinds import build_source
+from fantwin.pipeline.runtime.device_commands import DeviceCommands
+from fantwin.pipeline.runtime.sessions import Session
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.health import Counter, Health, Note
+from fantwin.schemas.topics import BY_NAME, alive_key, health_key
 from tests.support import made_messages
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import Chain, RunningCommand, eventually

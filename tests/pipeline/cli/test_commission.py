@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, next_recording_file
-from pipeline.config.loading import load_config
-from pipeline.config.models import TrayConfig
-from pipeline.learning.ordinary_operation import OrdinaryOperation
-from pipeline.recordings.disk_room import DAY_NS, DiskRoom
-from pipeline.recordings.parts import RecordingParts
-from pipeline.recordings.recorder_config import RecorderConfig
-from pipeline.recordings.sequence_ledger import SequenceLedger
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, next_recording_file
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
+from fantwin.pipeline.recordings.disk_room import DAY_NS, DiskRoom
+from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.recorder_config import RecorderConfig
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
 from tests.support.running_chain import fantwin
 
 TRAY = TrayConfig.model_validate({"name": "tray1", "fans": 2, "command_max": 100.0})

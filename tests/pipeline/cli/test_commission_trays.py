@@ -18,16 +18,16 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
-from pipeline.cli.twins.training_data import Part
-from pipeline.cli.watch import commission, commissioning
-from pipeline.cli.watch.child_commands import Commands, Stopped
-from pipeline.config.models import TrayConfig
-from pipeline.errors import UserError
-from pipeline.recordings.writing import RecordingWriter
-from schemas.header import Header
-from schemas.messages import Raw
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.cli.twins.training_data import Part
+from fantwin.pipeline.cli.watch import commission, commissioning
+from fantwin.pipeline.cli.watch.child_commands import Commands, Stopped
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 from tests.support.fantwin_command import fantwin
 from tests.support.replay_data import START_NS, raw_of
 from tests.support.running_chain import DEMO

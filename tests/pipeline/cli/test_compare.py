@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from fantwin.twin.build import train_twin
+from fantwin.twin.comparison import Contender, all_candidates, best
+from fantwin.twin.errors import TwinError
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.pipeline.cli.test_train_commands import record
 from tests.support.fan_data import rough_run
 from tests.support.fantwin_command import fantwin
-from twin.build import train_twin
-from twin.comparison import Contender, all_candidates, best
-from twin.errors import TwinError
 
 FIGURES = ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma")
 
@@ -101,7 +101,7 @@ def test_a_model_that_cannot_be_trained_is_a_row_and_not_the_end(folder, monkeyp
             raise TwinError("the narx model diverges")
         return train_twin(runs, validation_runs, kind, **options)
 
-    monkeypatch.setattr("twin.comparison.train_twin", train_or_diverge)
+    monkeypatch.setattr("fantwin.twin.comparison.train_twin", train_or_diverge)
     arguments = ("compare", folder / "healthy.mcap", "--model", "narx,physical")
     result = json.loads(fantwin(*arguments, "--json").stdout)
     assert result["best"] == "physical"

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.demo_report import SETTLING_NS, summarise
-from pipeline.errors import UserError
-from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import Severity, Transition
-from schemas.fields import columns
-from schemas.header import Header
-from schemas.messages import Alarm, Grid, Message, Raw, Score
-from schemas.topics import tray_key
+from fantwin.pipeline.cli.watch.demo_report import SETTLING_NS, summarise
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.fields import columns
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Grid, Message, Raw, Score
+from fantwin.schemas.topics import tray_key
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000

@@ -15,13 +15,13 @@ from pathlib import Path
 import pytest
 import typer
 
-from pipeline.bus.session import Bus
-from pipeline.cli.watch import doctor as module
-from pipeline.cli.watch.doctor import _of_roles_together, doctor
-from pipeline.config.models import BusConfig
-from pipeline.config.shards import Shard
-from pipeline.extras import how_to_install
-from pipeline.runtime.sessions import Session
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.cli.watch import doctor as module
+from fantwin.pipeline.cli.watch.doctor import _of_roles_together, doctor
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.extras import how_to_install
+from fantwin.pipeline.runtime.sessions import Session
 from tests.support.fantwin_command import fantwin
 from tests.support.running_chain import DEMO
 
@@ -127,7 +127,7 @@ def test_only_the_lines_of_the_named_trays_are_checked(tmp_path, port):
 
 
 def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(capsys, tmp_path, port, monkeypatch):
-    monkeypatch.setattr("pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
         settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]

@@ -10,13 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.cli.twins.drops_found import SPEEDS, STEADY_S, WITHIN_S, drop_lines, dropping, drops_found, smallest_drops
-from pipeline.runtime.modelled_fans import modelled_fans
-from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.units import NS_PER_S
-from scoring.calibration.calibration import Calibration
-from scoring.model.bins import Bins, bin_ns_of
-from scoring.model.decision import Decision
+from fantwin.pipeline.cli.twins.drops_found import (
+    SPEEDS,
+    STEADY_S,
+    WITHIN_S,
+    drop_lines,
+    dropping,
+    drops_found,
+    smallest_drops,
+)
+from fantwin.pipeline.runtime.modelled_fans import modelled_fans
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.calibration.calibration import Calibration
+from fantwin.scoring.model.bins import Bins, bin_ns_of
+from fantwin.scoring.model.decision import Decision
 from tests.support.twin_files import write_twin
 
 CALIBRATION = Calibration(false_alarms_per_day=24.0, fan_hours=100.0, runs=1, found=0, interval_95=(0.0, 0.9))

@@ -7,21 +7,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import (
+    Figures,
+    free_run_residuals,
+    healthy_sigma_rad_s,
+    one_step_residual,
+    sums_of_model,
+)
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.models.model import TwinModel
+from fantwin.twin.models.narx import PARAMETER_COUNT, Narx
+from fantwin.twin.models.network import Scaling
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.runs import Array, Run
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.pipeline.cli.test_train_commands import record
 from tests.support import fan_data
 from tests.support.fantwin_command import fantwin
 from tests.support.twin_files import write_twin
-from twin.build import evaluate, train_twin
-from twin.errors import TwinError
-from twin.evaluation.accuracy import Figures, free_run_residuals, healthy_sigma_rad_s, one_step_residual, sums_of_model
-from twin.export.onnx_twin import OnnxTwin
-from twin.models.model import TwinModel
-from twin.models.narx import PARAMETER_COUNT, Narx
-from twin.models.network import Scaling
-from twin.models.physical import PhysicalModel
-from twin.models.physics import PARAMETER_NAMES
-from twin.runs import Array, Run
 
 
 def parameters_of(**values: float) -> Array:

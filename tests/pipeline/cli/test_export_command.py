@@ -13,13 +13,13 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.recordings import read_arrays
-from pipeline.recordings.tables import PIECE_ROWS, open_table, table_columns
-from pipeline.recordings.writing import RecordingWriter
-from schemas.codec import proto_type
-from schemas.enums import FanState, Statistic
-from schemas.health import Health
-from schemas.messages import ModelCard, Raw
+from fantwin.pipeline.recordings import read_arrays
+from fantwin.pipeline.recordings.tables import PIECE_ROWS, open_table, table_columns
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.codec import proto_type
+from fantwin.schemas.enums import FanState, Statistic
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import ModelCard, Raw
 from tests.pipeline.recordings.test_arrays import alarm, raw, write
 from tests.support.failing_writers import disk_of
 from tests.support.fantwin_command import error_of, fantwin

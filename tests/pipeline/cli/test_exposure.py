@@ -6,16 +6,16 @@ import threading
 
 import pytest
 
-from pipeline.cli.exposure import checked_exposure
-from pipeline.config.models import BusConfig
-from pipeline.errors import UsageError
+from fantwin.pipeline.cli.exposure import checked_exposure
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.errors import UsageError
 
 OPEN, LOCAL = "tcp/0.0.0.0:7447", "tcp/127.0.0.1:7447"
 DRIVES = "whoever reaches it can drive the fans, forge samples and silence alarms"
 
 
 def test_who_accepts_it_is_reminded_until_the_end(monkeypatch):
-    monkeypatch.setattr("pipeline.cli.exposure.AGAIN_S", 0.001)
+    monkeypatch.setattr("fantwin.pipeline.cli.exposure.AGAIN_S", 0.001)
     said: list[str] = []
     often = threading.Event()
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.twins.excerpts import Excerpt
-from pipeline.cli.twins.fan_changes import (
+from fantwin.pipeline.cli.twins.excerpts import Excerpt
+from fantwin.pipeline.cli.twins.fan_changes import (
     changed_fans,
     changes_from_list,
     changes_to_list,
@@ -17,12 +17,12 @@ from pipeline.cli.twins.fan_changes import (
     have_most_changed_alike,
     mean_changes,
 )
-from pipeline.cli.twins.versions_text import check_line
-from pipeline.learning.healthy_history import healthy_recordings
-from pipeline.learning.versions import Check
+from fantwin.pipeline.cli.twins.versions_text import check_line
+from fantwin.pipeline.learning.healthy_history import healthy_recordings
+from fantwin.pipeline.learning.versions import Check
+from fantwin.twin.models.physical import PhysicalModel
 from tests.support.commanded_fans import moving, recorded
 from tests.support.twin_files import COMMAND_RANGE, write_twin
-from twin.models.physical import PhysicalModel
 
 
 def test_a_fan_at_commands_that_the_reference_does_not_know_is_not_comparable(tmp_path: Path) -> None:

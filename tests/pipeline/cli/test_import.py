@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.reading import read_metadata, read_recording
-from pipeline.recordings.runs import read_runs
-from pipeline.replay.default_config import default_config, first_raw
-from schemas.messages import Array, Raw
-from schemas.tacho import Tacho
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.replay.default_config import default_config, first_raw
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.tacho import Tacho
+from fantwin.twin.models.physical import PhysicalModel
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.twin_files import write_twin
-from twin.models.physical import PhysicalModel
 
 
 def measured(folder: Path, rows: int = 1234, start_s: float = 0.0) -> tuple[Path, Array]:

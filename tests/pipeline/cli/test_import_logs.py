@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.reading import read_recording
-from pipeline.recordings.runs import read_runs
-from schemas.fields import Array
-from schemas.messages import Raw
-from schemas.tacho import Tacho
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.schemas.fields import Array
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.tacho import Tacho
 from tests.support.fantwin_command import error_of, fantwin, usage_error_of
 from tests.support.written_logs import write_blackbox, write_rosbag, write_ulog
 

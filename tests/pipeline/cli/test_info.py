@@ -9,15 +9,15 @@ from typing import Any
 
 from mcap.writer import Writer
 
-from pipeline.recordings import contents
-from pipeline.recordings.contents import contents_of
-from pipeline.recordings.sequence_ledger import SequenceLedger
-from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Counter, Health, Input, Note
-from schemas.messages import ModelCard
-from schemas.topics import health_key, tray_key
+from fantwin.pipeline.recordings import contents
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Counter, Health, Input, Note
+from fantwin.schemas.messages import ModelCard
+from fantwin.schemas.topics import health_key, tray_key
 from tests.pipeline.recordings.test_parts import part, parts_in
 from tests.support import made_messages
 from tests.support.fantwin_command import error_of, fantwin

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from pipeline.recordings.records import RecordReader
+from fantwin.pipeline.recordings.records import RecordReader
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.offline_replay import changed, recorded, recording_of, without_topics
@@ -91,7 +91,7 @@ def test_a_view_makes_the_scores_again(lean, tmp_path):
 
 
 def test_what_a_view_and_a_plot_lack_is_told_as_by_a_replay(lean, tmp_path, monkeypatch):
-    monkeypatch.setattr("pipeline.recordings.writing.CHUNK_BYTES", 4096)
+    monkeypatch.setattr("fantwin.pipeline.recordings.writing.CHUNK_BYTES", 4096)
     damaged = without_topics(lean, tmp_path / "damaged.mcap", *MADE)
     content = bytearray(damaged.read_bytes())
     chunks = [record for record in RecordReader(damaged) if record.opcode == Opcode.CHUNK]

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import fantwin_client
-from pipeline.cli.watch.line_check import _findings, check_line, listening_settings, refusal
-from pipeline.config.loading import parse_config
-from pipeline.config.models import Config
-from pipeline.runtime.stage import Context
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
+import fantwin.client
+from fantwin.pipeline.cli.watch.line_check import _findings, check_line, listening_settings, refusal
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.runtime.stage import Context
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
 from tests.support.running_acquisition import SITE, acquisition, push_config
 
 TOML = """
@@ -215,11 +215,11 @@ def test_before_a_site_runs_pushed_samples_are_no_problem_and_are_said_to_be_che
 def test_while_a_site_runs_pushed_samples_are_listened_to(endpoint: str, tmp_path: Path) -> None:
     config, stop = push_config(endpoint, tmp_path), threading.Event()
 
-    def push(tray: fantwin_client.Tray) -> None:
+    def push(tray: fantwin.client.Tray) -> None:
         while not stop.wait(0.05):
             tray.publish(time.time(), [0.25, 0.5], [1500.0, 20_000.0 * 2])
 
-    with acquisition(config), fantwin_client.connect(endpoint, site=SITE) as client:
+    with acquisition(config), fantwin.client.connect(endpoint, site=SITE) as client:
         sender = threading.Thread(target=push, args=(client.tray("tray1", speed_unit="rpm"),))
         sender.start()
         try:

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pipeline.cli import main as command_line
-from pipeline.cli.main import COMMANDS, PANELS, expand_variadic
+from fantwin.pipeline.cli import main as command_line
+from fantwin.pipeline.cli.main import COMMANDS, PANELS, expand_variadic
 from tests.support.running_chain import DEMO, fantwin
 
 README = DEMO.parents[1] / "README.md"
@@ -34,7 +34,7 @@ def help_of(*words: str) -> str:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_says_what_the_list_says_has_an_example_and_prints_json_if_asked(command: str) -> None:
     module, about = COMMANDS[command]
-    function = getattr(import_module(f"pipeline.cli.{module}"), module.rpartition(".")[2])
+    function = getattr(import_module(f"fantwin.pipeline.cli.{module}"), module.rpartition(".")[2])
     assert about.split() == str(getdoc(function)).partition("\n\n")[0].split()
     text = help_of(command)
     assert f"Example: fantwin {command}" in " ".join(text.split())
@@ -65,7 +65,7 @@ def modules_after(code: str) -> set[str]:
     """What a new process has imported after this, and must have ended with nothing worse than SystemExit."""
     show = "finally: print('\\n' + ' '.join(sys.modules))"
     done = subprocess.run(
-        [sys.executable, "-c", f"import sys\nfrom pipeline.cli import main\ntry: {code}\n{show}"],
+        [sys.executable, "-c", f"import sys\nfrom fantwin.pipeline.cli import main\ntry: {code}\n{show}"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert "Traceback" not in done.stderr
@@ -75,14 +75,16 @@ def modules_after(code: str) -> set[str]:
 @pytest.mark.parametrize("words", ["--help", "dmo"])
 def test_the_list_of_commands_imports_none_of_them(words: str) -> None:
     modules = modules_after(f"sys.argv = ['fantwin', '{words}']; main.main()")
-    assert {m for m in modules if m in ("numpy", "scipy") or m.startswith("pipeline.cli.")} == {"pipeline.cli.main"}
+    assert {m for m in modules if m in ("numpy", "scipy") or m.startswith("fantwin.pipeline.cli.")} == {
+        "fantwin.pipeline.cli.main"
+    }
 
 
 def test_the_process_of_a_stage_imports_no_rich_and_no_other_command() -> None:
     modules = modules_after("main._register(['run'])")
-    assert {m for m in modules if m == "rich" or m.startswith(("rich.", "pipeline.cli."))} == {
-        *("pipeline.cli.exposure", "pipeline.cli.main", "pipeline.cli.options"),
-        *("pipeline.cli.watch", "pipeline.cli.watch.run"),
+    assert {m for m in modules if m == "rich" or m.startswith(("rich.", "fantwin.pipeline.cli."))} == {
+        *("fantwin.pipeline.cli.exposure", "fantwin.pipeline.cli.main", "fantwin.pipeline.cli.options"),
+        *("fantwin.pipeline.cli.watch", "fantwin.pipeline.cli.watch.run"),
     }
 
 
@@ -93,7 +95,8 @@ def test_commands_beside_a_running_site_import_nothing_that_is_slow() -> None:
 
 def test_a_command_imports_nothing_that_only_watching_and_judging_need() -> None:
     """It is to be answered at once, and most of its time is imports."""
-    unneeded = ("scoring", "stages", "twin", "pipeline.launch", "pipeline.runtime.stage", "rich", "scipy", "onnxr")
+    rooms = ("scoring", "stages", "twin", "pipeline.launch", "pipeline.runtime.stage")
+    unneeded = (*(f"fantwin.{room}" for room in rooms), "rich", "scipy", "onnxr")
     assert [name for name in modules_after("main._register(['command'])") if name.startswith(unneeded)] == []
 
 

@@ -18,16 +18,16 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 from typer.testing import Result
 
-from pipeline.cli.recordings_in_parallel import RecordingsInParallel
-from pipeline.cli.twins.training_data import Part, read_recording_data
-from pipeline.errors import UserError
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.cli.twins.training_data import Part, read_recording_data
+from fantwin.pipeline.errors import UserError
+from fantwin.twin.evaluation.resampling import thinned
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.but_for_times import but_for_times, content_of
 from tests.support.fan_data import published_run
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEADLINE_S
 from tests.support.written_recordings import write_run
-from twin.evaluation.resampling import thinned
 
 RECORDINGS = ("a.mcap", "b.mcap", "c.mcap")
 BAD = "bad.mcap"
@@ -192,7 +192,7 @@ def test_ctrl_c_ends_all_processes_with_one_line(tmp_path: Path) -> None:
     for pipe in pipes:
         os.mkfifo(pipe)
     command = subprocess.Popen(
-        [sys.executable, "-m", "pipeline", "identify", *map(str, pipes), "--jobs", "2"],
+        [sys.executable, "-m", "fantwin", "identify", *map(str, pipes), "--jobs", "2"],
         stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     ends = [os.open(pipe, os.O_WRONLY) for pipe in pipes]  # returns when a worker has opened it
@@ -236,7 +236,7 @@ def test_a_command_that_is_ended_while_it_fetches_a_recording_leaves_no_copy(tmp
         threading.Thread(target=server.serve_forever, daemon=True).start()
         urls = [f"http://127.0.0.1:{server.server_port}/{name}" for name in RECORDINGS[:2]]
         command = subprocess.Popen(
-            [sys.executable, "-m", "pipeline", "identify", *urls, "--jobs", "2"],
+            [sys.executable, "-m", "fantwin", "identify", *urls, "--jobs", "2"],
             stderr=subprocess.PIPE, text=True, env=os.environ | {"TMPDIR": str(temporary)},
         )  # fmt: skip
         assert begun.acquire(timeout=DEADLINE_S) and begun.acquire(timeout=DEADLINE_S)

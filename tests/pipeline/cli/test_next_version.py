@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli.twins import next_version
-from pipeline.cli.twins.next_version import make_next_version
-from pipeline.cli.twins.train import TrainingSettings, fit_twin
-from pipeline.cli.twins.version_data import newest_recordings
-from pipeline.errors import UserError
-from pipeline.learning.healthy_history import healthy_recordings
-from pipeline.learning.history_recordings import HistoryRecording
-from pipeline.learning.versions import TwinVersions, Version
-from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.units import NS_PER_S
+from fantwin.pipeline.cli.twins import next_version
+from fantwin.pipeline.cli.twins.next_version import make_next_version
+from fantwin.pipeline.cli.twins.train import TrainingSettings, fit_twin
+from fantwin.pipeline.cli.twins.version_data import newest_recordings
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.healthy_history import healthy_recordings
+from fantwin.pipeline.learning.history_recordings import HistoryRecording
+from fantwin.pipeline.learning.versions import TwinVersions, Version
+from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.schemas.units import NS_PER_S
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.healthy_recordings import FANS, START_S, add_recording
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 def _in_minutes() -> Iterator[None]:
     """What a site does in hours, with twins that are trained at once: what is chosen and why is the same."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.learning.versions.REFERENCE_S", 230.0)
+        patch.setattr("fantwin.pipeline.learning.versions.REFERENCE_S", 230.0)
         patch.setattr(next_version, "CHECKED_S", 100.0)
         patch.setattr(next_version, "LEAST_CHECKED_S", 60.0)
         patch.setattr(next_version, "fit_twin", partial(fit_twin, settings=TrainingSettings("physical")))

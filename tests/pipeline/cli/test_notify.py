@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from pipeline.cli.watch.doctor import doctor
+from fantwin.pipeline.cli.watch.doctor import doctor
 from tests.support.fantwin_command import error_of, fantwin, usage_error_of
 from tests.support.message_receivers import HttpReceiver, free_port
 from tests.support.notified_alarms import secret

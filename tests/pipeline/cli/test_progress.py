@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, cast
 import pytest
 import typer
 
-from pipeline.cli import progress
+from fantwin.pipeline.cli import progress
 
 if TYPE_CHECKING:
-    from pipeline.cli.twins.training_data import TrainingData
+    from fantwin.pipeline.cli.twins.training_data import TrainingData
 
 TRAINING_DATA = cast("TrainingData", SimpleNamespace(rad_s_per_unit=0.1, speed_unit="rpm"))
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from pipeline.recordings.contents import TRUNCATED, contents_of
-from pipeline.recordings.records import RecordReader
-from pipeline.recordings.repair import repair_in_place
-from pipeline.recordings.writing import RecordingWriter
-from schemas.health import Output
-from schemas.topics import health_key
+from fantwin.pipeline.recordings.contents import TRUNCATED, contents_of
+from fantwin.pipeline.recordings.records import RecordReader
+from fantwin.pipeline.recordings.repair import repair_in_place
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.health import Output
+from fantwin.schemas.topics import health_key
 from tests.pipeline.recordings.test_repair import chunk_ends, read_by_others, small
 from tests.support import made_messages
 from tests.support.fantwin_command import fantwin

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli import main as command_line
-from pipeline.cli.main import COMMANDS
+from fantwin.pipeline.cli import main as command_line
+from fantwin.pipeline.cli.main import COMMANDS
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.runs import Run
 from tests.pipeline.cli.test_train_commands import record
 from tests.support.fan_data import published_run
 from tests.support.running_chain import DEMO
 from tests.support.twin_files import write_twin
-from twin.models.physical import PhysicalModel
-from twin.runs import Run
 
 LINES = Path(__file__).with_name("refusals.txt").read_text(encoding="utf-8").splitlines()
 ROWS = [line for line in LINES if line and not line.startswith("#")]

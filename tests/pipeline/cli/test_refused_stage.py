@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.bus.access_rules import SiteRoles
-from pipeline.bus.router import open_router
+from fantwin.pipeline.bus.access_rules import SiteRoles
+from fantwin.pipeline.bus.router import open_router
 from tests.support.fantwin_command import fantwin as called
 from tests.support.running_chain import RunningCommand, fantwin
 from tests.support.secured_site import SITE, SecuredSite, free_endpoint

@@ -12,13 +12,13 @@ import onnx
 import pytest
 from typer.testing import Result
 
-from pipeline.recordings.reading import read_metadata, read_recording
-from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import InvalidReason
-from schemas.messages import Alarm, Raw, Score
-from schemas.twin_card import CARD_PROPERTY
-from schemas.units import NS_PER_S
-from scoring.diagnosis.shown_causes import short_name
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Alarm, Raw, Score
+from fantwin.schemas.twin_card import CARD_PROPERTY
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.diagnosis.shown_causes import short_name
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.killed_site import Site
 from tests.support.offline_replay import changed

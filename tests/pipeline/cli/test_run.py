@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.cli.watch import run
+from fantwin.pipeline.cli.watch import run
 
 
 def test_a_stage_that_runs_alone_says_a_problem_once_and_that_it_is_resolved(monkeypatch):

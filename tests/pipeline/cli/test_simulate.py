@@ -14,22 +14,22 @@ import numpy as np
 import pytest
 import serial
 
-from pipeline.cli.simulation.simulate import simulate
-from pipeline.devices import simulated_device as simulated_line
-from pipeline.devices.simulated_device import PseudoTerminal, play, wait_for_reader
-from pipeline.devices.table_device import TableSample
-from pipeline.errors import UserError
-from pipeline.recordings.reading import read_metadata, read_recording
-from schemas import wire
-from schemas.messages import Raw
-from schemas.tacho import Tacho
+from fantwin.pipeline.cli.simulation.simulate import simulate
+from fantwin.pipeline.devices import simulated_device as simulated_line
+from fantwin.pipeline.devices.simulated_device import PseudoTerminal, play, wait_for_reader
+from fantwin.pipeline.devices.table_device import TableSample
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.schemas import wire
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.tacho import Tacho
 from tests.support.running_chain import eventually
 
 FANTWIN = (
     sys.executable,
     "-P",
     "-c",
-    "import typer; from pipeline.cli.simulation.simulate import simulate as s; typer.run(s)",
+    "import typer; from fantwin.pipeline.cli.simulation.simulate import simulate as s; typer.run(s)",
 )
 KEEP = float("nan")
 

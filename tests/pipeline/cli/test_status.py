@@ -17,25 +17,25 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from pipeline import extras
-from pipeline.bus.publisher import Publisher
-from pipeline.bus.session import Bus
-from pipeline.cli.watch import status as status_command
-from pipeline.cli.watch.status import as_json, loss_lines, stage_table, unjudged
-from pipeline.config.loading import load_config
-from pipeline.config.models import BusConfig
-from pipeline.launch.judged_fans import JudgedFans
-from pipeline.launch.site_state import StageState, Word
-from pipeline.launch.site_watcher import SiteWatcher, StageView
-from pipeline.launch.this_host import load_for_this_host
-from schemas.codec import encode, type_name
-from schemas.enums import InvalidReason, Severity, StageStatus, Transition
-from schemas.header import Header
-from schemas.health import Counter, Health, Input, Output
-from schemas.messages import Alarm, Diagnosis
-from schemas.topics import BY_NAME, alive_key, health_key, tray_key
-from schemas.units import NS_PER_S
-from scoring.alarms.current_alarms import clock
+from fantwin.pipeline import extras
+from fantwin.pipeline.bus.publisher import Publisher
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.cli.watch import status as status_command
+from fantwin.pipeline.cli.watch.status import as_json, loss_lines, stage_table, unjudged
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.launch.judged_fans import JudgedFans
+from fantwin.pipeline.launch.site_state import StageState, Word
+from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.launch.this_host import load_for_this_host
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import InvalidReason, Severity, StageStatus, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Counter, Health, Input, Output
+from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.current_alarms import clock
 from tests.support.fantwin_command import error_of
 from tests.support.fantwin_command import fantwin as fantwin_here
 from tests.support.running_chain import DEMO, FANS, SITE, TRAY, RunningCommand, eventually

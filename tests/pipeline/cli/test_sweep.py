@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.watch import sweep as sweep_module
-from pipeline.cli.watch.commanding import NotReceivedError
-from pipeline.cli.watch.excitation import (
+from fantwin.pipeline.cli.watch import sweep as sweep_module
+from fantwin.pipeline.cli.watch.commanding import NotReceivedError
+from fantwin.pipeline.cli.watch.excitation import (
     LEVELS,
     SETTLING,
     SHORT_LEVELS,
@@ -21,16 +21,16 @@ from pipeline.cli.watch.excitation import (
     has_settled,
     time_constants,
 )
-from pipeline.cli.watch.sweep import range_within
-from pipeline.config.loading import load_config
-from pipeline.config.models import TrayConfig
-from pipeline.devices.serial_config import SerialConfig
-from pipeline.errors import UserError
-from pipeline.learning.ordinary_operation import OrdinaryOperation
-from pipeline.runtime.device_commands import DeviceCommands
-from schemas.codec import decode
-from schemas.health import Counter, Health, Input, Note
-from schemas.messages import Command
+from fantwin.pipeline.cli.watch.sweep import range_within
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.devices.serial_config import SerialConfig
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
+from fantwin.pipeline.runtime.device_commands import DeviceCommands
+from fantwin.schemas.codec import decode
+from fantwin.schemas.health import Counter, Health, Input, Note
+from fantwin.schemas.messages import Command
 from tests.support import made_messages
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO
@@ -230,7 +230,7 @@ class AcquisitionOfRefusals:
 
 
 def line_to(acquisition: AcquisitionOfRefusals, monkeypatch: pytest.MonkeyPatch) -> sweep_module._BusLine:
-    monkeypatch.setattr("pipeline.cli.watch.commanding.TrayAcquisition", lambda *_: acquisition)
+    monkeypatch.setattr("fantwin.pipeline.cli.watch.commanding.TrayAcquisition", lambda *_: acquisition)
     return sweep_module._BusLine(acquisition, "plant", TRAY_OF_SIX, threading.Event())  # type: ignore[arg-type]
 
 

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.cli.twins.training_data import TrainingData
-from pipeline.recordings.writing import RecordingWriter
-from schemas.header import Header
-from schemas.messages import Raw
-from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
-from schemas.topics import tray_key
+from fantwin.pipeline.cli.twins.training_data import TrainingData
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
+from fantwin.schemas.topics import tray_key
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.runs import Run
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, counted_run, published_run
 from tests.support.fantwin_command import error_of, fantwin
-from twin.export.onnx_twin import OnnxTwin
-from twin.runs import Run
 
 RPM = 60 / (2 * np.pi)
 
@@ -134,7 +134,7 @@ def test_ctrl_c_during_training_leaves_no_twin(folder, tmp_path, monkeypatch):
     def interrupted(*_arguments, **_options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("twin.fitting.reference_choice.identify", interrupted)
+    monkeypatch.setattr("fantwin.twin.fitting.reference_choice.identify", interrupted)
     result = fantwin("train", folder / "healthy.mcap", "--model", "physical", "-o", tmp_path / "twin.onnx")
     assert (result.exit_code, list(tmp_path.iterdir())) == (130, [])
     assert result.stderr.splitlines()[-1].startswith("interrupted: no twin was written")

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.learning.versions import Check, TwinVersions, learning_folder
-from schemas.units import NS_PER_S
+from fantwin.pipeline.learning.versions import Check, TwinVersions, learning_folder
+from fantwin.schemas.units import NS_PER_S
 from tests.pipeline.learning.test_versions import DAY_NS, version
 from tests.support.fantwin_command import fantwin
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.twins.excerpts import Excerpt, every_of, read_excerpts
-from pipeline.cli.twins.train import TrainingSettings, fit_twin
-from pipeline.cli.twins.version_data import CHECKED_PART_S, CHECKED_PARTS, split, spread_parts
-from pipeline.cli.twins.windows import windows_of
-from pipeline.errors import UserError
-from pipeline.learning.healthy_history import healthy_recordings
-from pipeline.learning.history_recordings import HistoryRecording
-from schemas.units import NS_PER_S
+from fantwin.pipeline.cli.twins.excerpts import Excerpt, every_of, read_excerpts
+from fantwin.pipeline.cli.twins.train import TrainingSettings, fit_twin
+from fantwin.pipeline.cli.twins.version_data import CHECKED_PART_S, CHECKED_PARTS, split, spread_parts
+from fantwin.pipeline.cli.twins.windows import windows_of
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.healthy_history import healthy_recordings
+from fantwin.pipeline.learning.history_recordings import HistoryRecording
+from fantwin.schemas.units import NS_PER_S
 from tests.support.commanded_fans import HELD, RATE_HZ, held, moving, recorded
 
 HOUR_S = 3600.0

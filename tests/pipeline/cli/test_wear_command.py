@@ -13,16 +13,16 @@ from typing import Any
 
 import pytest
 
-from pipeline.config.loading import load_config
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.runtime.healthy_twin import ScorerConfig
-from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import BuiltStage, Core, Stage
-from schemas.header import Header
-from schemas.messages import Message, ScorerSnapshot
-from schemas.topics import tray_key
-from scoring.wear.recorded_wear import shown
-from scoring.wear.trend import NS_PER_DAY, WearSeries
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.runtime.healthy_twin import ScorerConfig
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Message, ScorerSnapshot
+from fantwin.schemas.topics import tray_key
+from fantwin.scoring.wear.recorded_wear import shown
+from fantwin.scoring.wear.trend import NS_PER_DAY, WearSeries
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, SITE, TRAY
 from tests.support.wear_data import LOSS, START_NS, worn_snapshot
@@ -179,6 +179,6 @@ def test_a_scorer_that_has_noted_nothing_yet_is_one_line(site):
 
 
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, monkeypatch):
-    monkeypatch.setattr("pipeline.cli.watch.live_stages._DISCOVERY_S", 0.3)
+    monkeypatch.setattr("fantwin.pipeline.cli.watch.live_stages._DISCOVERY_S", 0.3)
     error = error_of("wear", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
     assert f"wear unknown: no scorer of site '{SITE}' answers at {endpoint}" in error

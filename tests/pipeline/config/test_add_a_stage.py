@@ -13,19 +13,19 @@ from typing import Any
 
 import pytest
 
-from pipeline.bus.session import Bus
-from pipeline.config.loading import parse_config
-from pipeline.config.models import ConfigError
-from pipeline.config.registry import STAGES, StageRow
-from pipeline.launch.processes import process_list
-from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, load_stage
-from schemas.codec import decode, encode, type_name
-from schemas.enums import Severity, StageStatus
-from schemas.header import Header
-from schemas.health import Health
-from schemas.messages import Alarm, Message
-from schemas.topics import BY_NAME, health_key, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.config.registry import STAGES, StageRow
+from fantwin.pipeline.launch.processes import process_list
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, load_stage
+from fantwin.schemas.codec import decode, encode, type_name
+from fantwin.schemas.enums import Severity, StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm, Message
+from fantwin.schemas.topics import BY_NAME, health_key, tray_key
 
 # --- the new file: stages/alarm_log.py ---
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config.loading import load_config, parse_config
-from pipeline.config.models import ConfigError
-from pipeline.devices.serial_config import SerialConfig
+from fantwin.pipeline.config.loading import load_config, parse_config
+from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.devices.serial_config import SerialConfig
 
 GOOD = """
 site = "lab"

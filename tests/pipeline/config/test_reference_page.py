@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.config.reference_page import page
+from fantwin.pipeline.config.reference_page import page
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "configuration.md"
 

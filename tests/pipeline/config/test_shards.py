@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config.loading import parse_config
-from pipeline.config.models import Config, ConfigError
-from pipeline.config.registry import STAGES
-from pipeline.config.shards import (
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import Config, ConfigError
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.shards import (
     MOST_NAME_CHARACTERS,
     Shard,
     chosen_shard,
@@ -17,9 +17,9 @@ from pipeline.config.shards import (
     own_file,
     shards_of,
 )
-from pipeline.errors import UserError
-from pipeline.launch.processes import process_list
-from pipeline.runtime.sessions import Session
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.launch.processes import process_list
+from fantwin.pipeline.runtime.sessions import Session
 
 NAMES = ("a", "b", "c", "d", "e")
 WHOLE = Shard("all", NAMES)

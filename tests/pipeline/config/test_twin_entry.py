@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config.loading import load_config
-from pipeline.config.models import ConfigError
-from pipeline.config.twin_entry import with_twin, write_twin
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.config.twin_entry import with_twin, write_twin
 
 PATH = Path("fantwin.toml")
 

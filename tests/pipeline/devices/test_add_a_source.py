@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.config.loading import parse_config
-from pipeline.config.models import ConfigError
-from pipeline.devices.sample_blocks import BlockEvent, SampleBlocks
-from pipeline.devices.serial_config import SerialConfig
-from pipeline.devices.source_kinds import SOURCE_KINDS, SourceKind
-from pipeline.runtime.stage import BuiltStage, Context
-from schemas.messages import Command, Raw, StatedTacho
-from schemas.tacho import Tacho
-from stages.acquisition import STAGE
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.devices.sample_blocks import BlockEvent, SampleBlocks
+from fantwin.pipeline.devices.serial_config import SerialConfig
+from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS, SourceKind
+from fantwin.pipeline.runtime.stage import BuiltStage, Context
+from fantwin.schemas.messages import Command, Raw, StatedTacho
+from fantwin.schemas.tacho import Tacho
+from fantwin.stages.acquisition import STAGE
 from tests.support.toy_source import ToyConfig, ToySource
 
 KINDS = ", ".join([*SOURCE_KINDS, "toy"])

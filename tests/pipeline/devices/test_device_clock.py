@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.devices.device_clock import UINT32, DeviceClock
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.device_clock import UINT32, DeviceClock
+from fantwin.schemas.units import NS_PER_S
 
 EPOCH_NS = 1_700_000_000_000_000_000
 MS, US = 1_000_000, 1_000

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.devices.device_counters import DeviceCounterSteps
-from schemas.wire import UINT32, DeviceCounters
+from fantwin.pipeline.devices.device_counters import DeviceCounterSteps
+from fantwin.schemas.wire import UINT32, DeviceCounters
 
 AT_100_HZ_S = UINT32 // 100
 """uptime after which the sample number of a device wraps"""

@@ -11,13 +11,13 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner
 
-from pipeline.cli import main as command_line
-from pipeline.config.loading import load_config, parse_config
-from pipeline.devices.discovery import discover_hwmon, discover_serial
-from pipeline.devices.hwmon_config import HwmonConfig
-from pipeline.devices.sample_source import SourceContext
-from pipeline.devices.source_kinds import build_source
-from pipeline.errors import UserError
+from fantwin.pipeline.cli import main as command_line
+from fantwin.pipeline.config.loading import load_config, parse_config
+from fantwin.pipeline.devices.discovery import discover_hwmon, discover_serial
+from fantwin.pipeline.devices.hwmon_config import HwmonConfig
+from fantwin.pipeline.devices.sample_source import SourceContext
+from fantwin.pipeline.devices.source_kinds import build_source
+from fantwin.pipeline.errors import UserError
 from tests.support.hwmon_trees import add_chip, board
 
 

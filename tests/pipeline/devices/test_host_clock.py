@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.devices.host_clock import VARIABLE, ClockStep, HostClock, handed_on
-from schemas.units import NS_PER_S
+from fantwin.pipeline.devices.host_clock import VARIABLE, ClockStep, HostClock, handed_on
+from fantwin.schemas.units import NS_PER_S
 
 EPOCH_NS = 1_700_000_000_000_000_000
 HOUR_NS = 3600 * NS_PER_S

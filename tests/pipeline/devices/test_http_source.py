@@ -18,11 +18,11 @@ import pytest
 import trustme
 from pydantic import ValidationError
 
-from pipeline.devices.http_config import HttpConfig
-from pipeline.devices.http_protocol import LimitedProtocol
-from pipeline.devices.http_source import MOST_CONNECTIONS, MOST_WAITING, HttpSource
-from pipeline.devices.json_samples import LARGEST_BYTES
-from pipeline.devices.sample_source import (
+from fantwin.pipeline.devices.http_config import HttpConfig
+from fantwin.pipeline.devices.http_protocol import LimitedProtocol
+from fantwin.pipeline.devices.http_source import MOST_CONNECTIONS, MOST_WAITING, HttpSource
+from fantwin.pipeline.devices.json_samples import LARGEST_BYTES
+from fantwin.pipeline.devices.sample_source import (
     LinkUp,
     Reading,
     ReadingBatch,
@@ -31,9 +31,9 @@ from pipeline.devices.sample_source import (
     SourceContext,
     SourceEvent,
 )
-from pipeline.errors import UserError
-from pipeline.runtime.stage import Context
-from stages.acquisition import STAGE
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.runtime.stage import Context
+from fantwin.stages.acquisition import STAGE
 from tests.support.mqtt_broker import free_port
 from tests.support.running_acquisition import push_config
 from tests.support.running_chain import eventually

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from pipeline.config.loading import parse_config
-from pipeline.devices.hwmon_config import HwmonConfig
-from pipeline.devices.hwmon_source import HwmonDevice, HwmonSource
-from pipeline.devices.polling import DeviceError
-from pipeline.devices.sample_source import Reading, Rejected, SourceContext
-from pipeline.errors import UserError
-from schemas.tacho import Tacho
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.devices.hwmon_config import HwmonConfig
+from fantwin.pipeline.devices.hwmon_source import HwmonDevice, HwmonSource
+from fantwin.pipeline.devices.polling import DeviceError
+from fantwin.pipeline.devices.sample_source import Reading, Rejected, SourceContext
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.tacho import Tacho
 from tests.support.hwmon_trees import add_chip, board
 
 NAN = float("nan")

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli.simulation.simulated_hwmon import InjectedFaults, tachos_of
-from pipeline.devices.hwmon_config import HwmonConfig
-from pipeline.devices.hwmon_simulator import HwmonTree, play_hwmon
-from pipeline.devices.hwmon_source import HwmonDevice
-from pipeline.devices.sample_source import Reading, SourceContext
-from pipeline.errors import UserError
-from schemas.tacho import Tacho
-from simulation.tacho import TachoSettings
-from simulation.tray import SimulatedTray, TraySettings
+from fantwin.pipeline.cli.simulation.simulated_hwmon import InjectedFaults, tachos_of
+from fantwin.pipeline.devices.hwmon_config import HwmonConfig
+from fantwin.pipeline.devices.hwmon_simulator import HwmonTree, play_hwmon
+from fantwin.pipeline.devices.hwmon_source import HwmonDevice
+from fantwin.pipeline.devices.sample_source import Reading, SourceContext
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.tacho import Tacho
+from fantwin.simulation.tacho import TachoSettings
+from fantwin.simulation.tray import SimulatedTray, TraySettings
 
 FAST = Tacho(kind="average", window_s=0.05)
 

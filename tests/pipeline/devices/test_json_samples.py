@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.devices.json_samples import (
+from fantwin.pipeline.devices.json_samples import (
     LARGEST_BYTES,
     MOST_SAMPLES,
     JsonSamplesError,
@@ -17,8 +17,8 @@ from pipeline.devices.json_samples import (
     batches_of,
     parse_samples,
 )
-from pipeline.devices.receipt_times import ReceiptTimes
-from pipeline.devices.sample_source import Reading, Rejected
+from fantwin.pipeline.devices.receipt_times import ReceiptTimes
+from fantwin.pipeline.devices.sample_source import Reading, Rejected
 
 
 def one(text: str) -> TimedReading | Rejected:

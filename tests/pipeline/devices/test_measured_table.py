@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.devices import measured_table
-from pipeline.devices.measured_table import Table, read_table
-from pipeline.errors import UserError
+from fantwin.pipeline.devices import measured_table
+from fantwin.pipeline.devices.measured_table import Table, read_table
+from fantwin.pipeline.errors import UserError
 
 RPM = 2 * np.pi / 60
 UNITS = {"rad/s": 1.0, "rpm": RPM, "hz": 2 * np.pi, "deg/s": np.pi / 180}

@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from pipeline.config.loading import parse_config
-from pipeline.config.models import ConfigError
-from pipeline.devices.modbus_config import ModbusConfig
-from pipeline.devices.modbus_source import ModbusDevice
-from pipeline.devices.polling import DeviceError
-from pipeline.devices.sample_source import SourceContext
-from schemas.tacho import Tacho
-from simulation.tray import SimulatedTray, TraySettings
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.devices.modbus_config import ModbusConfig
+from fantwin.pipeline.devices.modbus_source import ModbusDevice
+from fantwin.pipeline.devices.polling import DeviceError
+from fantwin.pipeline.devices.sample_source import SourceContext
+from fantwin.schemas.tacho import Tacho
+from fantwin.simulation.tray import SimulatedTray, TraySettings
 from tests.support.modbus_server import (
     COMMAND,
     CURRENT,

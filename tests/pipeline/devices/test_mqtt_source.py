@@ -19,11 +19,11 @@ from pwdlib import PasswordHash
 from pwdlib.hashers.argon2 import Argon2Hasher
 from pydantic import ValidationError
 
-from pipeline.devices import mqtt_source
-from pipeline.devices.fan_values import FanValues
-from pipeline.devices.mqtt_config import MqttConfig
-from pipeline.devices.mqtt_source import MqttSource
-from pipeline.devices.sample_source import (
+from fantwin.pipeline.devices import mqtt_source
+from fantwin.pipeline.devices.fan_values import FanValues
+from fantwin.pipeline.devices.mqtt_config import MqttConfig
+from fantwin.pipeline.devices.mqtt_source import MqttSource
+from fantwin.pipeline.devices.sample_source import (
     LinkDown,
     LinkUp,
     Reading,
@@ -32,7 +32,7 @@ from pipeline.devices.sample_source import (
     SourceContext,
     SourceEvent,
 )
-from pipeline.errors import UserError
+from fantwin.pipeline.errors import UserError
 from tests.support.mqtt_broker import MqttBroker, free_port
 from tests.support.running_chain import eventually
 

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.devices import polling
-from pipeline.devices.polling import DeviceError, PollingSource
-from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceEvent
+from fantwin.pipeline.devices import polling
+from fantwin.pipeline.devices.polling import DeviceError, PollingSource
+from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceEvent
 
 PERIOD_S = 0.02
 

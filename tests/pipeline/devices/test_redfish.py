@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 import trustme
 
-from pipeline.config.loading import parse_config
-from pipeline.config.models import ConfigError
-from pipeline.devices.polling import DeviceError
-from pipeline.devices.redfish_config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
-from pipeline.devices.redfish_source import RedfishDevice
-from pipeline.devices.sample_source import Reading, Rejected, SourceContext
-from schemas.tacho import Tacho
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.devices.polling import DeviceError
+from fantwin.pipeline.devices.redfish_config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
+from fantwin.pipeline.devices.redfish_source import RedfishDevice
+from fantwin.pipeline.devices.sample_source import Reading, Rejected, SourceContext
+from fantwin.schemas.tacho import Tacho
 from tests.support.redfish_server import Controller, redfish_server
 
 SECRET = "correct-horse"

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from pipeline.devices.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
-from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceEvent
+from fantwin.pipeline.devices.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
+from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceEvent
 
 MS = 1_000_000
 BLOCK_MS = 50

@@ -13,8 +13,8 @@ from typing import TypeVar, cast
 import pytest
 import serial
 
-from pipeline.devices.sample_source import LinkDown, LinkUp
-from pipeline.devices.serial_port import ReceivedBytes, SerialPort
+from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp
+from fantwin.pipeline.devices.serial_port import ReceivedBytes, SerialPort
 
 TIMEOUT_S = 20.0  # of a wait that normally ends at once
 T = TypeVar("T")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.devices.tacho_evidence import RAD_S_PER_RPM, find_tacho, tacho_hints
-from schemas.tacho import INSTANTANEOUS, Tacho
+from fantwin.pipeline.devices.tacho_evidence import RAD_S_PER_RPM, find_tacho, tacho_hints
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
 
 
 def readings(tacho: Tacho, rate_hz: float, duration_s: float = 300.0, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:

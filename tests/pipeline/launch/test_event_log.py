@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.launch.event_log import FOLD_S, QUEUE_SIZE, EventLog, RepeatedLines
+from fantwin.pipeline.launch.event_log import FOLD_S, QUEUE_SIZE, EventLog, RepeatedLines
 from tests.support.running_chain import eventually
 
 

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config.models import TrayConfig
-from pipeline.launch.judged_fans import JUDGED_WITHIN_S, JudgedChanges, JudgedFans, Unjudged, as_judged
-from pipeline.launch.site_state import StageState, Word
-from pipeline.launch.site_watcher import SiteWatcher
-from schemas.codec import encode
-from schemas.enums import FanState, InvalidReason
-from schemas.header import Header
-from schemas.health import Output
-from schemas.topics import tray_key
-from scoring.alarms.current_alarms import CurrentAlarm
-from scoring.alarms.words_now import RETURNING
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.launch.judged_fans import JUDGED_WITHIN_S, JudgedChanges, JudgedFans, Unjudged, as_judged
+from fantwin.pipeline.launch.site_state import StageState, Word
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.schemas.codec import encode
+from fantwin.schemas.enums import FanState, InvalidReason
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Output
+from fantwin.schemas.topics import tray_key
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.alarms.words_now import RETURNING
 from tests.pipeline.launch.test_site_watcher import SCORER, STRANGER, StubBus, health
 from tests.support import made_messages
 from tests.support.score_data import one_sample

@@ -15,15 +15,15 @@ from typing import Any, cast
 
 import pytest
 
-from pipeline.config.loading import load_config
-from pipeline.config.shards import Shard
-from pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
-from pipeline.errors import UserError
-from pipeline.launch.launcher import Launcher, Outcome, _Slot
-from pipeline.launch.processes import Child, StageProcess, process_list
-from pipeline.launch.site_watcher import SiteWatcher
-from schemas.enums import StageStatus
-from schemas.topics import alive_key
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.launch.launcher import Launcher, Outcome, _Slot
+from fantwin.pipeline.launch.processes import Child, StageProcess, process_list
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.topics import alive_key
 from tests.pipeline.launch.test_site_watcher import StubBus
 from tests.support.made_messages import health
 from tests.support.running_chain import DEMO, SITE, Chain
@@ -46,7 +46,7 @@ def no_bus(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def connect(*_: object, **__: object) -> None:
         raise ConnectionError
 
-    monkeypatch.setattr("pipeline.launch.launcher.join_bus", connect)
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.join_bus", connect)
     return connect
 
 
@@ -167,7 +167,7 @@ class LateBus:
 
 def search_time_s(bus: Any, monkeypatch: pytest.MonkeyPatch, *settings: str) -> float:
     """How long the launcher searched for another one in vain."""
-    monkeypatch.setattr("pipeline.launch.launcher.time", bus)
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.time", bus)
     config = load_config(DEMO / "demo.toml", settings)
     Launcher(config, (), lambda _line: None)._refuse_second_launcher(bus, bus)
     return bus.now_s - 100.0
@@ -181,7 +181,7 @@ def test_a_second_launcher_searches_for_stages_of_its_site_for_two_seconds_and_t
     assert search_time_s(LateBus(SITE, after_s=1.0, came_second=False), monkeypatch) == 0.0
     stopped, stop = LateBus("other", after_s=5.0), threading.Event()
     stop.set()
-    monkeypatch.setattr("pipeline.launch.launcher.time", stopped)
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.time", stopped)
     Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)._refuse_second_launcher(
         cast("Any", stopped), stop
     )
@@ -211,7 +211,7 @@ class NoRoom:
 @pytest.fixture
 def no_room(monkeypatch: pytest.MonkeyPatch) -> NoRoom:
     no_room = NoRoom()
-    monkeypatch.setattr("pipeline.launch.launcher.Child", no_room)
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.Child", no_room)
     monkeypatch.setattr(Launcher, "_is_back", lambda *_: True)
     return no_room
 
@@ -220,7 +220,7 @@ def recorder_only(lines: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[La
     """A launcher of one stage, its clock, and its only slot."""
     bus: Any = LateBus(SITE, 0.0)
     bus.sleep = bus.wait
-    monkeypatch.setattr("pipeline.launch.launcher.time", bus)
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.time", bus)
     settings = ["launcher.stages=['recorder']", "launcher.restart_delay_s=1.0", "launcher.restart_delay_max_s=3.0"]
     launcher = Launcher(load_config(DEMO / "demo.toml", settings), (), lines.append)
     launcher._watcher = SiteWatcher(cast("Any", StubBus()), SITE)
@@ -310,7 +310,7 @@ def stopped(watcher: Any, monkeypatch: pytest.MonkeyPatch, *, was_ready: bool = 
     """How a run ends whose only stage was the recorder."""
     bus: Any = LateBus(SITE, 0.0)
     bus.sleep = bus.wait
-    monkeypatch.setattr("pipeline.launch.launcher.time", bus)
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.time", bus)
     lines: list[str] = []
     launcher = Launcher(load_config(DEMO / "demo.toml", ["launcher.stages=['recorder']"]), (), lines.append)
     (slot,) = launcher._slots
@@ -365,8 +365,10 @@ class NoSessions:
 def test_it_says_which_files_a_run_recorded_also_one_that_failed(tmp_path, monkeypatch, files, recorded):
     for name in ("recording.mcap", "recording-2.mcap.active"):  # the latter was left by a killed recorder
         (tmp_path / name).touch()
-    monkeypatch.setattr("pipeline.launch.launcher.join_bus", lambda *_, **__: nullcontext(LateBus("elsewhere", 0.0)))
-    monkeypatch.setattr("pipeline.launch.launcher.SiteWatcher", lambda *_: NoSessions())
+    monkeypatch.setattr(
+        "fantwin.pipeline.launch.launcher.join_bus", lambda *_, **__: nullcontext(LateBus("elsewhere", 0.0))
+    )
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.SiteWatcher", lambda *_: NoSessions())
     settings = [f"run_folder='{tmp_path}'", "launcher.stages=['recorder']"]
     launcher = Launcher(load_config(DEMO / "demo.toml", settings), (), lambda _line: None)
 

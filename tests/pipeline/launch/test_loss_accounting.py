@@ -10,9 +10,9 @@ from functools import partial
 
 import pytest
 
-from pipeline.launch.loss_accounting import losses
-from schemas.enums import StageStatus
-from schemas.health import Counter, Health, Input, Output
+from fantwin.pipeline.launch.loss_accounting import losses
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.health import Counter, Health, Input, Output
 from tests.support import made_messages
 
 KEY, COMMAND = "fantwin/s/t/raw", "fantwin/s/t/command"
@@ -198,6 +198,6 @@ def test_counting_losses_imports_no_stage():
     look = (
         "import sys; from tests.pipeline.launch.test_loss_accounting import health, losses;"
         "losses([health('s1', 'scorer', 1), health('v1', 'viewer', 1)]);"
-        "print([name for name in sys.modules if name == 'scipy' or name.startswith('stages.')])"
+        "print([name for name in sys.modules if name == 'scipy' or name.startswith('fantwin.stages.')])"
     )
     assert subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout == "[]\n"

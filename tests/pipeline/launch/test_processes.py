@@ -12,11 +12,11 @@ from typing import Any, cast
 
 import pytest
 
-from pipeline.config.loading import load_config
-from pipeline.config.shards import Shard
-from pipeline.launch.launcher import Launcher
-from pipeline.launch.notices import Notices
-from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.launch.launcher import Launcher
+from fantwin.pipeline.launch.notices import Notices
+from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess
 from tests.support.running_chain import DEMO
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.launch.refused_input import refused, refused_lines, unusable_lines
-from schemas.enums import StageStatus
-from schemas.health import Counter, Health
-from schemas.wire import DEVICE_COUNTERS, FaultKind
+from fantwin.pipeline.launch.refused_input import refused, refused_lines, unusable_lines
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.health import Counter, Health
+from fantwin.schemas.wire import DEVICE_COUNTERS, FaultKind
 from tests.support import made_messages
 
 LAUNCHED = {("acquisition/bench", 7)}

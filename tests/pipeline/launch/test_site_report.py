@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.launch.site_report import RunningProcess, SiteReport
-from pipeline.launch.site_state import StageState, Word
-from pipeline.launch.site_watcher import StageView
-from schemas.enums import Severity, Transition
-from schemas.header import Header
-from schemas.health import Note
-from schemas.messages import Alarm
-from schemas.units import NS_PER_S
-from scoring.alarms.current_alarms import clock, current_alarms
+from fantwin.pipeline.launch.site_report import RunningProcess, SiteReport
+from fantwin.pipeline.launch.site_state import StageState, Word
+from fantwin.pipeline.launch.site_watcher import StageView
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Note
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.current_alarms import clock, current_alarms
 from tests.pipeline.launch.test_site_state import CONSUMER, view
 
 IDS = {"resampler": RunningProcess(11, is_at_work=True), "scorer": RunningProcess(12, is_at_work=True)}

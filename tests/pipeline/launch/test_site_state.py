@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.config.shards import Shard
-from pipeline.launch.processes import StageProcess
-from pipeline.launch.site_state import StageState, Word, stage_states
-from pipeline.launch.site_watcher import StageView
-from schemas.enums import StageStatus
-from schemas.health import AwaitedInput, Health, Input, Output
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.launch.processes import StageProcess
+from fantwin.pipeline.launch.site_state import StageState, Word, stage_states
+from fantwin.pipeline.launch.site_watcher import StageView
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.health import AwaitedInput, Health, Input, Output
+from fantwin.schemas.units import NS_PER_S
 from tests.support.made_messages import health
 
 GRID = "fantwin/s/tray1/grid"

@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 
-from pipeline.config.roles import roles_of_stages
-from pipeline.launch.site_watcher import MOST_UNKNOWN_SESSIONS, MOST_WATCHED_SESSIONS, SiteWatcher
-from pipeline.launch.watched_alarms import MOST_WATCHED_FANS, WATCHED_BYTES
-from pipeline.runtime.sessions import Session
-from schemas.codec import encode
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Output
-from schemas.messages import Alarm
-from schemas.topics import alive_key, health_key, sessions_key, tray_key
+from fantwin.pipeline.config.roles import roles_of_stages
+from fantwin.pipeline.launch.site_watcher import MOST_UNKNOWN_SESSIONS, MOST_WATCHED_SESSIONS, SiteWatcher
+from fantwin.pipeline.launch.watched_alarms import MOST_WATCHED_FANS, WATCHED_BYTES
+from fantwin.pipeline.runtime.sessions import Session
+from fantwin.schemas.codec import encode
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Output
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import alive_key, health_key, sessions_key, tray_key
 from tests.support import made_messages
 from tests.support.bus_peer import alarm
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import extras
-from pipeline.config.models import ConfigError
-from pipeline.launch.this_host import load_for_any_host, load_for_this_host, page_addresses, with_free_port
+from fantwin.pipeline import extras
+from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.launch.this_host import load_for_any_host, load_for_this_host, page_addresses, with_free_port
 
 TRAYS = "".join(f'[[tray]]\nname = "{name}"\nfans = 1\nport = "x"\ntwin = "t.onnx"\n' for name in "ab")
 
@@ -86,7 +86,7 @@ def test_all_shards_of_the_page_need_a_free_port_and_those_of_other_hosts_do_not
 
 @pytest.fixture
 def default_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
-    from pipeline.gateway.config import GatewayConfig  # noqa: PLC0415
+    from fantwin.pipeline.gateway.config import GatewayConfig  # noqa: PLC0415
 
     def change(port: int) -> None:
         monkeypatch.setattr(GatewayConfig.model_fields["port"], "default", port)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.launch.notices import Notices
-from pipeline.launch.watchdog import START_LIMIT_S, Watchdog
-from pipeline.runtime.notifier import Notifier, starting
+from fantwin.pipeline.launch.notices import Notices
+from fantwin.pipeline.launch.watchdog import START_LIMIT_S, Watchdog
+from fantwin.pipeline.runtime.notifier import Notifier, starting
 from tests.support.running_chain import eventually
 
 LIMIT_S = 10.0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.learning.fan_alarms import LONGEST_UNKNOWN_NS, FanAlarms
-from schemas.enums import FanState
-from schemas.messages import Score
-from schemas.units import NS_PER_S
+from fantwin.pipeline.learning.fan_alarms import LONGEST_UNKNOWN_NS, FanAlarms
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.messages import Score
+from fantwin.schemas.units import NS_PER_S
 
 N, S, A, R = FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING
 SAY_NOTHING = [FanState.UNKNOWN, FanState.STOPPED, FanState.STARTING]

@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.learning.healthy_history import (
+from fantwin.pipeline.learning.healthy_history import (
     LONGEST_LAG_NS,
     HealthyHistory,
     healthy_recordings,
     recorded_raws,
     recordings_near_alarms,
 )
-from pipeline.learning.history_recordings import OPEN_NAME
-from pipeline.recordings.disk import AtomicAppendFile
-from pipeline.recordings.reading import read_metadata
-from schemas.header import Header
-from schemas.messages import Raw
-from schemas.units import NS_PER_S
+from fantwin.pipeline.learning.history_recordings import OPEN_NAME
+from fantwin.pipeline.recordings.disk import AtomicAppendFile
+from fantwin.pipeline.recordings.reading import read_metadata
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.units import NS_PER_S
 
 START_S = 1_800_000_000
 
@@ -118,7 +118,7 @@ def test_samples_are_either_healthy_or_near_an_alarm(tmp_path: Path) -> None:
 def test_running_near_alarms_is_kept_for_some_time_and_begins_again_when_fans_are_commissioned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.learning.healthy_history.NEAR_ALARMS_KEPT_S", 4.5 * 3600)
+    monkeypatch.setattr("fantwin.pipeline.learning.healthy_history.NEAR_ALARMS_KEPT_S", 4.5 * 3600)
     history = history_in(tmp_path, hold_back_s=0.0)
     hour_s, day_s = 3600, 24 * 3600
     for first_s in range(0, 2 * day_s, 10 * hour_s):

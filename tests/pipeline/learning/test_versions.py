@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import UserError
-from pipeline.learning.versions import Check, Drop, TwinVersions, Version
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.versions import Check, Drop, TwinVersions, Version
+from fantwin.schemas.units import NS_PER_S
 
 DAY_NS = 86_400 * NS_PER_S
 

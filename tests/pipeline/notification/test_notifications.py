@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from pipeline.notification.config import NotifierConfig
-from pipeline.notification.deciding import Event
-from pipeline.notification.notifications import FIRST_LOOK_NS, Changes, Notifications, Saved
-from pipeline.notification.wording import Level, Place, Text
-from schemas.enums import Feedback, Severity, Transition
-from schemas.messages import Alarm, Diagnosis
-from schemas.units import NS_PER_S
+from fantwin.pipeline.notification.config import NotifierConfig
+from fantwin.pipeline.notification.deciding import Event
+from fantwin.pipeline.notification.notifications import FIRST_LOOK_NS, Changes, Notifications, Saved
+from fantwin.pipeline.notification.wording import Level, Place, Text
+from fantwin.schemas.enums import Feedback, Severity, Transition
+from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.schemas.units import NS_PER_S
 from tests.support.notified_alarms import START_NS, alarm, cleared
 
 TARGET = {"name": "mail", "url_file": "mail.url"}

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import UserError
-from pipeline.notification.deciding import Announced, Event, Kind
-from pipeline.notification.fan_alarm import after
-from pipeline.notification.gathering import Gathered, Happened
-from pipeline.notification.notifications import Basket, Changes, Outgoing, Saved
-from pipeline.notification.outbox import Outbox
-from pipeline.notification.wording import Level, Text
-from schemas.units import NS_PER_S
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.notification.deciding import Announced, Event, Kind
+from fantwin.pipeline.notification.fan_alarm import after
+from fantwin.pipeline.notification.gathering import Gathered, Happened
+from fantwin.pipeline.notification.notifications import Basket, Changes, Outgoing, Saved
+from fantwin.pipeline.notification.outbox import Outbox
+from fantwin.pipeline.notification.wording import Level, Text
+from fantwin.schemas.units import NS_PER_S
 from tests.support.notified_alarms import START_NS, alarm
 
 TEXT = Text("WARNING, fan 2", "fan 2 of tray1", Level.WARNING)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.notification.services import Service
-from pipeline.notification.wording import Level, Text
-from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, WHAT_TO_DO
+from fantwin.pipeline.notification.services import Service
+from fantwin.pipeline.notification.wording import Level, Text
+from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, WHAT_TO_DO
 from tests.support.message_receivers import HttpReceiver, MailServer, free_port
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "notify.md"

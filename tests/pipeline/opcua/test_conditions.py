@@ -10,14 +10,14 @@ pytest.importorskip("asyncua")
 
 from asyncua.ua.ua_binary import variant_to_binary
 
-from pipeline.opcua.conditions import ALL_FIELDS, Condition, ConditionBook, event_id, past_condition
-from pipeline.opcua.events import condition_event, system_event
-from pipeline.viewing.fleet import Fan
-from schemas.enums import Severity, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis
-from scoring.alarms.current_alarms import current_alarms
-from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from fantwin.pipeline.opcua.conditions import ALL_FIELDS, Condition, ConditionBook, event_id, past_condition
+from fantwin.pipeline.opcua.events import condition_event, system_event
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.scoring.alarms.current_alarms import current_alarms
+from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, TRAY, alarm
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.opcua.fan_values import NO_VALUE, NONE_YET, OLD, SILENT_TRAY, FanValues
-from pipeline.presenting.site_model import TrayNow
-from pipeline.viewing.fleet import Fan, FanNow
-from schemas.enums import InvalidReason
-from schemas.units import RAD_S_PER_UNIT
+from fantwin.pipeline.opcua.fan_values import NO_VALUE, NONE_YET, OLD, SILENT_TRAY, FanValues
+from fantwin.pipeline.presenting.site_model import TrayNow
+from fantwin.pipeline.viewing.fleet import Fan, FanNow
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 RPM = RAD_S_PER_UNIT["rpm"]
 NAN = float("nan")

@@ -15,13 +15,13 @@ pytest.importorskip("asyncua")
 
 from asyncua import ua
 
-from pipeline.config.models import TrayConfig
-from pipeline.opcua import history
-from pipeline.opcua.history import AlarmHistory
-from pipeline.presenting import alarm_store
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.site_model import SiteModel
-from schemas.enums import Transition
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.opcua import history
+from fantwin.pipeline.opcua.history import AlarmHistory
+from fantwin.pipeline.presenting import alarm_store
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.schemas.enums import Transition
 from tests.support.notified_alarms import START_NS, TRAY, alarm
 
 NAMESPACE = 2
@@ -46,7 +46,7 @@ def events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         decoded += 1
         return decode(data)
 
-    monkeypatch.setattr("pipeline.presenting.alarm_store._decoded", counted)
+    monkeypatch.setattr("fantwin.pipeline.presenting.alarm_store._decoded", counted)
     found = AlarmHistory(SiteModel("hall", (TrayConfig(name=TRAY, fans=10),), store, keeps_curves=False), NAMESPACE)
 
     def ask(start: float | None, end: float | None, most: int = 0, node: ua.NodeId = SERVER) -> tuple[Any, Any, int]:

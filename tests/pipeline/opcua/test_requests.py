@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.opcua.requests import FAN_METHODS, METHODS, SHELVING_METHODS, status_of
-from schemas.enums import Action, Severity, Transition
-from schemas.messages import Alarm
-from scoring.alarms.fan_condition import GIVES_FEEDBACK, ConditionSettings, FanCondition
+from fantwin.pipeline.opcua.requests import FAN_METHODS, METHODS, SHELVING_METHODS, status_of
+from fantwin.schemas.enums import Action, Severity, Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK, ConditionSettings, FanCondition
 from tests.stages.test_gateway import alarm
 
 NOW_NS = 1_790_000_000_000_000_000

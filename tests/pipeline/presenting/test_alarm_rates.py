@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.presenting import alarm_rates
-from pipeline.presenting.alarm_rates import AlarmRates
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.judged_time import JudgedStretch, JudgedTime
-from schemas.enums import Transition
-from schemas.units import NS_PER_S
+from fantwin.pipeline.presenting import alarm_rates
+from fantwin.pipeline.presenting.alarm_rates import AlarmRates
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.presenting.judged_time import JudgedStretch, JudgedTime
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.units import NS_PER_S
 from tests.stages.test_gateway import score
 from tests.support.made_messages import alarm
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.broker.transition_queue import TransitionQueue
-from pipeline.errors import UserError
-from pipeline.presenting import alarm_store
-from pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.broker.transition_queue import TransitionQueue
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.presenting import alarm_store
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
 from tests.support.notified_alarms import alarm
 
 

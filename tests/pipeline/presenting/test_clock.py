@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.config.models import TrayConfig
-from pipeline.presenting.alarm_store import AlarmStore
-from pipeline.presenting.request_desk import ANSWERED_WITHIN_S, MOST_UNDER_WAY, RequestDesk
-from pipeline.presenting.site_model import SILENT_AFTER_S, SiteModel
-from pipeline.viewing.fleet import Fan
-from schemas.enums import Action
-from schemas.envelope import Envelope
-from schemas.messages import Request
-from schemas.topics import tray_key
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.presenting.alarm_store import AlarmStore
+from fantwin.pipeline.presenting.request_desk import ANSWERED_WITHIN_S, MOST_UNDER_WAY, RequestDesk
+from fantwin.pipeline.presenting.site_model import SILENT_AFTER_S, SiteModel
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.schemas.enums import Action
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Request
+from fantwin.schemas.topics import tray_key
 from tests.stages.test_gateway import score
 from tests.support.running_core import FANS, SITE, TRAY
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from pipeline.presenting.security_log import MOST_LINES, WITHIN_S, SecurityLog
+from fantwin.pipeline.presenting.security_log import MOST_LINES, WITHIN_S, SecurityLog
 
 
 def test_a_flood_is_counted_and_left_out_and_the_next_minute_says_how_much():

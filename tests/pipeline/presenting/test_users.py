@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.errors import UserError
-from pipeline.presenting.users import checked_password
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.presenting.users import checked_password
 
 
 @pytest.mark.parametrize("password", ["correct horse battery", "ann likes 12 fans", "ünïcödé wörds", "aBc1 " * 12])

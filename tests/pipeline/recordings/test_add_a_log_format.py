@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.logs import formats
-from pipeline.recordings.logs.formats import LogFormat
-from pipeline.recordings.logs.log_file import LogFile, Series
-from pipeline.recordings.runs import read_runs
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.logs import formats
+from fantwin.pipeline.recordings.logs.formats import LogFormat
+from fantwin.pipeline.recordings.logs.log_file import LogFile, Series
+from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.schemas.units import NS_PER_S
 from tests.support.fantwin_command import fantwin
 
 START = b"TOY LOG\n"

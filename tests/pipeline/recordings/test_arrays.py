@@ -12,16 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.recordings import read_arrays
-from pipeline.recordings.arrays import Arrays, Block, block_columns, read_topics
-from pipeline.recordings.order import Seen
-from pipeline.recordings.reading import RecordingError
-from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import InvalidReason, Statistic, Transition
-from schemas.header import Header
-from schemas.health import Counter, Health
-from schemas.messages import Alarm, Array, Command, Grid, Message, ModelCard, Raw
-from schemas.topics import health_key, tray_key
+from fantwin.pipeline.recordings import read_arrays
+from fantwin.pipeline.recordings.arrays import Arrays, Block, block_columns, read_topics
+from fantwin.pipeline.recordings.order import Seen
+from fantwin.pipeline.recordings.reading import RecordingError
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.enums import InvalidReason, Statistic, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Counter, Health
+from fantwin.schemas.messages import Alarm, Array, Command, Grid, Message, ModelCard, Raw
+from fantwin.schemas.topics import health_key, tray_key
 from tests.support import made_messages
 from tests.support.made_messages import health
 from tests.support.score_data import made_up_tray
@@ -243,6 +243,8 @@ def test_unknown_topics_and_unreadable_files_are_a_one_line_error(tmp_path):
 
 
 def test_stages_that_read_recordings_load_nothing_of_pandas_or_arrow():
-    program = "import sys, pipeline.recordings; print(*{'pandas', 'pyarrow', 'rerun', 'torch'} & set(sys.modules))"
+    program = (
+        "import sys, fantwin.pipeline.recordings; print(*{'pandas', 'pyarrow', 'rerun', 'torch'} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []

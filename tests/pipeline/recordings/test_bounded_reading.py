@@ -12,9 +12,9 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, Header
 from mcap.writer import MCAP0_MAGIC
 
-from pipeline.recordings.contents import contents_of
-from pipeline.recordings.reading import read_recording
-from pipeline.recordings.records import (
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.records import (
     LARGEST_CHUNK_BYTES,
     LARGEST_RECORD_BYTES,
     RECORD,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pipeline.recordings.clips.clip import Clip, clip_lines, clips_as_text, clips_in, kept_clips
-from pipeline.recordings.clips.tracker import JUDGED_NS, LONGEST_NS, ClipTracker, CutResult
-from schemas.enums import Severity, Transition
-from schemas.header import Header
-from schemas.messages import Alarm
+from fantwin.pipeline.recordings.clips.clip import Clip, clip_lines, clips_as_text, clips_in, kept_clips
+from fantwin.pipeline.recordings.clips.tracker import JUDGED_NS, LONGEST_NS, ClipTracker, CutResult
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm
 
 S = 1_000_000_000
 T0 = 1_800_000_000 * S

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.excerpts import ExcerptReader
-from pipeline.recordings.reading import RecordingError
-from pipeline.recordings.runs import read_runs
-from pipeline.recordings.writing import RecordingWriter
-from schemas import envelope
-from schemas.header import Header
-from schemas.messages import Array, Raw
-from schemas.topics import tray_key
+from fantwin.pipeline.recordings.excerpts import ExcerptReader
+from fantwin.pipeline.recordings.reading import RecordingError
+from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas import envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.topics import tray_key
 
 START_NS = 1_800_000_000_000_000_000
 RATE_HZ, SECONDS, FANS, BLOCK = 20, 1200, 2, 10

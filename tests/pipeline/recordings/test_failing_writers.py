@@ -11,12 +11,12 @@ from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.decoder import DecoderFactory
 
-from pipeline.recordings import writing
-from pipeline.recordings.contents import contents_of
-from pipeline.recordings.disk import AtomicAppendFile, DiskError
-from pipeline.recordings.reading import RecordingError, read_recording
-from pipeline.recordings.records import ACTIVE_SUFFIX
-from pipeline.recordings.writing import CHUNK_BYTES, RecordingWriter
+from fantwin.pipeline.recordings import writing
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.disk import AtomicAppendFile, DiskError
+from fantwin.pipeline.recordings.reading import RecordingError, read_recording
+from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX
+from fantwin.pipeline.recordings.writing import CHUNK_BYTES, RecordingWriter
 from tests.support.failing_writers import disk_of
 from tests.support.written_recordings import RAW_KEY, raw, sequences
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.length import longest_s
-from pipeline.recordings.writing import RecordingWriter
-from schemas.header import Header
-from schemas.messages import Raw
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.length import longest_s
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 
 SAMPLES = 2
 """of a message, a second apart"""

@@ -17,10 +17,10 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 
-from pipeline.recordings.records import ACTIVE_SUFFIX
-from pipeline.recordings.writing import RecordingWriter
-from schemas.header import Header
-from schemas.messages import Alarm, Command, Message, Raw, Score
+from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Command, Message, Raw, Score
 from tests.pipeline.recordings.test_arrays import alarm, key_of, raw
 from tests.support.score_data import made_up_tray
 
@@ -132,7 +132,7 @@ with open(sys.argv[1], "rb") as file:
                       if channel.topic.endswith("/score")} or {"t_ns": proto.t_ns, "message": proto.message}
             values["published_ns"] = message.publish_time
             print(json.dumps({"type": type(proto).DESCRIPTOR.full_name, "sequence": message.sequence, **values}))
-assert not {"schemas", "pipeline"} & set(sys.modules)
+assert "fantwin" not in sys.modules
 """
 
 

@@ -9,12 +9,12 @@ from typing import NoReturn
 import pytest
 from mcap.opcode import Opcode
 
-from pipeline.recordings.contents import contents_of
-from pipeline.recordings.parts import RecordingParts
-from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.records import RecordReader
-from pipeline.recordings.sequence_ledger import SequenceLedger
-from pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.pipeline.recordings.records import RecordReader
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
+from fantwin.pipeline.recordings.writing import RecordingWriter
 from tests.support.failing_writers import disk_of, kill_a_recorder
 from tests.support.written_recordings import RAW_KEY, raw, sequences, write
 

@@ -8,15 +8,15 @@ import pytest
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
-import pipeline.recordings.rare_messages as rare
-from pipeline.recordings.index import SHORT_ENDING
-from pipeline.recordings.rare_messages import last_messages, rare_messages
-from pipeline.recordings.records import RecordReader
-from pipeline.recordings.writing import RecordingWriter
-from schemas.codec import decode
-from schemas.header import Header
-from schemas.messages import ModelCard
-from schemas.topics import tray_key
+import fantwin.pipeline.recordings.rare_messages as rare
+from fantwin.pipeline.recordings.index import SHORT_ENDING
+from fantwin.pipeline.recordings.rare_messages import last_messages, rare_messages
+from fantwin.pipeline.recordings.records import RecordReader
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.codec import decode
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import ModelCard
+from fantwin.schemas.topics import tray_key
 from tests.support.replay_data import START_NS, STEP_NS, raw_of
 
 AT = (0, 1500, 2999)
@@ -26,7 +26,7 @@ AT = (0, 1500, 2999)
 @pytest.fixture
 def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Of many chunks."""
-    monkeypatch.setattr("pipeline.recordings.writing.CHUNK_BYTES", 4096)
+    monkeypatch.setattr("fantwin.pipeline.recordings.writing.CHUNK_BYTES", 4096)
     with RecordingWriter(tmp_path / "r.mcap", {"trays": "tray1"}) as writer:
         for sample in range(3000):
             if sample in AT:
@@ -47,7 +47,7 @@ def test_they_are_found_by_the_index_without_reading_the_rest(recording, monkeyp
     def read(*_: object) -> None:
         raise AssertionError("the whole file is read")
 
-    monkeypatch.setattr("pipeline.recordings.rare_messages.read_recording", read)
+    monkeypatch.setattr("fantwin.pipeline.recordings.rare_messages.read_recording", read)
     assert found(recording) == CARDS
     assert rare_messages(recording, "grid") == []
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from pipeline.recordings.reading import RecordingError, read_recording
-from pipeline.recordings.records import RECORD, RecordReader
-from pipeline.recordings.scan import scan
-from pipeline.recordings.writing import RecordingWriter
-from schemas.codec import decode, encode
-from schemas.messages import newest_t_ns
+from fantwin.pipeline.recordings.reading import RecordingError, read_recording
+from fantwin.pipeline.recordings.records import RECORD, RecordReader
+from fantwin.pipeline.recordings.scan import scan
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.codec import decode, encode
+from fantwin.schemas.messages import newest_t_ns
 
 GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
 

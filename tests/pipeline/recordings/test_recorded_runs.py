@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.reading import RecordingError
-from pipeline.recordings.runs import read_runs
-from pipeline.recordings.writing import RecordingWriter
-from schemas.enums import TachoKind
-from schemas.header import Header
-from schemas.messages import Raw, StatedTacho
-from schemas.tacho import INSTANTANEOUS, Tacho
-from schemas.topics import tray_key
+from fantwin.pipeline.recordings.reading import RecordingError
+from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.enums import TachoKind
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Raw, StatedTacho
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
+from fantwin.schemas.topics import tray_key
 
 START_NS = 1_800_000_000_000_000_000
 

@@ -8,14 +8,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from pipeline.recordings.contents import contents_of
-from pipeline.recordings.rare_messages import last_message_ns, last_messages, rare_messages
-from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.scan import scan
-from pipeline.recordings.writing import RecordingWriter
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Message, Raw
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.rare_messages import last_message_ns, last_messages, rare_messages
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.pipeline.recordings.scan import scan
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Message, Raw
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, raw, sequences, write
 
 
@@ -174,7 +174,7 @@ def test_a_message_on_which_the_writer_crashes_is_not_counted_as_recorded(tmp_pa
     writer = RecordingWriter(tmp_path / "r.mcap", {})
     writer.add_message(RAW_KEY, raw(0), 1000)
     with monkeypatch.context() as patch:
-        patch.setattr("schemas.envelope.newest_t_ns", fails)
+        patch.setattr("fantwin.schemas.envelope.newest_t_ns", fails)
         with pytest.raises(ZeroDivisionError):
             writer.add_message(RAW_KEY, raw(1), 1001)
     writer.finish()

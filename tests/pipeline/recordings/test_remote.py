@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.recordings.reading import RecordingError, read_metadata
-from pipeline.recordings.remote import RemotePath, local_copies, matching, recording_path
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata
+from fantwin.pipeline.recordings.remote import RemotePath, local_copies, matching, recording_path
 from tests.support.fan_data import published_run
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.written_recordings import sequences, write, write_run

@@ -18,16 +18,16 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from pipeline.recordings.contents import contents_of, damage_of
-from pipeline.recordings.disk import AtomicAppendFile
-from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.records import RECORD, RecordReader, record_bytes
-from pipeline.recordings.repair import recover, repair_in_place
-from pipeline.recordings.scan import scan
-from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
-from pipeline.recordings.writing import RecordingWriter
-from schemas.health import Output
-from schemas.topics import health_key
+from fantwin.pipeline.recordings.contents import contents_of, damage_of
+from fantwin.pipeline.recordings.disk import AtomicAppendFile
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.pipeline.recordings.records import RECORD, RecordReader, record_bytes
+from fantwin.pipeline.recordings.repair import recover, repair_in_place
+from fantwin.pipeline.recordings.scan import scan
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.health import Output
+from fantwin.schemas.topics import health_key
 from tests.support.failing_writers import disk_of
 from tests.support.made_messages import health
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
@@ -265,7 +265,7 @@ def test_after_a_damaged_length_the_next_whole_chunk_is_found(tmp_path, whole):
 
 
 def test_a_sector_of_zeros_costs_the_chunks_it_touches(tmp_path, monkeypatch):
-    monkeypatch.setattr("pipeline.recordings.writing.CHUNK_BYTES", 64 * 1024)
+    monkeypatch.setattr("fantwin.pipeline.recordings.writing.CHUNK_BYTES", 64 * 1024)
     path = write(tmp_path / "r.mcap", 1000)
     content = bytearray(path.read_bytes())
     with path.open("rb") as file:

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli.recordings import info
-from pipeline.recordings.contents import contents_of
-from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.run_recordings import recorded_files
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.live.recording_playback import RecordingPlayback
-from pipeline.replay.offline.replay_input import open_replay_input
-from schemas.health import Counter
-from schemas.topics import health_key, tray_key
+from fantwin.pipeline.cli.recordings import info
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.pipeline.recordings.run_recordings import recorded_files
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
+from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.schemas.health import Counter
+from fantwin.schemas.topics import health_key, tray_key
 from tests.support.fantwin_command import fantwin
 from tests.support.killed_site import CONFIGURATION, SITE, TRAY, Site
 from tests.support.made_messages import health

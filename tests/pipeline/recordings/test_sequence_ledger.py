@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.recordings.sequence_ledger import (
+from fantwin.pipeline.recordings.sequence_ledger import (
     SequenceLedger,
     StreamCounts,
     before_from_metadata,
@@ -15,8 +15,8 @@ from pipeline.recordings.sequence_ledger import (
     next_sequences,
     sum_by_key,
 )
-from schemas.health import Health, Output
-from schemas.topics import health_key
+from fantwin.schemas.health import Health, Output
+from fantwin.schemas.topics import health_key
 from tests.support import made_messages
 
 KEY, TWIN_KEY = "fantwin/plant/tray1/raw", "fantwin/plant/tray1/twin"

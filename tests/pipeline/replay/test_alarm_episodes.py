@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from pipeline.replay.offline.alarm_episodes import Episode, compare_episodes, episodes
-from schemas.enums import Feedback, Severity, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis
+from fantwin.pipeline.replay.offline.alarm_episodes import Episode, compare_episodes, episodes
+from fantwin.schemas.enums import Feedback, Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis
 
 DRAG, GAIN = Diagnosis(cause="drag_up", probability=0.6), Diagnosis(cause="gain_down", probability=0.9)
 

@@ -9,14 +9,22 @@ from typing import cast
 import numpy as np
 import pytest
 
-from pipeline.cli.twins.outlier_run_check import outlier_warnings
-from pipeline.errors import UserError
-from pipeline.replay.offline.calibration_of_twin import CalibratedTwin, calibrated
-from pipeline.replay.offline.healthy_runs import DecidedRun, FreeLimit, HealthyRuns, LearnedRun, Limit, decide, learn
-from pipeline.replay.offline.kept_bins import RecordedTray, TrayRun
-from scoring.calibration.calibration import is_exceeded
-from scoring.model.bins import Bins, bin_ns_of
-from scoring.model.learned import RunSums
+from fantwin.pipeline.cli.twins.outlier_run_check import outlier_warnings
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.replay.offline.calibration_of_twin import CalibratedTwin, calibrated
+from fantwin.pipeline.replay.offline.healthy_runs import (
+    DecidedRun,
+    FreeLimit,
+    HealthyRuns,
+    LearnedRun,
+    Limit,
+    decide,
+    learn,
+)
+from fantwin.pipeline.replay.offline.kept_bins import RecordedTray, TrayRun
+from fantwin.scoring.calibration.calibration import is_exceeded
+from fantwin.scoring.model.bins import Bins, bin_ns_of
+from fantwin.scoring.model.learned import RunSums
 from tests.support.healthy_running import made_fans, running
 
 FANS = 12

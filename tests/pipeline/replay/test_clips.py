@@ -7,18 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.recordings.clips.clip import Clip, clip_lines
-from pipeline.recordings.clips.cutting import cut_clips
-from pipeline.recordings.contents import contents_of
-from pipeline.recordings.disk import DiskError
-from pipeline.recordings.reading import read_metadata, read_recording
-from pipeline.recordings.records import active_path
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.offline.comparison import CannotCompareError
-from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.replay.offline.rescoring import RescoredTray, rescore
-from schemas.enums import Action, Severity, Transition
-from schemas.messages import Alarm, Score, ScorerSnapshot
+from fantwin.pipeline.recordings.clips.clip import Clip, clip_lines
+from fantwin.pipeline.recordings.clips.cutting import cut_clips
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.disk import DiskError
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.pipeline.recordings.records import active_path
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.offline.comparison import CannotCompareError
+from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.pipeline.replay.offline.rescoring import RescoredTray, rescore
+from fantwin.schemas.enums import Action, Severity, Transition
+from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
 from tests.support.clipped_recordings import S, clip_of, of_tray, record
 from tests.support.failing_writers import disk_of
 from tests.support.killed_site import Site

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.replay.offline.compare_snapshots import first_difference
-from pipeline.replay.offline.tolerance import Apart
-from schemas.messages import ScorerSnapshot
-from scoring.model.saved import as_json
+from fantwin.pipeline.replay.offline.compare_snapshots import first_difference
+from fantwin.pipeline.replay.offline.tolerance import Apart
+from fantwin.schemas.messages import ScorerSnapshot
+from fantwin.scoring.model.saved import as_json
 
 STATE: dict[str, Any] = {
     "model": {

@@ -12,13 +12,13 @@ from typing import Any, NoReturn
 
 import pytest
 
-from pipeline.cli.recordings_in_parallel import RecordingsInParallel
-from pipeline.errors import UserError
-from pipeline.replay.offline import healthy_runs, kept_bins
-from pipeline.replay.offline.healthy_runs import DecidedRun, HealthyPart, HealthyRuns, LearnedRun, Limit
-from pipeline.replay.offline.kept_bins import KeptBins
-from scoring.model.learned import learned_priors
-from scoring.model.priors import Priors
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.replay.offline import healthy_runs, kept_bins
+from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, HealthyPart, HealthyRuns, LearnedRun, Limit
+from fantwin.pipeline.replay.offline.kept_bins import KeptBins
+from fantwin.scoring.model.learned import learned_priors
+from fantwin.scoring.model.priors import Priors
 from tests.support.healthy_site import recorded, start_ns
 from tests.support.twin_files import write_twin
 

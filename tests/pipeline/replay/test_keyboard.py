@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from pipeline.replay.live.keyboard import Key, KeyParser, Keys
+from fantwin.pipeline.replay.live.keyboard import Key, KeyParser, Keys
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.replay.offline.rescoring import rescore
-from schemas.enums import Action, FanState, InvalidReason, Transition
-from schemas.messages import ModelCard, Score
+from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.pipeline.replay.offline.rescoring import rescore
+from fantwin.schemas.enums import Action, FanState, InvalidReason, Transition
+from fantwin.schemas.messages import ModelCard, Score
 from tests.support.killed_site import CALIBRATION, FANS, Site, balanced_hybrid
 from tests.support.offline_replay import made_equal, recorded, verified
 from tests.support.twin_files import made_up_card, small_hybrid, write_twin

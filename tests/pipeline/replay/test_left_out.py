@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 
-from pipeline.replay.offline.comparison import CannotCompareError, Comparison
+from fantwin.pipeline.replay.offline.comparison import CannotCompareError, Comparison
 from tests.support.offline_replay import (
     alarms_of,
     made_equal,

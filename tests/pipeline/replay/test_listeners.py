@@ -6,13 +6,13 @@ import threading
 
 import pytest
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.replay.live.listeners import Listeners, Present, conflict, made_by_stages
-from pipeline.runtime.stage import load_stage
-from schemas.codec import encode, type_name
-from schemas.health import Health, Input, Output
-from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.replay.live.listeners import Listeners, Present, conflict, made_by_stages
+from fantwin.pipeline.runtime.stage import load_stage
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.health import Health, Input, Output
+from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from tests.support.made_messages import health
 from tests.support.running_chain import eventually
 
@@ -161,7 +161,7 @@ def test_the_replay_is_drained_when_the_whole_chain_has_consumed_everything(site
 
 
 def test_whoever_stops_changing_and_is_behind_is_named(sites, monkeypatch):
-    monkeypatch.setattr("pipeline.replay.live.listeners._STALLED_S", 0.2)
+    monkeypatch.setattr("fantwin.pipeline.replay.live.listeners._STALLED_S", 0.2)
     bus, listeners = sites
     (twin,) = seen_stages(bus, listeners, "twin_integrator")
     twin.say(line(GRID, "replay-1", 99))

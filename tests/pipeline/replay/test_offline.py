@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from mcap.records import Attachment
 
-from pipeline.recordings.metadata import CONFIGURATION
-from pipeline.recordings.reading import RecordingError
-from pipeline.recordings.records import RecordReader
-from pipeline.replay.offline.alarm_episodes import episodes
-from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.replay.offline.rescoring import rescore
-from schemas.enums import Action, FanState, Severity, Transition
-from schemas.messages import Alarm, Score
-from schemas.units import NS_PER_S
+from fantwin.pipeline.recordings.metadata import CONFIGURATION
+from fantwin.pipeline.recordings.reading import RecordingError
+from fantwin.pipeline.recordings.records import RecordReader
+from fantwin.pipeline.replay.offline.alarm_episodes import episodes
+from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.pipeline.replay.offline.rescoring import rescore
+from fantwin.schemas.enums import Action, FanState, Severity, Transition
+from fantwin.schemas.messages import Alarm, Score
+from fantwin.schemas.units import NS_PER_S
 from tests.support.killed_site import CHAIN, Site
 from tests.support.offline_replay import alarms_of, changed, made_equal, recorded, verified
 from tests.support.twin_files import small_hybrid, write_twin

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.recordings.reading import RecordingError
-from pipeline.replay.offline.comparison import CannotCompareError
-from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.replay.offline.rescoring import rescore
-from schemas import fan_pb2
+from fantwin.pipeline.recordings.reading import RecordingError
+from fantwin.pipeline.replay.offline.comparison import CannotCompareError
+from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.pipeline.replay.offline.rescoring import rescore
+from fantwin.schemas import fan_pb2
 from tests.support.killed_site import Site
 from tests.support.offline_replay import changed, made_equal, recorded, verified, verified_in_part
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from pipeline.replay.live.keyboard import Key
-from pipeline.replay.live.pace import FASTEST, SLOWEST, Pace, faster, slower
-from pipeline.replay.live.player import BEAT_S, Player, Progress, Stopped
-from schemas.enums import StageStatus
-from schemas.envelope import Envelope
-from schemas.messages import NewTwin
+from fantwin.pipeline.replay.live.keyboard import Key
+from fantwin.pipeline.replay.live.pace import FASTEST, SLOWEST, Pace, faster, slower
+from fantwin.pipeline.replay.live.player import BEAT_S, Player, Progress, Stopped
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import NewTwin
 from tests.support import made_messages
 from tests.support.replay_data import START_NS, STEP_NS, raw_of
 

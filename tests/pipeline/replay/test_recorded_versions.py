@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.bus.session import Bus
-from pipeline.config.loading import load_config
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.live.pace import Pace
-from pipeline.replay.live.player import Player
-from pipeline.replay.live.publishing import publish
-from pipeline.replay.live.recorded_versions import ComingVersions, read_versions
-from pipeline.replay.live.recording_playback import RecordingPlayback
-from pipeline.runtime.stage import Context, load_stage
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Grid, ModelCard, NewTwin, Prediction, Raw
-from schemas.topics import alive_key, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.live.pace import Pace
+from fantwin.pipeline.replay.live.player import Player
+from fantwin.pipeline.replay.live.publishing import publish
+from fantwin.pipeline.replay.live.recorded_versions import ComingVersions, read_versions
+from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
+from fantwin.pipeline.runtime.stage import Context, load_stage
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Grid, ModelCard, NewTwin, Prediction, Raw
+from fantwin.schemas.topics import alive_key, tray_key
 from tests.pipeline.replay.test_player import FakeTime, Sent
 from tests.support.killed_site import FANS, SITE, TRAY, Site
 from tests.support.offline_replay import recorded

@@ -12,16 +12,16 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 
-from pipeline.recordings.reading import RecordingError
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.live.recording_playback import RecordingPlayback, TimeExtent, shifted
-from schemas.enums import InvalidReason
-from schemas.envelope import Envelope
-from schemas.fields import columns
-from schemas.header import Header
-from schemas.messages import Alarm, Grid, ModelCard
-from schemas.topics import tray_key
-from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from fantwin.pipeline.recordings.reading import RecordingError
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback, TimeExtent, shifted
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fields import columns
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Grid, ModelCard
+from fantwin.schemas.topics import tray_key
+from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.support import made_messages
 from tests.support.replay_data import START_NS, STEP_NS, raw_of, write_raw
 
@@ -153,7 +153,7 @@ def test_a_truncated_part_is_played_as_far_as_it_can_be_read_and_reported(tmp_pa
 def test_damage_before_the_end_of_a_stretch_is_reported(tmp_path, monkeypatch, what):
     """Playback stops reading the file some seconds after the stretch; what it could not read until then counts."""
     path = tmp_path / "damaged.mcap"
-    monkeypatch.setattr("pipeline.recordings.writing.CHUNK_BYTES", 4096)
+    monkeypatch.setattr("fantwin.pipeline.recordings.writing.CHUNK_BYTES", 4096)
     write_raw(path, 4000, fans=1)
     content = bytearray(path.read_bytes())
     (chunk, *_) = (chunk for chunk in chunk_indexes(path) if chunk.message_start_time > START_NS + 5 * 10**9)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.replay.live.listeners import Listeners
-from pipeline.replay.live.recording_playback import RecordingPlayback
-from stages.resampler import ResamplerConfig, ResamplerCore
+from fantwin.pipeline.replay.live.listeners import Listeners
+from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
+from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 from tests.support.fantwin_command import error_of, usage_error_of
 from tests.support.replay_data import START_NS, STEP_NS, write_raw
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config.models import Config, ConfigError
-from pipeline.recordings.reading import read_metadata
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.live.recording_playback import RecordingPlayback
-from pipeline.replay.resolve_config import attached_config, resolve_config, trays_of
-from schemas.topics import tray_key
-from stages.resampler import ResamplerConfig
+from fantwin.pipeline.config.models import Config, ConfigError
+from fantwin.pipeline.recordings.reading import read_metadata
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
+from fantwin.pipeline.replay.resolve_config import attached_config, resolve_config, trays_of
+from fantwin.schemas.topics import tray_key
+from fantwin.stages.resampler import ResamplerConfig
 from tests.support.replay_data import START_NS, raw_of
 
 TOML = """

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.config.registry import STAGES
-from pipeline.replay.stage_chain import decision_chain, derive_chain, derive_starts, replay_starts
-from pipeline.runtime.stage import load_stage
-from schemas.topics import BY_NAME
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.replay.stage_chain import decision_chain, derive_chain, derive_starts, replay_starts
+from fantwin.pipeline.runtime.stage import load_stage
+from fantwin.schemas.topics import BY_NAME
 
 REGISTERED = [load_stage(name) for name in STAGES]
 

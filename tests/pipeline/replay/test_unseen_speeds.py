@@ -14,13 +14,13 @@ import numpy as np
 import onnx
 import pytest
 
-from pipeline.recordings.reading import read_recording
-from schemas.enums import Transition
-from schemas.messages import Alarm, Array, Score
-from schemas.twin_card import CARD_PROPERTY
+from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm, Array, Score
+from fantwin.schemas.twin_card import CARD_PROPERTY
+from fantwin.twin.runs import Run
 from tests.support.fan_data import rough_run
 from tests.support.fantwin_command import fantwin
-from twin.runs import Run
 
 KNEE, HIGHEST = 70.0, 77.0
 BLOCKED_S = 40.0

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.replay.offline.comparison import Comparison
-from pipeline.replay.offline.verify import AT_A_LIMIT, RecordedSession, compare_alarms, compare_scores
-from schemas.enums import FanState, Severity, Transition
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis, Score
+from fantwin.pipeline.replay.offline.comparison import Comparison
+from fantwin.pipeline.replay.offline.verify import AT_A_LIMIT, RecordedSession, compare_alarms, compare_scores
+from fantwin.schemas.enums import FanState, Severity, Transition
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis, Score
 from tests.support import made_messages
 from tests.support.score_data import made_up_tray
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from pipeline.runtime.clock import StageClock, is_of_replay
-from schemas.header import Header
-from schemas.messages import Clock
+from fantwin.pipeline.runtime.clock import StageClock, is_of_replay
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Clock
 
 HOST_NS = 1_800_000_000_000_000_000
 

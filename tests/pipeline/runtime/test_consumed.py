@@ -9,10 +9,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.runtime.consumed import PERIOD_NS, ConsumedReports
-from schemas.header import Header, InputPosition
-from schemas.messages import Consumed, Grid
-from schemas.streams import continues
+from fantwin.pipeline.runtime.consumed import PERIOD_NS, ConsumedReports
+from fantwin.schemas.header import Header, InputPosition
+from fantwin.schemas.messages import Consumed, Grid
+from fantwin.schemas.streams import continues
 from tests.support.made_messages import alarm
 
 STEP_NS = 1_000_000_000

@@ -8,13 +8,13 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.runtime.due_messages import MOST_JOINED_VALUES, DueMessages
-from schemas.blocks import can_join
-from schemas.enums import Action
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Message, Raw, Request
-from schemas.topics import tray_key
+from fantwin.pipeline.runtime.due_messages import MOST_JOINED_VALUES, DueMessages
+from fantwin.schemas.blocks import can_join
+from fantwin.schemas.enums import Action
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Message, Raw, Request
+from fantwin.schemas.topics import tray_key
 
 TRAYS = ("a", "b")
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.bus.session import Bus
-from pipeline.runtime.sequence_tracker import REFUSAL_SHOWN_S, Found, SequenceTracker
-from pipeline.runtime.tracked_streams import Request
-from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Output
-from schemas.messages import Grid, Raw
-from schemas.topics import BY_NAME, health_key, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.runtime.sequence_tracker import REFUSAL_SHOWN_S, Found, SequenceTracker
+from fantwin.pipeline.runtime.tracked_streams import Request
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Output
+from fantwin.schemas.messages import Grid, Raw
+from fantwin.schemas.topics import BY_NAME, health_key, tray_key
 from tests.pipeline.runtime.test_sequence_tracker import KEY, PRODUCER, health, packet, sequences
 from tests.support.toy_stage import TRAY_A, Bench, raw, toy
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from pipeline.runtime.inbox import INBOX_SIZE, MOST_PATIENT, FromBus, FromSource, Inbox, Item, Liveness
-from schemas.topics import health_key, tray_key
+from fantwin.pipeline.runtime.inbox import INBOX_SIZE, MOST_PATIENT, FromBus, FromSource, Inbox, Item, Liveness
+from fantwin.schemas.topics import health_key, tray_key
 from tests.support.running_chain import eventually
 
 LONG_S = 20.0

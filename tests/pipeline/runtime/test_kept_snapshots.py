@@ -7,17 +7,17 @@ from collections.abc import Callable, Iterator, Mapping
 
 import pytest
 
-from pipeline.bus.errors import NoAnswerError
-from pipeline.bus.kept_messages import KeptQuery
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.runtime.kept_snapshots import KeptForOthers, KeptSnapshots
-from pipeline.runtime.sessions import Session
-from schemas.codec import encode
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import ScorerSnapshot
-from schemas.topics import tray_key
+from fantwin.pipeline.bus.errors import NoAnswerError
+from fantwin.pipeline.bus.kept_messages import KeptQuery
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers, KeptSnapshots
+from fantwin.pipeline.runtime.sessions import Session
+from fantwin.schemas.codec import encode
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import ScorerSnapshot
+from fantwin.schemas.topics import tray_key
 from tests.support.running_chain import eventually
 from tests.support.written_recordings import alarm
 

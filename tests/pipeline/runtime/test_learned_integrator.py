@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.config.models import TrayConfig
-from pipeline.runtime.learned_integrator import MOST_COMING, LearnedTwinIntegrator
-from pipeline.runtime.twin_file import TwinFile
-from schemas.blocks import cut
-from schemas.messages import Grid, Message, ModelCard, NewTwin, Prediction
-from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.runtime.learned_integrator import MOST_COMING, LearnedTwinIntegrator
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.messages import Grid, Message, ModelCard, NewTwin, Prediction
+from fantwin.stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from tests.support.twin_files import small_hybrid, write_twin
 
 FANS = 2

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.runtime.healthy_twin import known_of
-from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
+from fantwin.pipeline.runtime.healthy_twin import known_of
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from tests.stages.test_twin_integrator import physical_twin
 
 COUNTING = (Tacho(kind="count", pulses=2, window_s=1.0),)

@@ -6,16 +6,16 @@ from collections.abc import Sequence, Set
 from dataclasses import replace
 from typing import Any
 
-from pipeline.bus.recovery import ALL_PRODUCERS, Answer
-from pipeline.config.models import Config
-from pipeline.runtime.inbox import Inbox, Newest
-from pipeline.runtime.newest_messages import MOST_UNDER_WAY, PAUSE_S, PERIOD_S, NewestMessages
-from pipeline.runtime.stage import BuiltStage
-from schemas.codec import encode
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.messages import Message
-from schemas.topics import tray_key
+from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, Answer
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.runtime.inbox import Inbox, Newest
+from fantwin.pipeline.runtime.newest_messages import MOST_UNDER_WAY, PAUSE_S, PERIOD_S, NewestMessages
+from fantwin.pipeline.runtime.stage import BuiltStage
+from fantwin.schemas.codec import encode
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Message
+from fantwin.schemas.topics import tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Silent, raw, toy
 

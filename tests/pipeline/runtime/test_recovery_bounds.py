@@ -8,20 +8,20 @@ from typing import Any
 
 import pytest
 
-from pipeline.bus import recovery as bus_recovery
-from pipeline.bus.recovery import LAST_SEQUENCE, Answer, recovery_key
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.runtime.inbox import INBOX_BYTES, FromBus, Inbox, Liveness, Recovered
-from pipeline.runtime.peers import MOST_PEERS, Peers
-from pipeline.runtime.recovery import BACK_OFF_S, MOST_AT_A_TIME, Recovery
-from pipeline.runtime.sequence_tracker import MOST_HELD_MESSAGES, Found, SequenceTracker
-from pipeline.runtime.sessions import Session, Sessions
-from pipeline.runtime.tracked_streams import MOST_HEALTH_PRODUCERS, MOST_PRODUCERS, SILENT_S, Request
-from schemas.codec import encode, type_name
-from schemas.header import Header
-from schemas.messages import Grid, Raw
-from schemas.topics import BY_NAME, health_key, tray_key
+from fantwin.pipeline.bus import recovery as bus_recovery
+from fantwin.pipeline.bus.recovery import LAST_SEQUENCE, Answer, recovery_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.runtime.inbox import INBOX_BYTES, FromBus, Inbox, Liveness, Recovered
+from fantwin.pipeline.runtime.peers import MOST_PEERS, Peers
+from fantwin.pipeline.runtime.recovery import BACK_OFF_S, MOST_AT_A_TIME, Recovery
+from fantwin.pipeline.runtime.sequence_tracker import MOST_HELD_MESSAGES, Found, SequenceTracker
+from fantwin.pipeline.runtime.sessions import Session, Sessions
+from fantwin.pipeline.runtime.tracked_streams import MOST_HEALTH_PRODUCERS, MOST_PRODUCERS, SILENT_S, Request
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Grid, Raw
+from fantwin.schemas.topics import BY_NAME, health_key, tray_key
 from tests.pipeline.runtime.test_sequence_tracker import KEY, health, packet, sequences
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, Bench, raw, toy
@@ -76,7 +76,7 @@ def test_row_11_a_stream_that_has_waited_for_too_many_messages_or_bytes_goes_on_
     due = [s for number in range(2, MOST_HELD_MESSAGES + 4) for s in sequences(tracker.accept(packet(number)))]
     assert due == list(range(2, MOST_HELD_MESSAGES + 4))
     assert tracker.inputs()[0].missing == 1
-    monkeypatch.setattr("pipeline.runtime.sequence_tracker.MOST_HELD_BYTES", 100)
+    monkeypatch.setattr("fantwin.pipeline.runtime.sequence_tracker.MOST_HELD_BYTES", 100)
     tracker = SequenceTracker(late)
     tracker.accept(packet(0))
     large = [replace(packet(number), payload=bytes(40)) for number in range(2, 6)]

@@ -10,22 +10,22 @@ from typing import Any
 
 import pytest
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import TrayConfig
-from pipeline.launch.loss_accounting import losses
-from pipeline.runtime.inbox import INBOX_SIZE
-from pipeline.runtime.runner import TICK_S
-from pipeline.runtime.sessions import Sessions
-from pipeline.runtime.silences import Silences
-from pipeline.runtime.stage import BuiltStage, Context, Core
-from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.envelope import Envelope
-from schemas.header import Header, InputPosition
-from schemas.health import Health, Note, Output
-from schemas.messages import Command, Grid, Message, Raw
-from schemas.topics import BY_NAME, alive_key, health_key, tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.launch.loss_accounting import losses
+from fantwin.pipeline.runtime.inbox import INBOX_SIZE
+from fantwin.pipeline.runtime.runner import TICK_S
+from fantwin.pipeline.runtime.sessions import Sessions
+from fantwin.pipeline.runtime.silences import Silences
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header, InputPosition
+from fantwin.schemas.health import Health, Note, Output
+from fantwin.schemas.messages import Command, Grid, Message, Raw
+from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from fantwin.schemas.units import NS_PER_S
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, Silent, raw, toy
 
@@ -146,7 +146,7 @@ def waits(health: Health, tray: str) -> bool:
 
 
 def test_row_16_a_stage_that_was_held_up_says_that_its_input_is_not_all_processed(config, monkeypatch):
-    monkeypatch.setattr("pipeline.runtime.runner.HEALTH_PERIOD_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.runner.HEALTH_PERIOD_S", 0.0)
     may_step, is_held = threading.Semaphore(0), threading.Event()
 
     class HeldUp(Answers):
@@ -190,8 +190,8 @@ class Endless:
 
 
 def test_row_16_a_tray_whose_source_is_silent_shows_it_although_input_of_other_trays_always_waits(config, monkeypatch):
-    monkeypatch.setattr("pipeline.runtime.runner.HEALTH_PERIOD_S", 0.0)
-    monkeypatch.setattr("pipeline.runtime.silences.BEGINS_NS", 0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.runner.HEALTH_PERIOD_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.silences.BEGINS_NS", 0)
     sources = {f"b{number}": Endless() for number in range(8)} | {"a": Endless(is_silent=True)}
 
     class OfSource(Passer):

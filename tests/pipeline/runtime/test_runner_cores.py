@@ -9,14 +9,14 @@ from typing import Any, ClassVar
 
 import pytest
 
-from pipeline.runtime.inbox import INBOX_SIZE
-from pipeline.runtime.joint_step import step_together
-from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, StageError
-from schemas.enums import StageStatus
-from schemas.header import Header, InputPosition
-from schemas.health import Health
-from schemas.messages import Grid, Message, Raw
+from fantwin.pipeline.runtime.inbox import INBOX_SIZE
+from fantwin.pipeline.runtime.joint_step import step_together
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, StageError
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header, InputPosition
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Grid, Message, Raw
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, toy
 

@@ -11,18 +11,18 @@ from typing import Any
 
 import pytest
 
-from pipeline.bus.recovery import recovery_key
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig, LauncherConfig
-from pipeline.config.shards import chosen_shard
-from pipeline.errors import UserError
-from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import BuiltStage, Context, Stage
-from schemas.codec import decode
-from schemas.enums import StageStatus
-from schemas.health import Health
-from schemas.messages import Message
-from schemas.topics import health_key, tray_key
+from fantwin.pipeline.bus.recovery import recovery_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig, LauncherConfig
+from fantwin.pipeline.config.shards import chosen_shard
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
+from fantwin.schemas.codec import decode
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Message
+from fantwin.schemas.topics import health_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, toy
 
@@ -120,7 +120,7 @@ def test_row_04_a_core_that_hangs_while_it_is_closed_is_left_behind_in_time(conf
 @pytest.mark.parametrize("who", ["stop", "launcher_gone"])
 def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config, monkeypatch, who):
     """As when a consumer hangs and takes no more of what is published; also where nobody is left to kill the stage."""
-    monkeypatch.setattr("pipeline.runtime.runner.PRODUCERS_END_LIMIT_S", 0.1)
+    monkeypatch.setattr("fantwin.pipeline.runtime.runner.PRODUCERS_END_LIMIT_S", 0.1)
     release, hanging = threading.Event(), threading.Event()
 
     class Hangs(Passer):
@@ -236,7 +236,7 @@ def test_row_04_each_source_is_stopped_once_before_its_core_is_closed_also_after
 
 BLOCKED = """
 import ctypes, threading
-from pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.runtime.signals import stop_on_signals
 stop_on_signals(threading.Event())
 libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)
 libc.pthread_mutex_lock(mutex)

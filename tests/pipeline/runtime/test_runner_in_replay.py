@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 import pytest
 
-from pipeline.bus.session import Bus
-from pipeline.config.models import Config
-from pipeline.runtime.stage import BuiltStage, Context
-from schemas.codec import encode, type_name
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health
-from schemas.messages import Clock, Command, Grid, Message
-from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.runtime.stage import BuiltStage, Context
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Clock, Command, Grid, Message
+from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, toy
 

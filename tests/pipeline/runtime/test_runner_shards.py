@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import BuiltStage, Context, StageError
-from schemas.codec import decode, encode, type_name
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health
-from schemas.messages import Grid, Message, ScorerSnapshot
-from schemas.topics import BY_NAME, health_key, tray_key
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, StageError
+from fantwin.schemas.codec import decode, encode, type_name
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Grid, Message, ScorerSnapshot
+from fantwin.schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, Silent, ToyConfig, toy
 

@@ -6,15 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from pipeline.runtime.sessions import Session, Sessions
-from pipeline.runtime.tracked_streams import Request
-from schemas.enums import Severity, StageStatus
-from schemas.envelope import Envelope
-from schemas.header import Header
-from schemas.health import Health, Output
-from schemas.messages import Alarm
-from schemas.topics import CATCH_UP_MESSAGES, tray_key
+from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
+from fantwin.pipeline.runtime.sessions import Session, Sessions
+from fantwin.pipeline.runtime.tracked_streams import Request
+from fantwin.schemas.enums import Severity, StageStatus
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Output
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import CATCH_UP_MESSAGES, tray_key
 
 KEY = tray_key("site", "tray", "alarm")
 PRODUCER = "scorer-all-p"

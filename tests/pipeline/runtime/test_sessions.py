@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.bus.session import Bus
-from pipeline.config.shards import Shard
-from pipeline.launch.site_watcher import SiteWatcher
-from pipeline.runtime.runner import Runner
-from pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
-from pipeline.runtime.snapshot_store import SnapshotStore
-from pipeline.runtime.stage import BuiltStage, StageError
-from schemas.codec import encode, type_name
-from schemas.enums import Severity
-from schemas.header import Header
-from schemas.messages import Alarm, Grid, Raw
-from schemas.topics import BY_NAME, alive_key, sessions_key, tray_key
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
+from fantwin.pipeline.runtime.snapshot_store import SnapshotStore
+from fantwin.pipeline.runtime.stage import BuiltStage, StageError
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Grid, Raw
+from fantwin.schemas.topics import BY_NAME, alive_key, sessions_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, raw, toy
 
@@ -131,7 +131,7 @@ def test_row_07_a_session_of_all_trays_and_one_of_some(whole_started, is_whole_i
 
 
 def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(config, monkeypatch):
-    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     stop = threading.Event()
     stop.set()
     with Bus(config.bus) as bus:
@@ -146,7 +146,7 @@ def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(
 
 
 def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_the_first(config, monkeypatch):
-    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     aborted: list[bool] = []
 
     class Aborts(Passer):
@@ -155,7 +155,7 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
 
     bench = Bench(toy(), config)
     first = os.getpid()
-    monkeypatch.setattr("pipeline.runtime.sessions.os.getpid", lambda: first + 1)
+    monkeypatch.setattr("fantwin.pipeline.runtime.sessions.os.getpid", lambda: first + 1)
     with pytest.raises(
         StageError, match=f"^resampler of site 's' already runs: process {first} on [^;]*; stop that, or give"
     ):
@@ -169,7 +169,7 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
 def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_site_and_others_are_not(
     config, monkeypatch
 ):
-    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     with Bus(config.bus) as replay:
         replay.declare_alive(alive_key("s", "replay", "all"))
         with pytest.raises(StageError) as refused:
@@ -184,7 +184,7 @@ def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_sit
 
 @pytest.mark.parametrize("process_id", [2**22 + 1, os.getpid()], ids=["ended", "our number, as in a container"])
 def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(config, monkeypatch, process_id):
-    monkeypatch.setattr("pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     ours = Session.of_this_process("resampler", Shard("all", (TRAY_A, TRAY_B)), 1, "resampler-all-1")
     with Bus(config.bus) as bus:
         bus.declare_alive(replace(ours, process_id=process_id).key("s"))

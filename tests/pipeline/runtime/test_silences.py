@@ -8,14 +8,14 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.runtime.lost_sessions import LostSessions
-from pipeline.runtime.sessions import Session, Sessions, this_host
-from pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, MOST_HEARD, RESTART_S, Silences
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import Health, Output
-from schemas.topics import tray_key
-from schemas.units import NS_PER_S
+from fantwin.pipeline.runtime.lost_sessions import LostSessions
+from fantwin.pipeline.runtime.sessions import Session, Sessions, this_host
+from fantwin.pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, MOST_HEARD, RESTART_S, Silences
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health, Output
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 
 KEY = tray_key("s", "a", "raw")
 STARTING, OK, DEGRADED, STOPPED = StageStatus.STARTING, StageStatus.OK, StageStatus.DEGRADED, StageStatus.STOPPED
@@ -262,7 +262,7 @@ def test_row_11_a_session_without_a_token_was_killed_if_its_process_runs_no_more
 
 
 def test_row_11_sessions_that_come_and_go_are_remembered_up_to_a_limit(monkeypatch):
-    monkeypatch.setattr("pipeline.runtime.lost_sessions.MOST_SESSIONS", 2)
+    monkeypatch.setattr("fantwin.pipeline.runtime.lost_sessions.MOST_SESSIONS", 2)
     sessions = LostSessions(this_host())
     processes = [subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) for _ in range(3)]
     for process in processes:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.runtime.snapshot_store import AHEAD_NS, RECENT_NS, SnapshotStore
-from pipeline.runtime.stage import StageError
-from schemas.messages import ScorerSnapshot
+from fantwin.pipeline.runtime.snapshot_store import AHEAD_NS, RECENT_NS, SnapshotStore
+from fantwin.pipeline.runtime.stage import StageError
+from fantwin.schemas.messages import ScorerSnapshot
 
 
 def snapshot(number: int) -> ScorerSnapshot:

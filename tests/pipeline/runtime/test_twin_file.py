@@ -13,13 +13,13 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from pipeline.runtime import twin_file
-from pipeline.runtime.stage import StageError
-from pipeline.runtime.twin_file import TwinFile
-from schemas.twin_card import CARD_PROPERTY
+from fantwin.pipeline.runtime import twin_file
+from fantwin.pipeline.runtime.stage import StageError
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.schemas.twin_card import CARD_PROPERTY
+from fantwin.twin.models.physical import PhysicalModel
 from tests.support.twin_files import PARAMETERS, SIGMA_COMMAND, SIGMA_RAD_S, made_up_balance, small_hybrid, write_twin
 from tests.twin.models.test_models import random_narx
-from twin.models.physical import PhysicalModel
 
 
 def _refusal(path: Path, fans: int = 2) -> str:

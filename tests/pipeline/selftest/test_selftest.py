@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.selftest import selftest
-from pipeline.selftest.scenarios import Scenario
-from pipeline.selftest.scratch_site import NotKept
-from pipeline.selftest.stepped_clock import set_offset_ns
+from fantwin.pipeline.selftest import selftest
+from fantwin.pipeline.selftest.scenarios import Scenario
+from fantwin.pipeline.selftest.scratch_site import NotKept
+from fantwin.pipeline.selftest.stepped_clock import set_offset_ns
 from tests.support.fantwin_command import fantwin
 
 
@@ -128,7 +128,7 @@ def test_the_exit_code_says_whether_all_promises_were_kept(monkeypatch, tmp_path
     monkeypatch.setattr(selftest, "ScratchSite", HealthySite)
     codes = {}
     for name, scenario in (("kept", FINE), ("not-kept", Scenario("bad", "promised", refuses))):
-        monkeypatch.setattr("pipeline.cli.watch.selftest.SCENARIOS", [scenario])
+        monkeypatch.setattr("fantwin.pipeline.cli.watch.selftest.SCENARIOS", [scenario])
         done = fantwin("selftest", "--json", "-o", tmp_path / name)
         codes[name] = (done.exit_code, json.loads(done.stdout)["kept"])
     assert codes == {"kept": (0, True), "not-kept": (1, False)}
@@ -137,7 +137,7 @@ def test_the_exit_code_says_whether_all_promises_were_kept(monkeypatch, tmp_path
 def test_the_clock_of_a_process_follows_the_file(tmp_path):
     clock = tmp_path / "clock"
     set_offset_ns(clock, -3600 * 10**9)
-    code = "from pipeline.selftest import stepped_clock; stepped_clock.install(); import time; print(time.time_ns())"
+    code = "from fantwin.pipeline.selftest.stepped_clock import install; install(); import time; print(time.time_ns())"
     environment = {**os.environ, "FANTWIN_SELFTEST_CLOCK": str(clock)}
     before_ns = time.time_ns()
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)

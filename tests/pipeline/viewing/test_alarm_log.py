@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.viewing.alarm_log import LINE_LENGTH, log_line
-from schemas.enums import Severity, Statistic, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis
+from fantwin.pipeline.viewing.alarm_log import LINE_LENGTH, log_line
+from fantwin.schemas.enums import Severity, Statistic, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis
 
 RAISED, REPUBLISHED = Transition.RAISED, Transition.REPUBLISHED
 DRAG = (Diagnosis(cause="external_torque", probability=0.64),)

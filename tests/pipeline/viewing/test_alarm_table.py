@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.viewing.alarm_table import ALARMS_LISTED, AlarmTable
-from schemas.enums import Severity, Statistic, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis
+from fantwin.pipeline.viewing.alarm_table import ALARMS_LISTED, AlarmTable
+from fantwin.schemas.enums import Severity, Statistic, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis
 from tests.stages.test_viewer import FLUSH_PERIOD_NS, REPEAT_STATES_NS, FakeSink, core_of, sent
 from tests.support.score_data import START_NS, made_up_tray
 

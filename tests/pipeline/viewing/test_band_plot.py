@@ -12,16 +12,16 @@ import pytest
 from matplotlib.colors import to_rgb
 from typer.testing import CliRunner
 
-from pipeline.cli.main import app
-from pipeline.cli.recordings.plot import plot
-from pipeline.errors import UserError
-from pipeline.recordings.writing import RecordingWriter
-from pipeline.viewing import band_plot
-from pipeline.viewing.band_plot import Fault, plot_bands, plot_recording, read_trace
-from pipeline.viewing.trace import SILENT, trace_of
-from schemas.enums import FanState
-from schemas.messages import Alarm, Score
-from schemas.topics import tray_key
+from fantwin.pipeline.cli.main import app
+from fantwin.pipeline.cli.recordings.plot import plot
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.viewing import band_plot
+from fantwin.pipeline.viewing.band_plot import Fault, plot_bands, plot_recording, read_trace
+from fantwin.pipeline.viewing.trace import SILENT, trace_of
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.messages import Alarm, Score
+from fantwin.schemas.topics import tray_key
 from tests.support.score_data import START_NS, made_up_tray
 
 FAULT = Fault("covered-inlet", 2, START_NS + 8_000_000_000, START_NS + 14_000_000_000)
@@ -31,7 +31,7 @@ def test_every_state_has_a_colour_of_its_own() -> None:
     names = {state.words for state in FanState} - {FanState.UNKNOWN.words}
     assert set(band_plot.STATE_COLORS) == names
     assert len({*band_plot.STATE_COLORS.values(), band_plot.UNKNOWN_COLOR}) == len(names) + 1
-    styles = pytest.importorskip("pipeline.viewing.rerun_styles", exc_type=ModuleNotFoundError)
+    styles = pytest.importorskip("fantwin.pipeline.viewing.rerun_styles", exc_type=ModuleNotFoundError)
     assert set(styles.STATE_COLORS) == {*names, SILENT}
     assert len({*styles.STATE_COLORS.values(), styles.UNKNOWN_COLOR}) == len(names) + 2
 
@@ -44,7 +44,7 @@ def luminance(color: tuple[int, int, int]) -> float:
 
 @pytest.mark.parametrize("background", [(13, 16, 17), (255, 255, 255)], ids=["dark", "light"])
 def test_every_line_is_legible_on_the_dark_and_on_the_light_background(background: tuple[int, int, int]) -> None:
-    styles = pytest.importorskip("pipeline.viewing.rerun_styles", exc_type=ModuleNotFoundError)
+    styles = pytest.importorskip("fantwin.pipeline.viewing.rerun_styles", exc_type=ModuleNotFoundError)
     for color in (styles.RED, *styles.FAN_COLORS):
         lighter, darker = sorted((luminance(color), luminance(background)), reverse=True)
         assert (lighter + 0.05) / (darker + 0.05) > 3.0, f"contrast of {color}, as WCAG asks of graphics"

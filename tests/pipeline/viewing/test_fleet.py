@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config.models import TrayConfig
-from pipeline.viewing.fleet import NORMAL_LEVELS, Fleet, class_names
-from schemas.enums import FanState, InvalidReason, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Score
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.viewing.fleet import NORMAL_LEVELS, Fleet, class_names
+from fantwin.schemas.enums import FanState, InvalidReason, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Score
 from tests.support import made_messages
 from tests.support.score_data import START_NS
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.viewing.fleet_map import CHARACTER_PX, LABEL_HEIGHT_PX, MAP_PX, fleet_map
+from fantwin.pipeline.viewing.fleet_map import CHARACTER_PX, LABEL_HEIGHT_PX, MAP_PX, fleet_map
 
 
 @given(st.lists(st.integers(1, 1024), min_size=1, max_size=40), st.integers(1, 12))

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.viewing.viewer_core import ViewerCore
-from stages.viewer import build
+from fantwin.pipeline.viewing.viewer_core import ViewerCore
+from fantwin.stages.viewer import build
 from tests.pipeline.viewing.test_viewer_picture import needs_a_driver, rerun_picture
 from tests.stages.test_viewer_fleet import context, messages_of, play
 
-rerun_fleet = pytest.importorskip("pipeline.viewing.rerun_fleet", exc_type=ModuleNotFoundError)
+rerun_fleet = pytest.importorskip("fantwin.pipeline.viewing.rerun_fleet", exc_type=ModuleNotFoundError)
 
 
 @pytest.fixture(scope="module")

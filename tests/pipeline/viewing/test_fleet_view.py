@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.config.models import TrayConfig
-from pipeline.viewing.fleet_view import FleetView
-from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
-from schemas.messages import Score
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.viewing.fleet_view import FleetView
+from fantwin.pipeline.viewing.plot_places import FleetPlots, PlotPlaces
+from fantwin.schemas.messages import Score
+from fantwin.schemas.units import NS_PER_S
 from tests.support.score_data import START_NS, made_up_tray
 
 WINDOW_S = 4

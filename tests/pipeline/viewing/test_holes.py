@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.viewing.trace import SILENT, state_changes, trace_of, with_holes
-from schemas.messages import Score
+from fantwin.pipeline.viewing.trace import SILENT, state_changes, trace_of, with_holes
+from fantwin.schemas.messages import Score
 from tests.stages.test_viewer import FakeSink, core_of, sent
 from tests.support.score_data import START_NS, STEP_NS, made_up_tray
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.viewing.fleet import Fan
-from pipeline.viewing.plot_places import FleetPlots, PlotPlaces
+from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.viewing.plot_places import FleetPlots, PlotPlaces
 
 A, B, C, D = (Fan("tray1", number) for number in range(4))
 ASKED = Fan("tray2", 0)

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.cli.options import ViewLayout
-from pipeline.cli.recordings.view import view
-from pipeline.errors import UserError
-from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Alarm, Message, Score
-from schemas.topics import health_key, tray_key
-from stages.viewer import build
+from fantwin.pipeline.cli.options import ViewLayout
+from fantwin.pipeline.cli.recordings.view import view
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.messages import Alarm, Message, Score
+from fantwin.schemas.topics import health_key, tray_key
+from fantwin.stages.viewer import build
 from tests.stages.test_viewer import card, chunks_of, context, health, rows_of, sent
 from tests.stages.test_viewer_fleet import TRAYS, messages_of
 from tests.support.score_data import START_NS, made_up_tray

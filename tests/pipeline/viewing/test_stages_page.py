@@ -2,11 +2,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from pipeline.viewing.stages_page import CHANGES_SHOWN, PROBLEMS_LISTED, SILENT_AFTER_NS, StagesPage
-from schemas.enums import StageStatus
-from schemas.header import Header
-from schemas.health import AwaitedInput, Health
-from schemas.messages import ModelCard
+from fantwin.pipeline.viewing.stages_page import CHANGES_SHOWN, PROBLEMS_LISTED, SILENT_AFTER_NS, StagesPage
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import AwaitedInput, Health
+from fantwin.schemas.messages import ModelCard
 
 NOW_NS = 1_760_000_000_000_000_000  # 2025-10-09 08:53:20
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.config.models import TrayConfig
-from pipeline.viewing import view_file
-from pipeline.viewing.rerun_sink import RerunSink
-from pipeline.viewing.view_file import ViewFile
-from pipeline.viewing.viewer_core import ViewerCore
-from schemas.units import NS_PER_S
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.viewing import view_file
+from fantwin.pipeline.viewing.rerun_sink import RerunSink
+from fantwin.pipeline.viewing.view_file import ViewFile
+from fantwin.pipeline.viewing.viewer_core import ViewerCore
+from fantwin.schemas.units import NS_PER_S
 from tests.stages.test_viewer import sent
 from tests.support.score_data import START_NS, made_up_tray
 

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.cli.recordings.picture import picture
-from pipeline.errors import UserError
-from pipeline.viewing.viewer_core import PAGE_PERIOD_NS
-from stages.viewer import build
+from fantwin.pipeline.cli.recordings.picture import picture
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.viewing.viewer_core import PAGE_PERIOD_NS
+from fantwin.stages.viewer import build
 from tests.stages.test_viewer import LATER_NS, card, context, free_port, health, play, sent
 from tests.support.running_chain import eventually
 from tests.support.score_data import START_NS, made_up_tray
 
-rerun_picture = pytest.importorskip("pipeline.viewing.rerun_picture", exc_type=ModuleNotFoundError)
+rerun_picture = pytest.importorskip("fantwin.pipeline.viewing.rerun_picture", exc_type=ModuleNotFoundError)
 needs_a_driver = pytest.mark.skipif(
     not rerun_picture.has_vulkan_driver(), reason="no Vulkan driver here: apt-get install mesa-vulkan-drivers"
 )

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.viewing.wear_points import wear_points
-from schemas.messages import ScorerSnapshot
+from fantwin.pipeline.viewing.wear_points import wear_points
+from fantwin.schemas.messages import ScorerSnapshot
 from tests.stages.test_viewer import FLUSH_PERIOD_NS, FakeSink, core_of
 from tests.support.score_data import START_NS
 from tests.support.wear_data import LOSS, worn_snapshot

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from schemas.enums import Severity, Statistic, Transition
-from schemas.messages import Alarm, Diagnosis
-from schemas.units import SpeedUnit
-from scoring.alarms.alarm_text import AlarmText
-from scoring.diagnosis.shown_causes import (
+from fantwin.schemas.enums import Severity, Statistic, Transition
+from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.schemas.units import SpeedUnit
+from fantwin.scoring.alarms.alarm_text import AlarmText
+from fantwin.scoring.diagnosis.shown_causes import (
     CANNOT_TELL,
     CAUSES,
     SENSOR_DROPOUT,
@@ -20,7 +20,7 @@ from scoring.diagnosis.shown_causes import (
     UNSTEADY,
     short_name,
 )
-from scoring.model.faults import FAULTS
+from fantwin.scoring.model.faults import FAULTS
 
 
 def line(

@@ -6,12 +6,12 @@ import itertools
 import json
 from typing import Any
 
-from schemas.enums import Severity, Transition
-from schemas.header import Header
-from schemas.messages import Alarm, Diagnosis
-from scoring.alarms.alarm_flags import is_retained
-from scoring.alarms.current_alarms import CurrentAlarm, current_alarms
-from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.scoring.alarms.alarm_flags import is_retained
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarms
+from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
 _numbers = itertools.count()
 

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.enums import Action, Severity, Transition
-from scoring.alarms.alarm_flags import is_retained, is_silenced
-from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, ConditionSettings
-from scoring.alarms.tray_conditions import AlarmEvent, Decided, TrayConditions
+from fantwin.schemas.enums import Action, Severity, Transition
+from fantwin.scoring.alarms.alarm_flags import is_retained, is_silenced
+from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, ConditionSettings
+from fantwin.scoring.alarms.tray_conditions import AlarmEvent, Decided, TrayConditions
 
 STEP_NS = 10
 LOST_NS = 35

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from schemas.enums import InvalidReason
-from schemas.units import NS_PER_S
-from scoring.alarms.unscored_monitor import REASONS, UnscoredMonitor
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.unscored_monitor import REASONS, UnscoredMonitor
 
 
 def test_a_reason_of_a_newer_twin_integrator_is_reported_with_its_number():

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from scoring.calibration.calibration import (
+from fantwin.scoring.calibration.calibration import (
     SHOWN_BY,
     Calibration,
     Excursions,
@@ -21,7 +21,7 @@ from scoring.calibration.calibration import (
     raised_limit,
     supports,
 )
-from scoring.model.priors import Priors
+from fantwin.scoring.model.priors import Priors
 
 ENTRY: dict[str, Any] = {
     "false_alarms_per_day": 1.0, "fan_hours": 72.0, "runs": 3, "found": 2, "interval_95": (0.08, 2.4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from scoring.calibration.observed_rate import ObservedRate, together
+from fantwin.scoring.calibration.observed_rate import ObservedRate, together
 
 DAYS_100 = 2400.0
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.messages import Diagnosis
-from scoring.diagnosis import cause_words
-from scoring.diagnosis.advice import KNOWN_SOON, Advice, SeenSinceOnset
-from scoring.diagnosis.cause_words import CauseWords, PossibleCause, says_more
-from scoring.diagnosis.shown_causes import CAUSES, ROWS, WHAT_TO_DO, CauseRow, Size, advice, likely_causes
-from scoring.diagnosis.steady_fan import SteadyFan
-from scoring.model.faults import FAULTS
+from fantwin.schemas.messages import Diagnosis
+from fantwin.scoring.diagnosis import cause_words
+from fantwin.scoring.diagnosis.advice import KNOWN_SOON, Advice, SeenSinceOnset
+from fantwin.scoring.diagnosis.cause_words import CauseWords, PossibleCause, says_more
+from fantwin.scoring.diagnosis.shown_causes import CAUSES, ROWS, WHAT_TO_DO, CauseRow, Size, advice, likely_causes
+from fantwin.scoring.diagnosis.steady_fan import SteadyFan
+from fantwin.scoring.model.faults import FAULTS
 
 FAN = SteadyFan(viscous=2e-4, drag=3e-6, friction=0.04, top_rad_s=500.0)
 OF_OWN_DRIVE = replace(FAN, has_own_drive=True)

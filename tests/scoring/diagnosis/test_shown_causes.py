@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from schemas.messages import Diagnosis
-from scoring.diagnosis.shown_causes import (
+from fantwin.schemas.messages import Diagnosis
+from fantwin.scoring.diagnosis.shown_causes import (
     CANNOT_TELL,
     advice,
     less_likely,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scoring.diagnosis.standstill_causes import BEGUN, Fall, Standing, standstill_causes
+from fantwin.scoring.diagnosis.standstill_causes import BEGUN, Fall, Standing, standstill_causes
 
 AT_ONCE_S, RESTS = 0.03, 0.08
 """time constant of a rotor that is held; share of the speed below which a reading is of a fan at rest"""

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from scoring.model.decision import OVER_S, Decision
-from scoring.model.faults import DRAG, DRAG_GROWS, DRIVE, FRICTION, GROWS_S
-from scoring.model.healthy import SLOW, K
+from fantwin.scoring.model.decision import OVER_S, Decision
+from fantwin.scoring.model.faults import DRAG, DRAG_GROWS, DRIVE, FRICTION, GROWS_S
+from fantwin.scoring.model.healthy import SLOW, K
 from tests.support.made_bins import Changes, MadeFans, plays
 from tests.support.scored_blocks import TWIN_SPEED, twin_of
 

@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.blocks import cut
-from schemas.units import NS_PER_S
-from scoring.model.bins import Bin, Bins, bin_ns_of
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
 from tests.support.scored_blocks import STEP_NS, TOP_SPEED, noise_of, prediction_of
 
 SAMPLES, BIN_NS = 60, 100_000_000

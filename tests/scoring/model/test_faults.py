@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scoring.diagnosis.shown_causes import CAUSES
-from scoring.model import decision
-from scoring.model.decision import Decision
-from scoring.model.faults import BEFORE_GROWTH, DRIVE, FALLS, FAULTS, RISES, SCALE, Fault
-from scoring.model.priors import Priors
+from fantwin.scoring.diagnosis.shown_causes import CAUSES
+from fantwin.scoring.model import decision
+from fantwin.scoring.model.decision import Decision
+from fantwin.scoring.model.faults import BEFORE_GROWTH, DRIVE, FALLS, FAULTS, RISES, SCALE, Fault
+from fantwin.scoring.model.priors import Priors
 from tests.support.made_bins import MadeFans, bin_of, plays, with_reading
 from tests.support.scored_blocks import twin_of
 

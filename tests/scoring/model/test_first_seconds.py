@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.messages import Array
-from scoring.model.bins import Bin
-from scoring.model.decision import FORGETS_S
-from scoring.model.faults import DRAG, SCALE
+from fantwin.schemas.messages import Array
+from fantwin.scoring.model.bins import Bin
+from fantwin.scoring.model.decision import FORGETS_S
+from fantwin.scoring.model.faults import DRAG, SCALE
 from tests.support.made_bins import MadeFans, plays, with_balance, with_reading
 from tests.support.scored_blocks import TWIN_SPEED, twin_of
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scoring.model import learned
-from scoring.model.bins import Bin, Bins, bin_ns_of
-from scoring.model.decision import Decision
-from scoring.model.learned import HealthyRun, RunSums, learned_priors
-from scoring.model.operation import Fans
-from scoring.model.priors import Priors
+from fantwin.scoring.model import learned
+from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
+from fantwin.scoring.model.decision import Decision
+from fantwin.scoring.model.learned import HealthyRun, RunSums, learned_priors
+from fantwin.scoring.model.operation import Fans
+from fantwin.scoring.model.priors import Priors
 from tests.support.healthy_running import made_fans, running
 
 FANS = 24

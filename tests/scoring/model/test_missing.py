@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from schemas.messages import Array
-from scoring.model.missing import MissingReadings
+from fantwin.schemas.messages import Array
+from fantwin.scoring.model.missing import MissingReadings
 
 FANS, DECLARED = 200, 2000
 SURE = 0.999

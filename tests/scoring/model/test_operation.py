@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scoring.model.operation import Inputs, Operation
+from fantwin.scoring.model.operation import Inputs, Operation
 from tests.support.made_bins import bin_of
 from tests.support.scored_blocks import twin_of
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from schemas.messages import Array
-from scoring.model.bins import Bin
-from scoring.model.healthy import COUNT
-from scoring.model.operation import Fans
+from fantwin.schemas.messages import Array
+from fantwin.scoring.model.bins import Bin
+from fantwin.scoring.model.healthy import COUNT
+from fantwin.scoring.model.operation import Fans
 from tests.support.made_bins import PRIORS, MadeFans, bin_of, plays, with_reading
 from tests.support.scored_blocks import twin_of
 

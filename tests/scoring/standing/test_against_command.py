@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.messages import Prediction
-from schemas.standstill import Standstill
-from schemas.tacho import Tacho
-from scoring.standing.against_command import AgainstCommand
+from fantwin.schemas.messages import Prediction
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.tacho import Tacho
+from fantwin.scoring.standing.against_command import AgainstCommand
 from tests.support.scored_blocks import prediction_of
 
 HOUR_NS = 3_600_000_000_000

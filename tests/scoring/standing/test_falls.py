@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from scoring.model.operation import Operation
-from scoring.standing.falls import Falls
+from fantwin.scoring.model.operation import Operation
+from fantwin.scoring.standing.falls import Falls
 from tests.support.made_bins import bin_of, with_reading
 from tests.support.scored_blocks import TWIN_SPEED, twin_of
 

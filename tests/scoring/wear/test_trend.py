@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scoring.wear.trend import CAPACITY, NS_PER_DAY, LimitForecast, Trend, WearSeries, forecast_limit
+from fantwin.scoring.wear.trend import CAPACITY, NS_PER_DAY, LimitForecast, Trend, WearSeries, forecast_limit
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.messages import Array
-from scoring.wear.slow_change import LIMIT_SHARE, MOST_FANS, WEAR_HINT
-from scoring.wear.trend import NS_PER_DAY
-from scoring.wear.wear_monitor import SETTLING_INTERVALS, WearMonitor
+from fantwin.schemas.messages import Array
+from fantwin.scoring.wear.slow_change import LIMIT_SHARE, MOST_FANS, WEAR_HINT
+from fantwin.scoring.wear.trend import NS_PER_DAY
+from fantwin.scoring.wear.wear_monitor import SETTLING_INTERVALS, WearMonitor
 from tests.support.wear_data import (
     DAYS_OF_WEAR,
     EVERY_S,

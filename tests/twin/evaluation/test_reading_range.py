@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.standstill import Standstill
-from schemas.tacho import Tacho
-from scoring.expected_reading import ExpectedReading
+from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.tacho import Tacho
+from fantwin.scoring.expected_reading import ExpectedReading
+from fantwin.twin.evaluation.accuracy import free_run_speeds
+from fantwin.twin.evaluation.reading_range import reading_sigma_rad_s
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.runs import Run
 from tests.support import fan_data
-from twin.evaluation.accuracy import free_run_speeds
-from twin.evaluation.reading_range import reading_sigma_rad_s
-from twin.models.physical import PhysicalModel
-from twin.runs import Run
 
 TACHO = Tacho(kind="count", window_s=0.5)
 PERIOD_S = 0.1

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import sums_of_model
+from fantwin.twin.evaluation.resampling import Grid, irregular, on_grid, resampled, thinned
+from fantwin.twin.models.hybrid import UNITS, Hybrid
+from fantwin.twin.models.model import TwinModel
+from fantwin.twin.models.network import Scaling, TanhNetwork
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
-from twin.errors import TwinError
-from twin.evaluation.accuracy import sums_of_model
-from twin.evaluation.resampling import Grid, irregular, on_grid, resampled, thinned
-from twin.models.hybrid import UNITS, Hybrid
-from twin.models.model import TwinModel
-from twin.models.network import Scaling, TanhNetwork
-from twin.models.physical import PhysicalModel
-from twin.models.physics import PARAMETER_NAMES
-from twin.runs import Array, Run
 
 OTHER_GRIDS: tuple[Grid, ...] = (20.0, 50.0, 200.0, "irregular")
 NOISE = fan_data.NOISE_RAD_S

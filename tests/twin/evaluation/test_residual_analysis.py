@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from fantwin.twin.evaluation.accuracy import free_run_residuals
+from fantwin.twin.evaluation.residual_analysis import ResidualAnalysis, analyse_residual, healthy_residual
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
-from twin.evaluation.accuracy import free_run_residuals
-from twin.evaluation.residual_analysis import ResidualAnalysis, analyse_residual, healthy_residual
-from twin.models.physical import PhysicalModel
-from twin.models.physics import PARAMETER_NAMES
-from twin.runs import Array, Run
 
 STEP_S = 0.01
 SAMPLES = 4000

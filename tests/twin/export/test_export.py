@@ -11,17 +11,17 @@ import onnx
 import pytest
 from onnx import helper
 
-from schemas.twin_card import CARD_PROPERTY, DataCard, TwinCard
+from fantwin.schemas.twin_card import CARD_PROPERTY, DataCard, TwinCard
+from fantwin.twin.errors import TwinError
+from fantwin.twin.export.onnx_export import export_onnx
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.model import Model
+from fantwin.twin.models.physical import PhysicalModel
 from tests.support import fan_data
 from tests.support.trained_once import TrainedOnce
 from tests.twin.models.test_models import ALL_MODELS, random_network
-from twin.errors import TwinError
-from twin.export.onnx_export import export_onnx
-from twin.export.onnx_twin import OnnxTwin
-from twin.finishing import TrainedTwin
-from twin.models.hybrid import Hybrid
-from twin.models.model import Model
-from twin.models.physical import PhysicalModel
 
 SAMPLES = 2000
 CREATED = datetime(2026, 1, 1, tzinfo=UTC)

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from bench.training import published_fan
-from pipeline.recordings.runs import read_runs
-from schemas.tacho import Tacho
-from simulation.plant import FanParameters, advance, at_rest
+from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.schemas.tacho import Tacho
+from fantwin.simulation.plant import FanParameters, advance, at_rest
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.resampling import resampled
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.fitting.balance import FILTER_RATE_PER_S, torque_balance
+from fantwin.twin.fitting.balance_fit import BalanceFit, fit_balance
+from fantwin.twin.fitting.identification import Identification, identify
+from fantwin.twin.runs import Array, Run
 from tests.support.fan_data import NOISE_RAD_S
 from tests.support.fantwin_command import fantwin
-from twin.errors import TwinError
-from twin.evaluation.resampling import resampled
-from twin.export.onnx_twin import OnnxTwin
-from twin.fitting.balance import FILTER_RATE_PER_S, torque_balance
-from twin.fitting.balance_fit import BalanceFit, fit_balance
-from twin.fitting.identification import Identification, identify
-from twin.runs import Array, Run
 
 PLANT = FanParameters(stribeck_rad_s=1.0)
 DUTY_PER_V = (PLANT.duty_full - PLANT.duty_dead) / PLANT.supply_v

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from fantwin.twin.fitting.cross_validation import choose_prior_std, simplest_of_the_best
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.fitting.training import GRID_PRIOR_STD, data_scaling
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.runs import Run
 from tests.support import fan_data
-from twin.fitting.cross_validation import choose_prior_std, simplest_of_the_best
-from twin.fitting.identification import identify
-from twin.fitting.training import GRID_PRIOR_STD, data_scaling
-from twin.models.hybrid import Hybrid
-from twin.models.network import TanhNetwork
-from twin.runs import Run
 
 
 def untrained(runs: list[Run]) -> Hybrid:

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.tacho import INSTANTANEOUS, Tacho
-from twin.fitting.drive_fit import MOST_ITERATIONS, FoundDrive, find_drive
-from twin.fitting.identification import identify
-from twin.fitting.standstill import find_standstill
-from twin.measurement import measurement_of
-from twin.models.drive import Drive
-from twin.models.physical import PhysicalModel
-from twin.progress import Progress, unreported
-from twin.runs import Run
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
+from fantwin.twin.fitting.drive_fit import MOST_ITERATIONS, FoundDrive, find_drive
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.fitting.standstill import find_standstill
+from fantwin.twin.measurement import measurement_of
+from fantwin.twin.models.drive import Drive
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.progress import Progress, unreported
+from fantwin.twin.runs import Run
 
 DRIVE = Drive(turning_command=10.0, kick_s=0.6, rest_s=2.0)
 PHYSICS = np.array([[0.35, 0.25, 5e-4, 0.0]])

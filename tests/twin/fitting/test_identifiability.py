@@ -8,13 +8,13 @@ import pandas as pd
 import pytest
 from numpy.typing import ArrayLike
 
-from schemas.tacho import Tacho
+from fantwin.schemas.tacho import Tacho
+from fantwin.twin.fitting.identifiability import feedback_share, identifiability_warnings
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
 from tests.support.fan_data import published_run, rough_run
-from twin.fitting.identifiability import feedback_share, identifiability_warnings
-from twin.fitting.identification import identify
-from twin.models.physics import PARAMETER_NAMES
-from twin.runs import Array, Run
 
 INERTIA, VISCOUS, DRAG = fan_data.PUBLISHED_PARAMETERS[:3]
 STEP_S = 1.0 / fan_data.RATE_HZ

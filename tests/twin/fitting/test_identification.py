@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from bench.training.published_fan import published_fan, rough_run
+from fantwin.twin.errors import TwinError
+from fantwin.twin.fitting.free_run_problem import FreeRunProblem
+from fantwin.twin.fitting.identifiability import short_warnings
+from fantwin.twin.fitting.identification import Identification, identify
+from fantwin.twin.runs import Run
 from tests.support import fan_data
-from twin.errors import TwinError
-from twin.fitting.free_run_problem import FreeRunProblem
-from twin.fitting.identifiability import short_warnings
-from twin.fitting.identification import Identification, identify
-from twin.runs import Run
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_fans_that_have_converged_are_left_out_and_all_end_as_if_they_were_not(m
         return normal_equations(problem, *arguments)
 
     monkeypatch.setattr(FreeRunProblem, "normal_equations", noted)
-    monkeypatch.setattr("twin.fitting.free_run_problem.WIDE_BATCH", 1)
+    monkeypatch.setattr("fantwin.twin.fitting.free_run_problem.WIDE_BATCH", 1)
     found, some_left = identify([tray]), min(fitted)
     fitted.clear()
     monkeypatch.setattr(FreeRunProblem, "pays_for_some", lambda *_: False)

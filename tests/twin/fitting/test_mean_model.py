@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from twin.fitting.mean_model import mean_model
-from twin.models.hybrid import Hybrid
-from twin.models.model import NetworkOde
-from twin.models.network import Scaling, TanhNetwork
-from twin.models.neural_ode import NeuralOde
-from twin.models.physics import LAG
-from twin.runs import Array
+from fantwin.twin.fitting.mean_model import mean_model
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.model import NetworkOde
+from fantwin.twin.models.network import Scaling, TanhNetwork
+from fantwin.twin.models.neural_ode import NeuralOde
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.runs import Array
 
 SCALING = Scaling(60.0, 70.0, 0.4, 0.5, 200.0)
 FANS = 3

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from scipy.linalg import cholesky
 
-from schemas.model_uncertainty import ModelUncertainty
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.twin.build import train_twin
+from fantwin.twin.evaluation.accuracy import compared_readings, free_run_readings
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.fitting.fan_evidence import variance_of_independent
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.fitting.model_uncertainty import COSINES, OWN_VARIANCE, _roots, model_uncertainty
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.models.recursion import linear_recursion
+from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
 from tests.support.trained_once import TrainedOnce
 from tests.twin.fitting.test_drive_fit import DRIVE, run_of
-from twin.build import train_twin
-from twin.evaluation.accuracy import compared_readings, free_run_readings
-from twin.finishing import TrainedTwin
-from twin.fitting.fan_evidence import variance_of_independent
-from twin.fitting.identification import identify
-from twin.fitting.model_uncertainty import COSINES, OWN_VARIANCE, _roots, model_uncertainty
-from twin.models.physical import PhysicalModel
-from twin.models.recursion import linear_recursion
-from twin.runs import Array, Run
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from fantwin.twin.fitting.outliers import without_outliers
+from fantwin.twin.runs import Run
 from tests.support import fan_data
-from twin.fitting.outliers import without_outliers
-from twin.runs import Run
 
 
 def with_speed(run: Run, speed_rad_s: np.ndarray) -> Run:

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.standstill import SLOWED_SHARE, Standstill
-from schemas.tacho import Tacho
-from twin.fitting.standstill import find_standstill
-from twin.runs import Array, Run
+from fantwin.schemas.standstill import SLOWED_SHARE, Standstill
+from fantwin.schemas.tacho import Tacho
+from fantwin.twin.fitting.standstill import find_standstill
+from fantwin.twin.runs import Array, Run
 
 PERIOD_S = 0.1
 COUNT = Tacho(kind="count", window_s=1.0)

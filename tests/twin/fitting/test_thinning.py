@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.fitting import thinning, training
+from fantwin.twin.fitting.free_run_fit import fit_free_run
+from fantwin.twin.fitting.thinning import coarser, thinning_factor, windows_of
+from fantwin.twin.fitting.trajectories import Trajectories
+from fantwin.twin.models.recursion import linear_recursion
+from fantwin.twin.runs import Run
 from tests.support import fan_data
-from twin.build import evaluate, train_twin
-from twin.finishing import TrainedTwin
-from twin.fitting import thinning, training
-from twin.fitting.free_run_fit import fit_free_run
-from twin.fitting.thinning import coarser, thinning_factor, windows_of
-from twin.fitting.trajectories import Trajectories
-from twin.models.recursion import linear_recursion
-from twin.runs import Run
 
 TIME_CONSTANT_S = 0.3
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.fitting.balance import FILTER_RATE_PER_S, torque_balance
+from fantwin.twin.fitting.balance import FILTER_RATE_PER_S, torque_balance
 
 COEFFICIENTS = np.array([[0.15, 0.012, 0.0025, 4.0], [0.3, 0.2, 0.001, -2.0]])
 LAG_S = np.array([0.05, 0.0])

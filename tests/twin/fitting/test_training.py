@@ -3,19 +3,19 @@
 import numpy as np
 import pytest
 
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.resampling import thinned
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.fitting import training
+from fantwin.twin.fitting.identification import identify
+from fantwin.twin.fitting.outliers import without_outliers
+from fantwin.twin.fitting.training import data_scaling
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.runs import Run
 from tests.support import fan_data
 from tests.support.trained_once import TrainedOnce
-from twin.build import evaluate, train_twin
-from twin.errors import TwinError
-from twin.evaluation.resampling import thinned
-from twin.finishing import TrainedTwin
-from twin.fitting import training
-from twin.fitting.identification import identify
-from twin.fitting.outliers import without_outliers
-from twin.fitting.training import data_scaling
-from twin.models.hybrid import Hybrid
-from twin.models.network import TanhNetwork
-from twin.runs import Run
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def test_progress_is_reported_of_each_part_of_the_work(rough) -> None:
 
 
 def test_adam_lowers_the_free_run_error_from_the_physics_on(rough) -> None:
-    from twin.fitting.torch_reference import train_adam  # noqa: PLC0415  torch takes seconds to import
+    from fantwin.twin.fitting.torch_reference import train_adam  # noqa: PLC0415  torch takes seconds to import
 
     short = thinned(rough[0].between(0.0, 2.0), 2)  # the cost is that of the steps
     found = identify([short])

@@ -11,22 +11,22 @@ import numpy as np
 import pytest
 from onnx import helper
 
-from pipeline.runtime.twin_file import TwinFile
-from schemas.enums import InvalidReason
-from schemas.messages import Grid, Prediction
-from schemas.twin_card import NetworkCard, StateLayout
-from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
+from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Grid, Prediction
+from fantwin.schemas.twin_card import NetworkCard, StateLayout
+from fantwin.stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
+from fantwin.twin import kinds
+from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.comparison import all_candidates
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.finishing import TrainedTwin
+from fantwin.twin.fitting.model_fits import FitRequest, FittedModel
+from fantwin.twin.models.onnx_nodes import Nodes, double
+from fantwin.twin.report.content import SpeedUnit, report_content
+from fantwin.twin.report.page import report_page
+from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
-from twin import kinds
-from twin.build import evaluate, train_twin
-from twin.comparison import all_candidates
-from twin.export.onnx_twin import OnnxTwin
-from twin.finishing import TrainedTwin
-from twin.fitting.model_fits import FitRequest, FittedModel
-from twin.models.onnx_nodes import Nodes, double
-from twin.report.content import SpeedUnit, report_content
-from twin.report.page import report_page
-from twin.runs import Array, Run
 
 
 @dataclass(frozen=True)

@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.twin_card import DriveCard, TwinCard
+from fantwin.schemas.twin_card import DriveCard, TwinCard
+from fantwin.twin.build import train_twin
+from fantwin.twin.export.onnx_export import export_onnx
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.models.drive import DRIVE_LAYOUT, DRIVE_PARAMETERS, Drive
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.model import OdeModel
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.models.physics import PARAMETER_NAMES
 from tests.support import fan_data
 from tests.twin.models.test_models import random_network
-from twin.build import train_twin
-from twin.export.onnx_export import export_onnx
-from twin.export.onnx_twin import OnnxTwin
-from twin.models.drive import DRIVE_LAYOUT, DRIVE_PARAMETERS, Drive
-from twin.models.hybrid import Hybrid
-from twin.models.model import OdeModel
-from twin.models.physical import PhysicalModel
-from twin.models.physics import PARAMETER_NAMES
 
 DRIVE = Drive(turning_command=20.0, kick_s=0.6, rest_s=2.0)
 SETTINGS = np.array([[50.0, 5.0, 180.0]])

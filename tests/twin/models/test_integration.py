@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from twin.models import integration
-from twin.models.integration import free_run, free_run_sensitivities, step_through
-from twin.models.lag import effective_command, effective_command_by_lag
-from twin.models.network import Scaling, TanhNetwork
-from twin.models.right_hand_side import FanEquation
+from fantwin.twin.models import integration
+from fantwin.twin.models.integration import free_run, free_run_sensitivities, step_through
+from fantwin.twin.models.lag import effective_command, effective_command_by_lag
+from fantwin.twin.models.network import Scaling, TanhNetwork
+from fantwin.twin.models.right_hand_side import FanEquation
 
 PARAMETERS = np.array([[0.15, 0.012, 0.0025, 0.0]])
 

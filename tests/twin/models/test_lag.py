@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from twin.models.lag import effective_command, effective_command_by_lag
+from fantwin.twin.models.lag import effective_command, effective_command_by_lag
 
 STEP_S = np.random.default_rng(1).uniform(0.003, 0.03, (40, 2))
 COMMAND = np.random.default_rng(2).uniform(0.0, 90.0, (40, 2))

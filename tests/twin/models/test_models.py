@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from schemas.twin_card import StateLayout
+from fantwin.schemas.twin_card import StateLayout
+from fantwin.twin.models.hybrid import Hybrid
+from fantwin.twin.models.narx import PARAMETER_COUNT, Narx
+from fantwin.twin.models.network import Scaling, TanhNetwork
+from fantwin.twin.models.neural_ode import NeuralOde
+from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
 from tests.support import fan_data
-from twin.models.hybrid import Hybrid
-from twin.models.narx import PARAMETER_COUNT, Narx
-from twin.models.network import Scaling, TanhNetwork
-from twin.models.neural_ode import NeuralOde
-from twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
 
 SCALING = Scaling(80.0, 90.0, 50.0, 50.0, 300.0)
 PARAMETERS = np.tile([*fan_data.PUBLISHED_PARAMETERS, 0.02], (2, 1))

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fantwin.twin.errors import TwinError
+from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
+from fantwin.twin.fitting.narx_fit import free_run_sensitivities
+from fantwin.twin.fitting.narx_stability import forgets_its_start
+from fantwin.twin.fitting.narx_start import starting_weights
+from fantwin.twin.fitting.narx_training import train_narx
+from fantwin.twin.models.narx import ORDER, PARAMETER_COUNT, Narx
+from fantwin.twin.models.network import Scaling
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
-from twin.errors import TwinError
-from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
-from twin.fitting.narx_fit import free_run_sensitivities
-from twin.fitting.narx_stability import forgets_its_start
-from twin.fitting.narx_start import starting_weights
-from twin.fitting.narx_training import train_narx
-from twin.models.narx import ORDER, PARAMETER_COUNT, Narx
-from twin.models.network import Scaling
-from twin.models.physics import PARAMETER_NAMES
-from twin.runs import Array, Run
 
 SCALING = Scaling(90.0, 100.0, 50.0, 50.0, 300.0)
 

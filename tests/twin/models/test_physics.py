@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twin.models import physics
+from fantwin.twin.models import physics
 
 PARAMETERS = np.array([[0.15, 0.012, 0.0025, 0.0], [0.003, 0.03, 1e-5, 0.01]])
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.model_uncertainty import ModelUncertainty
-from schemas.twin_card import DriveCard
+from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.schemas.twin_card import DriveCard
+from fantwin.twin.report.record_next import least_known
+from fantwin.twin.report.steady_states import StaticCurve
 from tests.support.uncertainty_tables import by_speed
-from twin.report.record_next import least_known
-from twin.report.steady_states import StaticCurve
 
 COMMANDS = np.linspace(0.0, 1.0, 11)
 CURVE = StaticCurve((), np.column_stack((COMMANDS, 200.0 * COMMANDS)))

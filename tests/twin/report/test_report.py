@@ -13,23 +13,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.twin_card import DataCard
+from fantwin.schemas.twin_card import DataCard
+from fantwin.twin.build import runs_of_twin
+from fantwin.twin.export.onnx_twin import OnnxTwin
+from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.report import figures
+from fantwin.twin.report.assessment import assess
+from fantwin.twin.report.content import Content, SpeedUnit, report_content, summary_of
+from fantwin.twin.report.page import MOST_FANS_DRAWN, drawn_fans, report_page
+from fantwin.twin.report.recording_sums import common_extent, extent_of, recording_sums
+from fantwin.twin.report.steady_states import static_curve
+from fantwin.twin.report.timeline import broken_at, kept_samples, timeline
+from fantwin.twin.runs import Run
 from tests.pipeline.cli.test_train_commands import record
 from tests.support.browser import seen_in_browser
 from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run, rough_run
 from tests.support.fantwin_command import error_of, fantwin
-from twin.build import runs_of_twin
-from twin.export.onnx_twin import OnnxTwin
-from twin.models.physical import PhysicalModel
-from twin.models.physics import PARAMETER_NAMES
-from twin.report import figures
-from twin.report.assessment import assess
-from twin.report.content import Content, SpeedUnit, report_content, summary_of
-from twin.report.page import MOST_FANS_DRAWN, drawn_fans, report_page
-from twin.report.recording_sums import common_extent, extent_of, recording_sums
-from twin.report.steady_states import static_curve
-from twin.report.timeline import broken_at, kept_samples, timeline
-from twin.runs import Run
 
 SECTIONS = ["assessment", "figures", "alarms", "parameters", "fan-0", "meaning", "card"]
 TITLES = [

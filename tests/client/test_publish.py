@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import fantwin_client
-from fantwin_client import (
+import fantwin.client
+from fantwin.client import (
     BusError,
     Client,
     ClientError,
@@ -26,13 +26,13 @@ from fantwin_client import (
     TimeOrderError,
     Tray,
 )
-from fantwin_client.outbox import MOST_SENT_MESSAGES
-from fantwin_client.times import times_ns
-from pipeline.bus.access_rules import SiteRoles
-from pipeline.bus.certificates import checked_credentials
-from pipeline.bus.router import open_router
-from pipeline.config.loading import parse_config
-from schemas.topics import BY_NAME
+from fantwin.client.outbox import MOST_SENT_MESSAGES
+from fantwin.client.times import times_ns
+from fantwin.pipeline.bus.access_rules import SiteRoles
+from fantwin.pipeline.bus.certificates import checked_credentials
+from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.schemas.topics import BY_NAME
 from tests.support.running_acquisition import SITE, TRAY, Raws, acquisition, push_config, raws_of
 from tests.support.running_chain import eventually
 from tests.support.secured_site import SecuredSite, free_endpoint
@@ -50,13 +50,13 @@ def raws(endpoint: str) -> Iterator[Raws]:
 
 @pytest.fixture
 def client(endpoint: str, raws: Raws) -> Iterator[Client]:
-    client = fantwin_client.connect(endpoint, site=SITE)
+    client = fantwin.client.connect(endpoint, site=SITE)
     yield client
     client.close(timeout_s=0.5)
 
 
 def test_samples_arrive_with_their_times_numbers_and_units(endpoint: str, raws: Raws, tmp_path: Path) -> None:
-    with acquisition(push_config(endpoint, tmp_path)), fantwin_client.connect(endpoint, site=SITE) as client:
+    with acquisition(push_config(endpoint, tmp_path)), fantwin.client.connect(endpoint, site=SITE) as client:
         tray = client.tray(TRAY, speed_unit="rpm")
         assert tray.fans == 2
         tray.publish(T_S, command=[0.25, 0.5], speed=[1500.0, np.nan])
@@ -145,9 +145,9 @@ def test_what_ends_the_thread_is_raised_by_publish_and_check(
     endpoint: str, raws: Raws, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with acquisition(push_config(endpoint, tmp_path)):
-        client = fantwin_client.connect(endpoint, site=SITE)
+        client = fantwin.client.connect(endpoint, site=SITE)
         tray = client.tray(TRAY)
-        monkeypatch.setattr("fantwin_client.tray.encode", lambda _message: 1 / 0)
+        monkeypatch.setattr("fantwin.client.tray.encode", lambda _message: 1 / 0)
         tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])
         with pytest.raises(SendError, match="ZeroDivisionError: division by zero; open the client again") as caught:
             tray.check(60.0)
@@ -201,13 +201,13 @@ def test_an_acquisition_that_is_restarted_gets_what_was_published_meanwhile(
     assert (tray.losses().received, tray.losses().waiting) == (10, 100)
     with pytest.raises(NotKeptError, match="100 are kept at most: acquisition is gone.*; 1 samples were not taken"):
         tray.publish(T_S + 11, [0.5, 0.5], [1.0, 1.0])
-    with pytest.raises(fantwin_client.NotReceivedError, match="has not received 100 of 110 samples"):
+    with pytest.raises(fantwin.client.NotReceivedError, match="has not received 100 of 110 samples"):
         tray.check(timeout_s=0)
     with acquisition(config):
         tray.wait_received(10)
         raws.wait_for(110)
         assert tray.losses().not_kept == 1
-        with pytest.raises(fantwin_client.SamplesLostError, match="1 not kept"):
+        with pytest.raises(fantwin.client.SamplesLostError, match="1 not kept"):
             tray.check()
     np.testing.assert_array_equal(raws.column("device_sequence"), np.arange(110))
     # kept samples are not late: they count as received when they would have been, had they been sent at once
@@ -217,7 +217,7 @@ def test_an_acquisition_that_is_restarted_gets_what_was_published_meanwhile(
 def test_messages_that_acquisition_missed_are_fetched_by_it(
     endpoint: str, client: Client, raws: Raws, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fantwin_client.tray.ASK_AGAIN_S", 0.2)
+    monkeypatch.setattr("fantwin.client.tray.ASK_AGAIN_S", 0.2)
     with acquisition(push_config(endpoint, tmp_path)):
         tray = client.tray(TRAY)
         tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])
@@ -239,14 +239,14 @@ def test_no_more_is_sent_than_can_be_asked_for_again() -> None:
 
 
 def test_the_client_that_came_last_has_the_tray(endpoint: str, client: Client, raws: Raws, tmp_path: Path) -> None:
-    with acquisition(push_config(endpoint, tmp_path)), fantwin_client.connect(endpoint, SITE) as other:
+    with acquisition(push_config(endpoint, tmp_path)), fantwin.client.connect(endpoint, SITE) as other:
         first, second = client.tray(TRAY), other.tray(TRAY)
         first.publish(T_S, [0.1, 0.1], [1.0, 1.0])
         first.check()
         second.publish(T_S, [0.2, 0.2], [1.0, 1.0])
         second.check()
         first.publish(T_S + 1, [0.1, 0.1], [1.0, 1.0])
-        with pytest.raises(fantwin_client.SamplesLostError, match=r"1 refused \(second_client\); two clients push"):
+        with pytest.raises(fantwin.client.SamplesLostError, match=r"1 refused \(second_client\); two clients push"):
             first.check()
         assert first.check().refused == {"second_client": 1}, "an old loss is not raised twice"
         raws.wait_for(2)
@@ -281,8 +281,8 @@ def test_a_certificate_that_may_not_publish_is_named_with_its_role(tmp_path: Pat
     security = {"ca": ca, "certificate": certificate, "key": key}
     with (
         site.running(),
-        fantwin_client.connect(site.endpoint, "site", mode="client", security=security) as client,
-        pytest.raises(fantwin_client.NotAllowedError, match=f"tray a: .*{role}.pem {why}; use one of role 'source', "),
+        fantwin.client.connect(site.endpoint, "site", mode="client", security=security) as client,
+        pytest.raises(fantwin.client.NotAllowedError, match=f"tray a: .*{role}.pem {why}; use one of role 'source', "),
     ):
         client.tray("a")
 
@@ -296,11 +296,11 @@ def test_with_certificates_a_source_publishes(endpoint: str, tmp_path: Path) -> 
     of_peers = push_config(endpoint, tmp_path, more=f"[bus.security]\n{lines}\n")
     config = parse_config(of_peers.text, of_peers.path, ("bus.mode='client'",))
     with pytest.raises(BusError, match='security needs mode="client"'):
-        fantwin_client.connect(endpoint, SITE, security=security)
+        fantwin.client.connect(endpoint, SITE, security=security)
     with (
         open_router(endpoint, checked_credentials(certificates.security, ("router",)), SiteRoles.of(config)),
         acquisition(config),
-        fantwin_client.connect(endpoint, SITE, mode="client", security=security) as client,
+        fantwin.client.connect(endpoint, SITE, mode="client", security=security) as client,
     ):
         tray = client.tray(TRAY)
         tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])

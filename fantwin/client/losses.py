@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from schemas.health import Health
-from schemas.streams import LOSS_PREFIX
+from fantwin.schemas.health import Health
+from fantwin.schemas.streams import LOSS_PREFIX
 
 REFUSED_KINDS = ("wrong_fan_count", "absurd_command", "time_order", "absurd_age", "second_client", "refused_readings")
 """counters of acquisition: samples that it refuses"""

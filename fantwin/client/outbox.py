@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.topics import CATCH_UP_MESSAGES
+from fantwin.schemas.topics import CATCH_UP_MESSAGES
 
 MOST_SAMPLES, MOST_FAN_SAMPLES = 1024, 1024 * 32
 """of one message; what waits is joined up to this"""

@@ -9,9 +9,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fantwin_client.errors import TimeOrderError
-from schemas.messages import FURTHEST_T_NS
-from schemas.units import NS_PER_S
+from fantwin.client.errors import TimeOrderError
+from fantwin.schemas.messages import FURTHEST_T_NS
+from fantwin.schemas.units import NS_PER_S
 
 Time: TypeAlias = "float | int | datetime | np.datetime64"
 _DAY_NS = 86_400 * NS_PER_S

@@ -17,19 +17,19 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fantwin_client import errors
-from fantwin_client.losses import WITHOUT_SPEED, CountsOfAcquisition, Losses
-from fantwin_client.outbox import Block, Outbox
-from fantwin_client.times import Time, times_ns
-from pipeline.bus.session import Bus
-from pipeline.devices.sample_source import limits_of_float32
-from pipeline.runtime.tray_acquisition import TrayAcquisition
-from schemas.codec import encode, type_name
-from schemas.header import Header
-from schemas.health import AcceptedSamples, Health
-from schemas.messages import PushedSamples
-from schemas.topics import BY_NAME, tray_key
-from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
+from fantwin.client import errors
+from fantwin.client.losses import WITHOUT_SPEED, CountsOfAcquisition, Losses
+from fantwin.client.outbox import Block, Outbox
+from fantwin.client.times import Time, times_ns
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.devices.sample_source import limits_of_float32
+from fantwin.pipeline.runtime.tray_acquisition import TrayAcquisition
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import AcceptedSamples, Health
+from fantwin.schemas.messages import PushedSamples
+from fantwin.schemas.topics import BY_NAME, tray_key
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
 
 Values: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | NDArray[Any]
 READING = "reading"

@@ -1,8 +1,8 @@
 """Push the samples of fans to fantwin over its bus, from any Python program.
 
-    import fantwin_client
+    import fantwin
 
-    with fantwin_client.connect("tcp/127.0.0.1:7447", site="plant") as client:
+    with fantwin.connect("tcp/127.0.0.1:7447", site="plant") as client:
         tray = client.tray("tray1", speed_unit="rpm")
         tray.publish(time.time(), command=[0.4, 0.6], speed=[1490.0, 2210.0])
         print(tray.losses())
@@ -12,8 +12,8 @@ The tray must have `source = { kind = "push" }` in the configuration of the site
 
 from __future__ import annotations
 
-from fantwin_client.client import Client, connect
-from fantwin_client.errors import (
+from fantwin.client.client import Client, connect
+from fantwin.client.errors import (
     ClientError,
     CommandError,
     FanCountError,
@@ -25,9 +25,9 @@ from fantwin_client.errors import (
     SendError,
     TimeOrderError,
 )
-from fantwin_client.losses import Losses
-from fantwin_client.tray import Tray
-from pipeline.bus.errors import BusError
+from fantwin.client.losses import Losses
+from fantwin.client.tray import Tray
+from fantwin.pipeline.bus.errors import BusError
 
 __all__ = [
     "BusError",

@@ -8,14 +8,14 @@ import time
 from types import TracebackType
 from typing import Any, Self
 
-from fantwin_client.errors import NotAllowedError, NotReceivedError, SendError
-from fantwin_client.tray import READING, Tray
-from pipeline.bus.errors import BusError
-from pipeline.bus.session import Bus
-from pipeline.config.models import BusConfig
-from pipeline.config.roles import SOURCE
-from schemas.topics import tray_key
-from schemas.units import SpeedUnit
+from fantwin.client.errors import NotAllowedError, NotReceivedError, SendError
+from fantwin.client.tray import READING, Tray
+from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.roles import SOURCE
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import SpeedUnit
 
 _LOG = logging.getLogger(__name__)
 KEPT_SAMPLES = 100_000

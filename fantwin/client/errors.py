@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class ClientError(Exception):
-    """Base of all errors of this package; the bus itself raises `fantwin_client.BusError`."""
+    """Base of all errors of this package; the bus itself raises `fantwin.client.BusError`."""
 
 
 class NoAcquisitionError(ClientError):

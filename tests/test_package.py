@@ -1,0 +1,66 @@
+"""The wheel: one package with all that runs, beside whatever else a user has."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import fantwin
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("fantwin", "pipeline", "schemas", "scoring", "simulation", "stages", "twin")
+FILES = ("pyproject.toml", "README.md", "LICENSE")
+DATA = ("*.toml", "*.onnx", "*.sh", "*.proto", "*.pyi", "*.html", "*.js", "*.css", "*.svg", "py.typed")
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an unpacked wheel, as site-packages would be."""
+    source, built = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("built")
+    for name in FILES:  # a copy: a build leaves its traces in the source
+        shutil.copy(ROOT / name, source)
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    build = "import sys, setuptools.build_meta as backend; print(backend.build_wheel(sys.argv[1]))"
+    subprocess.run([sys.executable, "-c", build, built], cwd=source, capture_output=True, check=True)
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(built / "installed")
+    return built / "installed"
+
+
+def test_the_wheel_holds_one_package_with_every_file_of_the_product(unpacked):
+    assert {path.name.partition("-")[0] for path in unpacked.iterdir()} == {"fantwin"}
+    patterns = ("*.py", *DATA)
+    ours = {path.relative_to(ROOT) for name in FOLDERS for kind in patterns for path in (ROOT / name).rglob(kind)}
+    # through a link or not, a file of the product is below `fantwin/`
+    expected = {path if path.parts[0] == "fantwin" else Path("fantwin") / path for path in ours}
+    found = {path.relative_to(unpacked) for path in (unpacked / "fantwin").rglob("*") if path.is_file()}
+    assert expected - found == set()
+
+
+def test_folders_and_files_of_a_user_with_our_names_do_no_harm(unpacked, tmp_path):
+    for name in FOLDERS[1:]:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise SystemExit('a file of the user was imported')")
+    (tmp_path / "client.py").write_text("raise SystemExit('a file of the user was imported')")
+    code = (
+        "import sys; sys.path.insert(1, sys.argv[1]); import fantwin; fantwin.connect, fantwin.read_arrays;"
+        "from fantwin.pipeline.config.registry import STAGES; print(len([row.load() for row in STAGES.values()]),"
+        "fantwin.__file__)"
+    )
+    words = [sys.executable, "-c", code, unpacked]  # `-c` puts the folder of the user first
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    stages, where = done.stdout.split()
+    assert int(stages) > 10 and Path(where).is_relative_to(unpacked), done.stderr
+
+
+def test_the_interface_is_what_the_package_names():
+    assert {name for name in fantwin.__all__ if callable(getattr(fantwin, name))} == set(fantwin.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'read_arays'"):
+        _ = fantwin.read_arays
