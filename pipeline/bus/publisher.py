@@ -1,11 +1,10 @@
-"""Publishing with recovery: a publisher keeps its last messages and answers requests for those that were missed. What
-its memory cannot keep it keeps on disk, where the configuration says so."""
+"""Publishing with recovery: a publisher keeps its last messages and answers requests for those that were missed."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from itertools import chain, islice
+from itertools import islice
 
 import zenoh
 
@@ -16,7 +15,6 @@ from fantwin.pipeline.bus.recovery import (
     number_in,
     recovery_key,
 )
-from fantwin.pipeline.bus.spool import Spool
 from fantwin.schemas.topics import Topic
 
 KEPT_BYTES = 16 << 20
@@ -37,14 +35,7 @@ class Publisher:
     """One output: publishes bytes on a key, and keeps the last ones for consumers that missed them."""
 
     def __init__(
-        self,
-        session: zenoh.Session,
-        key: str,
-        topic: Topic,
-        encoding: str,
-        producer: str,
-        kept_bytes: KeptBytes,
-        spool: Spool | None = None,
+        self, session: zenoh.Session, key: str, topic: Topic, encoding: str, producer: str, kept_bytes: KeptBytes
     ) -> None:
         self.key = key
         self.published = 0
@@ -52,7 +43,6 @@ class Publisher:
         self._kept: deque[tuple[int, bytes]] = deque()
         self._kept_bytes = 0
         self._of_all = kept_bytes
-        self._spooled = spool.stream() if spool and topic.recorded else None
         self._publisher = session.declare_publisher(
             key,
             encoding=f"application/protobuf;{encoding}",
@@ -68,20 +58,9 @@ class Publisher:
             self._kept.append((self.published, payload))
             self._add(len(payload))
             self.published += 1
-        self._publisher.put(payload)
-        self._keep_no_more()
-
-    def _keep_no_more(self) -> None:
-        """Drop what is too much from memory, once it is on disk."""
-        while True:
-            with self._of_all.lock:
-                if not self._keeps_too_much():
-                    return
-                sequence, oldest = self._kept[0]
-            if self._spooled:
-                self._spooled.add(sequence, oldest)  # without the lock: a slow disk holds up no other publisher
-            with self._of_all.lock:
+            while self._keeps_too_much():
                 self._add(-len(self._kept.popleft()[1]))
+        self._publisher.put(payload)
 
     def forget(self, before: int) -> None:
         """Keep no message with a sequence number below `before`: its consumer has it."""
@@ -116,11 +95,10 @@ class Publisher:
             if newest:
                 first = max(first, end - min(newest, self._topic.history))
             begin = max(first, oldest)
-            in_memory = [payload for _, payload in islice(self._kept, begin - oldest, max(begin, end) - oldest)]
-        on_disk = self._spooled.read(first, min(end, oldest)) if self._spooled and first < oldest else ()
+            kept = [payload for _, payload in islice(self._kept, begin - oldest, max(begin, end) - oldest)]
         messages, size = 0, 0
         with query:
-            for payload in chain(on_disk, in_memory):
+            for payload in kept:
                 messages, size = messages + 1, size + len(payload)
                 if messages > MOST_RECOVERED_MESSAGES or (size > MOST_RECOVERED_BYTES and messages > 1):
                     return

@@ -31,7 +31,6 @@ from fantwin.pipeline.bus.opening import (
 from fantwin.pipeline.bus.publisher import KeptBytes, Publisher
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
 from fantwin.pipeline.bus.rights import UNANSWERED_LIMIT_S, OwnRights, granted_rights
-from fantwin.pipeline.bus.spool import Spool
 from fantwin.pipeline.config.models import BusConfig, Config
 from fantwin.pipeline.config.roles import READERS
 from fantwin.schemas.topics import Topic, key_in_words, largest_bytes
@@ -85,8 +84,6 @@ class Bus:
         self._stop = stop or threading.Event()
         self.refused_too_large = 0
         self._kept_bytes = KeptBytes()
-        self.spool: Spool | None = None
-        """where publishers that are declared from now on keep what their memory cannot; None: nowhere"""
         self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
@@ -101,7 +98,7 @@ class Bus:
         """Declare an output; `encoding` is the full protobuf name of its messages."""
         self._claim("put", key)
         self._claim("declare_queryable", recovery_key(key, producer))
-        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes, self.spool)
+        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes)
 
     def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> Callable[[], None]:
         """Call `on_message(key, payload)` for what other sessions publish, from a thread of the bus. Returns what ends
@@ -280,8 +277,6 @@ class Bus:
     def close(self) -> None:
         """Leave the bus. What was published before has left this process."""
         self._session.close()
-        if self.spool:
-            self.spool.close()
 
 
 def join_bus(

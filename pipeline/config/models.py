@@ -120,13 +120,6 @@ class SecurityConfig(Section):
         return self.model_copy(update=paths)
 
 
-class SpoolConfig(Section):
-    """What a process keeps on disk of what it has published, in `run_folder/spool`."""
-
-    megabytes: float = Field(default=200.0, ge=1, description="most that a process keeps on disk, MB")
-    kept_s: float = Field(default=900.0, ge=1, description="how long a message is kept")
-
-
 class BusConfig(Section):
     """How processes find one another. On one host the first process to start listens on `endpoint`, the others
     connect there and learn of each other; if it dies, the next to start takes its place."""
@@ -147,10 +140,6 @@ class BusConfig(Section):
     )
     zenoh: dict[str, Any] = Field(
         default_factory=dict, description="settings of Zenoh itself, by path; not those that fantwin sets"
-    )
-    spool: SpoolConfig | None = Field(
-        default=None,
-        description="what producers keep on disk for consumers that are cut off for long; without it, nothing",
     )
 
     @property

@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from fantwin.pipeline.config.loading import LARGEST_FILE_BYTES, top_level
-from fantwin.pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, SpoolConfig, TrayConfig
+from fantwin.pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, TrayConfig
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.devices.sample_source import SourceConfig
 from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS
@@ -58,7 +58,7 @@ def page() -> str:
         "What a reading is of the speed ([tachos](../explanation/tachos.md)).\n",
         _table(Tacho, but=()),
         "## `[bus]`\n",
-        _table(BusConfig, but=("security", "spool", "zenoh")),
+        _table(BusConfig, but=("security", "zenoh")),
         "## `[bus.security]`\n",
         "Certificates and roles ([security](../how-to/security.md)). Without this section there are none.\n",
         _table(SecurityConfig, but=()),
@@ -66,11 +66,6 @@ def page() -> str:
         "Settings of Zenoh itself, passed to every session and to the router: path = value, with the paths of Zenoh's "
         'own configuration, for example `"transport/unicast/max_sessions" = 5000`. What Zenoh does not know, or '
         "fantwin sets itself, is refused.\n",
-        "## `[bus.spool]`\n",
-        "What a process keeps on disk of the messages that it has published, in `run_folder/spool`, for consumers that "
-        "are cut off for long ([partitions](../how-to/deployment.md#partitions)). Without this section it keeps "
-        "nothing.\n",
-        _table(SpoolConfig, but=()),
         "## `[launcher]`\n",
         _table(LauncherConfig, but=()),
     ]

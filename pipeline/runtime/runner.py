@@ -17,7 +17,6 @@ from dataclasses import replace
 from itertools import chain
 
 from fantwin.pipeline.bus.kept_messages import KeptQuery
-from fantwin.pipeline.bus.spool import Spool
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.shards import Shard, chosen_shard
@@ -97,9 +96,6 @@ class Runner:
         self._bus, self._parts = build_and_join(
             stage, config, shard, self._session, stop, lambda: self._clock.is_replay_alive
         )
-        if config.bus.spool:
-            folder = config.run_folder / "spool" / f"{stage.name}-{shard.name}"
-            self._bus.spool = Spool(folder, round(config.bus.spool.megabytes * 1e6), config.bus.spool.kept_s)
         before = {key: payload for parts in self._parts.values() for key, payload in parts.kept.items()}
         self._kept = KeptForOthers(
             self._bus, config.site, STAGES[stage.name].keeps, self.producer, before, self._inbox.put
@@ -401,7 +397,6 @@ class Runner:
                 self._bus.security_problem(),
                 self._sessions.problem(),
                 self._tracker.problem(),
-                self._bus.spool.problem() if self._bus.spool else "",
                 *(core.problem() for core in cores),
             ],
             inputs=self._tracker.inputs(self._unsaved(cores)) if with_counts else (),
@@ -419,8 +414,6 @@ class Runner:
             yield Note(tray="", text=note)
         for name, parts in self._parts.items():
             yield from (Note(tray=name, text=note) for note in parts.core.notes())
-        if self._bus.spool and (note := self._bus.spool.note()):
-            yield Note(tray="", text=note)
 
     def _publish_health(self, status: StageStatus) -> Health:
         health = self._build_health(status)
