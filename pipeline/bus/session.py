@@ -30,7 +30,7 @@ from fantwin.pipeline.bus.opening import (
 )
 from fantwin.pipeline.bus.publisher import KeptBytes, Publisher
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
-from fantwin.pipeline.bus.rights import UNANSWERED_LIMIT_S, OwnRights, granted_rights
+from fantwin.pipeline.bus.rights import awaited_rights, granted_rights, refused_by_router, refused_in_words
 from fantwin.pipeline.config.models import BusConfig, Config
 from fantwin.pipeline.config.roles import READERS
 from fantwin.schemas.topics import Topic, key_in_words, largest_bytes
@@ -74,12 +74,9 @@ class Bus:
         """Whether another process listened before: discovering the others takes a moment."""
         self._has_answered = config.mode == "client" or (self.came_second and answers(config, self.credentials, stop))
         self._session = open_session(config, self.credentials, stop, listens, site)
-        self.rights: OwnRights | None = None
-        """what this session may do; None: everything, as far as is known"""
-        if self.credentials and site:
-            role, is_client = self.credentials.role, config.mode == "client"
-            self.rights = OwnRights(self._session, site, role, is_client=is_client)
         self._site = site
+        self._claims: list[tuple[str, str]] = []
+        """what has been declared: kinds of messages of Zenoh, each with its key or key expression"""
         self._meeting = Meeting()
         self._stop = stop or threading.Event()
         self.refused_too_large = 0
@@ -96,8 +93,8 @@ class Bus:
 
     def publisher(self, key: str, topic: Topic, encoding: str, producer: str) -> Publisher:
         """Declare an output; `encoding` is the full protobuf name of its messages."""
-        self._claim("put", key)
-        self._claim("declare_queryable", recovery_key(key, producer))
+        self._claims.append(("put", key))
+        self._claims.append(("declare_queryable", recovery_key(key, producer)))
         return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes)
 
     def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> Callable[[], None]:
@@ -119,11 +116,10 @@ class Bus:
         handler = zenoh.handlers.Callback(receive, indirect=False)
         subscriber = self._session.declare_subscriber(key_expression, handler, allowed_origin=zenoh.Locality.REMOTE)
         self._declared.append(subscriber)
-        self._claim("declare_subscriber", key_expression)
+        self._claims.append(("declare_subscriber", key_expression))
 
         def unsubscribe() -> None:
-            if self.rights:
-                self.rights.discard("declare_subscriber", key_expression)
+            self._claims.remove(("declare_subscriber", key_expression))
             self._declared.remove(subscriber)
             subscriber.undeclare()
 
@@ -131,7 +127,7 @@ class Bus:
 
     def declare_alive(self, key: str) -> None:
         """Show a liveliness token until this session ends, however it ends."""
-        self._claim("liveliness_token", key)
+        self._claims.append(("liveliness_token", key))
         self._declared.append(self._session.liveliness().declare_token(key))
 
     def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> Callable[[], None]:
@@ -222,7 +218,7 @@ class Bus:
 
     def answer_for_kept(self, key_expression: str, kept_by: str, on_query: Callable[[KeptQuery], object]) -> None:
         """Call `on_query` when somebody asks for the last message on a key that is kept here."""
-        self._claim("declare_queryable", kept_key(key_expression, kept_by))
+        self._claims.append(("declare_queryable", kept_key(key_expression, kept_by)))
         self._declared.append(answer_for_kept(self._session, key_expression, kept_by, on_query))
 
     def ask_for_kept(self, key: str, timeout_s: float) -> tuple[list[bytes], bool]:
@@ -231,7 +227,15 @@ class Bus:
 
     def require_rights(self, stop: threading.Event | None = None) -> None:
         """Raises BusError if something that this session has declared is refused; waits a moment for the answer."""
-        if self.rights and (problem := self.rights.wait(stop)):
+        if not (self.credentials and self._site):
+            return
+        role, claims = self.credentials.role, tuple(self._claims)
+        problem = refused_in_words(claims, role, self._site)
+        if not problem and self._config.mode == "client":
+            granted = awaited_rights(self._session, self._site.site, role, stop)
+            if granted or self._has_its_router():  # one that is gone refuses nothing
+                problem = refused_by_router(claims, role, self._site, granted)
+        if problem and not (stop and stop.is_set()):
             raise BusError(problem)
 
     def has_all_rights_of_its_role(self, site: SiteRoles) -> bool:
@@ -250,9 +254,7 @@ class Bus:
         if self.credentials is None:
             return ""
         role = self.credentials.role
-        until_s = time.monotonic() + UNANSWERED_LIMIT_S
-        while (granted := granted_rights(self._session, site, role)) is None and time.monotonic() < until_s:
-            time.sleep(ROUTER_RETRY_S)
+        granted = awaited_rights(self._session, site, role)
         whose = f"{self.credentials.certificate} is a certificate of role {role!r}"
         if granted is None and not self._has_its_router():
             raise NoAnswerError(f"no router answers at {self._config.endpoint}")
@@ -261,18 +263,9 @@ class Bus:
             return f"{whose}: {no_answer}; it has no such role in site {site!r}, or is overloaded"
         return "" if granted.allow("put", key) else f"{whose}, which may not publish {key_in_words(key)}"
 
-    def security_problem(self) -> str:
-        """What is refused, or which certificate expires soon; empty if there is nothing, or without `bus.security`.
-        To be called often."""
-        if self.credentials is None:
-            return ""
-        if self.rights:
-            self.rights.ask()
-        return "; ".join(filter(None, (self.rights.problem() if self.rights else "", self.credentials.warning())))
-
-    def _claim(self, message: str, key: str) -> None:
-        if self.rights:
-            self.rights.add(message, key)
+    def certificate_warning(self) -> str:
+        """That the certificate of this session expires soon; empty if it does not, or without `bus.security`."""
+        return self.credentials.warning() if self.credentials else ""
 
     def close(self) -> None:
         """Leave the bus. What was published before has left this process."""

@@ -137,7 +137,7 @@ class Launcher:
         reads = {name: load_stage(name).reads_as_configured(self._config) for name in self._config.stages}
         with join_bus(self._config, stop, say=self._say) as bus:
             self._refuse_second_launcher(bus, stop)
-            if problem := bus.security_problem():
+            if problem := bus.certificate_warning():
                 self._say(problem)
             before = set(self._parts())
             self._watcher = SiteWatcher(bus, self._config.site, roles_of(self._config))

@@ -151,11 +151,6 @@ class Runner:
             clock=self._clock,
         )
 
-    @property
-    def refusal(self) -> str:
-        """What the bus refuses of this stage; empty if nothing: others may not hear it say so."""
-        return self._bus.rights.problem() if self._bus.rights else ""
-
     def run(self) -> Health:
         """Run to the end and return the last health, which is published whatever happens.
 
@@ -394,7 +389,7 @@ class Runner:
             status=status,
             problems=[
                 self._ending.problem,
-                self._bus.security_problem(),
+                self._bus.certificate_warning(),
                 self._sessions.problem(),
                 self._tracker.problem(),
                 *(core.problem() for core in cores),

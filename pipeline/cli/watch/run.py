@@ -73,8 +73,9 @@ def _run(
         with starting():
             problems = Problems(name)
 
-            def report(health: Health) -> None:  # the launcher reports what it hears itself
-                problems.report(runner.refusal if until_stdin_closes else health.problem)
+            def report(health: Health) -> None:
+                if not until_stdin_closes:  # a launcher hears it itself
+                    problems.report(health.problem)
 
             runner = Runner(load_stage(stage), settings, chosen, stop, report)
     except NoAnswerError as error:  # the bus may answer the next time
@@ -100,9 +101,6 @@ def _run(
         typer.echo(
             json.dumps({"stage": stage, "lost": last.lost, "counters": {c.name: c.value for c in last.counters}})
         )
-    if runner.refusal:
-        _say(f"{name}: its messages were refused until the end: {runner.refusal}")
-        raise typer.Exit(1)
     if last.lost:
         if not until_stdin_closes:
             counts = ", ".join(

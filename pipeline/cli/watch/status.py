@@ -160,7 +160,7 @@ def _bus_lines(bus: Bus) -> list[Text]:
         return []
     own = bus.credentials.own
     line = Text(f"certificate of this command: {own.role}, until {own.not_after:%Y-%m-%d}", style="dim")
-    return [line, *(Text(each, style="red") for each in [bus.security_problem()] if each)]
+    return [line, *(Text(each, style="red") for each in [bus.certificate_warning()] if each)]
 
 
 def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans, of_bus: Sequence[Text] = ()) -> Group:

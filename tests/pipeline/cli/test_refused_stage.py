@@ -11,7 +11,7 @@ import pytest
 from fantwin.pipeline.bus.access_rules import SiteRoles
 from fantwin.pipeline.bus.router import open_router
 from tests.support.fantwin_command import fantwin as called
-from tests.support.running_chain import RunningCommand, fantwin
+from tests.support.running_chain import fantwin
 from tests.support.secured_site import SITE, SecuredSite, free_endpoint
 
 
@@ -50,24 +50,6 @@ def test_whoever_may_not_command_is_told_the_role_that_may_in_words_of_the_docum
     assert str(done.exception) == (
         "its certificate says 'viewer', which may not publish command of a; use the certificate of role 'operator'"
     )
-
-
-@pytest.mark.real_time
-def test_a_stage_that_is_refused_while_it_runs_says_so_and_ends_with_1(site):
-    stage = None
-    try:
-        with open_router(site.endpoint, site.credentials("router"), site.site):
-            stage = RunningCommand(["run", "resampler", "-c", site.config.path])
-            with site.sessions_of():
-                assert site.sees("resampler")
-        with open_router(site.endpoint, site.credentials("router"), fewer_rights(site)):
-            line = stage.line_with("the router does not let 'resampler' publish grid of a")
-            assert line.startswith("resampler: ")
-            assert stage.end() == 1
-            assert "its messages were refused until the end" in stage.lines[-1]
-    finally:
-        if stage:
-            stage.kill()
 
 
 def examined(site: SecuredSite) -> tuple[list[str], list[str]]:

@@ -158,7 +158,7 @@ class LateBus:
     def wait_for_others(self, _stop: object) -> None:
         """One has been met."""
 
-    def security_problem(self) -> str:
+    def certificate_warning(self) -> str:
         return ""
 
     def alive(self, _key: str) -> set[str]:
