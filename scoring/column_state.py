@@ -1,4 +1,4 @@
-"""State in arrays with a column for each fan, so that trays can be joined (pipeline.runtime.joint_states)."""
+"""State in arrays with a column for each fan, so that trays can be joined (pipeline.prediction.joint_states)."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """Acquisition: the readings of a tray's source in, raw samples out; commands back to the device.
 
 Reads: topic `command` (fan commands in the tray's command unit, set-points in rad/s), and the source that `source` of
-the [[tray]] names (pipeline/devices/source_kinds.py; speed in the tray's speed unit). Where clients push the samples of
+the [[tray]] names (pipeline/sources/kinds.py; speed in the tray's speed unit). Where clients push the samples of
 a tray over the bus, that source is topic `reading` (time of the client in ns, command, speed in rad/s).
 Writes: topic `raw`: device clock (us, wraps), device sequence (wraps), host time of receipt (ns), command, speed
 (rad/s), and where the source measures them supply voltage (V), current (A), temperature (degrees Celsius).
-Timing: a message holds what arrives within `block_s` (pipeline/devices/sample_blocks.py), and is sent when the last of
-that has arrived.
+Timing: a message holds what arrives within `block_s` (pipeline/acquisition/sample_blocks.py), and is sent when the last
+of that has arrived.
 
 One process and one core per tray. What is done here is the same for all sources: check ranges, count lost and
 repeated samples, convert units, make messages of samples.
@@ -20,14 +20,18 @@ from typing import TypeAlias
 
 from pydantic import Field
 
+from fantwin.pipeline.acquisition.device_commands import DeviceCommands
+from fantwin.pipeline.acquisition.device_sequence import DeviceSequence
+from fantwin.pipeline.acquisition.input_quality import InputQuality
+from fantwin.pipeline.acquisition.plausibility import Plausibility
+from fantwin.pipeline.acquisition.raw_messages import ReceivedReading, raw_message
+from fantwin.pipeline.acquisition.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.devices.device_sequence import DeviceSequence
-from fantwin.pipeline.devices.host_clock import HOST_CLOCK, HostClock
-from fantwin.pipeline.devices.input_quality import InputQuality
-from fantwin.pipeline.devices.plausibility import Plausibility
-from fantwin.pipeline.devices.push_source import PushSource
-from fantwin.pipeline.devices.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
-from fantwin.pipeline.devices.sample_source import (
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
+from fantwin.pipeline.sources.kinds import build_source
+from fantwin.pipeline.sources.push.source import PushSource
+from fantwin.pipeline.sources.source import (
     LinkUp,
     Reading,
     ReadingBatch,
@@ -35,11 +39,7 @@ from fantwin.pipeline.devices.sample_source import (
     SampleSource,
     SourceContext,
 )
-from fantwin.pipeline.devices.source_kinds import build_source
-from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.runtime.device_commands import DeviceCommands
-from fantwin.pipeline.runtime.raw_messages import ReceivedReading, raw_message
-from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK, HostClock
 from fantwin.schemas.auxiliary import AUXILIARY
 from fantwin.schemas.health import AcceptedSamples
 from fantwin.schemas.messages import Command, PushedSamples, Raw, StatedTacho

@@ -15,19 +15,19 @@ from pathlib import Path
 
 from fantwin.pipeline.config.registry import RECORDER
 from fantwin.pipeline.errors import refusals
-from fantwin.pipeline.gateway.config import GatewayConfig
-from fantwin.pipeline.gateway.live_feed import LiveFeed
-from fantwin.pipeline.presenting.alarm_rates import AlarmRates
-from fantwin.pipeline.presenting.alarm_store import HISTORY, AlarmStore
-from fantwin.pipeline.presenting.fan_history import curves_of
-from fantwin.pipeline.presenting.other_stages import VIEWER, configured, recordings_of, viewer_urls
-from fantwin.pipeline.presenting.request_desk import RequestDesk
-from fantwin.pipeline.presenting.shown import alarm_json, curves_json, fleet_json, stages_json
-from fantwin.pipeline.presenting.site_core import SiteCore
-from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.outputs.web.config import GatewayConfig
+from fantwin.pipeline.outputs.web.live_feed import LiveFeed
 from fantwin.pipeline.recordings.clips.clip import clip_folder
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
-from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.site.alarm_rates import AlarmRates
+from fantwin.pipeline.site.alarm_store import HISTORY, AlarmStore
+from fantwin.pipeline.site.fan_history import curves_of
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.other_stages import VIEWER, configured, recordings_of, viewer_urls
+from fantwin.pipeline.site.request_desk import RequestDesk
+from fantwin.pipeline.site.shown import alarm_json, curves_json, fleet_json, stages_json
+from fantwin.pipeline.site.site_core import SiteCore
+from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message
 from fantwin.schemas.units import NS_PER_S
@@ -135,11 +135,11 @@ class _Running(Server):
         desk: RequestDesk,
         clip_folders: Sequence[Path],
     ) -> None:
-        from fantwin.pipeline.gateway.access import Access  # noqa: PLC0415  slow to import
-        from fantwin.pipeline.gateway.api import Api  # noqa: PLC0415
-        from fantwin.pipeline.gateway.app import application  # noqa: PLC0415
-        from fantwin.pipeline.gateway.server import WebServer, check_certificate, listen  # noqa: PLC0415
-        from fantwin.pipeline.presenting.users import Users  # noqa: PLC0415
+        from fantwin.pipeline.outputs.web.access import Access  # noqa: PLC0415  slow to import
+        from fantwin.pipeline.outputs.web.api import Api  # noqa: PLC0415
+        from fantwin.pipeline.outputs.web.app import application  # noqa: PLC0415
+        from fantwin.pipeline.outputs.web.server import WebServer, check_certificate, listen  # noqa: PLC0415
+        from fantwin.pipeline.site.users import Users  # noqa: PLC0415
 
         config: GatewayConfig = context.config
         tls = None
@@ -178,8 +178,8 @@ def build(context: Context) -> BuiltStage:
 
 def check(context: Context) -> list[str]:
     """Problems with the gateway: its port is taken by another program, or a file cannot be read."""
-    from fantwin.pipeline.gateway.server import check_certificate, check_files, listen  # noqa: PLC0415  slow to import
-    from fantwin.pipeline.presenting.users import read_users  # noqa: PLC0415
+    from fantwin.pipeline.outputs.web.server import check_certificate, check_files, listen  # noqa: PLC0415  slow to import
+    from fantwin.pipeline.site.users import read_users  # noqa: PLC0415
 
     config: GatewayConfig = context.config
     attempts: list[Callable[[], object]] = []

@@ -12,27 +12,27 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
-from fantwin.pipeline.broker.config import MqttConfig
-from fantwin.pipeline.broker.fan_states import FanStates, shown_alarm, topics_of
-from fantwin.pipeline.broker.home_assistant import OFFLINE, ONLINE, HomeAssistant
-from fantwin.pipeline.broker.json_text import json_text
-from fantwin.pipeline.broker.link import BrokerLink, Link
-from fantwin.pipeline.broker.outbox import Outbox, Outgoing
-from fantwin.pipeline.broker.requests import Requests
-from fantwin.pipeline.broker.topics import Topics, do_overlap
-from fantwin.pipeline.broker.transition_queue import TransitionQueue
-from fantwin.pipeline.devices.broker_client import connection_problems, new_client
-from fantwin.pipeline.devices.mqtt_config import FAN
-from fantwin.pipeline.devices.mqtt_config import MqttConfig as MqttSourceConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
-from fantwin.pipeline.presenting.alarm_store import AlarmStore
-from fantwin.pipeline.presenting.request_desk import RequestDesk
-from fantwin.pipeline.presenting.shown import stages_json, transition_json
-from fantwin.pipeline.presenting.site_core import SiteCore
-from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.outputs.mqtt.config import MqttConfig
+from fantwin.pipeline.outputs.mqtt.fan_states import FanStates, shown_alarm, topics_of
+from fantwin.pipeline.outputs.mqtt.home_assistant import OFFLINE, ONLINE, HomeAssistant
+from fantwin.pipeline.outputs.mqtt.json_text import json_text
+from fantwin.pipeline.outputs.mqtt.link import BrokerLink, Link
+from fantwin.pipeline.outputs.mqtt.outbox import Outbox, Outgoing
+from fantwin.pipeline.outputs.mqtt.requests import Requests
+from fantwin.pipeline.outputs.mqtt.topics import Topics, do_overlap
+from fantwin.pipeline.outputs.mqtt.transition_queue import TransitionQueue
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
-from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.request_desk import RequestDesk
+from fantwin.pipeline.site.shown import stages_json, transition_json
+from fantwin.pipeline.site.site_core import SiteCore
+from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.pipeline.sources.mqtt.client import connection_problems, new_client
+from fantwin.pipeline.sources.mqtt.config import FAN
+from fantwin.pipeline.sources.mqtt.config import MqttConfig as MqttSourceConfig
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message
 from fantwin.schemas.topics import ALL_TRAYS

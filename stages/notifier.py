@@ -13,13 +13,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.notification.alertmanager import AlertSender
-from fantwin.pipeline.notification.config import NotifierConfig
-from fantwin.pipeline.notification.notifications import Changes, Notifications
-from fantwin.pipeline.notification.outbox import Outbox
-from fantwin.pipeline.notification.sending import Sender
-from fantwin.pipeline.notification.targets import problems_of, sender_of
-from fantwin.pipeline.notification.wording import Place
+from fantwin.pipeline.outputs.notify.alertmanager import AlertSender
+from fantwin.pipeline.outputs.notify.config import NotifierConfig
+from fantwin.pipeline.outputs.notify.notifications import Changes, Notifications
+from fantwin.pipeline.outputs.notify.outbox import Outbox
+from fantwin.pipeline.outputs.notify.sending import Sender
+from fantwin.pipeline.outputs.notify.targets import problems_of, sender_of
+from fantwin.pipeline.outputs.notify.wording import Place
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from fantwin.schemas.messages import Alarm, Message
 from fantwin.schemas.topics import ALL_TRAYS

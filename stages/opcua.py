@@ -14,14 +14,14 @@ from pathlib import Path
 
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import missing_extra, require
-from fantwin.pipeline.opcua.conditions import Condition, ConditionBook
-from fantwin.pipeline.opcua.config import OpcuaConfig
-from fantwin.pipeline.presenting.alarm_store import AlarmStore
-from fantwin.pipeline.presenting.request_desk import RequestDesk
-from fantwin.pipeline.presenting.site_core import SiteCore
-from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.outputs.opcua.conditions import Condition, ConditionBook
+from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
-from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.request_desk import RequestDesk
+from fantwin.pipeline.site.site_core import SiteCore
+from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message
@@ -107,10 +107,10 @@ class OpcuaCore(SiteCore):
 
 class _Running(Server):
     def __init__(self, context: Context, model: SiteModel, book: ConditionBook, desk: RequestDesk) -> None:
-        from fantwin.pipeline.opcua.certificate import check_certificate, make_certificate  # noqa: PLC0415  an extra
-        from fantwin.pipeline.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
-        from fantwin.pipeline.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
-        from fantwin.pipeline.presenting.users import Users  # noqa: PLC0415
+        from fantwin.pipeline.outputs.opcua.certificate import check_certificate, make_certificate  # noqa: PLC0415  an extra
+        from fantwin.pipeline.outputs.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
+        from fantwin.pipeline.outputs.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
+        from fantwin.pipeline.site.users import Users  # noqa: PLC0415
 
         config: OpcuaConfig = context.config
         if config.certificate and config.key:
@@ -165,8 +165,8 @@ def check(context: Context) -> list[str]:
     """Report a missing extra, a port that another program has taken, and files that cannot be read."""
     if problem := missing_extra("stage opcua", "outputs", "asyncua"):
         return [problem]
-    from fantwin.pipeline.opcua.certificate import check_certificate, check_port  # noqa: PLC0415  the extra may not be installed
-    from fantwin.pipeline.presenting.users import read_users  # noqa: PLC0415
+    from fantwin.pipeline.outputs.opcua.certificate import check_certificate, check_port  # noqa: PLC0415  the extra may not be installed
+    from fantwin.pipeline.site.users import read_users  # noqa: PLC0415
 
     config: OpcuaConfig = context.config
     attempts: list[Callable[[], object]] = []

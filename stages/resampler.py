@@ -31,7 +31,8 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from fantwin.pipeline.devices.line_rate import (
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
+from fantwin.pipeline.timebase.line_rate import (
     ENOUGH_SAMPLES,
     LONGEST_WAIT_US,
     MIN_SAMPLES,
@@ -44,8 +45,7 @@ from fantwin.pipeline.devices.line_rate import (
     is_too_slow,
     leaves_gaps,
 )
-from fantwin.pipeline.runtime.sample_grid import SampleGrid
-from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
+from fantwin.pipeline.timebase.sample_grid import SampleGrid
 from fantwin.schemas.messages import Grid, Raw, StatedTacho
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from fantwin.schemas.units import NS_PER_S

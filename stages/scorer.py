@@ -1,13 +1,13 @@
 """Scorer: compares the measurements with the twin, and maintains the alarm of each fan.
 
 Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in command units), `request` (what
-operators request about alarms), and `twin` where twins are learned (pipeline.runtime.learned_scorer).
+operators request about alarms), and `twin` where twins are learned (pipeline.tray_scoring.learned_scorer).
 Writes: topic `score` (residuals, what is expected of the fan, how much speaks for a fault, state), `alarm` (every
 transition of a fan's alarm), `snapshot` (the state to continue from after a restart).
 Timing: one score message for every prediction message, immediately; of messages that wait together, one.
 
-How a block is scored is in pipeline.runtime.tray_scorer. Here is what a stage adds: samples that come again, requests,
-snapshots, and health. See docs/explanation/deciding.md.
+How a block is scored is in pipeline.tray_scoring.tray_scorer. Here is what a stage adds: samples that come again,
+requests, snapshots, and health. See docs/explanation/deciding.md.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, healthy_twin
-from fantwin.pipeline.runtime.judged_share import JudgedShare
-from fantwin.pipeline.runtime.learned_scorer import LearnedTwinScorer
-from fantwin.pipeline.runtime.old_samples import OldSamples
-from fantwin.pipeline.runtime.snapshot_store import Elsewhere, SnapshotStore
+from fantwin.pipeline.prediction.old_samples import OldSamples
+from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin_path
 from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError, never
-from fantwin.pipeline.runtime.tray_scorer import TrayScorer
-from fantwin.pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
+from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin, ScorerConfig, healthy_twin
+from fantwin.pipeline.tray_scoring.judged_share import JudgedShare
+from fantwin.pipeline.tray_scoring.learned_scorer import LearnedTwinScorer
+from fantwin.pipeline.tray_scoring.snapshot_store import Elsewhere, SnapshotStore
+from fantwin.pipeline.tray_scoring.tray_scorer import TrayScorer
 from fantwin.schemas.blocks import select
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot

@@ -1,7 +1,7 @@
 """Twin integrator: runs the healthy twin on the same commands as the fans.
 
 Reads: topic `grid` (command, measured speed rad/s, uniform time), and `new_twin` where the configuration names no twin
-(pipeline.runtime.learned_integrator).
+(pipeline.prediction.learned_integrator).
 Writes: topic `prediction` (measured and predicted speed rad/s, sigma rad/s), and `twin` (the model card) at start and
 when a new twin takes over.
 Timing: one prediction message for every grid message, immediately, in a process of many trays at its next tick; of
@@ -34,12 +34,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fantwin.pipeline.runtime.joint_tray_integrator import JointTrayIntegrator
-from fantwin.pipeline.runtime.learned_integrator import LearnedTwinIntegrator
-from fantwin.pipeline.runtime.old_samples import OldSamples
+from fantwin.pipeline.prediction.joint_tray_integrator import JointTrayIntegrator
+from fantwin.pipeline.prediction.learned_integrator import LearnedTwinIntegrator
+from fantwin.pipeline.prediction.old_samples import OldSamples
+from fantwin.pipeline.prediction.tray_integrator import TrayIntegrator, TwinIntegratorConfig
+from fantwin.pipeline.prediction.twin_file import TwinFile, load_twin
 from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError
-from fantwin.pipeline.runtime.tray_integrator import TrayIntegrator, TwinIntegratorConfig
-from fantwin.pipeline.runtime.twin_file import TwinFile, load_twin
 from fantwin.schemas.blocks import select
 from fantwin.schemas.messages import Grid, Message, ModelCard, NewTwin, Prediction
 from fantwin.schemas.units import NS_PER_S

@@ -25,8 +25,8 @@ from pydantic import Field
 from fantwin.pipeline.config.models import TrayConfig, nearest
 from fantwin.pipeline.extras import missing_extra, require
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageConfig, StageError
-from fantwin.pipeline.viewing.fleet import Fan
-from fantwin.pipeline.viewing.loopback import check_free
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.loopback import check_free
 
 READS = ("score", "alarm", "twin", "health", "snapshot")
 
@@ -99,7 +99,7 @@ def build(context: Context) -> BuiltStage:
         StageError: Rerun is not installed, a port is taken, the file cannot be written, or `show` names no fan.
     """
     require("stage viewer", "view", "rerun")
-    from fantwin.pipeline.viewing.view_of_site import ViewOptions, view_of_site  # noqa: PLC0415  an extra
+    from fantwin.pipeline.outputs.rerun.view_of_site import ViewOptions, view_of_site  # noqa: PLC0415  an extra
 
     config: ViewerConfig = context.config
     ports = _ports(context)

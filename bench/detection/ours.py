@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from bench.detection.methods import AlarmChange, MethodOutput
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibrated
 from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
 from fantwin.pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
-from fantwin.pipeline.runtime.modelled_fans import modelled_fans
 from fantwin.pipeline.runtime.stage import Core
-from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.pipeline.tray_scoring.modelled_fans import modelled_fans
 from fantwin.schemas.messages import Alarm, Array, Prediction, Score
 from fantwin.scoring.calibration.calibration import Calibration
 from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of

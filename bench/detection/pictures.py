@@ -23,12 +23,12 @@ from matplotlib.figure import Figure
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.detection.plant import START_NS
-from fantwin.pipeline.runtime.healthy_twin import ScorerConfig, known_of
-from fantwin.pipeline.runtime.tray_integrator import TrayIntegrator, TwinIntegratorConfig
-from fantwin.pipeline.runtime.tray_scorer import TrayScorer
-from fantwin.pipeline.runtime.tray_twin import load_tray_twin
-from fantwin.pipeline.runtime.twin_file import TwinFile
-from fantwin.pipeline.viewing.band_plot import BESIDE, FAULT, MEASURED, OUTSIDE, TWIN
+from fantwin.pipeline.outputs.rerun.band_plot import BESIDE, FAULT, MEASURED, OUTSIDE, TWIN
+from fantwin.pipeline.prediction.tray_integrator import TrayIntegrator, TwinIntegratorConfig
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
+from fantwin.pipeline.prediction.twin_file import TwinFile
+from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig, known_of
+from fantwin.pipeline.tray_scoring.tray_scorer import TrayScorer
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Array, Grid
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT

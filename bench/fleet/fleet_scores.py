@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.detection.plant import START_NS
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.viewing.fleet import Fan
+from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.enums import FanState, Severity, Statistic, Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.fields import columns

@@ -31,9 +31,9 @@ from bench.fleet.network_hosts import ALONE, Host, Process, bridge
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
 from fantwin.pipeline.recordings.order import in_order
 from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.messages import Raw, Score

@@ -31,7 +31,7 @@ from bench.fleet.fed_trays import BUSY, FREE_RUN_BEGINS_AGAIN_S, SITE, Feed, Loa
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 

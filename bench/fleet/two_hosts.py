@@ -29,7 +29,7 @@ from bench.fleet.network_hosts import ALONE, Host, Process, bridge
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.messages import Raw
 
 sys.path.insert(0, str(Path(__file__).parents[2]))

@@ -29,9 +29,9 @@ from bench.runtime.stage_memory import free_endpoint, memory_mb
 from bench.training.published_fan import RATE_HZ
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
 from fantwin.pipeline.runtime.inbox import Inbox, Newest
 from fantwin.pipeline.runtime.newest_messages import NewestMessages
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode, encode, type_name
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope

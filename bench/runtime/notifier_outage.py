@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.notification.sending import MAY_BE_REPEATED
+from fantwin.pipeline.outputs.notify.sending import MAY_BE_REPEATED
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.topics import BY_NAME, tray_key

@@ -19,7 +19,7 @@ from playwright.sync_api import sync_playwright
 
 from fantwin.pipeline.cli.watch.page_picture import installed_browser
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.gateway.config import GatewayConfig
+from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.runtime.stage import Context, Core
 from fantwin.pipeline.selftest.scratch_site import free_port
 from fantwin.schemas.enums import FanState

@@ -22,7 +22,7 @@ from scipy.io import loadmat
 from fantwin.pipeline.cli.recordings.import_table import write_table
 from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.twins.training_data import Part, read_training_data
-from fantwin.pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT, read_table
+from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT, read_table
 from fantwin.twin.runs import Run
 
 FOLDER = Path(os.environ.get("FANTWIN_DATA", Path(__file__).parents[3] / "shared" / "data"))

@@ -21,9 +21,9 @@ from fantwin.client import errors
 from fantwin.client.losses import WITHOUT_SPEED, CountsOfAcquisition, Losses
 from fantwin.client.outbox import Block, Outbox
 from fantwin.client.times import Time, times_ns
+from fantwin.pipeline.acquisition.tray_acquisition import TrayAcquisition
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.devices.sample_source import limits_of_float32
-from fantwin.pipeline.runtime.tray_acquisition import TrayAcquisition
+from fantwin.pipeline.sources.source import limits_of_float32
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import AcceptedSamples, Health

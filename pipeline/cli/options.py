@@ -34,7 +34,7 @@ DEFAULT_CONFIG = Path("fantwin.toml")
 
 
 class ViewLayout(StrEnum):
-    """The layouts of a view, which `pipeline.viewing.rerun_layout` draws; that needs the extra `view`."""
+    """The layouts of a view, which `pipeline.outputs.rerun.rerun_layout` draws; that needs the extra `view`."""
 
     ALL = "all"
     ALARMS = "alarms"

@@ -29,8 +29,8 @@ from fantwin.pipeline.config.models import (
     nearest,
 )
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.devices.sample_source import SourceConfig
-from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS, source_config
+from fantwin.pipeline.sources.kinds import SOURCE_KINDS, source_config
+from fantwin.pipeline.sources.source import SourceConfig
 from fantwin.schemas.formats import CONFIGURATION
 
 LARGEST_FILE_BYTES = 1 << 20

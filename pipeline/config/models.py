@@ -22,10 +22,10 @@ from pydantic import (
 )
 
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.devices.sample_source import MOST_FANS, SourceConfig, too_many_fans
-from fantwin.pipeline.devices.serial_config import MOST_FANS_ON_LINE
-from fantwin.pipeline.devices.source_kinds import parse_source
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.sources.kinds import parse_source
+from fantwin.pipeline.sources.serial.config import MOST_FANS_ON_LINE
+from fantwin.pipeline.sources.source import MOST_FANS, SourceConfig, too_many_fans
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 from fantwin.schemas.topics import RESERVED_TRAY_NAMES
 from fantwin.schemas.units import SpeedUnit

@@ -22,8 +22,8 @@ from pydantic.fields import FieldInfo
 from fantwin.pipeline.config.loading import LARGEST_FILE_BYTES, top_level
 from fantwin.pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, TrayConfig
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.devices.sample_source import SourceConfig
-from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS
+from fantwin.pipeline.sources.kinds import SOURCE_KINDS
+from fantwin.pipeline.sources.source import SourceConfig
 from fantwin.schemas.tacho import Tacho
 
 _INTRODUCTION = f"""# Configuration

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.errors import UsageError
-from fantwin.schemas.topics import ALL_TRAYS
+from fantwin.schemas.topics import ALL_TRAYS, stage_label
 
 LONGEST_NAME = 60
 """characters: a name begins files, whose names may have 255 bytes"""
@@ -132,3 +132,31 @@ def _numbers(text: str) -> tuple[int, int]:
 
 def _count(trays: int) -> str:
     return "1 tray" if trays == 1 else f"{trays} trays"
+
+
+@dataclass(frozen=True)
+class StageProcess:
+    """What to start: one row of the process list, which is data."""
+
+    stage: str
+    shard: Shard
+
+    @property
+    def instance(self) -> str:
+        """The name of the process among those of its stage."""
+        return self.shard.name
+
+    @property
+    def label(self) -> str:
+        """Its name for people."""
+        return stage_label(self.stage, self.instance)
+
+
+def process_list(config: Config, trays: Collection[str] | None = None) -> list[StageProcess]:
+    """The processes of a configuration, in the order of the data flow.
+
+    trays: only those whose first tray is one of these. So hosts that share the trays of a site among them start each
+    process once. None: all.
+    """
+    rows = (StageProcess(stage, shard) for stage in config.stages for shard in shards_of(stage, config))
+    return [row for row in rows if trays is None or row.shard.trays[0] in trays]

@@ -1,1 +1,1 @@
-"""Stages as child processes, watched from outside, and the accounting of what they lost."""
+"""Stages as child processes of one command, supervised and restarted."""

@@ -16,20 +16,20 @@ from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import LEARNER, RECORDER, STAGES
 from fantwin.pipeline.config.roles import role_names, roles_of
-from fantwin.pipeline.config.shards import own_file
-from fantwin.pipeline.devices.host_clock import HOST_CLOCK
+from fantwin.pipeline.config.shards import StageProcess, own_file, process_list
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.launch.loss_accounting import Launched
-from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
+from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child
 from fantwin.pipeline.launch.site_report import RunningProcess, SiteReport
-from fantwin.pipeline.launch.site_state import site_states
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
-from fantwin.pipeline.launch.stage_notes import note_lines
 from fantwin.pipeline.launch.watchdog import Watchdog
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin, twin_path
 from fantwin.pipeline.recordings.parts import part_files, part_path
-from fantwin.pipeline.runtime.clock import REPLAY
 from fantwin.pipeline.runtime.stage import load_stage
-from fantwin.pipeline.runtime.tray_twin import load_tray_twin, twin_path
+from fantwin.pipeline.site.loss_accounting import Launched
+from fantwin.pipeline.site.site_state import site_states
+from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.site.stage_notes import note_lines
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
+from fantwin.pipeline.timebase.stage_clock import REPLAY
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.topics import ALL_TRAYS, alive_key
 

@@ -9,46 +9,15 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from fantwin.pipeline.config.models import Config
-from fantwin.pipeline.config.shards import Shard, shards_of
-from fantwin.pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
+from fantwin.pipeline.config.shards import StageProcess
 from fantwin.pipeline.launch.notices import Notices
 from fantwin.pipeline.runtime.notifier import VARIABLE as NOTIFY_VARIABLE
-from fantwin.schemas.topics import stage_label
+from fantwin.pipeline.timebase.host_clock import VARIABLE as CLOCK_VARIABLE
 
 EXIT_CANNOT_START = 78  # the stage cannot run as configured; one line on stderr says why (EX_CONFIG of sysexits.h)
-
-
-@dataclass(frozen=True)
-class StageProcess:
-    """What to start: one row of the process list, which is data."""
-
-    stage: str
-    shard: Shard
-
-    @property
-    def instance(self) -> str:
-        """The name of the process among those of its stage."""
-        return self.shard.name
-
-    @property
-    def label(self) -> str:
-        """Its name for people."""
-        return stage_label(self.stage, self.instance)
-
-
-def process_list(config: Config, trays: Collection[str] | None = None) -> list[StageProcess]:
-    """The processes of a configuration, in the order of the data flow.
-
-    trays: only those whose first tray is one of these. So hosts that share the trays of a site among them start each
-    process once. None: all.
-    """
-    rows = (StageProcess(stage, shard) for stage in config.stages for shard in shards_of(stage, config))
-    return [row for row in rows if trays is None or row.shard.trays[0] in trays]
 
 
 class Child:

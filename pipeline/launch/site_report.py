@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from fantwin.pipeline.launch.site_state import OFF_THE_BUS, WHY_SILENT, StageState, Word
-from fantwin.pipeline.launch.site_watcher import StageView
-from fantwin.pipeline.launch.stage_notes import note_lines
 from fantwin.pipeline.runtime.figures import without_figures
 from fantwin.pipeline.runtime.latencies import LATENCY_WINDOW_S
+from fantwin.pipeline.site.site_state import OFF_THE_BUS, WHY_SILENT, StageState, Word
+from fantwin.pipeline.site.site_watcher import StageView
+from fantwin.pipeline.site.stage_notes import note_lines
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.health import Health
 from fantwin.schemas.units import NS_PER_S

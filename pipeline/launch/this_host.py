@@ -17,9 +17,8 @@ from typing import Any
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import GATEWAY, STAGES
-from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.config.shards import Shard, process_list
 from fantwin.pipeline.extras import missing_extra
-from fantwin.pipeline.launch.processes import process_list
 
 _PORTS = 1000
 """number of ports that are tried, from the configured one on"""

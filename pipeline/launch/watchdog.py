@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-START_LIMIT_S = 60.0
-"""silence while a stage starts: it may load large libraries and ask others for what it missed"""
+from fantwin.pipeline.site.site_state import START_LIMIT_S
+
 _AT_WORK_S = 2.0
 _OWN_PAUSE_S = 1.0  # the launcher itself did not run: the machine was suspended or very busy
 

@@ -1,7 +1,7 @@
 """Excerpts of a recording of one tray, read by its index: an excerpt costs what it holds, not what the recording holds.
 
 The device clock is followed from CLOCK_MARGIN_S before an excerpt, not from the start of the recording. By then the
-mapping to host time rests on the same least delayed samples (a sliding window of 60 s, pipeline.devices.device_clock),
+mapping to host time rests on the same least delayed samples (a sliding window of 60 s, pipeline.timebase.device_clock),
 and its times have approached the same line: with delays of milliseconds, within 0.1 ms. The time between neighbouring
 samples stays that of the device clock. pipeline.recordings.runs reads all of a recording, and its times are exactly
 those of the pipeline.

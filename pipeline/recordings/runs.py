@@ -1,7 +1,7 @@
 """A recording as input for training: time, command and speed of one tray as arrays.
 
 The time of a sample is computed as in the pipeline, from the device clock if there is one
-(pipeline.devices.device_clock).
+(pipeline.timebase.device_clock).
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fantwin.pipeline.devices.device_clock import DeviceClock
-from fantwin.pipeline.devices.measured_table import hold_last
 from fantwin.pipeline.recordings.left_out import left_out_hint
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.pipeline.sources.tables.measured_table import hold_last
+from fantwin.pipeline.timebase.device_clock import DeviceClock
 from fantwin.schemas.auxiliary import AUXILIARY, auxiliary_columns
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import Tacho, tacho_of_each_fan

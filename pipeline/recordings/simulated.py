@@ -10,9 +10,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from fantwin.pipeline.devices.simulated_device import Device, DeviceSample, PlaybackCounts
 from fantwin.pipeline.recordings.reading import TACHO_KEY
 from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.sources.simulated.device import Device, DeviceSample, PlaybackCounts
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json

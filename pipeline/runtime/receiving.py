@@ -13,9 +13,7 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.shards import Shard
-from fantwin.pipeline.devices.host_clock import HOST_CLOCK
 from fantwin.pipeline.runtime.believed_outputs import BelievedOutputs
-from fantwin.pipeline.runtime.clock import REPLAY, StageClock
 from fantwin.pipeline.runtime.due_messages import DueMessages
 from fantwin.pipeline.runtime.health import HealthBuilder
 from fantwin.pipeline.runtime.inbox import FromBus, Inbox, Liveness, Newest, Recovered
@@ -28,6 +26,8 @@ from fantwin.pipeline.runtime.sessions import Sessions, this_host
 from fantwin.pipeline.runtime.silences import Silences
 from fantwin.pipeline.runtime.stage import Stage
 from fantwin.pipeline.runtime.subscriptions import Subscriptions
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
+from fantwin.pipeline.timebase.stage_clock import REPLAY, StageClock
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health

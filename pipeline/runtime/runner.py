@@ -20,10 +20,8 @@ from fantwin.pipeline.bus.kept_messages import KeptQuery
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.shards import Shard, chosen_shard
-from fantwin.pipeline.devices.host_clock import HOST_CLOCK
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.building import abort, build_and_join
-from fantwin.pipeline.runtime.clock import StageClock
 from fantwin.pipeline.runtime.due_messages import DueMessages
 from fantwin.pipeline.runtime.ending import Ending, Step
 from fantwin.pipeline.runtime.health import HealthBuilder
@@ -36,6 +34,8 @@ from fantwin.pipeline.runtime.sessions import Session, Sessions
 from fantwin.pipeline.runtime.sources import Sources
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
 from fantwin.pipeline.runtime.steps import Steps
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
+from fantwin.pipeline.timebase.stage_clock import StageClock
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.envelope import Envelope

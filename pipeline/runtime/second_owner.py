@@ -7,9 +7,9 @@ import time
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.runtime.clock import REPLAY
 from fantwin.pipeline.runtime.sessions import Session, trays_in_words
 from fantwin.pipeline.runtime.stage import StageError
+from fantwin.pipeline.timebase.stage_clock import REPLAY
 from fantwin.schemas.topics import ALL_TRAYS, alive_key, sessions_key
 
 GOSSIP_S = 0.2

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fantwin.pipeline.devices.host_clock import HOST_CLOCK
-from fantwin.pipeline.runtime.clock import StageClock, is_of_replay
 from fantwin.pipeline.runtime.health import HealthBuilder
 from fantwin.pipeline.runtime.joint_step import step_together
 from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers
@@ -16,6 +14,8 @@ from fantwin.pipeline.runtime.outputs import Outputs
 from fantwin.pipeline.runtime.receiving import Receiver
 from fantwin.pipeline.runtime.sessions import Sessions
 from fantwin.pipeline.runtime.stage import BuiltStage, Stage
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
+from fantwin.pipeline.timebase.stage_clock import StageClock, is_of_replay
 from fantwin.schemas.blocks import join
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Message, newest_t_ns

@@ -9,7 +9,7 @@ import tty
 from collections import deque
 from pathlib import Path
 
-from fantwin.pipeline.devices.simulated_device import PseudoTerminal
+from fantwin.pipeline.sources.simulated.device import PseudoTerminal
 
 _POLL_S = 0.002
 _READ_BYTES = 2048

@@ -17,9 +17,9 @@ from typing import Any, Self
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
 from fantwin.pipeline.selftest.line_relay import LineRelay
 from fantwin.pipeline.selftest.stepped_clock import VARIABLE, set_offset_ns
+from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Score

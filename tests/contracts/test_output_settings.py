@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from pydantic import BaseModel
 
-from fantwin.pipeline.broker.config import MqttConfig
-from fantwin.pipeline.gateway.config import GatewayConfig
-from fantwin.pipeline.notification.config import NotifierConfig
-from fantwin.pipeline.opcua.config import OpcuaConfig
+from fantwin.pipeline.outputs.mqtt.config import MqttConfig
+from fantwin.pipeline.outputs.notify.config import NotifierConfig
+from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
+from fantwin.pipeline.outputs.web.config import GatewayConfig
 
 MAIL: dict[str, Any] = {"name": "mail", "url_file": "mail.url"}
 

@@ -46,7 +46,7 @@ def kind(request: pytest.FixtureRequest) -> Iterator[str]:
     if request.param == "mqtt" and shutil.which("mosquitto") is None:
         pytest.skip("mosquitto is not installed")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("fantwin.pipeline.presenting.site_model.SILENT_AFTER_S", 1e9)
+        patched.setattr("fantwin.pipeline.site.site_model.SILENT_AFTER_S", 1e9)
         yield request.param
 
 

@@ -9,8 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.devices import broker_client, http_source, polling, serial_port
-from fantwin.pipeline.devices.sample_source import (
+from fantwin.pipeline.sources import polling
+from fantwin.pipeline.sources.http import source as http_source
+from fantwin.pipeline.sources.kinds import SOURCE_KINDS, build_source, parse_source
+from fantwin.pipeline.sources.mqtt import client as broker_client
+from fantwin.pipeline.sources.serial import port as serial_port
+from fantwin.pipeline.sources.source import (
     LinkDown,
     LinkUp,
     Reading,
@@ -19,7 +23,6 @@ from fantwin.pipeline.devices.sample_source import (
     SourceContext,
     SourceEvent,
 )
-from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS, build_source, parse_source
 from tests.support.running_chain import eventually
 from tests.support.source_worlds import WORLDS, World, speeds_of
 

@@ -18,25 +18,25 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from fantwin.pipeline.broker.config import MqttConfig
-from fantwin.pipeline.broker.link import Received
-from fantwin.pipeline.broker.outbox import Outgoing
-from fantwin.pipeline.broker.topics import Topics
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.config.registry import STAGES, StageRow
-from fantwin.pipeline.notification.config import NotifierConfig
-from fantwin.pipeline.notification.notifications import Notifications, Saved
-from fantwin.pipeline.notification.outbox import Outbox
-from fantwin.pipeline.notification.wording import Place
-from fantwin.pipeline.presenting.alarm_store import AlarmStore
-from fantwin.pipeline.presenting.request_desk import RequestDesk
-from fantwin.pipeline.presenting.site_model import SiteModel
+from fantwin.pipeline.outputs.mqtt.config import MqttConfig
+from fantwin.pipeline.outputs.mqtt.link import Received
+from fantwin.pipeline.outputs.mqtt.outbox import Outgoing
+from fantwin.pipeline.outputs.mqtt.topics import Topics
+from fantwin.pipeline.outputs.notify.config import NotifierConfig
+from fantwin.pipeline.outputs.notify.notifications import Notifications, Saved
+from fantwin.pipeline.outputs.notify.outbox import Outbox
+from fantwin.pipeline.outputs.notify.wording import Place
+from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
+from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots, PlotPlaces
+from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
+from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import Context, Core, Stage, StageConfig, load_stage
-from fantwin.pipeline.runtime.twin_file import TwinFile
-from fantwin.pipeline.viewing.fleet import Fan
-from fantwin.pipeline.viewing.fleet_view import FleetView
-from fantwin.pipeline.viewing.plot_places import FleetPlots, PlotPlaces
-from fantwin.pipeline.viewing.viewer_core import ViewerCore
+from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.request_desk import RequestDesk
+from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.codec import decode, encode
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header

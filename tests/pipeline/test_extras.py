@@ -93,10 +93,10 @@ main._register(main.COMMANDS)
 from fantwin.pipeline.config.registry import STAGES
 for row in STAGES.values():
     row.load()
-from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS, _load
+from fantwin.pipeline.sources.kinds import SOURCE_KINDS, _load
 for row in SOURCE_KINDS.values():
     _load(row.config), _load(row.source)
-import fantwin.pipeline.gateway.app, fantwin.pipeline.gateway.server, fantwin.pipeline.presenting.users
+import fantwin.pipeline.outputs.web.app, fantwin.pipeline.outputs.web.server, fantwin.pipeline.site.users
 import fantwin.twin.build, fantwin.twin.comparison, fantwin.twin.report.assessment, fantwin.twin.export.onnx_twin
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from fantwin import pipeline
+from fantwin.pipeline.prediction.onnx_metadata import read_onnx_metadata
 from fantwin.pipeline.recordings.reading import read_recording
-from fantwin.pipeline.runtime.onnx_metadata import read_onnx_metadata
 from fantwin.schemas.messages import ModelCard
 from fantwin.schemas.twin_card import CARD_PROPERTY, CardError, TwinCard
 from fantwin.twin.models.physical import PhysicalModel
@@ -56,7 +56,7 @@ def test_the_twin_of_the_demo_and_the_card_in_the_golden_recording_are_read() ->
 
 def test_reading_a_card_loads_no_heavy_library() -> None:
     program = (
-        "import sys; from pathlib import Path; from fantwin.pipeline.runtime.tray_twin import load_tray_twin; "
+        "import sys; from pathlib import Path; from fantwin.pipeline.prediction.tray_twin import load_tray_twin; "
         f"load_tray_twin(Path({str(DEMO_TWIN)!r})); "
         "print([name for name in ('torch', 'onnx', 'onnxruntime', 'scipy') if name in sys.modules])"
     )

@@ -13,9 +13,9 @@ import pytest
 from cobs import cobs
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.devices.host_clock import HostClock
-from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch
-from fantwin.pipeline.devices.serial_port import ReceivedBytes
+from fantwin.pipeline.sources.serial.port import ReceivedBytes
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch
+from fantwin.pipeline.timebase.host_clock import HostClock
 from fantwin.schemas.codec import decode
 from fantwin.schemas.codec import encode as encode_message
 from fantwin.schemas.messages import Command, Raw

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp
-from fantwin.pipeline.devices.serial_config import SerialConfig
-from fantwin.pipeline.devices.serial_port import ReceivedBytes
+from fantwin.pipeline.sources.serial.config import SerialConfig
+from fantwin.pipeline.sources.serial.port import ReceivedBytes
+from fantwin.pipeline.sources.source import LinkDown, LinkUp
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.wire import (
     MAX_FRAME_BYTES,

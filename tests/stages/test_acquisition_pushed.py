@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fantwin.pipeline.devices.push_source import SILENT_NS, PushSource
 from fantwin.pipeline.runtime.stage import Context
+from fantwin.pipeline.sources.push.source import SILENT_NS, PushSource
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import PushedSamples, Raw
 from fantwin.schemas.units import NS_PER_S

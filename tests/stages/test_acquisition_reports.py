@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp
-from fantwin.pipeline.devices.serial_port import ReceivedBytes
+from fantwin.pipeline.sources.serial.port import ReceivedBytes
+from fantwin.pipeline.sources.source import LinkDown, LinkUp
 from fantwin.schemas.units import NS_PER_S as S
 from fantwin.schemas.wire import DeviceCounters, encode
 from tests.stages.test_acquisition import device_counts, feed, make_core, sample

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from fantwin.pipeline.gateway.config import GatewayConfig
+from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
 from fantwin.pipeline.recordings.rare_messages import rare_messages
 from fantwin.schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Transition
@@ -134,7 +134,7 @@ def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(g
     assert client.ask("GET", "/api/v1/fans/nowhere/0")[0] == 404
     described = client.ask("GET", "/api/v1/openapi.json")[1]
     assert {"/api/v1/fans/{tray}/{fan}/requests", "/api/v1/alarms/history"} <= described["paths"].keys()
-    monkeypatch.setattr("fantwin.pipeline.presenting.site_model.SILENT_AFTER_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.site.site_model.SILENT_AFTER_S", 0.0)
     silent = f"/api/v1/fans/{TRAY}/0"
     eventually(lambda: client.ask("GET", silent)[1]["state"] == "silent", "the tray is silent")
     metrics = client.ask("GET", "/metrics")[1]

@@ -24,11 +24,11 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.gateway import server
-from fantwin.pipeline.gateway.shared_answer import SharedAnswer
-from fantwin.pipeline.presenting import login_failures
-from fantwin.pipeline.presenting.users import UserRole
+from fantwin.pipeline.outputs.web import server
+from fantwin.pipeline.outputs.web.shared_answer import SharedAnswer
 from fantwin.pipeline.runtime.stage import StageError
+from fantwin.pipeline.site import login_failures
+from fantwin.pipeline.site.users import UserRole
 from tests.stages.test_gateway import SCRIPT, alarm, granted, score
 from tests.support.running_chain import eventually
 from tests.support.running_core import TRAY
@@ -75,7 +75,7 @@ def test_a_login_holds_nobody_up_and_guesses_side_by_side_are_as_few_as_one_afte
         assert goes_on.wait(30)
         return False
 
-    monkeypatch.setattr("fantwin.pipeline.presenting.users.Users.is_password", slowly)
+    monkeypatch.setattr("fantwin.pipeline.site.users.Users.is_password", slowly)
     answers: list[int] = []
     guesses = [
         threading.Thread(target=lambda: answers.append(Client(gateway).log_in("ann", "wrong wrong wrong")))
@@ -122,7 +122,7 @@ def test_guesses_from_elsewhere_do_not_lock_out_who_has_logged_in_where_he_is():
 
 
 def test_a_new_password_and_another_login_end_the_session_of_before(gateway, users, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.gateway.sessions.MOST_OF_A_USER", 2)
+    monkeypatch.setattr("fantwin.pipeline.outputs.web.sessions.MOST_OF_A_USER", 2)
     first, viewers = logged_in(gateway), [logged_in(gateway, "vic") for _ in range(3)]
     assert [each.ask("GET", "/api/v1/me")[1]["name"] for each in viewers] == ["", "vic", "vic"], "his own only"
     assert first.ask("GET", "/api/v1/me")[1]["name"] == "ann"
@@ -159,8 +159,8 @@ def test_while_the_file_of_users_cannot_be_used_nobody_acts_or_logs_in(gateway, 
 
 
 def test_live_events_end_for_who_may_not_read_any_more(gateway, users, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.gateway.api.CHECKED_EVERY_S", 0.0)
-    monkeypatch.setattr("fantwin.pipeline.gateway.config.GatewayConfig.is_loopback", False)
+    monkeypatch.setattr("fantwin.pipeline.outputs.web.api.CHECKED_EVERY_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.outputs.web.config.GatewayConfig.is_loopback", False)
     gateway.feed(score())
     assert events(gateway).status == 401
     stream = events(gateway, Cookie=logged_in(gateway, "vic").cookie)
@@ -197,7 +197,7 @@ def test_a_header_of_the_proxy_that_comes_twice_names_nobody(opened, tmp_path):
 
 def test_connections_that_ask_nothing_are_ended_and_those_that_are_answered_are_not(gateway, monkeypatch):
     monkeypatch.setattr(server, "REQUEST_WITHIN_S", 0.3)
-    monkeypatch.setattr("fantwin.pipeline.gateway.api.BODY_WITHIN_S", 0.3)
+    monkeypatch.setattr("fantwin.pipeline.outputs.web.api.BODY_WITHIN_S", 0.3)
     gateway.feed(score())
     stream = events(gateway)
     silent, slow, trickling = (socket.create_connection(("127.0.0.1", gateway.port), timeout=30) for _ in range(3))

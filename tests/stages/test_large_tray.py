@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fantwin.pipeline.acquisition.sample_blocks import ReadingBlock
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import Config, ConfigError
-from fantwin.pipeline.devices.sample_blocks import ReadingBlock
-from fantwin.pipeline.devices.sample_source import (
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.prediction.twin_file import TwinFile
+from fantwin.pipeline.runtime.stage import Context, Core, load_stage
+from fantwin.pipeline.sources.serial.config import MOST_FANS_ON_LINE
+from fantwin.pipeline.sources.source import (
     MOST_FANS,
     LinkUp,
     Reading,
     ReadingBatch,
 )
-from fantwin.pipeline.devices.serial_config import MOST_FANS_ON_LINE
-from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.runtime.stage import Context, Core, load_stage
-from fantwin.pipeline.runtime.twin_file import TwinFile
 from fantwin.schemas import wire
 from fantwin.schemas.codec import decode, encode
 from fantwin.schemas.enums import Transition

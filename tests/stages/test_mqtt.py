@@ -15,10 +15,10 @@ import pytest
 import trustme
 from paho.mqtt.enums import CallbackAPIVersion
 
-from fantwin.pipeline.broker.config import MqttConfig
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.devices.mqtt_config import MqttConfig as SourceConfig
+from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.runtime.stage import Context, StageError
+from fantwin.pipeline.sources.mqtt.config import MqttConfig as SourceConfig
 from fantwin.schemas.enums import Action, FanState, Transition
 from fantwin.schemas.messages import Alarm, Request
 from fantwin.stages.mqtt import build, check
@@ -145,7 +145,7 @@ def test_of_too_many_transitions_that_wait_the_oldest_are_lost_counted_and_said(
 
 
 def test_a_broker_that_hangs_holds_nobody_up_and_is_named(tmp_path, broker, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.broker.link.SILENT_AFTER_S", 0.2)
+    monkeypatch.setattr("fantwin.pipeline.outputs.mqtt.link.SILENT_AFTER_S", 0.2)
     stage = RunningMqtt(tmp_path, broker.port)
     stage.feed(score())
     eventually(lambda: f"{FAN}/state" in retained_by(broker.port), "it is published")
@@ -223,7 +223,7 @@ def test_what_the_scorer_refuses_is_an_error_a_silent_scorer_too_and_a_retained_
     listener.publish(f"{FAN}/request", '{"action": "acknowledge"}')
     answer = json.loads(eventually(lambda: listener.last(f"{FAN}/request/answer"), "it is answered"))
     assert (answer["ok"], answer["error"]) == (False, "fan 2: there is nothing to acknowledge")
-    monkeypatch.setattr("fantwin.pipeline.broker.requests.ANSWERED_WITHIN_S", 0.1)
+    monkeypatch.setattr("fantwin.pipeline.outputs.mqtt.requests.ANSWERED_WITHIN_S", 0.1)
     listener.publish(f"{ROOT}/{TRAY}/all/request", '{"action": "acknowledge"}')
     silent = eventually(lambda: listener.last(f"{ROOT}/{TRAY}/all/request/answer"), "it is answered")
     assert json.loads(silent)["error"] == f"tray {TRAY}: no scorer has answered"

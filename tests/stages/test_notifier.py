@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from fantwin.pipeline.notification import sending
-from fantwin.pipeline.notification.config import NotifierConfig
-from fantwin.pipeline.notification.outbox import Outbox
-from fantwin.pipeline.notification.sending import MAY_BE_REPEATED
+from fantwin.pipeline.outputs.notify import sending
+from fantwin.pipeline.outputs.notify.config import NotifierConfig
+from fantwin.pipeline.outputs.notify.outbox import Outbox
+from fantwin.pipeline.outputs.notify.sending import MAY_BE_REPEATED
 from fantwin.pipeline.runtime.stage import StageError
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.messages import Alarm
@@ -190,7 +190,7 @@ def test_a_fan_that_is_taken_out_of_the_configuration_is_not_spoken_of_any_more(
 
 @pytest.mark.skipif(ALERTMANAGER is None, reason="needs Debian's prometheus-alertmanager")
 def test_an_alertmanager_has_what_is_presented_and_no_more(tmp_path, started, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.notification.alertmanager.RESEND_S", 0.5)
+    monkeypatch.setattr("fantwin.pipeline.outputs.notify.alertmanager.RESEND_S", 0.5)
     manager = RunningAlertmanager(tmp_path)
     try:
         eventually(lambda: manager.alerts() is not None, "it answers")
@@ -232,7 +232,7 @@ def test_an_alertmanager_has_what_is_presented_and_no_more(tmp_path, started, mo
 
 
 def test_an_alertmanager_that_comes_late_gets_all(tmp_path, started, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.notification.alertmanager.LONGEST_DELAY_S", 0.2)
+    monkeypatch.setattr("fantwin.pipeline.outputs.notify.alertmanager.LONGEST_DELAY_S", 0.2)
     receiver = HttpReceiver()
     receiver.status = 503
     url = f"http://ann:secret@127.0.0.1:{receiver.port}"

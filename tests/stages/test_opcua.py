@@ -29,11 +29,11 @@ from asyncua.ua.ua_binary import (
 )
 from cryptography import x509
 
-from fantwin.pipeline.opcua.certificate import make_certificate
-from fantwin.pipeline.opcua.config import OpcuaConfig
-from fantwin.pipeline.opcua.sessions import LONGEST_LIFETIME_S
-from fantwin.pipeline.presenting.users import UserRole
+from fantwin.pipeline.outputs.opcua.certificate import make_certificate
+from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
+from fantwin.pipeline.outputs.opcua.sessions import LONGEST_LIFETIME_S
 from fantwin.pipeline.runtime.stage import Context
+from fantwin.pipeline.site.users import UserRole
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Request
 from fantwin.stages.opcua import check
@@ -100,7 +100,7 @@ def test_a_session_ends_with_the_password_that_began_it_and_lasts_as_long_as_wha
 
 
 def test_a_scorer_that_does_not_answer_is_a_timeout_and_others_are_served_meanwhile(opcua, tmp_path, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.presenting.request_desk.ANSWERED_WITHIN_S", 3.0)
+    monkeypatch.setattr("fantwin.pipeline.site.request_desk.ANSWERED_WITHIN_S", 3.0)
 
     async def acts() -> tuple[str, str]:
         client = await encrypted(opcua, tmp_path, UNHEARD)
@@ -164,8 +164,8 @@ def test_a_session_cannot_be_guessed_and_nobody_refreshes_the_subscription_of_an
 
 
 def test_a_client_that_asks_and_does_not_read_is_cut_off(opcua, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.opcua.server.LARGEST_BACKLOG_BYTES", 1 << 20)
-    monkeypatch.setattr("fantwin.pipeline.opcua.server.LONGEST_BACKLOG_S", 5.0)
+    monkeypatch.setattr("fantwin.pipeline.outputs.opcua.server.LARGEST_BACKLOG_BYTES", 1 << 20)
+    monkeypatch.setattr("fantwin.pipeline.outputs.opcua.server.LONGEST_BACKLOG_S", 5.0)
     with socket.create_connection(("127.0.0.1", opcua.port)) as client:
         client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         ended = threading.Event()

@@ -83,7 +83,7 @@ def opcua(_installed: Path, tmp_path_factory: pytest.TempPathFactory, scorer: Sc
 @pytest.fixture
 def never_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     """One score is enough, also on a slow host."""
-    monkeypatch.setattr("fantwin.pipeline.presenting.site_model.SILENT_AFTER_S", 600.0)
+    monkeypatch.setattr("fantwin.pipeline.site.site_model.SILENT_AFTER_S", 600.0)
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +219,7 @@ def test_who_may_do_what(opcua, new_client, scorer):
 
 
 def test_a_client_that_hangs_holds_nobody_up(opcua, new_client, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.opcua.sessions.EVENT_QUEUE", 50)
+    monkeypatch.setattr("fantwin.pipeline.outputs.opcua.sessions.EVENT_QUEUE", 50)
     opcua.feed(score())
     hanging, other = new_client(), new_client()
     for client in (hanging, other):

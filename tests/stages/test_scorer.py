@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.runtime.healthy_twin import FALSE_ALARMS_PER_DAY, ScorerConfig
 from fantwin.pipeline.runtime.stage import Context, StageError
+from fantwin.pipeline.tray_scoring.healthy_twin import FALSE_ALARMS_PER_DAY, ScorerConfig
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, InvalidReason, Severity, Statistic, Transition
 from fantwin.schemas.fields import columns

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fantwin.pipeline.runtime.healthy_twin import ScorerConfig
+from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig
 from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import Statistic, Transition
 from fantwin.schemas.messages import Alarm, Prediction, Raw

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fantwin.pipeline.runtime.snapshot_store import SnapshotStore
+from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, Transition
 from fantwin.schemas.fields import columns

@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import Context
-from fantwin.pipeline.runtime.twin_file import TwinFile
 from fantwin.schemas.blocks import cut, join
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.header import Header

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fantwin import pipeline
-from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.fields import columns
 from fantwin.schemas.messages import Grid, Prediction

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fantwin.pipeline.runtime.joint_tray_integrator import JointTrayIntegrator
-from fantwin.pipeline.runtime.tray_integrator import TwinIntegratorConfig
-from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.pipeline.prediction.joint_tray_integrator import JointTrayIntegrator
+from fantwin.pipeline.prediction.tray_integrator import TwinIntegratorConfig
+from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.schemas.blocks import cut, join
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.fields import columns

@@ -13,19 +13,19 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.runtime.stage import Context, Core, StageError
-from fantwin.pipeline.viewing.alarm_log import LogLine
-from fantwin.pipeline.viewing.fleet import Fan
-from fantwin.pipeline.viewing.fleet_view import Overview
-from fantwin.pipeline.viewing.trace import Trace
-from fantwin.pipeline.viewing.viewer_core import (
+from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
+from fantwin.pipeline.outputs.rerun.fleet_view import Overview
+from fantwin.pipeline.outputs.rerun.viewer_core import (
     FLUSH_PERIOD_NS,
     PAGE_PERIOD_NS,
     REPEAT_STATES_NS,
     SAMPLES_HELD,
     ViewerCore,
 )
-from fantwin.pipeline.viewing.wear_points import WearPoints
+from fantwin.pipeline.outputs.rerun.wear_points import WearPoints
+from fantwin.pipeline.runtime.stage import Context, Core, StageError
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.trace import Trace
 from fantwin.schemas.codec import encode
 from fantwin.schemas.enums import FanState, InvalidReason, StageStatus
 from fantwin.schemas.envelope import Envelope

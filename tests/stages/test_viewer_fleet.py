@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.outputs.rerun.fleet_view import SILENT_AFTER_NS, FleetView
+from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots, PlotPlaces
+from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from fantwin.pipeline.runtime.stage import Context, StageError
-from fantwin.pipeline.viewing.fleet import SILENT, Fan, class_names
-from fantwin.pipeline.viewing.fleet_view import SILENT_AFTER_NS, FleetView
-from fantwin.pipeline.viewing.plot_places import FleetPlots, PlotPlaces
-from fantwin.pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
+from fantwin.pipeline.site.fleet import SILENT, Fan, class_names
 from fantwin.schemas.messages import Alarm, Score
 from fantwin.stages.viewer import ViewerConfig, build, check, topics_read
 from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of

@@ -17,10 +17,10 @@ import numpy as np
 
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.runtime.consumed import ConsumedReports
 from fantwin.pipeline.runtime.stage import Context, Core, load_stage
-from fantwin.pipeline.runtime.twin_file import TwinFile
 from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import Action
 from fantwin.schemas.header import Header, InputPosition

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.notification.config import NotifierConfig
+from fantwin.pipeline.outputs.notify.config import NotifierConfig
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.header import Header

@@ -13,8 +13,8 @@ from asyncua.client.client import Client as OpcuaClient
 from prometheus_client.parser import text_string_to_metric_families
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.notification.config import NotifierConfig
-from fantwin.pipeline.viewing.viewer_core import FLUSH_PERIOD_NS, ViewerCore
+from fantwin.pipeline.outputs.notify.config import NotifierConfig
+from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Message, Score
 from fantwin.schemas.topics import tray_key

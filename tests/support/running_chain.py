@@ -17,8 +17,8 @@ from typing import Any
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
 from fantwin.pipeline.selftest.scratch_site import FANTWIN
+from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
 
 DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8

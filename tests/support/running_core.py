@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.presenting.site_core import SiteCore
 from fantwin.pipeline.runtime.stage import Context, Stage
+from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Message, Request, Score

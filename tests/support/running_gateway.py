@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from fantwin.pipeline.gateway.config import GatewayConfig
+from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.stages.gateway import STAGE, GatewayCore
 from tests.support.running_core import FANS, Answer, RunningCore
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from fantwin.pipeline.broker.config import MqttConfig
+from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.stages.mqtt import STAGE, MqttCore
 from tests.support.running_core import FANS, SITE, Answer, RunningCore
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from asyncua.server.internal_server import InternalServer
 
-from fantwin.pipeline.opcua.config import OpcuaConfig
+from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
 from fantwin.stages.opcua import STAGE, OpcuaCore
 from tests.support.running_core import FANS, Answer, RunningCore
 from tests.support.running_gateway import free_port

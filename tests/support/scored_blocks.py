@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fantwin.pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
-from fantwin.pipeline.runtime.snapshot_store import SnapshotStore
+from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin, ScorerConfig
+from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.enums import Action, InvalidReason
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot

@@ -12,10 +12,10 @@ import numpy as np
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.devices.host_clock import HOST_CLOCK
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.sessions import Session
 from fantwin.pipeline.runtime.stage import load_stage
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from fantwin.pipeline.acquisition.sample_blocks import SampleBlocks
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.devices.host_clock import HOST_CLOCK, HostClock
-from fantwin.pipeline.devices.sample_blocks import SampleBlocks
-from fantwin.pipeline.devices.sample_source import LinkDown, LinkUp, ReadingBatch, SourceContext
-from fantwin.pipeline.devices.serial_config import SerialConfig
-from fantwin.pipeline.devices.serial_port import ReceivedBytes
-from fantwin.pipeline.devices.serial_source import ByteLink, SerialSource
+from fantwin.pipeline.sources.serial.config import SerialConfig
+from fantwin.pipeline.sources.serial.port import ReceivedBytes
+from fantwin.pipeline.sources.serial.source import ByteLink, SerialSource
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, ReadingBatch, SourceContext
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK, HostClock
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.acquisition import AcquisitionConfig, AcquisitionCore, Item

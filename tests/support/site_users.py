@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from argon2 import PasswordHasher
 
-from fantwin.pipeline.presenting.users import User, UserRole, write_users
+from fantwin.pipeline.site.users import User, UserRole, write_users
 
 PASSWORD = "correct horse battery"
 OPERATOR, VIEWER = "ann", "vic"
@@ -23,7 +23,7 @@ def quick_hasher() -> PasswordHasher:
 def quickly_hashed() -> Iterator[None]:
     """For the modules that import it: a hash that takes 64 MB and a tenth of a second is not what they test."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("fantwin.pipeline.presenting.users.hasher", quick_hasher)
+        patched.setattr("fantwin.pipeline.site.users.hasher", quick_hasher)
         yield
 
 

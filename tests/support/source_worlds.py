@@ -22,8 +22,8 @@ import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 from pymodbus.constants import ExcCodes
 
-from fantwin.pipeline.devices.push_source import PushSource
-from fantwin.pipeline.devices.sample_source import SampleSource, SourceEvent
+from fantwin.pipeline.sources.push.source import PushSource
+from fantwin.pipeline.sources.source import SampleSource, SourceEvent
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import PushedSamples
 from fantwin.schemas.units import RAD_S_PER_UNIT

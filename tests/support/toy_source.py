@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from fantwin.pipeline.devices.sample_source import (
+from fantwin.pipeline.sources.source import (
     LinkUp,
     Reading,
     ReadingBatch,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import onnx
 
-from fantwin.pipeline.runtime.tray_twin import Balance
+from fantwin.pipeline.prediction.tray_twin import Balance
 from fantwin.schemas.twin_card import (
     CARD_PROPERTY,
     BalanceCard,

@@ -12,8 +12,8 @@ import pytest
 from fantwin.pipeline.cli.watch import commission
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.learning import ordinary_operation
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.reading import read_recording
-from fantwin.pipeline.runtime.tray_twin import load_tray_twin
 from fantwin.scoring.calibration.calibration import Calibration
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import RunningCommand

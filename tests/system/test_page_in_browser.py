@@ -48,7 +48,7 @@ class Scorer:
 
 @pytest.fixture
 def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningGateway]:
-    monkeypatch.setattr("fantwin.pipeline.presenting.site_model.SILENT_AFTER_S", 1e9)
+    monkeypatch.setattr("fantwin.pipeline.site.site_model.SILENT_AFTER_S", 1e9)
     running = RunningGateway(tmp_path, Scorer(), users=make_users(tmp_path / "users.toml"))
     running.feed(score(), score(1.0, state=FanState.ALARM), alarm())
     try:

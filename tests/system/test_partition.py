@@ -17,8 +17,8 @@ import pytest
 from fantwin.pipeline.bus.link import LEASE_MS
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
 from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Grid
 from tests.support.fantwin_command import as_typed

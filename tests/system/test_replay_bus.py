@@ -18,9 +18,9 @@ import pytest
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header

@@ -14,7 +14,7 @@ import pytest
 
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from tests.support.fantwin_command import as_typed
 from tests.support.running_chain import DEMO, TRAY, Chain, RunningCommand, eventually, received, view_of
 

@@ -19,8 +19,8 @@ import pytest
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
 from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode, encode, type_name
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.header import Header

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
 from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Request
 from tests.stages.test_viewer import rows_of

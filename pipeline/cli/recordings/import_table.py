@@ -22,13 +22,13 @@ from fantwin.pipeline.cli.options import (
     auxiliary_options,
 )
 from fantwin.pipeline.config.models import NAME_PATTERN
-from fantwin.pipeline.devices.measured_table import Table, read_table
-from fantwin.pipeline.devices.tacho_evidence import tacho_hints
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.recordings.logs.formats import LogFormat, log_format, open_log
-from fantwin.pipeline.recordings.logs.samples_of_log import read_samples
 from fantwin.pipeline.recordings.reading import TACHO_KEY
 from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.sources.logs.formats import LogFormat, log_format, open_log
+from fantwin.pipeline.sources.logs.samples_of_log import read_samples
+from fantwin.pipeline.sources.tables.measured_table import Table, read_table
+from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan, tachos_to_json

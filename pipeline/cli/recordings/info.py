@@ -17,9 +17,6 @@ from rich.table import Table
 
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.progress import working
-from fantwin.pipeline.launch.loss_accounting import label, losses
-from fantwin.pipeline.launch.refused_input import refused, refused_lines
-from fantwin.pipeline.launch.stage_notes import note_lines, notes_as_json
 from fantwin.pipeline.recordings.clips.clip import clip_lines
 from fantwin.pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
 from fantwin.pipeline.recordings.dates import format_clock, format_local
@@ -28,6 +25,9 @@ from fantwin.pipeline.recordings.reading import left_out_of
 from fantwin.pipeline.recordings.records import active_path
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
 from fantwin.pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
+from fantwin.pipeline.site.loss_accounting import label, losses
+from fantwin.pipeline.site.refused_input import refused, refused_lines
+from fantwin.pipeline.site.stage_notes import note_lines, notes_as_json
 from fantwin.schemas.health import Health
 from fantwin.schemas.streams import StreamId
 from fantwin.schemas.units import NS_PER_S

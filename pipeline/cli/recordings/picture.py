@@ -33,7 +33,7 @@ def picture(
     Example: fantwin picture runs/demo/view.rrd --fans 2,5 --at 25 -o view.png
     """
     require("a picture of a view", "view")
-    from fantwin.pipeline.viewing.rerun_picture import draw_picture  # noqa: PLC0415  an extra
+    from fantwin.pipeline.outputs.rerun.rerun_picture import draw_picture  # noqa: PLC0415  an extra
 
     with Console(stderr=True).status(f"drawing {view_file}"):
         drawn = draw_picture(

@@ -38,7 +38,7 @@ def plot(
     Example: fantwin plot runs/demo/recording.mcap --truth runs/demo/truth.json -o bands.png
     """
     require("a plot", "report", "matplotlib")
-    from fantwin.pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  an extra
+    from fantwin.pipeline.outputs.rerun.band_plot import plot_recording  # noqa: PLC0415  an extra
 
     if unit not in ("rpm", "rad/s", None):
         raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")

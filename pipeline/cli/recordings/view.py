@@ -38,8 +38,8 @@ def view(
     Example: fantwin view runs/demo/recording.mcap --layout alarms -o alarms.rrd
     """
     require("a view", "view")
-    from fantwin.pipeline.viewing.recorded_view import recorded_site, write_view  # noqa: PLC0415  an extra
-    from fantwin.pipeline.viewing.view_of_site import ViewOptions  # noqa: PLC0415
+    from fantwin.pipeline.outputs.rerun.recorded_view import recorded_site, write_view  # noqa: PLC0415  an extra
+    from fantwin.pipeline.outputs.rerun.view_of_site import ViewOptions  # noqa: PLC0415
 
     if output.suffix != ".rrd":
         raise UsageError(f"{output}: name a file that ends in .rrd with -o")

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import typer
 
 from fantwin.pipeline.cli.simulation.simulated_hwmon import InjectedFaults
-from fantwin.pipeline.devices.hwmon_simulator import FAULT_FILE, HwmonTree, play_hwmon
-from fantwin.pipeline.devices.simulated_device import PlaybackCounts, PseudoTerminal, play, wait_for_reader
-from fantwin.pipeline.devices.table_device import TableDevice
 from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.sources.simulated.device import PlaybackCounts, PseudoTerminal, play, wait_for_reader
+from fantwin.pipeline.sources.simulated.hwmon import FAULT_FILE, HwmonTree, play_hwmon
+from fantwin.pipeline.sources.simulated.table import TableDevice
 from fantwin.schemas import wire
 from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
 

@@ -23,11 +23,11 @@ from fantwin.pipeline.cli.simulation.serving import serve_hwmon, serve_line
 from fantwin.pipeline.cli.simulation.simulated_hwmon import RATE_HZ, tachos_of
 from fantwin.pipeline.cli.simulation.simulated_tray import made_tacho, made_tray, measured_columns
 from fantwin.pipeline.cli.simulation.summary import count_text, save, save_start, summary_of_file, summary_of_tray
-from fantwin.pipeline.devices.measured_table import read_table
-from fantwin.pipeline.devices.simulated_device import PlaybackCounts
-from fantwin.pipeline.devices.table_device import TableDevice
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.simulated import record
+from fantwin.pipeline.sources.simulated.device import PlaybackCounts
+from fantwin.pipeline.sources.simulated.table import TableDevice
+from fantwin.pipeline.sources.tables.measured_table import read_table
 from fantwin.schemas import wire
 from fantwin.schemas.tacho import INSTANTANEOUS
 from fantwin.schemas.units import SpeedUnit

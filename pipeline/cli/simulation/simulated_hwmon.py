@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from fantwin.pipeline.devices.hwmon_chips import chip_of
-from fantwin.pipeline.devices.hwmon_simulator import FAULT_FILE
+from fantwin.pipeline.sources.hwmon.chips import chip_of
+from fantwin.pipeline.sources.simulated.hwmon import FAULT_FILE
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
 
 if TYPE_CHECKING:

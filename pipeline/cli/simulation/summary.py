@@ -7,9 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fantwin.pipeline.devices.simulated_device import PlaybackCounts
-from fantwin.pipeline.devices.table_device import TableDevice
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.simulated.device import PlaybackCounts
+from fantwin.pipeline.sources.simulated.table import TableDevice
 
 if TYPE_CHECKING:
     from fantwin.simulation.tray import SimulatedTray

@@ -23,6 +23,7 @@ from fantwin.pipeline.cli.twins.marked_running import marked_running
 from fantwin.pipeline.cli.twins.outlier_run_check import outlier_warnings
 from fantwin.pipeline.cli.twins.training_data import FromOption, ToOption, twin_errors
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.pipeline.replay.offline.calibration_of_twin import (
     LARGEST_PER_DAY,
@@ -33,7 +34,6 @@ from fantwin.pipeline.replay.offline.calibration_of_twin import (
 )
 from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
 from fantwin.pipeline.replay.offline.kept_bins import KeptBins
-from fantwin.pipeline.runtime.tray_twin import load_tray_twin
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.scoring.calibration.calibration import Calibration, changed_priors, expected_alarms, needed_fan_hours
 from fantwin.scoring.model.priors import Priors

@@ -11,13 +11,13 @@ from typing import Any
 
 from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin
 from fantwin.pipeline.recordings.checksum import sha256_of
 from fantwin.pipeline.replay.offline.alarm_episodes import episodes
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in, number_text
 from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart
 from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, concerning
 from fantwin.pipeline.replay.offline.rescoring import rescore
-from fantwin.pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
 from fantwin.scoring.calibration.alarm_rate import daily_interval
 from fantwin.scoring.calibration.calibration import Calibration, expected_alarms, is_exceeded
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
 from fantwin.pipeline.replay.offline.healthy_runs import FreeLimit
-from fantwin.pipeline.runtime.modelled_fans import modelled_fans
-from fantwin.pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
+from fantwin.pipeline.tray_scoring.modelled_fans import modelled_fans
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Prediction
 from fantwin.schemas.units import NS_PER_S

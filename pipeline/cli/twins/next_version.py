@@ -36,14 +36,14 @@ from fantwin.pipeline.cli.twins.fan_changes import (
 from fantwin.pipeline.cli.twins.train import fit_twin
 from fantwin.pipeline.cli.twins.training_data import TrainingData, twin_errors
 from fantwin.pipeline.cli.twins.version_data import Split, newest_long, newest_recordings, split, spread_parts
-from fantwin.pipeline.devices.tacho_evidence import tacho_hints
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
 from fantwin.pipeline.learning.history_recordings import HistoryRecording
 from fantwin.pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList, overlap
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.excerpts import ExcerptReader
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
-from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.scoring.calibration.calibration import Calibration, needed_fan_hours
 
 if TYPE_CHECKING:

@@ -16,12 +16,12 @@ from pydantic import ValidationError
 
 from fantwin.pipeline.cli.options import fan_numbers, make_folder
 from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
-from fantwin.pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT
-from fantwin.pipeline.devices.tacho_evidence import tacho_hints
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.checksum import sha256_of
 from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
+from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT
+from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.schemas.reference_conditions import HOLD_S
 from fantwin.schemas.tacho import Tacho
 
@@ -96,7 +96,7 @@ class TrainingData:
     """Runs without their outliers, with the fan numbers and the speed unit of their recordings.
 
     sources: of each run. fans: the fan number of each column. outliers: a warning for each fan and file with many
-    outliers. hints: what speaks against the declared tachos in the longest run; see pipeline.devices.tacho_evidence.
+    outliers. hints: what speaks against the declared tachos in the longest run; see pipeline.sources.tacho_evidence.
     damage: what could not be read, a line for each file. sha256: of files that were read whole.
     """
 

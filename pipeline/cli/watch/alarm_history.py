@@ -16,8 +16,6 @@ from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.shards import own_file, shards_of
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.presenting.alarm_rates import AlarmRates
-from fantwin.pipeline.presenting.alarm_store import HISTORY
 from fantwin.pipeline.recordings.clips.clip import require_no_clip
 from fantwin.pipeline.recordings.dates import format_local
 from fantwin.pipeline.recordings.rare_messages import rare_messages
@@ -25,6 +23,8 @@ from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.run_recordings import recorded_files
 from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
 from fantwin.pipeline.replay.offline.marked_alarms import alarms_in
+from fantwin.pipeline.site.alarm_rates import AlarmRates
+from fantwin.pipeline.site.alarm_store import HISTORY
 from fantwin.schemas.codec import CodecError, decode_columns
 from fantwin.schemas.enums import Feedback
 from fantwin.schemas.messages import Alarm, ModelCard, Score

@@ -18,11 +18,11 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch.live_stages import wait_for_stages
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import roles_of
-from fantwin.pipeline.launch.judged_fans import JudgedChanges, JudgedFans, Unjudged, as_judged
-from fantwin.pipeline.launch.processes import process_list
-from fantwin.pipeline.launch.site_state import site_states
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
-from fantwin.pipeline.launch.stage_notes import note_lines
+from fantwin.pipeline.config.shards import process_list
+from fantwin.pipeline.site.judged_fans import JudgedChanges, JudgedFans, Unjudged, as_judged
+from fantwin.pipeline.site.site_state import site_states
+from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.site.stage_notes import note_lines
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.messages import Alarm, Diagnosis, newest_t_ns

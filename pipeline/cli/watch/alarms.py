@@ -25,9 +25,9 @@ from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import OPERATOR, roles_of
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
 from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.enums import Action, Transition
 from fantwin.schemas.messages import Alarm, Request
 from fantwin.schemas.units import NS_PER_S

@@ -11,11 +11,11 @@ from typing import TypeVar
 
 import numpy as np
 
+from fantwin.pipeline.acquisition.device_commands import not_sent, reason_in
+from fantwin.pipeline.acquisition.tray_acquisition import TrayAcquisition
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.runtime.device_commands import not_sent, reason_in
-from fantwin.pipeline.runtime.tray_acquisition import TrayAcquisition
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health

@@ -27,9 +27,9 @@ from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.config.registry import RECORDER, STAGES
 from fantwin.pipeline.config.twin_entry import with_twin
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
 from fantwin.pipeline.runtime.signals import stop_on_signals
-from fantwin.pipeline.runtime.tray_twin import load_tray_twin
 from fantwin.pipeline.selftest.scratch_site import FANTWIN
 
 EXIT_LOST = 3

@@ -220,7 +220,7 @@ def _draw(out: Path, console: Console) -> None:
     if problem := missing_extra("bands.png is left out: it", "report", "matplotlib"):
         console.print(problem, markup=False, soft_wrap=True)
         return
-    from fantwin.pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  an extra
+    from fantwin.pipeline.outputs.rerun.band_plot import plot_recording  # noqa: PLC0415  an extra
 
     with console.status("drawing bands.png"):
         plot_recording(sorted(out.glob("recording*.mcap")), out / "bands.png", truth=out / "truth.json")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fantwin.pipeline.cli.watch.page_picture import BROWSERS, LIMIT_S, installed_browser, take_picture
 from fantwin.pipeline.config.models import Config
-from fantwin.pipeline.viewing.loopback import LOOPBACK
+from fantwin.pipeline.site.loopback import LOOPBACK
 
 PICTURE = "page.png"
 SIZE = (1280, 1560)

@@ -11,8 +11,8 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch.status import stage_table
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import roles_of
-from fantwin.pipeline.launch.judged_fans import JudgedFans
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.site.judged_fans import JudgedFans
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import FanState, InvalidReason
 from fantwin.schemas.messages import Score

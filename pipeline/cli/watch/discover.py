@@ -14,9 +14,9 @@ import typer
 from rich.console import Console
 
 from fantwin.pipeline.cli.options import JsonOption
-from fantwin.pipeline.devices.discovery import Found, discover_hwmon, discover_serial
-from fantwin.pipeline.devices.hwmon_config import ROOT
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.hwmon.config import ROOT
+from fantwin.pipeline.sources.hwmon.discovery import Found, discover_hwmon, discover_serial
 
 
 def discover(

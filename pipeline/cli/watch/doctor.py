@@ -29,9 +29,9 @@ from fantwin.pipeline.cli.watch.line_check import check_line
 from fantwin.pipeline.config.models import Config, ConfigError
 from fantwin.pipeline.config.registry import RECORDER, STAGES
 from fantwin.pipeline.config.roles import READERS, role_names
+from fantwin.pipeline.config.shards import process_list
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import how_to_install
-from fantwin.pipeline.launch.processes import process_list
 from fantwin.pipeline.launch.this_host import load_for_this_host
 from fantwin.pipeline.recordings.disk_room import usage_of
 from fantwin.pipeline.runtime.second_owner import GOSSIP_S

@@ -17,8 +17,11 @@ import numpy as np
 
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.models import Config, TrayConfig
-from fantwin.pipeline.devices.device_clock import UINT32
-from fantwin.pipeline.devices.line_rate import (
+from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin_path
+from fantwin.pipeline.runtime.stage import Context, StageError, load_stage
+from fantwin.pipeline.sources.tacho_evidence import find_tacho, tacho_hints
+from fantwin.pipeline.timebase.device_clock import UINT32
+from fantwin.pipeline.timebase.line_rate import (
     MAX_SAMPLES,
     GridTiming,
     SampleTimes,
@@ -26,9 +29,6 @@ from fantwin.pipeline.devices.line_rate import (
     is_too_slow,
     leaves_gaps,
 )
-from fantwin.pipeline.devices.tacho_evidence import find_tacho, tacho_hints
-from fantwin.pipeline.runtime.stage import Context, StageError, load_stage
-from fantwin.pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.topics import tray_key

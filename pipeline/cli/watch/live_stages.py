@@ -8,7 +8,7 @@ import time
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.topics import alive_key
 
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time

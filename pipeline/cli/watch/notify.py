@@ -11,9 +11,9 @@ import typer
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.notification.config import NotifierConfig
-from fantwin.pipeline.notification.targets import send_test
-from fantwin.pipeline.notification.wording import Place
+from fantwin.pipeline.outputs.notify.config import NotifierConfig
+from fantwin.pipeline.outputs.notify.targets import send_test
+from fantwin.pipeline.outputs.notify.wording import Place
 
 
 def notify(

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import CodecError, decode, encode, type_name
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Request

@@ -21,16 +21,15 @@ from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOptio
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.roles import READERS, role_names, roles_of
-from fantwin.pipeline.config.shards import chosen_shard
+from fantwin.pipeline.config.shards import StageProcess, chosen_shard, process_list
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.launch.judged_fans import JudgedFans, Unjudged, as_judged
-from fantwin.pipeline.launch.processes import StageProcess, process_list
-from fantwin.pipeline.launch.refused_input import refused_lines
-from fantwin.pipeline.launch.site_state import AT_WORK, StageState, Word, site_states
-from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
-from fantwin.pipeline.launch.stage_notes import note_lines, notes_as_json
 from fantwin.pipeline.launch.this_host import load_for_any_host
 from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.site.judged_fans import JudgedFans, Unjudged, as_judged
+from fantwin.pipeline.site.refused_input import refused_lines
+from fantwin.pipeline.site.site_state import AT_WORK, StageState, Word, site_states
+from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.site.stage_notes import note_lines, notes_as_json
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.streams import LOSS_PREFIX
 from fantwin.schemas.topics import ALL_TRAYS

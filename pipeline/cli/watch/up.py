@@ -17,9 +17,9 @@ from fantwin.pipeline.config.shards import chosen_trays
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.launch.event_log import EventLog
 from fantwin.pipeline.launch.launcher import Launcher, Outcome
-from fantwin.pipeline.launch.refused_input import refused_lines
 from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port
 from fantwin.pipeline.runtime.signals import ignore_hangup, set_when_stdin_closes, stop_on_signals
+from fantwin.pipeline.site.refused_input import refused_lines
 
 
 def up(

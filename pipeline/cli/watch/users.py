@@ -14,9 +14,9 @@ import typer
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.gateway.config import GatewayConfig
-from fantwin.pipeline.opcua.config import OpcuaConfig
-from fantwin.pipeline.presenting.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
+from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
+from fantwin.pipeline.outputs.web.config import GatewayConfig
+from fantwin.pipeline.site.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
 
 
 class UserAction(StrEnum):

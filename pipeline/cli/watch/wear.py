@@ -23,10 +23,10 @@ from fantwin.pipeline.cli.watch.live_stages import wait_for_stages
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
 from fantwin.pipeline.recordings.dates import format_local, has_date
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.messages import ScorerSnapshot
 from fantwin.schemas.topics import tray_key

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.launch.loss_accounting import label
-from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
 from fantwin.pipeline.replay.stage_chain import replay_starts
-from fantwin.pipeline.runtime.clock import REPLAY
 from fantwin.pipeline.runtime.sessions import Sessions
 from fantwin.pipeline.runtime.stage import Stage, load_stage
+from fantwin.pipeline.site.loss_accounting import label
+from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.timebase.stage_clock import REPLAY
 from fantwin.schemas.health import Health
 from fantwin.schemas.streams import StreamId, input_streams, output_streams
 from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, alive_key, sessions_key, stage_label

@@ -11,8 +11,8 @@ from dataclasses import replace
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.runtime.clock import REPLAY
 from fantwin.pipeline.runtime.health import HealthBuilder
+from fantwin.pipeline.timebase.stage_clock import REPLAY
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.envelope import Envelope

@@ -9,8 +9,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.prediction.tray_twin import TrayTwin
 from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, FreeLimit, HealthyRuns, LearnedRun, Limit
-from fantwin.pipeline.runtime.tray_twin import TrayTwin
 from fantwin.scoring.calibration.alarm_rate import HOURS_PER_DAY, daily_interval
 from fantwin.scoring.calibration.calibration import (
     Calibration,

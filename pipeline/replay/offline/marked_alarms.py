@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.presenting.alarm_store import AlarmStore
 from fantwin.pipeline.recordings.dates import format_local, has_date
 from fantwin.pipeline.recordings.rare_messages import rare_messages
 from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
+from fantwin.pipeline.site.alarm_store import AlarmStore
 from fantwin.schemas.enums import Feedback, InvalidReason
 from fantwin.schemas.messages import Alarm, Prediction
 from fantwin.schemas.units import NS_PER_S

@@ -25,9 +25,9 @@ from fantwin.pipeline.replay.offline.plan_reader import PlanReader
 from fantwin.pipeline.replay.offline.raw_blocks import RawBlocks
 from fantwin.pipeline.replay.resolve_config import attached_config
 from fantwin.pipeline.replay.stage_chain import StageChain, decision_chain
-from fantwin.pipeline.runtime.clock import is_of_replay
 from fantwin.pipeline.runtime.consumed import CONSUMED
 from fantwin.pipeline.runtime.stage import Context
+from fantwin.pipeline.timebase.stage_clock import is_of_replay
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 

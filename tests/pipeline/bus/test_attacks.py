@@ -20,9 +20,9 @@ import zenoh
 from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.devices.host_clock import HOST_CLOCK
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.runtime.sessions import Session
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.schemas.codec import decode, encode
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header

@@ -20,9 +20,9 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch.alarm_list import alarm_lines
 from fantwin.pipeline.cli.watch.alarms import OperatorAction
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.runtime.healthy_twin import ScorerConfig
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
+from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig
 from fantwin.schemas.codec import decode, encode, type_name
 from fantwin.schemas.enums import Action, InvalidReason, Severity, StageStatus, Transition
 from fantwin.schemas.header import Header

@@ -14,10 +14,10 @@ import pytest
 
 from fantwin.pipeline.cli.main import expand_variadic
 from fantwin.pipeline.cli.twins.calibration_check import Check
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in, number_text
-from fantwin.pipeline.runtime.tray_twin import load_tray_twin
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.topics import tray_key

@@ -14,9 +14,9 @@ from fantwin.pipeline.cli.main import expand_variadic
 from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.twins.calibration_check import check_declared_rate
 from fantwin.pipeline.cli.twins.marked_running import marked_running
-from fantwin.pipeline.presenting.alarm_store import AlarmStore
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, alarms_in, concerning, marked_alarms
+from fantwin.pipeline.site.alarm_store import AlarmStore
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm

@@ -7,10 +7,10 @@ import socket
 from pathlib import Path
 from typing import Any
 
+from fantwin.pipeline.acquisition.sample_blocks import SampleBlocks
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.devices.sample_blocks import SampleBlocks
-from fantwin.pipeline.devices.serial_source import SerialSource
 from fantwin.pipeline.runtime.stage import Context
+from fantwin.pipeline.sources.serial.source import SerialSource
 from fantwin.stages import acquisition, recorder, viewer
 
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
+from fantwin.pipeline.acquisition.device_commands import DeviceCommands
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch.commanding import CommandSender, command_of, share_note, why_not_sent
 from fantwin.pipeline.config.models import BusConfig, TrayConfig
-from fantwin.pipeline.devices.sample_source import SourceContext
-from fantwin.pipeline.devices.serial_config import SerialConfig
-from fantwin.pipeline.devices.source_kinds import build_source
-from fantwin.pipeline.runtime.device_commands import DeviceCommands
 from fantwin.pipeline.runtime.sessions import Session
+from fantwin.pipeline.sources.kinds import build_source
+from fantwin.pipeline.sources.serial.config import SerialConfig
+from fantwin.pipeline.sources.source import SourceContext
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.health import Counter, Health, Note
 from fantwin.schemas.topics import BY_NAME, alive_key, health_key

@@ -18,8 +18,8 @@ from fantwin.pipeline.cli.watch.demo_page import SIZE
 from fantwin.pipeline.cli.watch.page_picture import installed_browser, take_picture
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import Config
-from fantwin.pipeline.devices.serial_config import SerialConfig
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.serial.config import SerialConfig
 from tests.support.running_chain import DEADLINE_S, fantwin, is_running
 
 

@@ -19,8 +19,8 @@ from fantwin.pipeline.cli.twins.drops_found import (
     drops_found,
     smallest_drops,
 )
-from fantwin.pipeline.runtime.modelled_fans import modelled_fans
-from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
+from fantwin.pipeline.tray_scoring.modelled_fans import modelled_fans
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.calibration.calibration import Calibration
 from fantwin.scoring.model.bins import Bins, bin_ns_of

@@ -18,7 +18,7 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.healthy_history import healthy_recordings
 from fantwin.pipeline.learning.history_recordings import HistoryRecording
 from fantwin.pipeline.learning.versions import TwinVersions, Version
-from fantwin.pipeline.runtime.tray_twin import load_tray_twin
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.schemas.units import NS_PER_S
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fantwin_command import error_of, fantwin

@@ -15,11 +15,11 @@ import pytest
 import serial
 
 from fantwin.pipeline.cli.simulation.simulate import simulate
-from fantwin.pipeline.devices import simulated_device as simulated_line
-from fantwin.pipeline.devices.simulated_device import PseudoTerminal, play, wait_for_reader
-from fantwin.pipeline.devices.table_device import TableSample
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.pipeline.sources.simulated import device as simulated_line
+from fantwin.pipeline.sources.simulated.device import PseudoTerminal, play, wait_for_reader
+from fantwin.pipeline.sources.simulated.table import TableSample
 from fantwin.schemas import wire
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import Tacho

@@ -24,10 +24,10 @@ from fantwin.pipeline.cli.watch import status as status_command
 from fantwin.pipeline.cli.watch.status import as_json, loss_lines, stage_table, unjudged
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.launch.judged_fans import JudgedFans
-from fantwin.pipeline.launch.site_state import StageState, Word
-from fantwin.pipeline.launch.site_watcher import SiteWatcher, StageView
 from fantwin.pipeline.launch.this_host import load_for_this_host
+from fantwin.pipeline.site.judged_fans import JudgedFans
+from fantwin.pipeline.site.site_state import StageState, Word
+from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import InvalidReason, Severity, StageStatus, Transition
 from fantwin.schemas.header import Header

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fantwin.pipeline.acquisition.device_commands import DeviceCommands
 from fantwin.pipeline.cli.watch import sweep as sweep_module
 from fantwin.pipeline.cli.watch.commanding import NotReceivedError
 from fantwin.pipeline.cli.watch.excitation import (
@@ -24,10 +25,9 @@ from fantwin.pipeline.cli.watch.excitation import (
 from fantwin.pipeline.cli.watch.sweep import range_within
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.devices.serial_config import SerialConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
-from fantwin.pipeline.runtime.device_commands import DeviceCommands
+from fantwin.pipeline.sources.serial.config import SerialConfig
 from fantwin.schemas.codec import decode
 from fantwin.schemas.health import Counter, Health, Input, Note
 from fantwin.schemas.messages import Command

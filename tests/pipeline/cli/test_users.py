@@ -9,7 +9,7 @@ import pytest
 from argon2 import PasswordHasher
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.presenting.users import Users
+from fantwin.pipeline.site.users import Users
 from tests.support.fantwin_command import error_of, fantwin, usage_error_of
 
 PASSWORD, OTHER_PASSWORD = "correct horse battery", "another horse battery"
@@ -18,7 +18,7 @@ PASSWORD, OTHER_PASSWORD = "correct horse battery", "another horse battery"
 @pytest.fixture
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     quick = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
-    for place in ("fantwin.pipeline.presenting.users", "fantwin.pipeline.cli.watch.users"):
+    for place in ("fantwin.pipeline.site.users", "fantwin.pipeline.cli.watch.users"):
         monkeypatch.setattr(f"{place}.hasher", lambda: quick)
     path = tmp_path / "fantwin.toml"
     path.write_text('[[tray]]\nname = "tray1"\nfans = 1\n[gateway]\nusers = "users.toml"\n')

@@ -15,9 +15,9 @@ import pytest
 
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.recordings.writing import RecordingWriter
-from fantwin.pipeline.runtime.healthy_twin import ScorerConfig
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
+from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Message, ScorerSnapshot
 from fantwin.schemas.topics import tray_key

@@ -6,7 +6,7 @@ import pytest
 
 from fantwin.pipeline.config.loading import load_config, parse_config
 from fantwin.pipeline.config.models import ConfigError
-from fantwin.pipeline.devices.serial_config import SerialConfig
+from fantwin.pipeline.sources.serial.config import SerialConfig
 
 GOOD = """
 site = "lab"

@@ -10,8 +10,8 @@ import pytest
 
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.devices.sample_source import SourceContext
-from fantwin.pipeline.devices.source_kinds import SOURCE_KINDS, build_source
+from fantwin.pipeline.sources.kinds import SOURCE_KINDS, build_source
+from fantwin.pipeline.sources.source import SourceContext
 
 PAGES = {
     page.stem: page.read_text(encoding="utf-8") for page in (Path(__file__).parents[3] / "docs/how-to").glob("*.md")

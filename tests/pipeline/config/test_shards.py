@@ -15,10 +15,10 @@ from fantwin.pipeline.config.shards import (
     chosen_shard,
     chosen_trays,
     own_file,
+    process_list,
     shards_of,
 )
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.launch.processes import process_list
 from fantwin.pipeline.runtime.sessions import Session
 
 NAMES = ("a", "b", "c", "d", "e")

@@ -16,15 +16,15 @@ from typing import Any, cast
 import pytest
 
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.shards import Shard
-from fantwin.pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
+from fantwin.pipeline.config.shards import Shard, StageProcess, process_list
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.launch.launcher import Launcher, Outcome, _Slot
-from fantwin.pipeline.launch.processes import Child, StageProcess, process_list
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
+from fantwin.pipeline.launch.processes import Child
+from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.timebase.host_clock import VARIABLE as CLOCK_VARIABLE
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.topics import alive_key
-from tests.pipeline.launch.test_site_watcher import StubBus
+from tests.pipeline.site.test_site_watcher import StubBus
 from tests.support.made_messages import health
 from tests.support.running_chain import DEMO, SITE, Chain
 from tests.support.site_certificates import SiteCertificates

@@ -13,10 +13,10 @@ from typing import Any, cast
 import pytest
 
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.config.shards import Shard, StageProcess
 from fantwin.pipeline.launch.launcher import Launcher
 from fantwin.pipeline.launch.notices import Notices
-from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess
+from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child
 from tests.support.running_chain import DEMO
 
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 
 from fantwin.pipeline.launch.site_report import RunningProcess, SiteReport
-from fantwin.pipeline.launch.site_state import StageState, Word
-from fantwin.pipeline.launch.site_watcher import StageView
+from fantwin.pipeline.site.site_state import StageState, Word
+from fantwin.pipeline.site.site_watcher import StageView
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Note
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.current_alarms import clock, current_alarms
-from tests.pipeline.launch.test_site_state import CONSUMER, view
+from tests.pipeline.site.test_site_state import CONSUMER, view
 
 IDS = {"resampler": RunningProcess(11, is_at_work=True), "scorer": RunningProcess(12, is_at_work=True)}
 

@@ -86,7 +86,7 @@ def test_all_shards_of_the_page_need_a_free_port_and_those_of_other_hosts_do_not
 
 @pytest.fixture
 def default_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
-    from fantwin.pipeline.gateway.config import GatewayConfig  # noqa: PLC0415
+    from fantwin.pipeline.outputs.web.config import GatewayConfig  # noqa: PLC0415
 
     def change(port: int) -> None:
         monkeypatch.setattr(GatewayConfig.model_fields["port"], "default", port)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from fantwin.pipeline.launch.notices import Notices
-from fantwin.pipeline.launch.watchdog import START_LIMIT_S, Watchdog
+from fantwin.pipeline.launch.watchdog import Watchdog
 from fantwin.pipeline.runtime.notifier import Notifier, starting
+from fantwin.pipeline.site.site_state import START_LIMIT_S
 from tests.support.running_chain import eventually
 
 LIMIT_S = 10.0

@@ -12,12 +12,12 @@ import pytest
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.launch.loss_accounting import losses
 from fantwin.pipeline.runtime.inbox import INBOX_SIZE
 from fantwin.pipeline.runtime.runner import TICK_S
 from fantwin.pipeline.runtime.sessions import Sessions
 from fantwin.pipeline.runtime.silences import Silences
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core
+from fantwin.pipeline.site.loss_accounting import losses
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.envelope import Envelope

@@ -11,11 +11,11 @@ import pytest
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.shards import Shard
-from fantwin.pipeline.launch.site_watcher import SiteWatcher
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
-from fantwin.pipeline.runtime.snapshot_store import SnapshotStore
 from fantwin.pipeline.runtime.stage import BuiltStage, StageError
+from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.header import Header

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.devices.simulated_device import PseudoTerminal, wait_for_reader
 from fantwin.pipeline.selftest.line_relay import LineRelay
+from fantwin.pipeline.sources.simulated.device import PseudoTerminal, wait_for_reader
 
 LIMIT_S = 20.0
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from onnx import helper
 
-from fantwin.pipeline.runtime.twin_file import TwinFile
+from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Grid, Prediction
 from fantwin.schemas.twin_card import NetworkCard, StateLayout

@@ -1,0 +1,93 @@
+"""Whether what a source delivers can be used, and what to look at if it cannot."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+
+from fantwin.pipeline.sources.source import Rejected
+from fantwin.schemas.units import NS_PER_S
+
+WINDOW = 100
+"""pieces of input from which the quality is computed"""
+JUDGED_FROM = WINDOW // 5
+"""so many are needed for a judgement"""
+GOOD_AGAIN = 0.25
+"""a source whose input was mostly faulty is in order again below this share: a share near the limit is one problem"""
+
+
+class InputQuality:
+    """The quality of one source's input. Times: host time, ns since the epoch."""
+
+    def __init__(self, started_t_ns: int, silence_s: float) -> None:
+        """silence_s: a source without a valid sample for longer is a problem."""
+        self._silence_s = silence_s
+        self._input_t_ns = self._valid_t_ns = started_t_ns
+        self._recent: deque[str] = deque()
+        """kind of fault of each of the newest WINDOW pieces; empty: a valid sample"""
+        self._faulty = 0
+        """number of faulty pieces in `_recent`"""
+        self._examples: dict[str, Rejected] = {}
+        """by kind: the first since the source was last in order, so that the report of one problem stays the same"""
+        self._mostly_faulty = False
+
+    def connection_changed(self) -> None:
+        """The source was connected or disconnected: what came before says nothing about what follows."""
+        self._recent.clear()
+        self._faulty = 0
+        self._examples.clear()
+        self._mostly_faulty = False
+
+    def start_waiting(self, t_ns: int) -> None:
+        """Silence counts from this time on."""
+        self._input_t_ns = self._valid_t_ns = t_ns
+
+    def wait_no_longer_than_since(self, t_ns: int) -> None:
+        """Silence before this time does not count: the clock was set."""
+        self._input_t_ns, self._valid_t_ns = max(self._input_t_ns, t_ns), max(self._valid_t_ns, t_ns)
+
+    def add_input(self, t_ns: int) -> None:
+        """Something has arrived."""
+        self._input_t_ns = t_ns
+
+    def add_valid(self) -> None:
+        """What arrived last has a valid sample."""
+        self._valid_t_ns = self._input_t_ns
+        self._add("")
+
+    def add_fault(self, rejected: Rejected) -> None:
+        """What arrived last has a piece that cannot be used."""
+        self._examples.setdefault(rejected.kind, rejected)
+        self._add(rejected.kind)
+
+    def problem(self, now_ns: int, settings: str) -> str:
+        """What is wrong now, and what to check; empty if nothing is.
+
+        settings: of the tray, to be checked where the fault does not say which one it is.
+        """
+        if now_ns - self._input_t_ns > self._silence_s * NS_PER_S:
+            return f"nothing received for {self._silence_s:g} s; is the source running, connected and sending?"
+        has_valid = now_ns - self._valid_t_ns <= self._silence_s * NS_PER_S
+        if has_valid and not self._mostly_faulty:
+            return ""
+        fault = self._fault()
+        of_fault = f" ({fault.kind}: {fault.detail})" if fault else ""
+        if fault and fault.setting:
+            settings = fault.setting
+        if has_valid and "" in self._recent:
+            return f"most input is faulty{of_fault}; check the wiring, and {settings} of the [[tray]]"
+        return f"no valid sample{of_fault}; check {settings} of the [[tray]]"
+
+    def _add(self, kind: str) -> None:
+        self._recent.append(kind)
+        self._faulty += bool(kind)
+        if len(self._recent) > WINDOW:
+            self._faulty -= bool(self._recent.popleft())
+        if not self._faulty:
+            self._examples.clear()
+        limit = GOOD_AGAIN if self._mostly_faulty else 0.5
+        self._mostly_faulty = len(self._recent) >= JUDGED_FROM and self._faulty > limit * len(self._recent)
+
+    def _fault(self) -> Rejected | None:
+        """An example of the fault that is most frequent."""
+        kinds = Counter(filter(None, self._recent)).most_common(1)
+        return self._examples[kinds[0][0]] if kinds else None

@@ -1,0 +1,60 @@
+"""Section `[mqtt]`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from fantwin.pipeline.config.models import Name
+from fantwin.pipeline.runtime.stage import StageConfig
+from fantwin.pipeline.site.request_form import OperatorAction
+from fantwin.pipeline.sources.mqtt.settings import BrokerSettings
+
+TopicPrefix = Annotated[str, Field(pattern=r"^[^+#$/\x00-\x1f][^+#\x00-\x1f]*[^+#/\x00-\x1f]$|^[^+#$/\x00-\x1f]$")]
+
+
+class MqttConfig(StageConfig, BrokerSettings, frozen=True):  # pyright: ignore[reportGeneralTypeIssues]  both are frozen
+    """The broker, how often states are published, what may be asked, and what Home Assistant shows."""
+
+    prefix: TopicPrefix = Field(default="fantwin", description="first part of all topics: PREFIX/SITE/TRAY/FAN/state")
+    period_s: float = Field(
+        default=5.0,
+        ge=0.5,
+        le=3600,
+        description="how often the state of a fan is published if its numbers have changed; a change of state or alarm "
+        "is published at once",
+    )
+    most_waiting: int = Field(
+        default=10_000,
+        ge=1,
+        le=100_000,
+        description="most transitions of alarms that wait on disk while the broker is away; beyond that, the oldest "
+        "are lost",
+    )
+    accept: tuple[OperatorAction, ...] = Field(
+        default=(), description="actions that may be requested by MQTT; by default none, and no request is read"
+    )
+    operator_name: Annotated[str, Field(pattern=r"^[^\x00-\x1f]*$", max_length=64)] = Field(
+        default="",
+        description='required with accept: recorded as "mqtt:NAME" with each request, since a broker does not say who '
+        "sent a message",
+    )
+    home_assistant: Literal["off", "publish", "remove"] = Field(
+        default="off", description="publish: fans become devices in Home Assistant; remove: these devices are removed"
+    )
+    home_assistant_prefix: TopicPrefix = Field(
+        default="homeassistant", description="discovery prefix of Home Assistant"
+    )
+    home_assistant_trays: tuple[Name, ...] = Field(
+        default=(), description="trays whose fans become devices; empty: all"
+    )
+    home_assistant_fans: int = Field(
+        default=64, ge=0, le=10_000, description="how many fans at most become devices, with 5 entities each"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if bool(self.accept) != bool(self.operator_name):
+            raise ValueError("accept and operator_name belong together: give both, or neither")
+        return self

@@ -1,0 +1,187 @@
+"""An Alertmanager as a target: it is given the alarms that are presented now, again and again, and those that are over.
+
+Nothing waits for it: what it missed while it was away is sent when it answers. An alert that is not sent again expires
+there by itself.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import sqlite3
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from http.client import HTTPException
+from typing import Any
+from urllib.parse import unquote, urlsplit, urlunsplit
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm
+from fantwin.pipeline.outputs.notify.outbox import FiringKey, Outbox
+from fantwin.pipeline.outputs.notify.sending import FIRST_DELAY_S, LONGEST_DELAY_S, Failure
+from fantwin.pipeline.outputs.notify.wording import Place, describe
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.units import NS_PER_S
+
+RESEND_S = 60.0
+EXPIRES_S = 5 * RESEND_S
+TIMEOUT_S = 10.0
+MOST_AT_ONCE = 500
+"""alerts in a request"""
+ALERT_NAME, TEST_ALERT_NAME = "FantwinFanAlarm", "FantwinTest"
+
+
+class Alertmanager:
+    """Its address; a user and a password may be part of it."""
+
+    def __init__(self, url: str) -> None:
+        """Check the URL.
+
+        Raises:
+            UserError: it is none of http or https.
+        """
+        parts = urlsplit(url)
+        try:
+            is_usable = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+        except ValueError:
+            is_usable = False
+        if not is_usable:
+            raise UserError("an Alertmanager needs a URL of http or https, such as http://127.0.0.1:9093")
+        host = parts.netloc.rpartition("@")[2]
+        self._url = urlunsplit((parts.scheme, host, f"{parts.path.rstrip('/')}/api/v2/alerts", "", ""))
+        self._headers = {"Content-Type": "application/json"}
+        if parts.username:
+            login = f"{unquote(parts.username)}:{unquote(parts.password or '')}"
+            self._headers["Authorization"] = f"Basic {base64.b64encode(login.encode()).decode()}"
+
+    def post(self, alerts: Sequence[dict[str, Any]]) -> Failure | None:
+        """Give it alerts; None: it has taken them."""
+        for first in range(0, len(alerts), MOST_AT_ONCE):
+            body = json.dumps(alerts[first : first + MOST_AT_ONCE]).encode()
+            request = urllib.request.Request(self._url, body, self._headers, method="POST")
+            try:
+                with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
+                    answer.read()
+            except urllib.error.HTTPError as error:
+                with error:
+                    return Failure(f"it answers {error.code} {error.reason}")
+            except (OSError, HTTPException) as error:
+                return Failure(str(getattr(error, "reason", error)) or type(error).__name__)
+        return None
+
+
+def alert(place: Place, alarm: FanAlarm, now_ns: int) -> dict[str, Any]:
+    """An alarm that is active, as Alertmanager takes it. Without another one it expires after EXPIRES_S."""
+    lines = describe(place, alarm)
+    return {
+        **_labels(place, _key(alarm), now_ns),
+        "endsAt": _rfc3339(now_ns + round(EXPIRES_S * NS_PER_S)),
+        "annotations": {"summary": lines[0], "description": "\n".join(lines[1:])},
+        "generatorURL": place.page_of(alarm),
+    }
+
+
+def resolved(place: Place, key: FiringKey, now_ns: int) -> dict[str, Any]:
+    """The same once it is over."""
+    return {**_labels(place, key, now_ns), "endsAt": _rfc3339(now_ns)}
+
+
+def test_alert(place: Place, target: str, now_ns: int) -> dict[str, Any]:
+    """An alert that says that it is a test, and expires after a minute."""
+    return {
+        "labels": {"alertname": TEST_ALERT_NAME, "site": place.site, "severity": "none"},
+        "startsAt": _rfc3339(now_ns),
+        "endsAt": _rfc3339(now_ns + 60 * NS_PER_S),
+        "annotations": {"summary": f"A test of target {target} of the notifier at {place.site}"},
+        "generatorURL": place.page,
+    }
+
+
+class AlertSender:
+    """Keeps an Alertmanager in line with the alarms, in a thread of its own."""
+
+    def __init__(self, target: str, manager: Alertmanager, outbox: Outbox, place: Place) -> None:
+        self._target = target
+        self._manager = manager
+        self._outbox = outbox
+        self._place = place
+        self._wanted: Sequence[FanAlarm] | None = None
+        """None: it is not known yet"""
+        self._stop = threading.Event()
+        self._changed = threading.Event()
+        self._failing = ""
+        self.sent = self.attempts = 0
+        self._thread = threading.Thread(target=self._run, name=f"alerts of {target}", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def want(self, alarms: Sequence[FanAlarm]) -> None:
+        """These are to be there now, and no others."""
+        if alarms != self._wanted:
+            self._wanted = alarms
+            self._changed.set()
+
+    def stop(self, timeout_s: float) -> None:
+        """End after the request that is under way."""
+        self._stop.set()
+        self._changed.set()
+        self._thread.join(timeout_s)
+
+    def problem(self) -> str:
+        """Why it does not take them; empty if it does."""
+        return self._failing
+
+    def _run(self) -> None:
+        delay_s = 0.0
+        while not self._stop.is_set():
+            self._changed.clear()
+            try:
+                failure = self._send()
+            except sqlite3.Error as error:
+                failure = Failure(f"the outbox cannot be read or written: {error}")
+            if failure is not None:
+                self._failing = f"target {self._target}: not delivered ({failure.reason}); tried again until it is"
+                delay_s = min(LONGEST_DELAY_S, max(FIRST_DELAY_S, 2 * delay_s))
+                self._stop.wait(delay_s)
+            else:
+                self._failing, delay_s = "", 0.0
+                self._changed.wait(RESEND_S)
+
+    def _send(self) -> Failure | None:
+        now_ns = time.time_ns()
+        wanted = self._wanted
+        if wanted is None:
+            return None
+        keys = [_key(alarm) for alarm in wanted]
+        still = {key[:3] for key in keys}
+        over = sorted(key for key in self._outbox.firing(self._target) if key[:3] not in still)
+        alerts = [alert(self._place, alarm, now_ns) for alarm in wanted]
+        alerts += [resolved(self._place, key, now_ns) for key in over]
+        self.attempts += 1
+        if alerts and (failure := self._manager.post(alerts)) is not None:
+            return failure
+        self.sent += len(alerts)
+        if over or alerts:
+            self._outbox.set_firing(self._target, keys)
+        return None
+
+
+def _key(alarm: FanAlarm) -> FiringKey:
+    return alarm.tray, alarm.fan, Severity(alarm.severity).name.lower(), alarm.onset_t_ns
+
+
+def _labels(place: Place, key: FiringKey, now_ns: int) -> dict[str, Any]:
+    tray, fan, severity, onset_t_ns = key
+    labels = {"alertname": ALERT_NAME, "site": place.site, "tray": tray, "fan": str(fan), "severity": severity}
+    # the clock of a device may be ahead of that of the host, and a start after the end is refused
+    return {"labels": labels, "startsAt": _rfc3339(min(max(onset_t_ns, 0), now_ns))}
+
+
+def _rfc3339(t_ns: int) -> str:
+    return datetime.fromtimestamp(t_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,0 +1,111 @@
+"""What goes into one message: events that come close together, and those of quiet hours."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from datetime import datetime, tzinfo
+from typing import Self
+
+from fantwin.pipeline.outputs.notify.config import NotifierConfig, QuietHours
+from fantwin.pipeline.outputs.notify.deciding import Kind
+from fantwin.pipeline.outputs.notify.fan_alarm import FanName
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.units import NS_PER_S
+
+LONGEST_S = 600.0
+"""a message that waits for more fans waits no longer"""
+
+
+@dataclass(frozen=True)
+class Happened:
+    """What happened to a fan since the last message, in order. number: of the last repetition."""
+
+    kinds: tuple[Kind, ...]
+    number: int = 0
+
+    def then(self, later: Happened) -> Happened:
+        """Both."""
+        return Happened(self.kinds + later.kinds, later.number or self.number)
+
+
+@dataclass
+class Gathered:
+    """What goes into the next message. Times are those of the host.
+
+    Attributes:
+        in_a_row: how many messages before this one were sent although more fans kept coming.
+    """
+
+    opened_ns: int = 0
+    newest_ns: int = 0
+    in_a_row: int = 0
+    fans: dict[FanName, Happened] = field(default_factory=dict)
+
+    def add(self, fan: FanName, happened: Happened, now_ns: int) -> None:
+        """Something has happened to one more fan, or more to the same one."""
+        if not self.fans:
+            self.opened_ns = now_ns
+        self.newest_ns = now_ns
+        self.fans[fan] = self.fans.get(fan, Happened(())).then(happened)
+
+    def to_json(self) -> str:
+        """For the outbox."""
+        fans = [(*fan, list(each.kinds), each.number) for fan, each in self.fans.items()]
+        return json.dumps([self.opened_ns, self.newest_ns, self.in_a_row, fans])
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """What `to_json` wrote."""
+        opened_ns, newest_ns, in_a_row, fans = json.loads(text)
+        happened = {(t, f): Happened(tuple(map(Kind, kinds)), number) for t, f, kinds, number in fans}
+        return cls(opened_ns, newest_ns, in_a_row, happened)
+
+
+def is_due(gathered: Gathered, config: NotifierConfig, now_ns: int) -> bool:
+    """Whether it becomes a message now. A clock that was set back holds nothing up."""
+    if not gathered.fans:
+        return False
+    waited_ns, silent_ns = abs(now_ns - gathered.opened_ns), abs(now_ns - gathered.newest_ns)
+    gather_ns = config.gather_s * NS_PER_S
+    if len(gathered.fans) <= config.digest_above:
+        return waited_ns >= gather_ns
+    return silent_ns >= gather_ns or waited_ns >= _longest_ns(gathered, config)
+
+
+def next_after(gathered: Gathered, config: NotifierConfig, now_ns: int) -> Gathered:
+    """What is gathered after a message: nothing. If more fans kept coming, it then waits twice as long for them."""
+    is_many = len(gathered.fans) > config.digest_above
+    keep_coming = is_many and abs(now_ns - gathered.newest_ns) < config.gather_s * NS_PER_S
+    return Gathered(in_a_row=gathered.in_a_row + 1 if keep_coming else 0)
+
+
+def _longest_ns(gathered: Gathered, config: NotifierConfig) -> float:
+    doubled_s = config.digest_within_s * 2 ** min(gathered.in_a_row, 10)
+    return max(config.digest_within_s, min(LONGEST_S, doubled_s)) * NS_PER_S
+
+
+def is_held(hours: QuietHours | None, severity: int, now_ns: int, zone: tzinfo | None) -> bool:
+    """Whether a message about an alarm of a severity is held now."""
+    if hours is None or not is_within(hours, now_ns, zone):
+        return False
+    return hours.sent_from == "none" or severity < Severity.ALARM
+
+
+def is_within(hours: QuietHours, now_ns: int, zone: tzinfo | None) -> bool:
+    """Whether it is such an hour. zone: None is that of the host."""
+    now = datetime.fromtimestamp(now_ns / NS_PER_S, zone).time()
+    begin, end = hours.times
+    return begin <= now < end if begin < end else now >= begin or now < end
+
+
+def ranges(numbers: Iterable[int]) -> str:
+    """Numbers of fans, short: `0-3, 7`."""
+    parts: list[list[int]] = []
+    for number in sorted(numbers):
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1] = [parts[-1][0], number]
+        else:
+            parts.append([number])
+    return ", ".join("-".join(map(str, part)) for part in parts)

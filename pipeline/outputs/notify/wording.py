@@ -1,0 +1,217 @@
+"""Messages in words: short, plain, without markup, for a mail as for a phone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, tzinfo
+from enum import StrEnum
+from urllib.parse import quote
+
+from fantwin.pipeline.outputs.notify.deciding import Kind
+from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm, NamedCause
+from fantwin.pipeline.outputs.notify.gathering import Happened, ranges
+from fantwin.schemas.enums import Severity
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.diagnosis.advice import KNOWN_SOON
+from fantwin.scoring.diagnosis.shown_causes import (
+    CANNOT_TELL,
+    CAUSES,
+    advice,
+    less_likely,
+    likely_causes,
+    likely_evidence,
+    likely_with_share,
+)
+
+MOST_TRAYS, MOST_RANGE_CHARACTERS, MOST_NAMED_CAUSES = 20, 120, 4
+"""of a message about many fans"""
+_BEGINNING = {
+    Kind.RAISED: "",
+    Kind.WORSE: "Worse: ",
+    Kind.CLEARED: "Cleared: ",
+    Kind.AGAIN: "Still: ",
+    Kind.ESCALATED: "Nobody has acknowledged: ",
+    Kind.NOT_CONFIRMED: "Not confirmed by data: ",
+}
+_WHERE_IT_IS_KNOWN = "the page or `fantwin alarms` may show it by now"
+_BY_IMPORTANCE = (Kind.ESCALATED, Kind.RAISED, Kind.WORSE, Kind.NOT_CONFIRMED, Kind.AGAIN, Kind.CLEARED)
+
+
+class Level(StrEnum):
+    """What a service may show by a colour."""
+
+    INFO = "info"
+    GOOD = "good"
+    WARNING = "warning"
+    ALARM = "alarm"
+
+
+@dataclass(frozen=True)
+class Text:
+    """A message before it has a target."""
+
+    title: str
+    body: str
+    level: Level
+
+
+@dataclass(frozen=True)
+class Place:
+    """What all messages of a site say. page: address of the operators' page; may be empty. zone: None is that of the
+    host."""
+
+    site: str
+    page: str = ""
+    zone: tzinfo | None = None
+
+    def clock(self, t_ns: int) -> str:
+        """A date and a time of day with its zone."""
+        try:
+            at = datetime.fromtimestamp(t_ns / NS_PER_S, self.zone).astimezone(self.zone)
+        except (ValueError, OverflowError, OSError):  # a device may send any time
+            return "at an unknown time"
+        return at.strftime("%Y-%m-%d %H:%M:%S %Z")
+
+    def page_of(self, alarm: FanAlarm) -> str:
+        """The address of a fan on the page; empty without a page."""
+        return f"{self.page.rstrip('/')}/#/fan/{quote(alarm.tray, safe='')}/{alarm.fan}" if self.page else ""
+
+
+def cause_line(causes: Sequence[NamedCause]) -> str:
+    """The likely causes with probability and evidence, and other ones that are probable."""
+    if not causes:
+        return "Cause: unknown"
+    first = causes[0]
+    if first.cause == CANNOT_TELL:
+        # a message does not change: what is known later is elsewhere
+        return f"Cause: {first.evidence or CAUSES[CANNOT_TELL]}".replace(KNOWN_SOON, _WHERE_IT_IS_KNOWN)
+    others = [_with_probability(each) for each in less_likely(causes)]
+    evidence = f" ({found})" if (found := likely_evidence(causes)) else ""
+    return f"Cause: {likely_with_share(causes)}{evidence}{''.join(f', or {each}' for each in others)}"
+
+
+def about_fan(place: Place, alarm: FanAlarm, happened: Happened, now_ns: int) -> Text:
+    """A message about one fan."""
+    kinds = happened.kinds
+    if alarm.active:
+        beginning, word = _BEGINNING[min(kinds, key=_BY_IMPORTANCE.index)], alarm.severity_name
+    else:
+        is_new = bool({Kind.RAISED, Kind.ESCALATED} & set(kinds))
+        beginning, word = "Raised and cleared: " if is_new else _BEGINNING[Kind.CLEARED], "alarm"
+    lines = describe(place, alarm)
+    if kinds[-1] == Kind.AGAIN and happened.number > 1:
+        lines.append(f"This is reminder {happened.number}.")
+    lines.append(f"As of {place.clock(now_ns)}")
+    if address := place.page_of(alarm):
+        lines.append(address)
+    return Text(f"{beginning}{word}, fan {alarm.fan} of {alarm.tray} ({place.site})", "\n".join(lines), _level([alarm]))
+
+
+def describe(place: Place, alarm: FanAlarm) -> list[str]:
+    """The alarm of a fan: since when, how far it is from its twin, the cause, what to do, and who knows."""
+    fan = f"fan {alarm.fan} of {alarm.tray} at {place.site}"
+    if alarm.onset_t_ns == 0:
+        return [f"{fan}: no alarm"]
+    if not alarm.active:
+        lines = [f"{fan}: back to normal; the alarm began {place.clock(alarm.onset_t_ns)}"]
+        lines += [f"Deviation: {_deviation(place, alarm)}"] if alarm.deviation else []
+    else:
+        lines = [f"{fan}: {alarm.severity_name} since {place.clock(alarm.onset_t_ns)}"]
+        lines += [_deviation(place, alarm) or "deviates from its twin", cause_line(alarm.causes)]
+        if to_do := advice(alarm.causes):
+            lines.append(f"What to do: {to_do}")
+    if alarm.acknowledged:
+        lines.append(f"Acknowledged{f' by {alarm.acknowledged_by}' if alarm.acknowledged_by else ''}.")
+    else:
+        lines.append("Not acknowledged.")
+    if alarm.stale:
+        lines.append("Not confirmed by data: there are no samples to judge.")
+    return lines
+
+
+def _deviation(place: Place, alarm: FanAlarm) -> str:
+    """With its time: it is not as new as the message."""
+    at = f" at {place.clock(alarm.deviation_t_ns)}" if alarm.deviation and alarm.deviation_t_ns else ""
+    return f"{alarm.deviation}{at}"
+
+
+def about_many(
+    place: Place, fans: Sequence[tuple[FanAlarm, Happened]], now_ns: int, *, were_held: bool = False
+) -> Text:
+    """One message about many fans, or about those of quiet hours."""
+    alarms = [alarm for alarm, _ in fans]
+    trays = sorted({alarm.tray for alarm in alarms})
+    active = [alarm for alarm in alarms if alarm.active]
+    subject = f"{_count(len(fans), 'alarm')}{'' if active else ' cleared'} in {_count(len(trays), 'tray')}"
+    counted = f": {', '.join(_how_many(fans))}" if active else ""
+    lines = [f"{subject} at {place.site}{counted}"]
+    if were_held:
+        lines.insert(0, "Held during quiet hours:")
+    lines += _of_each_tray(alarms)
+    if active:
+        causes = Counter(likely_causes(each.causes) or "unknown" for each in active)
+        named = [f"{words} {count}" for words, count in causes.most_common(MOST_NAMED_CAUSES)]
+        lines.append(f"Most probable causes: {'; '.join(named)}")
+        lines.append(f"The first alarm began {place.clock(min(each.onset_t_ns for each in active))}")
+        if (stale := sum(each.stale for each in active)) > 0:
+            lines.append(f"Not confirmed by data: {stale}")
+    lines.append(f"As of {place.clock(now_ns)}")
+    if place.page:
+        lines.append(place.page)
+    return Text(f"{subject} ({place.site}){counted}", "\n".join(lines), _level(alarms))
+
+
+def test_text(place: Place, target: str, now_ns: int) -> Text:
+    """A message that says that it is a test."""
+    body = f"A test of target {target} of the notifier at {place.site}.\nAs of {place.clock(now_ns)}"
+    return Text(f"Test ({place.site})", f"{body}\n{place.page}" if place.page else body, Level.INFO)
+
+
+def _with_probability(cause: NamedCause) -> str:
+    return f"{CAUSES.get(cause.cause, cause.cause)}, {100 * cause.probability:.0f} %"
+
+
+def _how_many(fans: Sequence[tuple[FanAlarm, Happened]]) -> list[str]:
+    """How many are in alarm, warned of and cleared, and why they are in the message where that is not clear."""
+    alarms = [alarm for alarm, _ in fans]
+    active: Mapping[str, int] = Counter(each.severity_name for each in alarms if each.active)
+    parts = [f"{active[name]} {name}" for name in ("ALARM", "WARNING") if active.get(name)]
+    if cleared := sum(not each.active for each in alarms):
+        parts.append(f"{cleared} cleared")
+    reasons = (
+        (Kind.WORSE, "worse"),
+        (Kind.AGAIN, "not acknowledged for a long time"),
+        (Kind.ESCALATED, "acknowledged by nobody"),
+        (Kind.NOT_CONFIRMED, "no longer confirmed by data"),
+    )
+    for kind, words in reasons:
+        if count := sum(a.active and kind in h.kinds and Kind.RAISED not in h.kinds for a, h in fans):
+            parts.append(f"{count} {words}")
+    return parts
+
+
+def _of_each_tray(alarms: Sequence[FanAlarm]) -> list[str]:
+    fans: dict[tuple[str, bool], list[int]] = {}
+    for alarm in alarms:
+        fans.setdefault((alarm.tray, not alarm.active), []).append(alarm.fan)
+    lines: list[str] = []
+    for (tray, is_over), numbers in sorted(fans.items()):
+        shown = ranges(numbers)
+        if len(shown) > MOST_RANGE_CHARACTERS:
+            shown = shown[:MOST_RANGE_CHARACTERS].rpartition(",")[0] + ", ..."
+        lines.append(f"{tray}: {'cleared: ' if is_over else ''}{_count(len(numbers), 'fan')}: {shown}")
+    more = len(lines) - MOST_TRAYS
+    return lines[:MOST_TRAYS] + ([f"and {_count(more, 'more line')}"] if more > 0 else [])
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}" if number == 1 else f"{number} {word}s"
+
+
+def _level(alarms: Sequence[FanAlarm]) -> Level:
+    highest = max((each.severity for each in alarms if each.active), default=0)
+    if not highest:
+        return Level.GOOD
+    return Level.ALARM if highest >= Severity.ALARM else Level.WARNING

@@ -1,0 +1,105 @@
+"""The variables of a fan: their values now, each with its status and the time of its sample.
+
+An old value is never good: of a silent tray it is uncertain, and where a fan is not judged there is none. No OPC UA
+library is needed here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from fantwin.pipeline.site.fan_history import CURVES
+from fantwin.pipeline.site.fleet import SILENT, Fan, FanNow
+from fantwin.pipeline.site.site_model import TrayNow
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.units import RAD_S_PER_UNIT
+
+GOOD, SILENT_TRAY, OLD = "Good", "UncertainNoCommunicationLastUsableValue", "UncertainLastUsableValue"
+NONE_YET, NO_VALUE = "BadWaitingForInitialData", "BadNoData"
+_LINE_IS_SILENT = (InvalidReason.STALE, InvalidReason.GAP)
+
+
+class Value(NamedTuple):
+    """value: None where the status is bad. t_ns: of the sample, or since when a state lasts; 0: unknown."""
+
+    value: Any
+    status: str
+    t_ns: int
+
+
+@dataclass(frozen=True)
+class FanVariable:
+    """A variable of every fan.
+
+    Attributes:
+        name: browse name, and the last part of the node's identifier.
+        type: built-in type.
+        curve: of `CURVES`; empty: none.
+        scale: by which the curve is divided.
+        unit: "rpm" for speeds; empty: none.
+        about: for people.
+    """
+
+    name: str
+    type: str
+    about: str
+    curve: str = ""
+    scale: float = 1.0
+    unit: str = ""
+
+
+_RPM = RAD_S_PER_UNIT["rpm"]
+VARIABLES = (
+    FanVariable("Speed", "Double", "measured speed", "measured_speed_rad_s", _RPM, "rpm"),
+    FanVariable(
+        "PredictedSpeed", "Double", "speed of the twin at the same commands", "predicted_speed_rad_s", _RPM, "rpm"
+    ),
+    FanVariable(
+        "BandHalfWidth",
+        "Double",
+        "half width of the band around the speed of the twin",
+        "band_half_width_rad_s",
+        _RPM,
+        "rpm",
+    ),
+    FanVariable("Score", "Double", "how near the fan is to its limit: 1 is at the limit", "score"),
+    FanVariable("State", "String", "state of the fan, in words"),
+    FanVariable(
+        "Judged",
+        "Boolean",
+        "whether the newest sample is judged, or the fan stands or starts as commanded: if not, no alarm can be raised",
+    ),
+)
+VARIABLE = {each.name: each for each in VARIABLES}
+
+
+class FanValues:
+    """All fans at one moment."""
+
+    def __init__(self, trays: Sequence[TrayNow] = (), states: Sequence[FanNow] = ()) -> None:
+        self._trays: Mapping[str, TrayNow] = {each.tray: each for each in trays}
+        self._states: Mapping[Fan, FanNow] = {each.fan: each for each in states}
+
+    def of(self, fan: Fan, name: str) -> Value:
+        """The value of one of `VARIABLES`."""
+        tray = self._trays.get(fan.tray)
+        if name == "State":
+            state = self._states.get(fan)
+            return Value(state.state, GOOD, state.since_t_ns) if state else Value(SILENT, GOOD, 0)
+        if tray is None:
+            return Value(False, GOOD, 0) if name == "Judged" else Value(None, NONE_YET, 0)
+        if name == "Judged":
+            state = self._states.get(fan)
+            is_judged = tray.is_heard and bool(tray.is_judged[fan.number])
+            return Value(is_judged, GOOD, state.since_t_ns if state else tray.t_ns)
+        variable = VARIABLE[name]
+        value = float(tray.values[fan.number, CURVES.index(variable.curve)]) / variable.scale
+        if math.isnan(value):
+            return Value(None, NO_VALUE, tray.t_ns)
+        if not tray.is_heard:
+            return Value(value, SILENT_TRAY, tray.t_ns)
+        is_old = int(tray.invalid_reason[fan.number]) in _LINE_IS_SILENT
+        return Value(value, OLD if is_old else GOOD, tray.t_ns)

@@ -1,0 +1,273 @@
+"""The OPC UA server, in a thread and an event loop of its own."""
+
+# pyright: reportPrivateImportUsage=false, reportArgumentType=false
+# (the library declares its names and integers otherwise than it uses them)
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from asyncua import Server, ua
+from asyncua.common.connection import TransportLimits
+from cryptography import x509
+
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.outputs.opcua.address_space import build_address_space
+from fantwin.pipeline.outputs.opcua.conditions import Condition, ConditionBook
+from fantwin.pipeline.outputs.opcua.events import EventDelivery, system_event
+from fantwin.pipeline.outputs.opcua.history import AlarmHistory
+from fantwin.pipeline.outputs.opcua.identifiers import NAMESPACE
+from fantwin.pipeline.outputs.opcua.log_in import LogIn, Permissions, TrustedClients
+from fantwin.pipeline.outputs.opcua.methods import Methods
+from fantwin.pipeline.outputs.opcua.sessions import SiteServer
+from fantwin.pipeline.outputs.opcua.site_nodes import SiteNode, SiteNodes
+from fantwin.pipeline.outputs.opcua.site_values import SiteValues
+from fantwin.pipeline.runtime.stage import StageError
+from fantwin.pipeline.site.request_desk import RequestDesk
+from fantwin.pipeline.site.site_model import SiteModel
+
+UPDATE_PERIOD_S = 1.0
+START_LIMIT_S, STOP_LIMIT_S = 120.0, 5.0
+MOST_PENDING = 20_000
+"""transitions that wait to become events; of more, the oldest are left out, and clients are asked to refresh"""
+LARGEST_BACKLOG_BYTES, LONGEST_BACKLOG_S = 16 << 20, 30.0
+"""answers that wait because a client does not read them; with more, or after so long, it is cut off"""
+_LARGEST_REQUEST_BYTES = 16 << 20
+_CHUNK_BYTES = 65_535
+_AT_ONCE = 200
+"""values that are published before others may do something"""
+
+
+@dataclass(frozen=True)
+class Listening:
+    """Where the server listens, and how it shows who it is. is_open: whoever does not log in may read, unencrypted."""
+
+    host: str
+    port: int
+    certificate: Path
+    key: Path
+    is_open: bool
+
+
+class RequestLimits(TransportLimits):
+    """How large a request may be. The library takes what a client can receive for what it may send."""
+
+    def create_acknowledge_and_set_limits(self, msg: ua.Hello) -> ua.Acknowledge:
+        """The answer to a client's greeting."""
+        largest, chunks = self.max_message_size, self.max_chunk_count
+        answer = super().create_acknowledge_and_set_limits(msg)
+        self.max_message_size, self.max_chunk_count = largest, chunks
+        answer.MaxMessageSize, answer.MaxChunkCount = ua.UInt32(largest), ua.UInt32(chunks)
+        return answer
+
+
+class OpcuaServer:
+    """Answers from the start until it is stopped."""
+
+    def __init__(
+        self,
+        listening: Listening,
+        model: SiteModel,
+        book: ConditionBook,
+        desk: RequestDesk,
+        log_in: LogIn,
+        trusted: TrustedClients,
+    ) -> None:
+        """Raises:
+        StageError: it cannot listen there, or does not start.
+        """
+        for name in ("asyncua", "asyncio"):  # of each client that leaves without a word they say a lot
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        self._listening, self._model, self._book, self._desk = listening, model, book, desk
+        self._log_in, self._trusted = log_in, trusted
+        self._site: str = model.site
+        self._trays: Sequence[TrayConfig] = model.trays
+        self._pending: deque[Condition] = deque()
+        self._lock = threading.Lock()
+        self._lost_unsaid = False
+        self._error = ""
+        self._is_ready = threading.Event()
+        self.events_sent = self.events_lost = self.clients = self.cut_off = 0
+        self._waiting_since_s: dict[asyncio.Transport, float] = {}
+        """since when answers wait for a client that does not read them"""
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread = threading.Thread(target=self._run, name="OPC UA server", daemon=True)
+        self._thread.start()
+        if not self._is_ready.wait(START_LIMIT_S):
+            raise StageError(f"the OPC UA server does not start within {START_LIMIT_S:.0f} s")
+        if self._error:
+            raise StageError(self._error)
+
+    @property
+    def problem(self) -> str:
+        """Empty while it answers."""
+        ended = "" if self._thread.is_alive() else "the OPC UA server has ended: restart the stage"
+        return "; ".join(filter(None, (self._error, ended, self._log_in.problem)))
+
+    def publish(self, condition: Condition) -> None:
+        """Send an event to whoever subscribes; never waits."""
+        with self._lock:
+            if len(self._pending) >= MOST_PENDING:
+                self._pending.popleft()
+                self.events_lost += 1
+                self._lost_unsaid = True
+            self._pending.append(condition)
+        self._wake()
+
+    def stop(self) -> None:
+        """End it; clients are cut off."""
+        loop = self._loop
+        if loop is not None and self._thread.is_alive():
+            loop.call_soon_threadsafe(self._stopping.set)
+        self._thread.join(STOP_LIMIT_S)
+
+    def _wake(self) -> None:
+        loop = self._loop
+        if loop is not None and self._thread.is_alive():
+            loop.call_soon_threadsafe(self._woken.set)
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        except Exception as error:  # noqa: BLE001  of a library, in a thread: the stage reports it
+            self._error = self._error or f"the OPC UA server has failed: {type(error).__name__}: {error}"
+        self._is_ready.set()
+
+    async def _serve(self) -> None:
+        self._stopping, self._woken = asyncio.Event(), asyncio.Event()
+        server, nodes, values, namespace = await self._made()
+        try:
+            await server.start()
+        except OSError as error:
+            where = f"opcua.host = {self._listening.host!r}, opcua.port = {self._listening.port}"
+            self._error = f"{where}: cannot listen there ({error.strerror or error}): choose another one"
+            return
+        self._loop = asyncio.get_running_loop()
+        self._is_ready.set()
+        delivery = EventDelivery(server.iserver.subscription_service.subscriptions, namespace)
+        tasks = [
+            asyncio.create_task(self._stopping.wait()),
+            asyncio.create_task(self._publish_values(server, nodes, values)),
+            asyncio.create_task(self._publish_events(delivery)),
+        ]
+        self._wake()
+        done, others = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in others:
+            task.cancel()
+        await self._end(server)
+        for task in done:
+            task.result()
+
+    async def _made(self) -> tuple[Server, SiteNodes, SiteValues, int]:
+        iserver = SiteServer(self._log_in, self._trusted)
+        server = Server(iserver=iserver)
+        iserver.connections = lambda: server.bserver.clients if server.bserver else ()
+        await server.init()
+        listening = self._listening
+        await server.load_certificate(listening.certificate)
+        await server.load_private_key(listening.key)
+        await server.set_application_uri(uri_of(server.iserver.certificate) or application_uri(self._site))
+        server.set_server_name(f"fantwin {self._site}")
+        server.application_type = ua.ApplicationType.Server
+        server.product_uri = "urn:fantwin"
+        host = listening.host.strip("[]")
+        server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{listening.port}/fantwin")
+        server.socket_address = (host, listening.port)
+        server.limits = RequestLimits(
+            _CHUNK_BYTES, _CHUNK_BYTES, _LARGEST_REQUEST_BYTES // _CHUNK_BYTES + 1, _LARGEST_REQUEST_BYTES
+        )
+        policies = [
+            ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
+            ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
+        ]
+        tokens: list[type] = [ua.UserNameIdentityToken]
+        if listening.is_open:
+            policies.append(ua.SecurityPolicyType.NoSecurity)
+            tokens.append(ua.AnonymousIdentityToken)
+        server.set_security_policy(policies, permission_ruleset=Permissions(self._log_in))  # type: ignore[arg-type]
+        server.set_identity_tokens(tokens)
+        namespace = await server.register_namespace(NAMESPACE)
+        values = SiteValues(self._model, self._book, namespace)
+        nodes = await build_address_space(server, namespace, self._site, self._trays, values.of)
+        delivery = EventDelivery(iserver.subscription_service.subscriptions, namespace)
+        Methods(self._model, self._book, self._desk, nodes, delivery).bind(server, namespace)
+        iserver.history_manager.set_storage(AlarmHistory(self._model, namespace))
+        return server, nodes, values, namespace
+
+    async def _publish_values(self, server: Server, nodes: SiteNodes, values: SiteValues) -> None:
+        """Once a second: what has changed, to those who subscribe to it."""
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        while True:
+            values.use(await asyncio.to_thread(values.newest))
+            for number, node in enumerate(list(nodes.subscribed.values())):
+                await _publish(node)
+                if number % _AT_ONCE == _AT_ONCE - 1:
+                    await asyncio.sleep(0)
+            self._cut_off(server)
+            due_s = max(due_s + UPDATE_PERIOD_S, loop.time())
+            await asyncio.sleep(due_s - loop.time())
+
+    def _cut_off(self, server: Server) -> None:
+        """Clients that send requests and read no answers."""
+        now_s, transports = time.monotonic(), list(server.iserver.asyncio_transports)
+        self.clients = len(transports)
+        waiting = {each: size for each in transports if (size := each.get_write_buffer_size())}
+        self._waiting_since_s = {each: self._waiting_since_s.get(each, now_s) for each in waiting}
+        for transport, size in waiting.items():
+            if size > LARGEST_BACKLOG_BYTES or now_s - self._waiting_since_s[transport] > LONGEST_BACKLOG_S:
+                transport.abort()
+                self.cut_off += 1
+
+    async def _publish_events(self, delivery: EventDelivery) -> None:
+        while True:
+            await self._woken.wait()
+            self._woken.clear()
+            with self._lock:
+                taken, lost = list(self._pending), self._lost_unsaid
+                self._pending.clear()
+                self._lost_unsaid = False
+            await delivery.to_all(taken)
+            self.events_sent += len(taken)
+            if lost:
+                await delivery.of_server_to_all(system_event("RefreshRequiredEventType", "events were left out"))
+
+    async def _end(self, server: Server) -> None:
+        for transport in list(server.iserver.asyncio_transports):
+            transport.abort()
+        with contextlib.suppress(TimeoutError):  # the thread ends with its loop
+            await asyncio.wait_for(server.stop(), STOP_LIMIT_S / 2)
+
+
+async def _publish(node: SiteNode) -> None:
+    attribute = node.attributes.get(ua.AttributeIds.Value)
+    if attribute is None or node.value is None or not attribute.datachange_callbacks:
+        return
+    value = node.value()
+    if node.is_news(value):
+        for handle, callback in list(attribute.datachange_callbacks.items()):
+            await callback(handle, value)
+
+
+def application_uri(site: str) -> str:
+    """Of a server whose certificate names none."""
+    return f"urn:{socket.gethostname()}:fantwin:{site}"
+
+
+def uri_of(certificate: x509.Certificate | None) -> str:
+    """The application URI that a certificate names; empty: none."""
+    if certificate is None:
+        return ""
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return ""
+    return next(iter(names.get_values_for_type(x509.UniformResourceIdentifier)), "")

@@ -1,0 +1,72 @@
+"""The lines of the alarm log: short enough to be read in a third of a window."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from fantwin.pipeline.outputs.rerun.worst_page import clock_utc
+from fantwin.schemas.enums import Severity, Statistic, Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.alarm_text import TRANSITIONS
+from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, with_share
+
+LINE_LENGTH = 64
+"""a longer line is cut"""
+_EXCEEDED = {
+    Statistic.STANDSTILL: "does not turn as commanded",
+    Statistic.MISSING_READINGS: "the tacho loses readings",
+    Statistic.WEAR: "a slow change has reached its limit",
+}
+
+
+class LogLine(NamedTuple):
+    """One line; `t_ns` is the time of the sample, ns since the epoch, `level` INFO, WARN or ERROR."""
+
+    tray: str
+    t_ns: int
+    level: str
+    text: str
+
+
+def log_line(alarm: Alarm) -> LogLine:
+    """The line about an alarm's transition."""
+    level = "INFO"
+    is_bad = alarm.active or alarm.transition != Transition.REPUBLISHED
+    if is_bad and alarm.transition in (Transition.RAISED, Transition.SEVERITY, Transition.REPUBLISHED):
+        level = "ERROR" if alarm.severity == Severity.ALARM else "WARN"
+    text = f"fan {alarm.fan}: {_what_happened(alarm)}"
+    return LogLine(alarm.header.tray, alarm.t_ns, level, cut(text, LINE_LENGTH))
+
+
+def cut(text: str, length: int) -> str:
+    """The text on one line, at most so long."""
+    text = " ".join(text.split())
+    return text if len(text) <= length else f"{text[: length - 1].rstrip()}…"
+
+
+def _what_happened(alarm: Alarm) -> str:
+    transition, by = alarm.transition, f" by {alarm.operator_name}" if alarm.operator_name else ""
+    if transition in (Transition.RAISED, Transition.SEVERITY):
+        return f"{alarm.severity.words} {transition.words}, {exceeded(alarm)}"
+    if transition == Transition.DIAGNOSED and alarm.causes:
+        first = alarm.causes[0]
+        return with_share(first) if first.cause == CANNOT_TELL else f"probably {with_share(first)}"
+    if transition == Transition.REPUBLISHED:
+        over = "no alarm" if alarm.severity == Severity.NONE else "back to normal"
+        return f"{f'{alarm.severity.words} goes on' if alarm.active else over}, after a restart"
+    if transition == Transition.SHELVED:
+        ends = alarm.shelved_until_t_ns
+        until = "it clears" if ends == UNTIL_IT_CLEARS_T_NS else clock_utc(ends, alarm.t_ns)
+        return f"shelved until {until}{by}"
+    if transition == Transition.REFUSED:
+        return f"request{by} refused: {alarm.message.partition('refused: ')[2] or alarm.message}"
+    return f"{TRANSITIONS.get(transition, transition.words)}{by}"
+
+
+def exceeded(alarm: Alarm) -> str:
+    """What raised the alarm: `torque balance off, 1.7 x the limit of the evidence`."""
+    if alarm.statistic in _EXCEEDED:
+        return _EXCEEDED[alarm.statistic]
+    residual = "torque balance" if alarm.torque_balance_command and not alarm.residual_rad_s else "speed"
+    return f"{residual} off, evidence {alarm.score:.2g} x its limit"

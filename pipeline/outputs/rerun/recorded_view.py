@@ -1,0 +1,88 @@
+"""A recording as a view file: what the viewer stage would have written, drawn by the same core."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.outputs.rerun.view_of_site import ViewOptions, view_of_site
+from fantwin.pipeline.recordings.left_out import left_out_hint
+from fantwin.pipeline.recordings.order import Seen, in_order
+from fantwin.pipeline.recordings.reading import RecordingMetadata, read_recording
+from fantwin.pipeline.recordings.run_recordings import run_metadata
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.units import SpeedUnit
+
+TOPICS = ("score", "alarm", "twin", "health", "snapshot")
+"""what the viewer reads"""
+
+
+@dataclass(frozen=True)
+class RecordedSite:
+    """The site of some recordings. parts: the earliest first."""
+
+    name: str
+    trays: Sequence[TrayConfig]
+    parts: Sequence[Path]
+
+
+def recorded_site(recordings: Iterable[Path]) -> RecordedSite:
+    """The site and those trays of it that have scores.
+
+    Raises:
+        UserError: a recording cannot be read, or has no scores.
+    """
+    parts = in_order(recordings)
+    metadata = run_metadata(parts)
+    stated = {tray: metadata.metadata.get(f"fans.{tray}") for tray in metadata.trays}
+    counts = {tray: int(fans) for tray, fans in stated.items() if fans}
+    trays = [TrayConfig(name=tray, fans=fans, speed_unit=_unit(metadata, tray)) for tray, fans in counts.items()]
+    if not trays:
+        why = left_out_hint(parts, ("score",)) or "did twin_integrator and scorer run?"
+        raise UserError(f"{', '.join(map(str, parts))}: holds no scores to show; {why}")
+    return RecordedSite(metadata.metadata.get("site", "site"), trays, parts)
+
+
+def write_view(site: RecordedSite, output: Path, options: ViewOptions) -> list[str]:
+    """Write the view file. Returns what could not be read, a line each.
+
+    Raises:
+        UserError: the file cannot be written, or a recording cannot be read.
+    """
+    damage: list[str] = []
+    messages = _messages(site.parts, damage)
+    first = next(messages, None)
+    core = view_of_site(site.name, site.trays, first.received_t_ns if first else 0, output, options)
+    try:
+        while first is not None:
+            envelope, first = first, next(messages, None)
+            try:
+                core.step(envelope if envelope.topic == "score" else envelope.message)
+            except CodecError:
+                continue  # counted by the reading
+            core.tick(envelope.received_t_ns)
+    except BaseException:
+        core.abort()
+        raise
+    core.close()
+    return [*damage, *filter(None, [core.problem()])]
+
+
+def _messages(parts: Sequence[Path], damage: list[str]) -> Iterator[Envelope]:
+    """The messages of all parts, each once: a message may be in two parts after a restart."""
+    seen: dict[tuple[str, str], Seen] = {}
+    for part in parts:
+        reading = read_recording(part, TOPICS)
+        for envelope in reading:
+            header = envelope.header
+            if seen.setdefault((envelope.key, header.producer), Seen()).is_new(header.sequence):
+                yield envelope
+        damage += [reading.damage] if reading.damage else []
+
+
+def _unit(metadata: RecordingMetadata, tray: str) -> SpeedUnit:
+    return "rpm" if metadata.speed_unit(tray) == "rpm" else "rad/s"

@@ -1,0 +1,298 @@
+"""The layout of a view in Rerun. Live views, view files and pictures have the same: it comes from here alone.
+
+`all`: for each tray a tab with plots, state lanes, alarms and log, and a tab for the stages; of a fleet, see
+`rerun_fleet`. `alarms`: the fans that are in alarm or were, and nothing else. `wear`: how the speed of each fan has
+changed, on a timeline of days. All plots of a layout share one time axis. Only the modules whose names begin with
+`rerun_` import rerun. Measured with Rerun 0.41; see docs/how-to/viewing.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.archetypes import TextLogColumns
+from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
+
+from fantwin.pipeline.outputs.rerun.rerun_paths import (
+    ALARMS_PATH,
+    BALANCE,
+    DAYS,
+    FAN_PARTS,
+    FANS_ON_A_PAGE,
+    FLEET_LOG,
+    SCORE,
+    STAGES_PATH,
+    TIMELINE,
+    auxiliary_path,
+    fan_path,
+    judged_path,
+    log_path,
+    pages_of,
+    place_beside,
+    place_lane,
+    place_root,
+    state_path,
+    wear_path,
+)
+from fantwin.pipeline.outputs.rerun.rerun_styles import (
+    LINE_WIDTH,
+    balance_style,
+    log_fan_styles,
+    log_state_styles,
+    score_style,
+    speed_style,
+)
+from fantwin.pipeline.site.trace import state_names
+from fantwin.schemas.auxiliary import AuxiliaryColumn
+from fantwin.schemas.units import SpeedUnit
+
+LayoutName = Literal["all", "alarms", "wear"]
+ALARMS_ON_A_PAGE = 4
+MARGIN_FOR_LEGEND = {1: 0.12, 2: 0.25, 4: 0.02}
+"""columns of plots -> share of the window kept free at the right; four columns leave no room for legends"""
+MIN_LANE_SHARE = 0.24
+"""of the height, for state lanes, alarms and log"""
+LINKED = rrb.TimeAxis(link="LinkToGlobal")
+_SHARED_VIEW = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc"
+"""where a blueprint keeps the range of all linked time axes (`GLOBAL_VIEW_ID` of Rerun, for which it has no call)"""
+
+
+@dataclass(frozen=True)
+class TrayLayout:
+    """The fans of a tray that are shown, counted from 0, and their unit of speed.
+
+    all_fans: how many the tray has. places: in the view of a fleet, the numbers of the plots that have shown each fan.
+    auxiliary: the columns beside command and speed that are drawn. alarmed: the fans that have been in alarm.
+    """
+
+    name: str
+    fans: Sequence[int]
+    speed_unit: SpeedUnit
+    all_fans: int
+    places: Mapping[int, Sequence[int]] = field(default_factory=dict[int, Sequence[int]])
+    auxiliary: Sequence[AuxiliaryColumn] = ()
+    alarmed: Sequence[int] = ()
+
+    def roots(self, fan: int) -> list[str]:
+        """The entities below which the fan is drawn."""
+        return [place_root(place, self.name) for place in self.places.get(fan, ())] or [self.name]
+
+    def lanes(self, fan: int) -> list[str]:
+        """The entities of the state lane of a fan."""
+        return [place_lane(place) for place in self.places.get(fan, ())] or [state_path(self.name, fan)]
+
+    @property
+    def log(self) -> str:
+        """The entity of the log."""
+        return FLEET_LOG if self.places else log_path(self.name)
+
+
+FanPlot = tuple[TrayLayout, int]
+
+
+def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
+    """Log the static names, colours and widths of every series of a tray."""
+    for fan in tray.fans:
+        log_fan_styles(recording, tray.name, fan, speed_style(tray.speed_unit, LINE_WIDTH))
+        log_state_styles(recording, state_path(tray.name, fan), state_names())
+    for page, fans in enumerate(pages_of(tray.fans)):
+        recording.log(judged_path(tray.name, BALANCE, page), balance_style(len(fans)), static=True)
+        recording.log(judged_path(tray.name, SCORE, page), score_style(len(fans)), static=True)
+
+
+class _Linked(rrb.Blueprint):
+    """A blueprint whose linked time axes all show one range."""
+
+    def __init__(self, *parts: Any, shown: rr.TimeRange, **options: bool) -> None:
+        super().__init__(*parts, **options)
+        self._axis = rrb.TimeAxis(view_range=shown)
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        super()._log_to_stream(stream)
+        stream.log(f"{_SHARED_VIEW}/TimeAxis", self._axis)
+
+
+def blueprint(
+    tabs: Sequence[rrb.Container | rrb.View], window_s: float, margin: float, *, for_picture: bool = False
+) -> rrb.Blueprint:
+    """The whole layout of some tabs; it follows the newest data. A picture has no panels and no tab for the stages.
+
+    window_s: length of time shown. margin: the share of it that is kept free at the right.
+    """
+    if not for_picture:
+        tabs = [*tabs, rrb.TextDocumentView(origin=f"/{STAGES_PATH}", name="stages")]
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    window = rr.TimeRange(start=cursor(seconds=-window_s), end=cursor(seconds=margin * window_s))
+    return _tabbed(tabs, TIMELINE, window, for_picture=for_picture)
+
+
+def _tabbed(
+    tabs: Sequence[rrb.Container | rrb.View], timeline: str, shown: rr.TimeRange, *, for_picture: bool
+) -> rrb.Blueprint:
+    return _Linked(
+        rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0],
+        rrb.TopPanel(state="hidden" if for_picture else "expanded"),
+        rrb.TimePanel(timeline=timeline, play_state="following", state="hidden" if for_picture else "collapsed"),
+        shown=shown,
+        auto_views=False,
+        collapse_panels=True,
+    )
+
+
+def trays_blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool = False) -> rrb.Blueprint:
+    """The layout `all` of some trays."""
+    margin = max(MARGIN_FOR_LEGEND[columns_of(len(page))] for tray in trays for page in pages_of(tray.fans))
+    return blueprint([_tray_tab(tray) for tray in trays], window_s, margin, for_picture=for_picture)
+
+
+def alarms_blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool = False) -> rrb.Blueprint:
+    """The layout `alarms` of some trays: the fans that are in alarm or were, four on a page."""
+    plots = [(tray, fan) for tray in trays for fan in tray.alarmed]
+    pages = [plots[start : start + ALARMS_ON_A_PAGE] for start in range(0, len(plots), ALARMS_ON_A_PAGE)]
+    tabs = [page_tab("fans that were in alarm" if len(pages) == 1 else _names(page), page) for page in pages]
+    lists = rrb.Horizontal(alarms_view(), log_view([tray.log for tray in trays], "alarm log"), name="alarms")
+    margin = max((MARGIN_FOR_LEGEND[columns_of(len(page))] for page in pages), default=0.0)
+    return blueprint(tabs or [lists], window_s, margin, for_picture=for_picture)
+
+
+def wear_blueprint(trays: Sequence[str], *, for_picture: bool = False) -> rrb.Blueprint:
+    """The layout `wear`: a tab for each of these trays."""
+    tabs = [_wear_tab(tray) for tray in trays]
+    everything = rr.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
+    return _tabbed(tabs, DAYS, everything, for_picture=for_picture)
+
+
+def _wear_tab(tray: str) -> rrb.Container:
+    view = rrb.TimeSeriesView(
+        origin=f"/{wear_path(tray)}",
+        name=f"{tray} / speed since commissioning (%)",
+        axis_x=LINKED,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+    )
+    return rrb.Grid(view, name=tray)
+
+
+def columns_of(plots: int) -> int:
+    """In how many columns so many plots stand."""
+    return 1 if plots <= 2 else 2 if plots <= 4 else 4
+
+
+def _tray_tab(tray: TrayLayout) -> rrb.Container:
+    pages = [
+        page_tab(_page_name(tray, fans), [(tray, fan) for fan in fans], tray.auxiliary) for fans in pages_of(tray.fans)
+    ]
+    return rrb.Tabs(*pages, active_tab=0, name=tray.name) if len(pages) > 1 else pages[0]
+
+
+def _page_name(tray: TrayLayout, fans: Sequence[int]) -> str:
+    return tray.name if len(fans) == len(tray.fans) else f"{tray.name} / fans {fans[0]} to {fans[-1]}"
+
+
+def _names(plots: Iterable[FanPlot]) -> str:
+    return ", ".join(f"{tray.name}/{fan}" for tray, fan in plots)
+
+
+def page_tab(name: str, plots: Sequence[FanPlot], auxiliary: Sequence[AuxiliaryColumn] = ()) -> rrb.Container:
+    """Up to `FANS_ON_A_PAGE` fans, each with speed above torque balance and score; their lanes, the alarms, the log."""
+    columns = columns_of(len(plots))
+    lanes = rrb.StateTimelineView(
+        origin="/",
+        contents=[f"/{path}" for tray, fan in plots for path in tray.lanes(fan)],
+        name="state of each fan",
+        time_view=LINKED,
+    )
+    lane_share = max(MIN_LANE_SHARE, (1.6 + len(plots)) / 25)
+    above: rrb.Container = rrb.Grid(*(_fan_rows(*plot, columns) for plot in plots), grid_columns=columns)
+    if auxiliary:
+        beside = [_auxiliary_view(plots, column) for column in auxiliary]
+        above = rrb.Vertical(above, rrb.Horizontal(*beside), row_shares=[4, 1])
+    logs = list(dict.fromkeys(tray.log for tray, _ in plots))
+    return rrb.Vertical(
+        above,
+        rrb.Horizontal(lanes, alarms_view(), log_view(logs, "alarm log"), column_shares=[4, 4, 3]),
+        row_shares=[1 - lane_share, lane_share],
+        name=name,
+    )
+
+
+def _auxiliary_view(plots: Sequence[FanPlot], column: AuxiliaryColumn) -> rrb.TimeSeriesView:
+    """What is measured of some fans beside command and speed: one line for each."""
+    contents = [path for tray, fan in plots for path in _beside(tray, fan, column.name)]
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[f"/{path}" for path in contents],
+        name=f"{column.title} ({column.unit})",
+        axis_x=LINKED,
+    )
+
+
+def _beside(tray: TrayLayout, fan: int, column: str) -> list[str]:
+    places = tray.places.get(fan, ())
+    return [place_beside(place, column) for place in places] or [auxiliary_path(tray.name, column, fan)]
+
+
+def _fan_rows(tray: TrayLayout, fan: int, columns: int) -> rrb.Container:
+    fill, lines = speed_style(tray.speed_unit, 0.0), speed_style(tray.speed_unit, LINE_WIDTH)
+    roots = tray.roots(fan)
+    speed = rrb.TimeSeriesView(
+        origin=f"/{roots[0]}/fan_{fan}",
+        contents=[f"/{fan_path(root, fan, part)}" for root in roots for part in FAN_PARTS],
+        name=f"{tray.name} / fan {fan} speed ({tray.speed_unit})",
+        axis_x=LINKED,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=columns < FANS_ON_A_PAGE // 2),
+        # A single band is faint. Drawing the same data twice makes it solid and sends no more bytes.
+        overrides={fan_path(root, fan, "speed"): [fill.visualizer(), lines.visualizer()] for root in roots},
+    )
+    page, number = divmod(fan, FANS_ON_A_PAGE)
+    on_page = min(FANS_ON_A_PAGE, tray.all_fans - page * FANS_ON_A_PAGE)
+    names = (f"{tray.name} / fan {fan} torque balance", f"{tray.name} / fan {fan} score")
+    if columns == 4:  # narrow: a longer name is cut off
+        names = (f"balance {fan}", f"score {fan}")
+    places = tray.places.get(fan, ())
+    styles = {BALANCE: balance_style(on_page, number), SCORE: score_style(on_page, number)}
+    kinds = [
+        judged_view(
+            [place_beside(place, kind) for place in places] or [judged_path(tray.name, kind, page)],
+            name,
+            None if places else style,
+        )
+        for (kind, style), name in zip(styles.items(), names, strict=True)
+    ]
+    return rrb.Vertical(speed, rrb.Horizontal(*kinds), row_shares=[5, 3])
+
+
+def judged_view(paths: Sequence[str], name: str, style: rr.SeriesLines | None) -> rrb.TimeSeriesView:
+    """The view of a fan's torque balance beside what is expected, or of its score beside the limit.
+
+    style: shows the series of this fan, where an entity has those of others too.
+    """
+    return rrb.TimeSeriesView(
+        origin=f"/{paths[0]}",
+        contents=[f"/{path}" for path in paths],
+        name=name,
+        axis_x=LINKED,
+        plot_legend=rrb.PlotLegend(visible=False),
+        overrides={path: style.visualizer() for path in paths} if style else None,
+    )
+
+
+def alarms_view() -> rrb.TextDocumentView:
+    """The view of the table of alarms."""
+    return rrb.TextDocumentView(origin=f"/{ALARMS_PATH}", name="alarms")
+
+
+def log_view(paths: Sequence[str], name: str) -> rrb.TextLogView:
+    """The view of one or more logs."""
+    return rrb.TextLogView(
+        origin="/",
+        contents=[f"/{path}" for path in paths],
+        name=name,
+        columns=TextLogColumns(
+            timeline_columns=[TimelineColumn(TIMELINE, visible=False)],  # too narrow to read: lines begin with it
+            text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
+        ),
+    )

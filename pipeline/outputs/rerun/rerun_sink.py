@@ -1,0 +1,237 @@
+"""The viewer's sink: a Rerun recording that goes to a file and to live viewers on this host."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
+from fantwin.pipeline.outputs.rerun.fleet_view import Overview
+from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots
+from fantwin.pipeline.outputs.rerun.rerun_bands import RerunBands
+from fantwin.pipeline.outputs.rerun.rerun_fleet import RerunFleet
+from fantwin.pipeline.outputs.rerun.rerun_layout import LayoutName, TrayLayout, log_styles
+from fantwin.pipeline.outputs.rerun.rerun_paths import ALARMS_PATH, FLEET_LOG, STAGES_PATH, TIMELINE, log_path
+from fantwin.pipeline.outputs.rerun.rerun_wear import RerunWear
+from fantwin.pipeline.outputs.rerun.site_layout import SiteLayout
+from fantwin.pipeline.outputs.rerun.view_file import ViewFile
+from fantwin.pipeline.outputs.rerun.wear_points import WearPoints
+from fantwin.pipeline.runtime.stage import StageError
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.loopback import LOOPBACK, check_free
+from fantwin.pipeline.site.trace import Trace
+from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import SpeedUnit
+
+APPLICATION = "fantwin"
+FLUSH_LIMIT_S = 2.0
+"""how long a flush may take; it is called twice a second and usually takes milliseconds"""
+# Rerun's page server runs in a shell that ends with this process, even when it is killed: the pipe to its input closes.
+_PAGE_SCRIPT = '"$@" >/dev/null 2>&1 & cat >/dev/null; kill $!'
+
+
+def rerun_program() -> Path:
+    """Path of Rerun's executable inside its package; the `rerun` on the path is a wrapper around it."""
+    spec = importlib.util.find_spec("rerun_cli")
+    assert spec is not None and spec.origin is not None, "rerun-sdk contains rerun_cli"
+    folder = Path(spec.origin).parent
+    return folder / "Rerun.app/Contents/MacOS/Rerun" if sys.platform == "darwin" else folder / "rerun"
+
+
+def _open_view(file: Path, limit_bytes: float) -> ViewFile:
+    path = unused_path(file)
+    try:
+        return ViewFile(path, limit_bytes)
+    except OSError as error:
+        raise StageError(f"{path}: cannot write the view: {error.strerror}; change viewer.file") from error
+
+
+def unused_path(path: Path) -> Path:
+    """Create and return `path`, or the first of path-2, path-3 ... that does not exist.
+
+    Raises:
+        StageError: the file cannot be created.
+    """
+    candidate, number = path, 1
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while candidate.exists():
+            number += 1
+            candidate = path.with_stem(f"{path.stem}-{number}")
+        candidate.open("xb").close()
+    except OSError as error:
+        raise StageError(f"{candidate}: cannot write the view: {error.strerror}; change viewer.file") from error
+    return candidate
+
+
+class RerunSink:
+    """A Rerun recording, written to a file and served to viewers."""
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        trays: Sequence[TrayConfig],
+        fleet: FleetPlots | None,
+        started_t_ns: int,
+        layout: LayoutName,
+        window_s: float,
+        file: Path | None,
+        grpc_port: int | None,
+        web_port: int | None,
+        memory_limit: str,
+        file_bytes: float = math.inf,
+    ) -> None:
+        """Open `file`, a data server at `grpc_port` and a page for browsers at `web_port`; None leaves one out.
+
+        file_bytes: the size at which the file ends. layout: which of the layouts is shown. fleet: None shows every fan
+        with its band.
+
+        Raises:
+            StageError: the file cannot be written, or a port is taken.
+        """
+        for key, port in (("grpc_port", grpc_port), ("web_port", web_port)):
+            if port is not None:
+                check_free(port, f"viewer.{key}", "viewer.serve = false")
+        self._recording = rr.RecordingStream(APPLICATION)
+        self._bands = RerunBands(self._recording)
+        self._fleet = RerunFleet(self._recording, trays) if fleet else None
+        layouts = [] if fleet else [TrayLayout(t.name, range(t.fans), t.speed_unit, t.fans) for t in trays]
+        bounds = self._fleet.bounds if self._fleet else None
+        self._layout = SiteLayout(tuple(layouts), window_s, fleet, bounds)
+        self._wear = RerunWear(self._recording)
+        self._layout_name: LayoutName = layout
+        self._late = False
+        self._file = _open_view(file, file_bytes) if file is not None else None
+        sinks: list[rr.FileSink | rr.GrpcServerSink] = []
+        if self._file is not None:
+            # Without a footer, memory does not grow with the file, and the file can be opened after a crash.
+            sinks.append(rr.FileSink(self._file.pipe, write_footer=False))
+        if grpc_port is not None:
+            server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=memory_limit)
+            sinks.append(server)
+        self._recording.set_sinks(*sinks, default_blueprint=self._layout.blueprint(layout))
+        if self._file is not None:
+            self._file.release_pipe()
+        self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
+        for of_tray in layouts:
+            log_styles(self._recording, of_tray)
+        if fleet and self._fleet:
+            self._fleet.log_styles(fleet.count)
+        self.flush()  # the styles reach the file first, so that the file of a killed viewer has them
+        self._page = _serve_page(web_port, grpc_port) if web_port is not None and grpc_port is not None else None
+
+    def draw(self, trace: Trace) -> None:
+        """Send the next stretch of a tray."""
+        self._lay_out(trace)
+        self._bands.draw(trace)
+
+    def _lay_out(self, trace: Trace) -> None:
+        """Give its plots to what a source measures beside command and speed, when it comes for the first time, and in
+        the layout `alarms` to a fan that goes into alarm for the first time."""
+        before, drawn = self._layout, self._layout.auxiliary_of(trace.tray)
+        if not trace.auxiliary.keys() <= {column.name for column in drawn}:
+            shown = [column for column in AUXILIARY if column in drawn or column.name in trace.auxiliary]
+            self._layout = self._layout.with_auxiliary(trace.tray, shown)
+        if self._layout_name == "alarms":
+            in_alarm = [trace.fan_numbers[column] for column in np.flatnonzero(trace.in_alarm.any(axis=0)).tolist()]
+            self._layout = self._layout.with_alarmed(trace.tray, in_alarm)
+        if self._layout is not before:
+            self._recording.send_blueprint(self._layout.blueprint(self._layout_name))
+
+    def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:
+        """Send the newest points of the wear of some fans."""
+        self._wear.draw(tray, points)
+
+    def show_alarms(self, table: str, t_ns: int) -> None:
+        """Show the table of alarms from `t_ns` on."""
+        self._recording.send_columns(
+            ALARMS_PATH,
+            [rr.TimeColumn(TIMELINE, timestamp=np.array([t_ns], "datetime64[ns]"))],
+            rr.TextDocument.columns(text=[table], media_type=[rr.MediaType.MARKDOWN]),
+        )
+
+    def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
+        """Set the state of a fan's lane from each time on."""
+        self._bands.change_states(tray, fan, t_ns, names)
+
+    def show_fan(self, fan: Fan, place: int, unit: SpeedUnit) -> None:
+        """From now on a fan of a fleet is drawn in this place."""
+        self._bands.show(fan, place, unit)
+
+    def hide_fan(self, fan: Fan, t_ns: int) -> None:
+        """From `t_ns` on a fan of a fleet has no place."""
+        self._bands.hide(fan, t_ns)
+
+    def draw_overview(self, overview: Overview) -> None:
+        """Send what has changed in the overview of a fleet."""
+        assert self._fleet is not None, "the view has no overview"
+        self._fleet.draw(overview)
+
+    def log(self, lines: Sequence[LogLine]) -> None:
+        """Add lines to the log of their tray, or of the fleet, with their time of day (UTC)."""
+        placed = [(FLEET_LOG if self._fleet else log_path(line.tray), line) for line in lines]
+        for path, group in groupby(sorted(placed, key=itemgetter(0)), key=itemgetter(0)):
+            of_log = [line for _, line in group]
+            times = np.array([line.t_ns for line in of_log]).astype("datetime64[ns]")
+            clocks = [text.split("T")[1] for text in np.datetime_as_string(times, unit="s").tolist()]
+            trays = [f"{line.tray} " if self._fleet else "" for line in of_log]
+            texts = [f"{clock}  {tray}{line.text}" for clock, tray, line in zip(clocks, trays, of_log, strict=True)]
+            columns = rr.TextLog.columns(text=texts, level=[line.level for line in of_log])
+            self._recording.send_columns(path, [rr.TimeColumn(TIMELINE, timestamp=times)], columns)
+
+    def show_stages(self, page: str) -> None:
+        """Replace the page about the stages. It has no time and so does not move a cursor that follows the newest."""
+        self._recording.log(STAGES_PATH, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN), static=True)
+
+    def flush(self) -> None:
+        """Pass everything on, so that it survives a crash of this process. Waits some seconds at most."""
+        try:
+            self._recording.flush(timeout_sec=FLUSH_LIMIT_S)
+        except RuntimeError:  # the only error it raises
+            self._late = True
+        else:
+            self._late = False
+        if self._file is not None:
+            self._file.flush()
+
+    def problem(self) -> str:
+        """Why the view is not complete; empty if all is well."""
+        late = f"live viewers take more than {FLUSH_LIMIT_S:g} s for the newest data; close slow viewers"
+        return "; ".join(filter(None, [self._file.problem if self._file else "", late if self._late else ""]))
+
+    def close(self) -> None:
+        """Write everything and stop serving, within some seconds."""
+        self.flush()
+        ending = threading.Thread(target=self._recording.disconnect, daemon=True)
+        ending.start()
+        ending.join(FLUSH_LIMIT_S)
+        if self._file is not None:
+            self._file.close()
+        if self._page is not None:
+            assert self._page.stdin is not None
+            self._page.stdin.close()
+            try:
+                self._page.wait(FLUSH_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                self._page.kill()
+
+
+def _serve_page(web_port: int, grpc_port: int) -> subprocess.Popen[bytes]:
+    """Serve the browser viewer's page on the loopback only; the call in Rerun's package listens on all interfaces."""
+    data = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
+    page = [rerun_program(), "--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(web_port), data]
+    # A separate session keeps Ctrl-C from the shell, which must end the server first.
+    return subprocess.Popen(["sh", "-c", _PAGE_SCRIPT, "sh", *page], stdin=subprocess.PIPE, start_new_session=True)

@@ -1,0 +1,259 @@
+"""Who asks, and what he may do.
+
+A page is read without a login on loopback; whoever acts is a user, by a session or by the header of a proxy. What
+changes something must come from a page of this server: the browser says so (Sec-Fetch-Site, Origin), and the page sends
+the token of its session, which no other page can read.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import ipaddress
+from base64 import b64decode
+from collections.abc import Mapping
+from dataclasses import dataclass
+from urllib.parse import urlsplit
+
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+
+from fantwin.pipeline.outputs.web.config import GatewayConfig
+from fantwin.pipeline.outputs.web.sessions import LoginSessions, Session
+from fantwin.pipeline.site.login_failures import LoginFailures
+from fantwin.pipeline.site.security_log import SecurityLog
+from fantwin.pipeline.site.users import NAME, User, UserRole, Users
+
+COOKIE, SECURE_COOKIE = "fantwin", "__Host-fantwin"
+CSRF_HEADER = "X-CSRF-Token"
+MOST_LOGINS = 16
+"""that wait for their password to be checked, which takes memory and time"""
+_OWN_SITE = {"same-origin"}
+_OF_PROXIES = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
+_ASK_FOR_PASSWORD = {"WWW-Authenticate": 'Basic realm="fantwin"'}
+
+
+@dataclass(frozen=True)
+class Visitor:
+    """Who asks. name: of the user, empty if nobody is logged in. session: None without a login of this server."""
+
+    name: str
+    may_read: bool
+    may_act: bool
+    session: Session | None = None
+
+
+class Access:
+    """The rules of one gateway."""
+
+    def __init__(self, config: GatewayConfig, users: Users | None, log: SecurityLog | None = None) -> None:
+        """users: None where a proxy knows them, or nobody may act."""
+        self._config = config
+        self._users = users
+        self.sessions = LoginSessions()
+        self.log = log or SecurityLog()
+        self._failures = LoginFailures()
+        self._logins = 0
+        self._one_at_a_time = asyncio.Lock()
+
+    @property
+    def has_login(self) -> bool:
+        """Whether users log in here."""
+        return self._users is not None
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the file of users; empty if nothing is."""
+        return self._users.problem if self._users else ""
+
+    @property
+    def cookie_name(self) -> str:
+        """Over https, browsers accept the cookie from this host only, and send it by https only."""
+        return SECURE_COOKIE if self._config.certificate else COOKIE
+
+    @property
+    def is_cookie_secure(self) -> bool:
+        """Whether browsers send it by https only."""
+        return self._config.certificate is not None
+
+    def visitor(self, request: Request) -> Visitor:
+        """Who sends a request."""
+        if self._config.user_header:
+            return self._of_proxy(request)
+        cookie = request.cookies.get(self.cookie_name, "")
+        session = self.sessions.of(cookie) if cookie else None
+        user = self._users.of(session.user) if session and self._users else None
+        if session is not None and (user is None or user.password_hash != session.password_hash):
+            self.sessions.end(cookie)
+        elif session is not None and user is not None:
+            return Visitor(user.name, may_read=True, may_act=user.role == UserRole.OPERATOR, session=session)
+        return Visitor("", may_read=self._is_free(request), may_act=False)
+
+    def reader(self, request: Request) -> Visitor:
+        """Who sends a request that only reads.
+
+        Raises:
+            HTTPException: 401, he may not read.
+        """
+        visitor = self.visitor(request)
+        if not visitor.may_read:
+            raise HTTPException(401, "log in first")
+        return visitor
+
+    def operator(self, request: Request) -> Visitor:
+        """Who sends a request that changes something.
+
+        Raises:
+            HTTPException: 401 or 403, he may not, or it does not come from a page of this server.
+        """
+        name = ""
+        try:
+            require_own_page(request)
+            visitor = self.visitor(request)
+            name = visitor.name
+            if not name:
+                raise HTTPException(401, self._who_acts(request))
+            if visitor.session is not None:
+                require_token(request, visitor.session)
+            if not visitor.may_act:
+                raise HTTPException(403, f"{name} may view but not act")
+        except HTTPException as error:
+            self.log.add("request refused", user=name, path=request.url.path, why=error.detail, **address_of(request))
+            raise
+        return visitor
+
+    async def log_in(self, name: str, password: str, request: Request) -> tuple[str, Session]:
+        """Begin a session, in place of the one before: its cookie, and what it is.
+
+        Raises:
+            HTTPException: 401, 404, 429 or 503.
+        """
+        if self._users is None:
+            raise HTTPException(404, "nobody logs in here")
+        user = await self._verified(self._users, name, password, request)
+        self.log.add("login", user=user.name, role=str(user.role), **address_of(request))
+        self.sessions.end(request.cookies.get(self.cookie_name, ""))
+        return self.sessions.begin(user.name, user.password_hash)
+
+    async def require_scraper(self, request: Request) -> None:
+        """Let whoever may read have the metrics, and a program that sends name and password of a user each time (HTTP
+        Basic).
+
+        Raises:
+            HTTPException: 401, 429 or 503, he may not.
+        """
+        kind, _, encoded = request.headers.get("authorization", "").partition(" ")
+        try:
+            if self._users is None or kind.lower() != "basic":
+                self.reader(request)
+            else:
+                await self._verified(self._users, *_name_and_password(encoded), request)
+        except HTTPException as error:
+            if self.has_login and error.status_code == 401:
+                error.headers = _ASK_FOR_PASSWORD
+            raise
+
+    async def _verified(self, users: Users, name: str, password: str, request: Request) -> User:
+        """The user with this name and password. To check one takes long; the server goes on meanwhile.
+
+        Raises:
+            HTTPException: 401, 429 or 503.
+        """
+        where = address_of(request)
+        if self._logins >= MOST_LOGINS:
+            raise HTTPException(503, "too many logins at once: try again")
+        user = users.of(name)
+        if users.problem:
+            raise HTTPException(503, "nobody can log in: the file of users cannot be read; health says why")
+        if wait_s := self._failures.begin(name, where["address"]):
+            self.log.add("login refused: too many wrong passwords", user=name, **where)
+            raise HTTPException(429, "too many wrong passwords: try again later", {"Retry-After": f"{wait_s:.0f}"})
+        self._logins += 1
+        try:
+            async with self._one_at_a_time:  # each takes 64 MB and much of a processor
+                is_right = await asyncio.to_thread(users.is_password, user, password)
+        finally:
+            self._logins -= 1
+        if user is None or not is_right:
+            self.log.add("login refused: wrong name or password", user=name, **where)
+            raise HTTPException(401, "wrong name or password")
+        self._failures.succeed(name, where["address"])
+        return user
+
+    def _who_acts(self, request: Request) -> str:
+        """What somebody without a name must do to act."""
+        if self.has_login:
+            return "log in first"
+        header = self._config.user_header
+        if not header:
+            return "nobody can act here: [gateway] has no users"
+        if plain_address(address_of(request)["address"]) not in self._config.proxies:
+            return "users come through the proxy of this page: ask there"
+        return f"the proxy has sent no {header} with the name of a user, or no valid one"
+
+    def _is_free(self, request: Request) -> bool:
+        """Whether whoever asks may read without a login: only on this host, and not through a proxy that has its users
+        here."""
+        if not self._config.is_loopback or self._config.user_header:
+            return False
+        is_through_proxy = self._config.has_other_hosts or any(name in request.headers for name in _OF_PROXIES)
+        return not (self.has_login and is_through_proxy)
+
+    def _of_proxy(self, request: Request) -> Visitor:
+        """The name counts only if the proxy has sent it, and once; whoever else reaches the server is nobody."""
+        names = request.headers.getlist(self._config.user_header)
+        if plain_address(address_of(request)["address"]) not in self._config.proxies:
+            return Visitor("", may_read=False, may_act=False)
+        if len(names) != 1 or not NAME.fullmatch(names[0]):
+            return Visitor("", may_read=False, may_act=False)
+        return Visitor(names[0], may_read=True, may_act=names[0] in self._config.operators)
+
+
+def _name_and_password(encoded: str) -> tuple[str, str]:
+    """Those of HTTP Basic. HTTPException 401: there are none."""
+    try:
+        name, _, password = b64decode(encoded, validate=True).decode().partition(":")
+    except ValueError as error:
+        raise HTTPException(401, "no valid name and password") from error
+    return name, password
+
+
+def address_of(request: Request) -> dict[str, str]:
+    """From where a request comes, for the log: of the connection, whatever headers say."""
+    return {"address": request.client.host if request.client else ""}
+
+
+def plain_address(address: str) -> str:
+    """Without the form that IPv4 has on a socket of IPv6."""
+    try:
+        found = ipaddress.ip_address(address)
+    except ValueError:
+        return address
+    return str(getattr(found, "ipv4_mapped", None) or found)
+
+
+def require_own_page(request: Request) -> None:
+    """What changes something must come from a page of this server, or from a program that is no browser.
+
+    Raises:
+        HTTPException: 403, another site's page has sent it.
+    """
+    headers: Mapping[str, str] = request.headers
+    site, origin = headers.get("sec-fetch-site", ""), headers.get("origin", "")
+    if (site and site not in _OWN_SITE) or (origin and _host_of(origin) != headers.get("host", "")):
+        raise HTTPException(403, "the request comes from a page of another site")
+
+
+def require_token(request: Request, session: Session) -> None:
+    """Raises:
+    HTTPException: 403, the token of the session is missing or another one.
+    """
+    if not hmac.compare_digest(request.headers.get(CSRF_HEADER, "").encode(), session.csrf_token.encode()):
+        raise HTTPException(403, f"{CSRF_HEADER} is missing or wrong: load the page again")
+
+
+def _host_of(origin: str) -> str | None:
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None

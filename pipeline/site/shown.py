@@ -1,0 +1,231 @@
+"""What is known about the site, as JSON: what the page, the API and the live events send."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.recordings.clips.clip import Clip
+from fantwin.pipeline.site.fan_groups import SHOWN_CLASSES, FanGroup
+from fantwin.pipeline.site.fan_history import Curves
+from fantwin.pipeline.site.fleet import Fan, FanNow
+from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.pipeline.site.site_state import StageState
+from fantwin.schemas.enums import Feedback
+from fantwin.schemas.messages import Alarm, Array, ModelCard
+from fantwin.schemas.twin_card import CardError, TwinCard
+from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.scoring.alarms.alarm_flags import is_listed
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.calibration.observed_rate import together
+from fantwin.scoring.diagnosis.shown_causes import (
+    CANNOT_TELL,
+    advice,
+    less_likely,
+    likely_causes,
+    likely_evidence,
+    likely_with_share,
+    short_name,
+)
+
+LEVELS, NO_LEVEL = 250, 255
+"""a score of 1, at the limit, is level 100; what is not judged has none"""
+_SPEEDS = 3
+"""the first curves are speeds"""
+
+
+def site_json(model: SiteModel, viewer_urls: Mapping[str, str]) -> dict[str, Any]:
+    """What does not change while the gateway runs: the trays in the order of the cells, and what their classes mean:
+    name, group, and what a fan with an alarm does now."""
+    trays = [
+        {
+            "name": tray.name,
+            "fans": tray.fans,
+            "speed_unit": tray.speed_unit,
+            "viewer_url": viewer_urls.get(tray.name, ""),
+        }
+        for tray in model.trays
+    ]
+    return {
+        "site": model.site,
+        "trays": trays,
+        "classes": [each.name for each in SHOWN_CLASSES],
+        "groups": [str(each.group) for each in SHOWN_CLASSES],
+        "now": [each.now for each in SHOWN_CLASSES],
+        "level_at_limit": 100,
+    }
+
+
+def fleet_json(model: SiteModel) -> dict[str, Any]:
+    """All fans at a glance: class and level of each cell, a byte each, in base64."""
+    now = model.fans_now()
+    level = np.where(np.isnan(now.score), NO_LEVEL, (np.nan_to_num(now.score, posinf=9.0) * 100).clip(0, LEVELS))
+    return {
+        "classes": _packed(now.classes),
+        "levels": _packed(level.astype(np.uint8)),
+        "counts": model.counts(),
+    }
+
+
+def fan_json(now: FanNow, group: FanGroup) -> dict[str, Any]:
+    """One fan in a list."""
+    return {
+        "tray": now.fan.tray,
+        "fan": now.fan.number,
+        "state": now.state,
+        "group": str(group),
+        "score": None if math.isnan(now.score) else round(now.score, 4),
+        "since_t_ns": now.since_t_ns,
+        "in_alarm": group == FanGroup.ALARM,
+    }
+
+
+def fan_in_full(model: SiteModel, fan: Fan) -> dict[str, Any]:
+    """One fan with its alarm and its twin."""
+    alarm, twin = model.current_alarm(fan), model.twin(fan.tray)
+    return {
+        **fan_json(model.fan_now(fan), model.groups()[fan]),
+        "newest_t_ns": model.newest_t_ns(fan.tray),
+        "alarm": alarm_json(alarm) | {"now": model.words_now([fan])[0]} if alarm else None,
+        "twin": twin_json(twin, fan.number) if twin else None,
+        "wear": [_wear_json(row) for row in model.wear(fan)],
+    }
+
+
+def _wear_json(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Changes and limit are shares of the speed. t_ns: at which they hold."""
+    shown = ("parameter", "unit", "change", "beside", "per_day", "days", "limit", "reached_t_ns", "unknown_reason")
+    values = {name: row[name] for name in shown}
+    return _without_nan({**values, "error": row["change_std_error"], "t_ns": row["seen_t_ns"]})
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(each) for key, each in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def twin_json(card: ModelCard, fan: int) -> dict[str, Any]:
+    """The twin in force, and the parameters of one fan that it uses."""
+    try:
+        found = TwinCard.from_json(card.card_json)
+    except CardError:  # of a version that this one does not know
+        shown = {}
+    else:
+        values = found.parameters[fan if fan < found.fans else 0]
+        used = found.used_parameters or found.parameter_names
+        shown = {name: value for name, value in zip(found.parameter_names, values, strict=True) if name in used}
+    return {"name": card.twin, "kind": card.kind, "sha256": card.sha256, "since_t_ns": card.t_ns, "parameters": shown}
+
+
+def curves_json(curves: Curves, tray: TrayConfig) -> dict[str, Any]:
+    """Columns by name; speeds in the unit of the tray, null where nothing was measured or judged."""
+    values = curves.values.astype(np.float64)
+    values[:, :_SPEEDS] /= RAD_S_PER_UNIT[tray.speed_unit]
+    names = ("measured", "predicted", "half_width", "torque_balance_command", "score", "command")
+    columns = {name: _or_null(values[:, number]) for number, name in enumerate(names)}
+    return {"speed_unit": tray.speed_unit, "t_s": (curves.t_ns / 1e9).round(3).tolist(), **columns}
+
+
+def alarm_json(current: CurrentAlarm) -> dict[str, Any]:
+    """A current alarm with what the page says of it. probability: of the first of the likely causes."""
+    causes = current.causes
+    return {
+        **current.as_json(),
+        "listed": is_listed(current.newest),
+        "states": current.states(),
+        "cause": likely_causes(causes),
+        "cause_with_share": likely_with_share(causes),
+        "probability": causes[0].probability if causes and causes[0].cause != CANNOT_TELL else None,
+        "evidence": likely_evidence(causes),
+        "advice": advice(causes),
+        "other_causes": [
+            {"cause": short_name(each.cause), "probability": each.probability} for each in less_likely(causes)
+        ],
+    }
+
+
+def alarms_json(model: SiteModel, *, everything: bool) -> dict[str, Any]:
+    """All current alarms, each with what its fan does `now`. everything: also those that are over."""
+    found = [each for each in model.current_alarms() if everything or is_listed(each.newest)]
+    words = model.words_now([Fan(each.newest.header.tray, each.newest.fan) for each in found])
+    return {"alarms": [alarm_json(each) | {"now": now} for each, now in zip(found, words, strict=True)]}
+
+
+def clip_json(clip: Clip) -> dict[str, Any]:
+    """A clip of alarms, for machines."""
+    return {
+        "name": clip.name,
+        "tray": clip.tray,
+        "since_t_ns": clip.since_ns,
+        "until_t_ns": clip.until_ns,
+        "bytes": clip.size_bytes,
+        "acknowledged": clip.is_acknowledged,
+        "problem": clip.problem,
+        "alarms": [{"fan": each.fan, "onset_t_ns": each.onset_t_ns, "t_ns": each.t_ns} for each in clip.alarms],
+    }
+
+
+def transition_json(number: int, alarm: Alarm, feedback: Feedback = Feedback.NONE) -> dict[str, Any]:
+    """A transition of the history. feedback: the last one on its alarm."""
+    return {
+        "number": number,
+        "t_ns": alarm.t_ns,
+        "tray": alarm.header.tray,
+        "fan": alarm.fan,
+        "onset_t_ns": alarm.onset_t_ns,
+        "transition": alarm.transition.name.lower(),
+        "severity": alarm.severity.name.lower(),
+        "active": alarm.active,
+        "message": alarm.message,
+        "operator_name": alarm.operator_name,
+        "comment": alarm.comment,
+        "feedback": feedback.name.lower(),
+    }
+
+
+def rates_json(model: SiteModel) -> dict[str, Any]:
+    """The rate of false alarms that really was beside the declared one, of each tray and of all."""
+    rates = model.observed_rates()
+    trays = {tray: rate.as_json() for tray, rate in rates.items()}
+    return {"trays": trays, "site": together(list(rates.values())).as_json()}
+
+
+def stages_json(states: Iterable[StageState]) -> list[dict[str, Any]]:
+    """The stages, in the order of the data flow."""
+    return [_stage_json(state) for state in states]
+
+
+def _stage_json(state: StageState) -> dict[str, Any]:
+    view = state.view
+    health = view.health if view else None
+    return {
+        "name": state.label,
+        "state": str(state.word),
+        "detail": state.detail or (health.problem if health else ""),
+        "in_hz": round(view.rate_in_hz, 1) if view else 0.0,
+        "out_hz": round(view.rate_out_hz, 1) if view else 0.0,
+        "lost": health.lost if health else 0,
+        "latency_p50_ms": _rounded(health.latency_p50_ms, 1) if health else 0.0,
+        "latency_p99_ms": _rounded(health.latency_p99_ms, 1) if health else 0.0,
+        "uptime_s": _rounded(health.uptime_s, 0) if health else 0.0,
+        "notes": [f"{note.tray}: {note.text}" if note.tray else note.text for note in health.notes] if health else [],
+    }
+
+
+def _rounded(value: float, digits: int) -> float:
+    """0 for what is no number: health is what its sender makes it."""
+    return round(value, digits) if math.isfinite(value) else 0.0
+
+
+def _or_null(values: Array) -> Sequence[float | None]:
+    return [None if math.isnan(value) else float(f"{value:.5g}") for value in values.tolist()]
+
+
+def _packed(values: Array) -> str:
+    return base64.b64encode(values.tobytes()).decode()

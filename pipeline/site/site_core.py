@@ -1,0 +1,51 @@
+"""What the cores have in common that show a site to operators and pass on what they ask."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import Counter
+from collections.abc import Sequence
+
+from fantwin.pipeline.runtime.stage import Core
+from fantwin.pipeline.site.request_desk import RequestDesk
+from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
+
+
+class SiteCore(Core):
+    """Keeps in a model what arrives. Scores arrive as envelopes."""
+
+    def __init__(self, model: SiteModel, desk: RequestDesk) -> None:
+        self._model, self._desk = model, desk
+        self._counts: Counter[str] = Counter()
+
+    def step(self, item: Message | Envelope) -> Sequence[Message]:
+        """Keep what has arrived, if it is about a fan of the site or about a stage."""
+        if isinstance(item, Health):
+            self._model.add_health(item)
+            return ()
+        tray = self._model.tray(item.header.tray)
+        if tray is None:
+            self._counts["unknown_tray"] += 1
+        elif isinstance(item, Envelope):
+            self.add_score(item)
+        elif isinstance(item, ModelCard):
+            self._model.add_twin(item)
+        elif isinstance(item, ScorerSnapshot):
+            self._model.add_snapshot(item)
+        elif isinstance(item, Alarm):
+            if item.fan < tray.fans:
+                self.add_alarm(item)
+            else:
+                self._counts["unknown_fan"] += 1
+        return ()
+
+    @abstractmethod
+    def add_score(self, envelope: Envelope) -> None:
+        """A score of a known tray has arrived."""
+
+    @abstractmethod
+    def add_alarm(self, alarm: Alarm) -> None:
+        """A transition of the alarm of a known fan has arrived, which may be the answer to a request."""

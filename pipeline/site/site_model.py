@@ -1,0 +1,347 @@
+"""What the gateway knows about its site now: the newest sample and the alarm of every fan, the stages, the twins.
+
+The stage fills it in, and the web server reads it, each in a thread of its own.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.site.alarm_rates import AlarmRates
+from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.fan_groups import SHOWN_CLASSES, FanGroup, classes_of, counts_of
+from fantwin.pipeline.site.fan_history import COLUMNS, Curves, FanHistory, values_of
+from fantwin.pipeline.site.fleet import Fan, FanNow, Fleet, last_sample
+from fantwin.pipeline.site.judged_time import LEARNED, JudgedTime
+from fantwin.pipeline.site.site_state import StageState, stage_states
+from fantwin.pipeline.site.site_watcher import StageView
+from fantwin.pipeline.site.watched_alarms import WatchedAlarms
+from fantwin.schemas.codec import CodecError, decode_columns, encode
+from fantwin.schemas.enums import Feedback, StageStatus, Transition
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.alarms.unscored_monitor import JUDGED_AT_REST
+from fantwin.scoring.calibration.observed_rate import ObservedRate, declared_per_day
+from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
+
+SILENT_AFTER_S = 5.0
+"""a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus"""
+
+
+@dataclass(frozen=True, eq=False)
+class FleetNow:
+    """Of all fans, tray after tray in the order of the configuration: the class of each fan's cell, (fans,) uint8, an
+    index into `SHOWN_CLASSES`, and its score, (fans,) float32, NaN where it is not judged."""
+
+    classes: Array
+    score: Array
+
+
+@dataclass(frozen=True, eq=False)
+class TrayNow:
+    """The newest sample of a tray: values (fans, len(CURVES)) and whether each fan is judged (fans,).
+
+    is_heard: False: it has sent none for long, and this is an old one.
+    """
+
+    tray: str
+    t_ns: int
+    values: Array
+    is_judged: Array
+    invalid_reason: Array
+    is_heard: bool
+
+
+@dataclass(slots=True)
+class _Heard:
+    health: Health
+    previous: Health | None
+    heard_s: float
+
+
+class SiteModel:
+    """Thread-safe."""
+
+    def __init__(
+        self,
+        site: str,
+        trays: Sequence[TrayConfig],
+        store: AlarmStore,
+        *,
+        keeps_curves: bool = True,
+        rates: AlarmRates | None = None,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 86 MB.
+        rates: takes for how long fans are judged, for `observed_rates`. now_s: a clock that is never set."""
+        self._now_s = now_s
+        self.site = site
+        self.trays = tuple(trays)
+        self._by_name = {tray.name: tray for tray in trays}
+        self._lock = threading.Lock()
+        self._fleet = Fleet(trays, has_all_alarms=True)
+        self._history = FanHistory(trays) if keeps_curves else None
+        self._heard_s: dict[str, float] = {}
+        self._newest: dict[str, Score] = {}
+        """by tray, its last sample alone"""
+        self._raised: Counter[tuple[str, int, str]] = Counter()
+        """by tray, fan and severity"""
+        self._counted: dict[tuple[str, int], tuple[int, int]] = {}
+        """by tray and fan: the onset of the alarm that was counted last, and its worst severity"""
+        fans = sum(tray.fans for tray in trays)
+        self._alarms = WatchedAlarms(lambda _producer: True, most_fans=fans)
+        self._store = store
+        self._stages: dict[tuple[str, str], _Heard] = {}
+        self._twins: dict[str, ModelCard] = {}
+        self._wear: dict[str, tuple[int, Sequence[Mapping[str, Any]]]] = {}
+        """by tray: the time of the snapshot, and its rows"""
+        self._rates = rates
+        self._judged = JudgedTime()
+        self._judging: dict[str, tuple[str, float | None]] = {}
+        """by tray, the name of its twin for the judged time, and the rate that it declares"""
+        self.refused_scores = 0
+        """with another number of fans than the configuration says, or not to be decoded"""
+
+    def add_score(self, envelope: Envelope) -> Score | None:
+        """A score of a known tray has arrived; returns it, or None if it cannot be shown."""
+        tray = self._by_name[envelope.header.tray]
+        try:
+            score = decode_columns(Score, envelope.payload, COLUMNS)
+        except CodecError:
+            self.refused_scores += 1
+            return None
+        if score.fans != tray.fans or not len(score.t_ns):
+            self.refused_scores += score.fans != tray.fans
+            return None
+        with self._lock:
+            self._heard_s[tray.name] = self._now_s()
+            self._newest[tray.name] = last_sample(score, COLUMNS)
+            self._fleet.update(score)
+            if self._history is not None:
+                self._history.add(score)
+            if self._rates is not None and tray.name in self._judging:
+                stretches = self._judged.add(score, *self._judging[tray.name])
+                if stretches:
+                    self._rates.catch_up(self._store, stretches)
+        return score
+
+    def add_alarm(self, alarm: Alarm) -> bool:
+        """A transition has arrived; returns whether it is new."""
+        with self._lock:
+            self._alarms.add(alarm, len(encode(alarm)))
+            current = self._alarms.of(alarm.header.tray, alarm.fan)
+            self._fleet.add_alarm(current.newest if current else alarm)  # this one may be late
+            is_new = self._store.add(alarm)
+            if is_new and alarm.transition in (Transition.RAISED, Transition.SEVERITY):
+                self._count(alarm)
+            return is_new
+
+    def _count(self, alarm: Alarm) -> None:
+        """Once for each severity that it reaches."""
+        name = (alarm.header.tray, alarm.fan)
+        onset_t_ns, worst = self._counted.get(name, (0, 0))
+        if alarm.onset_t_ns != onset_t_ns or alarm.severity > worst:
+            self._counted[name] = (alarm.onset_t_ns, int(alarm.severity))
+            self._raised[*name, alarm.severity.name.lower()] += 1
+
+    def add_health(self, health: Health) -> None:
+        """A stage has reported."""
+        name = (health.stage, health.instance)
+        with self._lock:
+            before = self._stages.get(name)
+            previous = before.health if before and before.health.header.producer == health.header.producer else None
+            self._stages[name] = _Heard(health, previous, self._now_s())
+
+    def add_twin(self, card: ModelCard) -> None:
+        """A tray has another twin."""
+        tray = self._by_name.get(card.header.tray)
+        name = LEARNED if tray and tray.twin is None else card.sha256
+        with self._lock:
+            self._twins[card.header.tray] = card
+            self._judging[card.header.tray] = (name, declared_per_day(card.card_json))
+
+    def notice_silence(self) -> None:
+        """Trays that have sent no score for long are silent."""
+        before_s = self._now_s() - SILENT_AFTER_S
+        with self._lock:
+            for tray, heard_s in self._heard_s.items():
+                if heard_s < before_s:
+                    self._fleet.silence(tray, int(self._newest[tray].t_ns[-1]))
+
+    def tray(self, name: str) -> TrayConfig | None:
+        """None: there is no such tray."""
+        return self._by_name.get(name)
+
+    def fans_now(self) -> FleetNow:
+        """All fans at a glance."""
+        with self._lock:
+            return FleetNow(classes_of(self._fleet), self._fleet.scores())
+
+    def every_fan(self) -> list[FanNow]:
+        """All fans in words, the worst first."""
+        with self._lock:
+            return self._fleet.every_fan()
+
+    def fan_now(self, fan: Fan) -> FanNow:
+        """One of them."""
+        with self._lock:
+            return self._fleet.fan_now(fan)
+
+    def groups(self) -> dict[Fan, FanGroup]:
+        """The group of each fan."""
+        with self._lock:
+            classes = classes_of(self._fleet).tolist()
+            return {fan: SHOWN_CLASSES[each].group for fan, each in zip(self._fleet.fans, classes, strict=True)}
+
+    def words_now(self, fans: Sequence[Fan]) -> list[str]:
+        """Words for each: that it is stopped, starting or like a healthy fan again; empty: none of these."""
+        with self._lock:
+            classes = classes_of(self._fleet)
+            return [SHOWN_CLASSES[classes[self._fleet.index(fan)]].now for fan in fans]
+
+    def counts(self) -> dict[str, int]:
+        """How many fans are in alarm, suspect, not judged, and in an alarm that an operator has silenced."""
+        with self._lock:
+            found = counts_of(classes_of(self._fleet))
+        return {
+            "in_alarm": found[FanGroup.ALARM],
+            "suspect": found[FanGroup.SUSPECT],
+            "not_judged": found[FanGroup.NOT_JUDGED],
+            "silenced": found[FanGroup.SILENCED],
+        }
+
+    def history(self, fan: Fan, since_t_ns: int) -> Curves:
+        """The last hour of a fan."""
+        assert self._history is not None, "no curves are kept"
+        with self._lock:
+            return self._history.of(fan.tray, fan.number, since_t_ns)
+
+    def newest_t_ns(self, tray: str) -> int:
+        """Time of the newest sample of a tray; 0: there was none."""
+        with self._lock:
+            newest = self._newest.get(tray)
+        return int(newest.t_ns[-1]) if newest else 0
+
+    def trays_now(self) -> list[TrayNow]:
+        """The newest sample of each tray that was ever heard."""
+        after_s = self._now_s() - SILENT_AFTER_S
+        with self._lock:
+            newest = [(tray, score, self._heard_s[tray] >= after_s) for tray, score in self._newest.items()]
+        return [
+            TrayNow(
+                tray,
+                int(score.t_ns[-1]),
+                values_of(score)[-1],
+                score.valid[-1] | np.isin(score.invalid_reason[-1], JUDGED_AT_REST),
+                score.invalid_reason[-1],
+                is_heard,
+            )
+            for tray, score, is_heard in newest
+        ]
+
+    def raised(self) -> dict[tuple[str, int, str], int]:
+        """How many alarms have reached a severity since the gateway began, by tray, fan and severity."""
+        with self._lock:
+            return dict(self._raised)
+
+    def current_alarms(self) -> list[CurrentAlarm]:
+        """The alarm of each fan that had one, by tray and fan."""
+        with self._lock:
+            return self._alarms.current()
+
+    def current_alarm(self, fan: Fan) -> CurrentAlarm | None:
+        """That of one fan; None: it had none."""
+        with self._lock:
+            return self._alarms.of(fan.tray, fan.number)
+
+    def past_alarms(
+        self, most: int, *, tray: str = "", fan: int = -1, before: int | None = None
+    ) -> Sequence[tuple[int, Alarm]]:
+        """The last transitions: `AlarmStore.newest`."""
+        with self._lock:
+            return self._store.newest(most, tray=tray, fan=fan, before=before)
+
+    def alarms_between(
+        self, begin_ns: int, end_ns: int, most: int, *, tray: str = "", fan: int = -1, is_backwards: bool = False
+    ) -> Sequence[Alarm]:
+        """The transitions of a stretch of time: `AlarmStore.between`."""
+        with self._lock:
+            return self._store.between(begin_ns, end_ns, most, tray=tray, fan=fan, is_backwards=is_backwards)
+
+    def history_begins_t_ns(self) -> int | None:
+        """How far back the history of alarms reaches; None: nobody has said it."""
+        with self._lock:
+            return self._store.begins_t_ns()
+
+    def add_snapshot(self, snapshot: ScorerSnapshot) -> None:
+        """A scorer has sent its state, of which the wear is kept."""
+        tray = snapshot.header.tray
+        with self._lock:
+            kept = self._wear.get(tray)
+            if kept is not None and kept[0] > snapshot.t_ns:
+                return
+        wear = wear_in(snapshot)
+        if wear is not None and len(wear["fans"]) == self._by_name[tray].fans:
+            with self._lock:
+                self._wear[tray] = (snapshot.t_ns, wear_rows(tray, snapshot.t_ns, wear))
+
+    def wear(self, fan: Fan) -> Sequence[Mapping[str, Any]]:
+        """The wear of a fan as of the last snapshot of its scorer, one row; empty: none is known."""
+        with self._lock:
+            _, rows = self._wear.get(fan.tray, (0, ()))
+        return [row for row in rows if row["fan"] == fan.number]
+
+    def feedback_on(self, alarms: Sequence[Alarm]) -> list[Feedback]:
+        """What operators said last of the alarm that each of these messages is about."""
+        if self._rates is None:
+            return [alarm.feedback for alarm in alarms]
+        with self._lock:
+            self._rates.catch_up(self._store, ())
+            return [self._rates.feedback(alarm.header.tray, alarm.fan, alarm.onset_t_ns) for alarm in alarms]
+
+    def observed_rates(self) -> dict[str, ObservedRate]:
+        """Of each tray, the rate of false alarms beside the declared one: `AlarmRates.observed`."""
+        if self._rates is None:
+            return {}
+        with self._lock:
+            self._rates.catch_up(self._store, self._judged.growing())
+            return self._rates.observed()
+
+    def twin(self, tray: str) -> ModelCard | None:
+        """The twin in force; None: it has not been heard."""
+        return self._twins.get(tray)
+
+    def stages(self) -> list[StageState]:
+        """The stages that have been heard. One that is silent for long may have left the bus."""
+        now_s = self._now_s()
+        with self._lock:
+            views = [
+                StageView(each.health, each.previous, each.health.status != StageStatus.STOPPED, now_s - each.heard_s)
+                for each in self._stages.values()
+            ]
+        alive = {(view.health.stage, view.health.instance) for view in views if view.alive}
+        rank = {name: number for number, name in enumerate(STAGES)}
+        return sorted(stage_states(views, alive, ()), key=lambda state: rank.get(state.stage, len(rank)))
+
+    def problem(self) -> str:
+        """What is wrong with the history of alarms; empty if nothing is."""
+        return "; ".join(filter(None, (self._store.problem, self._rates.problem if self._rates else "")))
+
+    def close(self) -> None:
+        """Leave complete files."""
+        with self._lock:
+            if self._rates is not None:
+                self._rates.catch_up(self._store, self._judged.growing())
+                self._rates.close()
+            self._store.close()

@@ -1,0 +1,241 @@
+"""Watches a running site from outside: the last health of each session, and the alarms."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from itertools import chain
+
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import NAME_PATTERN
+from fantwin.pipeline.config.roles import Role, roles_of_stages
+from fantwin.pipeline.runtime.believed_outputs import BelievedOutputs
+from fantwin.pipeline.runtime.lost_sessions import LostSessions
+from fantwin.pipeline.runtime.sessions import Session, this_host
+from fantwin.pipeline.site.known_sessions import KnownSessions
+from fantwin.pipeline.site.loss_accounting import Launched, label, losses
+from fantwin.pipeline.site.refused_input import refused, unusable_lines
+from fantwin.pipeline.site.watched_alarms import WatchedAlarms
+from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import alive_key, health_key, sessions_key, tray_key
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+
+MOST_WATCHED_SESSIONS = 1000
+"""so many last healths are kept; of more, those heard longest ago are forgotten, those of launched sessions last"""
+MOST_UNKNOWN_SESSIONS = 64
+"""producers without a token of a session whose health is kept; those heard longest ago are forgotten first"""
+
+
+@dataclass(frozen=True)
+class StageView:
+    """A stage session as seen from outside."""
+
+    health: Health
+    previous: Health | None
+    alive: bool
+    age_s: float = 0.0
+    """since the health was heard here: clocks of other hosts may differ"""
+
+    @property
+    def rate_in_hz(self) -> float:
+        """Messages received a second between the last two healths."""
+        return self._rate(sum(i.received for i in self.health.inputs), lambda h: sum(i.received for i in h.inputs))
+
+    @property
+    def rate_out_hz(self) -> float:
+        """Messages published a second between the last two healths."""
+        return self._rate(sum(o.published for o in self.health.outputs), lambda h: sum(o.published for o in h.outputs))
+
+    def _rate(self, now: int, count: Callable[[Health], int]) -> float:
+        if self.previous is None or self.health.t_ns <= self.previous.t_ns:
+            return 0.0
+        return (now - count(self.previous)) / ((self.health.t_ns - self.previous.t_ns) / NS_PER_S)
+
+
+@dataclass(frozen=True, slots=True)
+class _Heard:
+    """The last health of a session, the one before, and when the last was heard, of a monotonic clock in s."""
+
+    health: Health
+    previous: Health | None
+    heard_s: float
+
+
+class SiteWatcher:
+    """Keeps the last health of each session, and the last alarm of each fan. Thread-safe.
+
+    Whoever is no session of the site is not shown and not counted: `pipeline.site.known_sessions`.
+    """
+
+    def __init__(self, bus: Bus, site: str, roles: Mapping[str, Role] | None = None) -> None:
+        """roles: those of the site, each with the trays to which it is limited. None: the roles of all stages, not
+        limited to trays."""
+        self._believed_outputs = BelievedOutputs(roles_of_stages() if roles is None else roles)
+        self._bus = bus
+        self._site = site
+        self._lock = threading.Lock()
+        self._sessions = KnownSessions()
+        self._lost = LostSessions(this_host())
+        self._healths: dict[str, _Heard] = {}
+        """by producer, in the order heard: of the sessions that have shown their token"""
+        self._unknown: dict[str, _Heard] = {}
+        """the same of others: their token may still be on its way"""
+        self._alarms = WatchedAlarms(self._sessions.is_known)
+        bus.watch_alive(alive_key(site, "*", "*"), self._on_liveness)
+        bus.watch_alive(sessions_key(site), self._on_session)
+        bus.subscribe(health_key(site, "*", "*"), self._on_health)
+        bus.subscribe(tray_key(site, "*", "alarm"), self._on_alarm)
+
+    def ask_for_past_alarms(self) -> None:
+        """Fetch the alarms that were raised before this watcher started."""
+        key = tray_key(self._site, "*", "alarm")
+        for its_key, payload in self._bus.recover(key):
+            self._on_alarm(its_key, payload)
+
+    def ask_for_health(self, stage: str, instance: str) -> None:
+        """Fetch the last health of a stage, instead of waiting for its next one."""
+        for key, payload in self._bus.recover(health_key(self._site, stage, instance)):
+            self._on_health(key, payload)
+
+    def stages(self) -> list[StageView]:
+        """The latest session of every stage instance, by name; one whose token is there, if there is one. A session
+        whose link was cut is looked for."""
+        with self._lock:
+            are_apart = any(map(self._sessions.may_return, self._lost.cut_off()))
+        if are_apart:
+            self._bus.meet_again()
+        with self._lock:
+            latest: dict[tuple[str, str], StageView] = {}
+            at_work = self._sessions.alive()
+            heard = self._believed()  # as heard: a host's clock may be set back
+            for each in sorted(heard, key=lambda each: self._sessions.is_alive(each.health.header.producer)):
+                if self._sessions.is_replaced(each.health.header.producer):
+                    continue
+                name = (each.health.stage, each.health.instance)
+                age_s = time.monotonic() - each.heard_s
+                latest[name] = StageView(each.health, each.previous, name in at_work, age_s)
+            return [latest[name] for name in sorted(latest)]
+
+    def alive(self) -> set[tuple[str, str]]:
+        """Stage and instance of each session that is on the bus now."""
+        with self._lock:
+            return self._sessions.alive()
+
+    def is_ready(self, process_id: int) -> bool:
+        """Whether the session of this process is alive and at work."""
+        return any(view.alive and view.health.process_id == process_id for view in self.stages())
+
+    def counts(self, key: str, producer: str) -> bool:
+        """Whether a message of this producer on this key is one of the site."""
+        with self._lock:
+            return self._sessions.counts(key, producer)
+
+    def owner(self, stage: str, tray: str) -> Session | None:
+        """The session of a stage that owns a tray now; None: there is none."""
+        with self._lock:
+            return self._sessions.owner(stage, tray)
+
+    def alarms(self) -> list[Alarm]:
+        """The last alarm message of every fan that had one, oldest first."""
+        return sorted((current.newest for current in self.current_alarms()), key=lambda alarm: alarm.t_ns)
+
+    def current_alarms(self) -> list[CurrentAlarm]:
+        """The current alarm of each fan that had one, by tray and fan."""
+        with self._lock:
+            self._alarms.drop(self._is_of_stranger)  # the session that publishes there may have been heard after it
+            return self._alarms.current()
+
+    def add_launched(self, session: Launched) -> None:
+        """Register a session that this process has started: a flood of others does not displace what it lost."""
+        with self._lock:
+            self._sessions.add_launched(session)
+
+    def last_health(self, session: Launched) -> Health | None:
+        """The last health of a session; None if none has been heard."""
+        with self._lock:
+            healths = [each.health for each in self._believed()]
+        return next((health for health in healths if (label(health), health.process_id) == session), None)
+
+    def losses(
+        self, launched: Collection[Launched] | None = None, reads: Mapping[str, Collection[str]] | None = None
+    ) -> dict[str, int]:
+        """What every stage has lost, over all its sessions; see `pipeline.site.loss_accounting`."""
+        with self._lock:
+            return losses((each.health for each in self._believed()), launched, reads)
+
+    def refused(self) -> dict[str, dict[str, int]]:
+        """What every stage has refused, over all its sessions; see `pipeline.site.refused_input`."""
+        with self._lock:
+            return refused(each.health for each in self._believed())
+
+    def unusable(self, launched: Collection[Launched]) -> list[str]:
+        """A line for each device of which no sample could be used by the sessions given."""
+        with self._lock:
+            return unusable_lines((each.health for each in self._believed()), launched)
+
+    def _believed(self) -> list[_Heard]:
+        every = chain(self._unknown.values(), self._healths.values())
+        return [each for each in every if self._sessions.is_health_of_stage(each.health)]
+
+    def _is_of_stranger(self, alarm: Alarm) -> bool:
+        return self._sessions.is_stranger(_alarm_key(self._site, alarm.header.tray), alarm.header.producer)
+
+    def _on_liveness(self, key: str, alive: bool) -> None:
+        with self._lock:
+            self._sessions.update_stage(key, alive)
+
+    def _on_session(self, key: str, alive: bool) -> None:
+        with self._lock:
+            self._lost.update(key, alive)
+            session = self._sessions.update(key, alive)
+            if session and (heard := self._unknown.pop(session.producer, None)):
+                self._keep(heard)
+
+    def _on_health(self, key: str, payload: bytes) -> None:
+        health = _decoded(Health, payload)
+        if isinstance(health, Health) and key == health_key(self._site, health.stage, health.instance):
+            health = self._believed_outputs.of(health)
+            with self._lock:
+                self._sessions.add_health(health)
+                before = self._healths.get(health.header.producer) or self._unknown.get(health.header.producer)
+                self._keep(_Heard(health, before.health if before else None, time.monotonic()))
+
+    def _keep(self, heard: _Heard) -> None:
+        producer = heard.health.header.producer
+        if not self._sessions.is_known(producer):
+            self._unknown.pop(producer, None)
+            self._unknown[producer] = heard
+            if len(self._unknown) > MOST_UNKNOWN_SESSIONS:
+                del self._unknown[next(iter(self._unknown))]
+        elif self._sessions.is_health_of_stage(heard.health):
+            self._healths.pop(producer, None)
+            self._healths[producer] = heard
+            if len(self._healths) > MOST_WATCHED_SESSIONS:
+                others = (of for of, each in self._healths.items() if not self._sessions.is_launched(each.health))
+                del self._healths[next(others, next(iter(self._healths)))]
+
+    def _on_alarm(self, key: str, payload: bytes) -> None:
+        """A message without a producer (empty bytes decode as one), or of another tray than its key, is ignored."""
+        alarm = _decoded(Alarm, payload)
+        if isinstance(alarm, Alarm) and alarm.header.producer and key == _alarm_key(self._site, alarm.header.tray):
+            with self._lock:
+                if self._sessions.counts(key, alarm.header.producer):
+                    self._alarms.add(alarm, len(payload))
+
+
+def _alarm_key(site: str, tray: str) -> str:
+    return tray_key(site, tray, "alarm") if re.fullmatch(NAME_PATTERN, tray) else ""
+
+
+def _decoded(kind: type[Health] | type[Alarm], payload: bytes) -> object | None:
+    """None for undecodable bytes: the stages count those."""
+    try:
+        return decode(kind, payload)
+    except CodecError:
+        return None

@@ -1,0 +1,1 @@
+"""Samples that a program posts to acquisition."""

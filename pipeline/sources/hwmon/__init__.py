@@ -1,0 +1,1 @@
+"""Samples of the fans that the kernel of this host knows."""

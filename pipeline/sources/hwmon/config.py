@@ -1,0 +1,62 @@
+"""Settings of a hwmon chip: `source = { kind = "hwmon", chip = "nct6798", fans = [1, 2] }`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from fantwin.pipeline.sources.hwmon.chips import chip_of
+from fantwin.pipeline.sources.polling import PolledConfig
+from fantwin.schemas.tacho import Tacho
+
+ROOT = Path("/sys/class/hwmon")
+
+Number = Annotated[int, Field(ge=0, le=99)]
+
+
+class HwmonConfig(PolledConfig, frozen=True):
+    """Fans of this computer, as Linux shows them. The command is pwm, 0 to 255; the speed is in rpm."""
+
+    kind: Literal["hwmon"] = "hwmon"
+    chip: str = Field(
+        min_length=1, description="`name` of the chip, for example nct6798; `fantwin discover` lists them"
+    )
+    device: str = Field(
+        default="",
+        description="end of the path of its device; needed where several chips have the same name",
+    )
+    fans: tuple[Number, ...] = Field(
+        default=(),
+        description="N of fanN_input, in the order of the tray; without it 1, 2, ... up to the number of fans",
+    )
+    pwms: tuple[Number, ...] = Field(
+        default=(), description="N of pwmN that drives each fan, or one for all; without it the numbers of the fans"
+    )
+    temperatures: tuple[Number, ...] = Field(
+        default=(), description="N of tempN_input, the temperature of the air at each fan, or one for all"
+    )
+    voltages: tuple[Number, ...] = Field(
+        default=(), description="N of inN_input, the supply voltage of each fan, or one for all"
+    )
+    voltage_scale: float = Field(
+        default=1.0, gt=0, le=1000, description="factor for inN_input, for a divider on the board"
+    )
+    currents: tuple[Number, ...] = Field(default=(), description="N of currN_input of each fan, or one for all")
+    writable: bool = Field(
+        default=False,
+        description="whether commands are written; pwmN_enable is then set to 1 (manual), and restored at the end",
+    )
+    root: Path = Field(default=ROOT, description="folder of the chips")
+
+    @property
+    def why_no_commands(self) -> str:
+        """Commands are written only if `writable` is set."""
+        return "" if self.writable else "its source does not have writable = true"
+
+    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
+        """What the driver of the chip gives, where it is known."""
+        del fans
+        chip = chip_of(self.chip)
+        return (chip.tacho,) if chip and chip.tacho else None

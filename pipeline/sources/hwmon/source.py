@@ -1,0 +1,280 @@
+"""Fans of this computer as a source of samples: the chips of /sys/class/hwmon, read as files.
+
+The chip is found by its name and its device, each time it is connected: hwmonN changes from boot to boot, and when a
+driver is loaded again. A file that cannot be read is NaN; a chip that goes away is a LinkDown.
+
+How a pwm was found is kept in a file before it is written for the first time, until it has been given back: after a
+process that was killed, the next one finds it manual and would otherwise leave it so.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+from collections.abc import Sequence
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.hwmon.chips import chip_of
+from fantwin.pipeline.sources.hwmon.config import HwmonConfig
+from fantwin.pipeline.sources.hwmon.modes import FoundModes, FoundPwm
+from fantwin.pipeline.sources.hwmon.tree import ChipFolder, chip_folders, device_words
+from fantwin.pipeline.sources.polling import DeviceError, PollingSource
+from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
+from fantwin.schemas.units import RAD_S_PER_UNIT
+
+MANUAL = 1
+"""in pwmN_enable"""
+HIGHEST_PWM = 255
+HOTTEST_C = 127
+"""a sensor that is not connected reads more (Documentation/hwmon/dell-smm-hwmon.rst)"""
+
+
+class HwmonSource(PollingSource):
+    """A `SampleSource`."""
+
+    def __init__(self, config: HwmonConfig, context: SourceContext) -> None:
+        """Raises UserError if the numbers do not fit the fans of the tray."""
+        super().__init__(HwmonDevice(config, context), config.period_s)
+
+
+class HwmonDevice:
+    """A `PolledDevice`."""
+
+    def __init__(self, config: HwmonConfig, context: SourceContext) -> None:
+        self._config = config
+        self._root = context.folder / config.root
+        self._quirks = chip_of(config.chip)
+        self._unit_per_rpm = RAD_S_PER_UNIT["rpm"] / RAD_S_PER_UNIT[context.speed_unit]
+        fans = config.fans or tuple(range(1, context.fans + 1))
+        if len(fans) != context.fans:
+            raise UserError(f"fans = {context.fans}, and source.fans names {len(fans)}: give the same number")
+        self._fans = fans
+        self._pwms = _of_each_fan("pwms", config.pwms, fans) or fans
+        self._temperatures = _of_each_fan("temperatures", config.temperatures, fans)
+        self._voltages = _of_each_fan("voltages", config.voltages, fans)
+        self._currents = _of_each_fan("currents", config.currents, fans)
+        self._chip: ChipFolder | None = None
+        self._modes = FoundModes(context.run_folder / f"hwmon-{context.tray}.json" if context.run_folder else None)
+        self._before: dict[int, FoundPwm] = {}
+        """how each pwm that was written, also by a process that was killed, was found"""
+        self._taken_over: set[int] = set()
+        """the pwms that this connection has made manual"""
+        self._written = False
+
+    @property
+    def name(self) -> str:
+        """The chip as the configuration names it."""
+        return self._config.chip
+
+    @property
+    def settings_to_check(self) -> str:
+        """What may be wrong."""
+        return f"chip = {self._config.chip!r}"
+
+    @property
+    def is_writable(self) -> bool:
+        """As the configuration says."""
+        return self._config.writable
+
+    def connect(self) -> None:
+        """Find the chip."""
+        self._chip = chip = self._find()
+        kept = self._modes.kept(chip)
+        # What is not manual any more has been given back, or the driver was loaded again.
+        self._taken_over = set()
+        self._before = {number: found for number, found in kept.items() if self._mode(chip, number) in (None, MANUAL)}
+
+    def read(self) -> Reading | Rejected:
+        """Speeds, pwm values and what else is asked for."""
+        chip = self._connected()
+        pwm = {number: self._pwm(chip, number) for number in dict.fromkeys(self._pwms)}
+        speed = tuple(self._speed(chip, number) for number in self._fans)
+        if self._quirks and self._quirks.pwm_is_known_after_write and not self._written and not any(pwm.values()):
+            return Rejected(
+                "unknown_command",
+                f"pwm of {chip.name} reads 0 until a program has set it: set it once",
+                is_sample=True,
+                setting="writable",
+            )
+        return Reading(
+            command=tuple(float(pwm[number]) for number in self._pwms),
+            speed=speed,
+            supply_voltage_v=tuple(
+                _value(chip, f"in{number}_input", 1e-3 * self._config.voltage_scale) for number in self._voltages
+            ),
+            current_a=tuple(_value(chip, f"curr{number}_input", 1e-3) for number in self._currents),
+            temperature_c=tuple(_temperature_c(chip, number) for number in self._temperatures),
+        )
+
+    def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
+        """Set pwm values, after `pwmN_enable` is manual."""
+        if not all(map(math.isnan, set_point)):
+            raise DeviceError("hwmon fans take commands, no set-points")
+        chip = self._connected()
+        wanted: dict[int, int] = {}
+        for number, value in zip(self._pwms, command, strict=True):
+            if math.isnan(value):
+                continue
+            pwm = min(max(round(value), 0), HIGHEST_PWM)
+            if wanted.setdefault(number, pwm) != pwm:
+                raise DeviceError(
+                    f"pwm{number} moves several fans: give them one command, not {wanted[number]} and {pwm}"
+                )
+        for number, pwm in wanted.items():
+            self._take_over(chip, number)
+            _write(chip, f"pwm{number}", pwm)
+            self._written = True
+
+    def disconnect(self) -> None:
+        """Give the fans that were commanded back to whatever drove them."""
+        chip, before = self._chip, self._before
+        self._chip, self._before = None, {}
+        failures = []
+        for number, found in before.items() if chip else ():
+            assert chip is not None
+            try:
+                if found.mode == MANUAL or found.mode is None:
+                    _write(chip, f"pwm{number}", HIGHEST_PWM if found.pwm is None else found.pwm)
+                if found.mode not in (None, MANUAL):
+                    _write(chip, f"pwm{number}_enable", found.mode)
+            except DeviceError as error:
+                failures.append(str(error))
+        if failures:
+            raise DeviceError("; ".join(failures))
+        if before:  # kept until all of it was given back
+            self._modes.forget()
+
+    def check(self) -> list[str]:
+        """What is not there, or may not be read or written."""
+        try:
+            chip = self._find()
+        except DeviceError as error:
+            return [str(error)]
+        found = []
+        for kind, suffix, numbers in self._files():
+            lacking = [number for number in dict.fromkeys(numbers) if number not in chip.numbers(kind, suffix)]
+            found += [f"{chip.name} has no {kind}{number}{suffix}: correct {_SETTING[kind]}" for number in lacking]
+        for number in dict.fromkeys(self._pwms) if self._config.writable else ():
+            if not os.access(chip.path / f"pwm{number}", os.W_OK):
+                found.append(f"{chip.path / f'pwm{number}'}: this user may not write it; {_MAY_WRITE}")
+        return found
+
+    def _files(self) -> tuple[tuple[str, str, Sequence[int]], ...]:
+        return (
+            ("fan", "_input", self._fans),
+            ("pwm", "", self._pwms),
+            ("temp", "_input", self._temperatures),
+            ("in", "_input", self._voltages),
+            ("curr", "_input", self._currents),
+        )
+
+    def _find(self) -> ChipFolder:
+        config = self._config
+        try:
+            chips = chip_folders(self._root)
+        except OSError as error:
+            raise DeviceError(f"{self._root}: {error.strerror}; correct root", is_lost=True) from error
+        found = [chip for chip in chips if chip.is_called(config.chip, config.device)]
+        if len(found) > 1:
+            devices = ", ".join(repr(device_words(chip, chips)) for chip in found)
+            raise DeviceError(
+                f"{len(found)} chips are called {config.chip}: name one by device = {devices}", is_lost=True
+            )
+        if not found:
+            there = ", ".join(dict.fromkeys(chip.name for chip in chips)) or "none"
+            of_device = f" with device {config.device}" if config.device else ""
+            raise DeviceError(
+                f"no chip is called {config.chip}{of_device} in {self._root}; there are: {there}; load its driver, or "
+                "see `fantwin discover`",
+                is_lost=True,
+            )
+        return found[0]
+
+    def _connected(self) -> ChipFolder:
+        """The chip, if its folder is still that of this chip: a driver that is loaded again may take another number."""
+        chip = self._chip
+        if chip is None:
+            raise DeviceError("not connected", is_lost=True)
+        try:
+            name = (chip.path / "name").read_text(encoding="utf-8", errors="replace").strip()
+        except OSError as error:
+            raise DeviceError(f"{chip.name} has gone ({error.strerror}); waiting for it", is_lost=True) from error
+        if name != chip.name:
+            raise DeviceError(f"{chip.path.name} is {name} now, no longer {chip.name}", is_lost=True)
+        return chip
+
+    def _pwm(self, chip: ChipFolder, number: int) -> int:
+        """Without the command a reading is of no use."""
+        try:
+            return chip.number(f"pwm{number}")
+        except FileNotFoundError as error:
+            raise DeviceError(f"{chip.name} has no pwm{number}: correct pwms", is_lost=True) from error
+        except OSError as error:
+            raise DeviceError(f"pwm{number} of {chip.name} cannot be read: {error.strerror}") from error
+
+    def _speed(self, chip: ChipFolder, number: int) -> float:
+        rpm = _value(chip, f"fan{number}_input", 1.0)
+        # What the chip itself calls faulty is no measurement, but a fan that stands may well be a fault.
+        if rpm > 0.0 and _value(chip, f"fan{number}_fault", 1.0) > 0.0:
+            return math.nan
+        return rpm * self._unit_per_rpm
+
+    def _take_over(self, chip: ChipFolder, number: int) -> None:
+        if number in self._taken_over:
+            return
+        enable, mode = chip.path / f"pwm{number}_enable", self._mode(chip, number)
+        has_enable = enable.exists()
+        if number not in self._before:
+            automatic = self._quirks.automatic if self._quirks else None
+            try:
+                pwm = chip.number(f"pwm{number}")
+            except OSError:
+                pwm = None
+            self._before[number] = FoundPwm(automatic if has_enable and mode is None else mode, pwm)
+        try:
+            self._modes.keep(chip, self._before)
+        except OSError as error:
+            raise DeviceError(f"the mode of pwm{number} cannot be kept in run_folder: {error.strerror}") from error
+        if has_enable and mode != MANUAL:
+            _write(chip, enable.name, MANUAL)
+        self._taken_over.add(number)
+
+    def _mode(self, chip: ChipFolder, number: int) -> int | None:
+        """What pwmN_enable says; None if there is no such file, or it cannot be read."""
+        try:
+            return chip.number(f"pwm{number}_enable")
+        except OSError:
+            return None
+
+
+_SETTING = {"fan": "fans", "pwm": "pwms", "temp": "temperatures", "in": "voltages", "curr": "currents"}
+_MAY_WRITE = "run as root, or give it this group by a udev rule"
+
+
+def _of_each_fan(setting: str, numbers: Sequence[int], fans: Sequence[int]) -> tuple[int, ...]:
+    if len(numbers) not in (0, 1, len(fans)):
+        raise UserError(f"source.{setting} names {len(numbers)}: give one for all fans, or {len(fans)}")
+    return tuple(numbers) * (len(fans) if len(numbers) == 1 else 1)
+
+
+def _value(chip: ChipFolder, file: str, scale: float) -> float:
+    """NaN where the driver gives none: ENODATA, EIO, EAGAIN and others say so."""
+    try:
+        return chip.number(file) * scale
+    except OSError:
+        return math.nan
+
+
+def _temperature_c(chip: ChipFolder, number: int) -> float:
+    value = _value(chip, f"temp{number}_input", 1e-3)
+    return math.nan if value > HOTTEST_C else value
+
+
+def _write(chip: ChipFolder, file: str, value: int) -> None:
+    path = chip.path / file
+    try:
+        path.write_text(str(value), encoding="ascii")
+    except OSError as error:
+        remedy = f"; {_MAY_WRITE}" if error.errno in (errno.EACCES, errno.EPERM) else ""
+        raise DeviceError(f"{path} cannot be written: {error.strerror}{remedy}") from error

@@ -1,0 +1,93 @@
+"""The kinds of sources: one row each, and the only place that lists them.
+
+A row holds import strings, so that a process imports the source that its configuration names and no other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any, NamedTuple
+
+from fantwin.pipeline.sources.source import SampleSource, SourceConfig, SourceContext
+
+
+class SourceKind(NamedTuple):
+    """Import strings, `module:class`. The settings are apart: every process reads them, only acquisition connects."""
+
+    config: str
+    """a `SourceConfig`"""
+    source: str
+    """a `SampleSource`, built from that configuration and a `SourceContext`"""
+
+
+SOURCE_KINDS: dict[str, SourceKind] = {
+    "serial": SourceKind(
+        config="fantwin.pipeline.sources.serial.config:SerialConfig",
+        source="fantwin.pipeline.sources.serial.source:SerialSource",
+    ),
+    "mqtt": SourceKind(
+        config="fantwin.pipeline.sources.mqtt.config:MqttConfig",
+        source="fantwin.pipeline.sources.mqtt.source:MqttSource",
+    ),
+    "http": SourceKind(
+        config="fantwin.pipeline.sources.http.config:HttpConfig",
+        source="fantwin.pipeline.sources.http.source:HttpSource",
+    ),
+    "push": SourceKind(
+        config="fantwin.pipeline.sources.push.config:PushConfig",
+        source="fantwin.pipeline.sources.push.source:PushSource",
+    ),
+    "hwmon": SourceKind(
+        config="fantwin.pipeline.sources.hwmon.config:HwmonConfig",
+        source="fantwin.pipeline.sources.hwmon.source:HwmonSource",
+    ),
+    "modbus": SourceKind(
+        config="fantwin.pipeline.sources.modbus.config:ModbusConfig",
+        source="fantwin.pipeline.sources.modbus.source:ModbusSource",
+    ),
+    "redfish": SourceKind(
+        config="fantwin.pipeline.sources.redfish.config:RedfishConfig",
+        source="fantwin.pipeline.sources.redfish.source:RedfishSource",
+    ),
+}
+
+
+def parse_source(values: Any) -> SourceConfig:
+    """The settings of a source, checked by the model of its `kind`.
+
+    Raises:
+        ValueError: no such kind, or an unknown key.
+        ValidationError: a wrong value.
+    """
+    if isinstance(values, SourceConfig):
+        return values
+    if not isinstance(values, Mapping) or "kind" not in values:
+        raise ValueError(f'write source = {{ kind = "...", ... }}; kinds: {", ".join(SOURCE_KINDS)}')
+    kind = values["kind"]
+    if not isinstance(kind, str) or kind not in SOURCE_KINDS:
+        raise ValueError(f"unknown kind {kind!r}; known: {', '.join(SOURCE_KINDS)}")
+    model = source_config(kind)
+    for key in values:
+        if key not in model.model_fields:
+            raise ValueError(f"unknown key {key!r} of kind {kind!r}; known: {', '.join(model.model_fields)}")
+    return model.model_validate(values)
+
+
+def source_config(kind: str) -> type[SourceConfig]:
+    """The model of the settings of a kind."""
+    return _load(SOURCE_KINDS[kind].config)
+
+
+def build_source(config: SourceConfig, context: SourceContext) -> SampleSource:
+    """The source of these settings, not yet started.
+
+    Raises:
+        UserError: a setting is missing or cannot be used.
+    """
+    return _load(SOURCE_KINDS[config.kind].source)(config, context)
+
+
+def _load(import_string: str) -> Any:
+    module, _, name = import_string.partition(":")
+    return getattr(import_module(module), name)

@@ -1,0 +1,58 @@
+"""What a log of another system is to fantwin: fields with names, each with values at its own times.
+
+To add a format, write one file with a reader and add its row to pipeline/sources/logs/formats.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
+
+
+class LogError(UserError):
+    """A log that cannot be read: one line that says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """The values of a field: (n,) int64 ns, in the order of the log, and (n,) float64."""
+
+    t_ns: Array
+    values: Array
+
+    @property
+    def rate_hz(self) -> float:
+        """Values a second, by the median time between two; 0 where there are fewer than two."""
+        steps = np.diff(self.t_ns)
+        steps = steps[steps > 0]
+        return NS_PER_S / float(np.median(steps)) if len(steps) else 0.0
+
+
+class LogFile(Protocol):
+    """An open log, with all its numbers in memory or at hand."""
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """What is unusual about the log, one line each."""
+        ...
+
+    @property
+    def motor_poles(self) -> int | None:
+        """Magnetic poles of the motors, if the log says so: needed for speeds in electrical revolutions."""
+        ...
+
+    @property
+    def names(self) -> Sequence[str]:
+        """The names of the fields that have numbers."""
+        ...
+
+    def read(self, names: Sequence[str]) -> Mapping[str, Series]:
+        """Some fields by name. Raises LogError."""
+        ...

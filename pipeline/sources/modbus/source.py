@@ -1,0 +1,265 @@
+"""Fans behind Modbus as a source of samples: the registers that the configuration names, read at each poll.
+
+Registers that follow one another in one device are read by one request. A request that the device refuses, or a number
+that is none, is NaN; a device that does not answer is a failed poll.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.extras import require
+from fantwin.pipeline.sources.modbus.config import ModbusConfig, ModbusFan, Register
+from fantwin.pipeline.sources.polling import DeviceError, PollingSource
+from fantwin.pipeline.sources.source import Reading, SourceContext
+from fantwin.schemas.units import RAD_S_PER_UNIT
+
+if TYPE_CHECKING:
+    from pymodbus.client.base import ModbusBaseSyncClient
+
+MOST_REGISTERS = 120
+"""of one request; the protocol allows 125"""
+_FORMATS = {"u16": ">H", "s16": ">h", "u32": ">I", "s32": ">i", "f32": ">f"}
+
+
+class ModbusSource(PollingSource):
+    """A `SampleSource`."""
+
+    def __init__(self, config: ModbusConfig, context: SourceContext) -> None:
+        """Raises UserError if the extra is missing, or the fans are not those of the tray."""
+        super().__init__(ModbusDevice(config, context), config.period_s)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a register is: the device, the table of it, and the address."""
+
+    unit: int
+    table: str
+    address: int
+
+
+@dataclass(frozen=True)
+class _Request:
+    """Registers that are read together."""
+
+    first: _Place
+    count: int
+
+
+class ModbusDevice:
+    """A `PolledDevice`."""
+
+    def __init__(self, config: ModbusConfig, context: SourceContext) -> None:
+        require("source modbus", "devices", "pymodbus")
+        if context.fans != len(config.fan):
+            raise UserError(
+                f"fans = {context.fans}, and there are {len(config.fan)} [[tray.source.fan]]: name each fan"
+            )
+        self._config = config
+        self._port = str(context.folder / config.port) if config.port else ""
+        self._unit_per_rpm = RAD_S_PER_UNIT["rpm"] / RAD_S_PER_UNIT[context.speed_unit]
+        self._requests = tuple(_requests(config.fan))
+        self._client: ModbusBaseSyncClient | None = None
+
+    @property
+    def name(self) -> str:
+        """Host or port."""
+        config = self._config
+        return f"{config.host}:{config.tcp_port}" if config.host else config.port
+
+    @property
+    def settings_to_check(self) -> str:
+        """What may differ between the two ends."""
+        config = self._config
+        line = "" if config.host else f"baud = {config.baud}, parity = {config.parity!r}, "
+        return f"{line}unit and registers"
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether a fan has a register for commands."""
+        return any(fan.write for fan in self._config.fan)
+
+    def connect(self) -> None:
+        """Open the connection."""
+        self._client = client = self._made_client()
+        if not client.connect():
+            raise self._lost("cannot be opened or reached")
+
+    def read(self) -> Reading:
+        """Commands, speeds and what else has registers."""
+        words: dict[_Place, int] = {}
+        refused: list[str] = []
+        for request in self._requests:
+            self._ask(request, words, refused)
+        fans = self._config.fan
+        command = tuple(_value(words, fan.unit, fan.command) for fan in fans)
+        if any(map(math.isnan, command)):
+            why = f": {refused[0]}" if refused else ""
+            raise DeviceError(f"the command of fan {[*map(math.isnan, command)].index(True)} cannot be read{why}")
+        return Reading(
+            command=command,
+            speed=tuple(_value(words, fan.unit, fan.speed) * self._unit_per_rpm for fan in fans),
+            supply_voltage_v=_column(words, fans, "supply_voltage"),
+            current_a=_column(words, fans, "current"),
+            temperature_c=_column(words, fans, "temperature"),
+        )
+
+    def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
+        """Write commands to the registers that are declared for them."""
+        if not all(map(math.isnan, set_point)):
+            raise DeviceError("modbus fans take commands, no set-points")
+        wanted = [(fan, value) for fan, value in zip(self._config.fan, command, strict=True) if not math.isnan(value)]
+        for number, (fan, _) in enumerate(wanted):
+            if fan.write is None:
+                raise DeviceError(f"fan {number} has no register for commands (write)")
+        for fan, value in wanted:
+            assert fan.write is not None
+            self._write(fan.unit, fan.write, value)
+
+    def disconnect(self) -> None:
+        """Close the connection; the fans keep their commands."""
+        client, self._client = self._client, None
+        if client:
+            client.close()
+
+    def check(self) -> list[str]:
+        """Whether the serial port is there; a host is not asked."""
+        if self._port and not os.access(self._port, os.R_OK | os.W_OK):
+            return [f"{self._port}: no such port, or this user may not open it (group dialout); correct source.port"]
+        return []
+
+    def _made_client(self) -> ModbusBaseSyncClient:
+        from pymodbus.client import ModbusSerialClient, ModbusTcpClient  # noqa: PLC0415  slow to import
+
+        config = self._config
+        logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # a failure is a line of this source already
+        if config.host:
+            return ModbusTcpClient(config.host, port=config.tcp_port, timeout=config.timeout_s, retries=0)
+        return ModbusSerialClient(
+            self._port,
+            baudrate=config.baud,
+            parity=config.parity,
+            stopbits=config.stop_bits,
+            timeout=config.timeout_s,
+            retries=0,
+        )
+
+    def _ask(self, request: _Request, words: dict[_Place, int], refused: list[str]) -> None:
+        """Add the words that a request gives, none if the device refuses it."""
+        unit, table, address = request.first.unit, request.first.table, request.first.address
+        client = self._connected()
+        read = client.read_holding_registers if table == "holding" else client.read_input_registers
+        answer = self._answer(unit, lambda: read(address, count=request.count, device_id=unit))
+        if answer.isError():
+            refused.append(f"unit {unit} refuses {table} register {address} (exception {answer.exception_code})")
+            return
+        for number, word in enumerate(answer.registers[: request.count]):
+            words[_Place(unit, table, address + number)] = word
+
+    def _write(self, unit: int, register: Register, value: float) -> None:
+        client = self._connected()
+        number = (value - register.offset) / register.scale
+        packed = _packed(register, number)
+        answer = self._answer(unit, lambda: client.write_registers(register.address, packed, device_id=unit))
+        if answer.isError():
+            raise DeviceError(
+                f"unit {unit} refuses {value:g} for register {register.address} (exception {answer.exception_code})"
+            )
+
+    def _answer(self, unit: int, request: Any) -> Any:
+        from pymodbus.exceptions import ConnectionException, ModbusException  # noqa: PLC0415
+
+        try:
+            return request()
+        except ConnectionException as error:
+            raise self._lost("the connection is gone") from error
+        except ModbusException as error:
+            raise DeviceError(
+                f"unit {unit} does not answer within {self._config.timeout_s:g} s; check unit and wiring"
+            ) from error
+        except OSError as error:
+            raise self._lost(error.strerror or str(error)) from error
+
+    def _lost(self, what: str) -> DeviceError:
+        """The error of a lost line. For a port that no longer exists it says so, whatever failed."""
+        if self._port and not Path(self._port).exists():
+            what = "no such port, is it unplugged?"
+        return DeviceError(f"{what}; waiting for it", is_lost=True)
+
+    def _connected(self) -> ModbusBaseSyncClient:
+        if self._client is None:
+            raise DeviceError("not connected", is_lost=True)
+        return self._client
+
+
+def _registers(fan: ModbusFan) -> Iterator[Register]:
+    for register in (fan.speed, fan.command, fan.supply_voltage, fan.current, fan.temperature):
+        if register is not None:
+            yield register
+
+
+def _size(register: Register) -> int:
+    return struct.calcsize(_FORMATS[register.type]) // 2
+
+
+def _requests(fans: tuple[ModbusFan, ...]) -> Iterator[_Request]:
+    """The registers of all fans, those together that follow one another in one table of one device."""
+    places = {
+        (fan.unit, register.table, register.address + word)
+        for fan in fans
+        for register in _registers(fan)
+        for word in range(_size(register))
+    }
+    first: _Place | None = None
+    count = 0
+    for place in sorted(places):
+        if first and place == (first.unit, first.table, first.address + count) and count < MOST_REGISTERS:
+            count += 1
+            continue
+        if first:
+            yield _Request(first, count)
+        first, count = _Place(*place), 1
+    if first:
+        yield _Request(first, count)
+
+
+def _value(words: dict[_Place, int], unit: int, register: Register) -> float:
+    """NaN where a register was refused, or holds no number."""
+    found = [words.get(_Place(unit, register.table, register.address + word)) for word in range(_size(register))]
+    if register.word_order == "little":
+        found.reverse()
+    if None in found:
+        return math.nan
+    (number,) = struct.unpack(_FORMATS[register.type], struct.pack(f">{len(found)}H", *found))
+    return number * register.scale + register.offset if math.isfinite(number) else math.nan
+
+
+def _packed(register: Register, number: float) -> list[int]:
+    """The registers for a number. Raises DeviceError where it does not fit."""
+    kind = _FORMATS[register.type]
+    try:
+        data = struct.pack(kind, number if register.type == "f32" else round(number))
+    except (struct.error, OverflowError) as error:
+        raise DeviceError(f"{number:g} does not fit into {register.type} of register {register.address}") from error
+    words = list(struct.unpack(f">{len(data) // 2}H", data))
+    return words[::-1] if register.word_order == "little" else words
+
+
+def _column(words: dict[_Place, int], fans: tuple[ModbusFan, ...], name: str) -> tuple[float, ...]:
+    """A value for each fan, NaN for a fan without this register; empty if none has it."""
+    registers = [getattr(fan, name) for fan in fans]
+    if not any(registers):
+        return ()
+    return tuple(
+        math.nan if register is None else _value(words, fan.unit, register)
+        for fan, register in zip(fans, registers, strict=True)
+    )

@@ -1,0 +1,1 @@
+"""Samples from an MQTT broker."""

@@ -1,0 +1,99 @@
+"""A client of an MQTT broker (paho), with its user, its password and TLS, that connects again with growing delays."""
+
+from __future__ import annotations
+
+import ssl
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.mqtt.settings import BrokerSettings
+from fantwin.pipeline.sources.secret_file import read_secret, secret_of_environment
+
+if TYPE_CHECKING:
+    from paho.mqtt.client import Client
+
+RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 1, 10
+ANSWER_S = 5.0
+"""for a check"""
+NOT_REACHED = "the broker cannot be reached; check host and port, and whether it runs"
+
+
+def refusal(reason: object) -> str:
+    """The line about a broker that does not let this client in."""
+    return f"the broker refuses this client: {reason}; check username and password"
+
+
+def new_client(
+    settings: BrokerSettings, folder: Path, what: str, process: str, client_id: str = "", *, is_kept: bool = False
+) -> Client:
+    """A client that is not connected yet.
+
+    folder: relative paths start here. what: who it is for, in errors. process: of that name, which needs the
+    environment. client_id: the broker ends an older connection of the same one. is_kept: the broker keeps what comes
+    while the client is away; needs client_id.
+
+    Raises:
+        UserError: a password or certificate cannot be read.
+    """
+    from paho.mqtt import client as paho  # noqa: PLC0415  an extra
+    from paho.mqtt.enums import CallbackAPIVersion  # noqa: PLC0415
+
+    client = paho.Client(CallbackAPIVersion.VERSION2, client_id, clean_session=not is_kept, protocol=paho.MQTTv311)
+    client.reconnect_delay_set(RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S)
+    if settings.username:
+        password = None
+        if settings.password_file:
+            password = read_secret(folder / settings.password_file)
+        elif settings.password_env:
+            password = secret_of_environment(settings.password_env, process)
+        client.username_pw_set(settings.username, password)
+    if settings.tls:
+        ca, certificate, key = (
+            None if path is None else str(folder / path) for path in (settings.ca, settings.certificate, settings.key)
+        )
+        try:
+            client.tls_set(ca, certificate, key)
+        except (OSError, ssl.SSLError, ValueError) as error:
+            named = ", ".join(
+                f"{name} = {str(path)!r}"
+                for name, path in (("ca", settings.ca), ("certificate", settings.certificate), ("key", settings.key))
+                if path is not None
+            )
+            raise UserError(f"a certificate of {what} cannot be used: {named}: {error}") from error
+    return client
+
+
+def _of_tls(error: ssl.SSLError) -> str:
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"{error.verify_message}: check ca, and that host is a name in the certificate of the broker"
+    return "check port, and whether the broker has TLS there: if not, tls = false"
+
+
+def connection_problems(client: Client, settings: BrokerSettings, name: str) -> list[str]:
+    """Whether the broker answers and accepts a new client, which is not used afterwards; one line each.
+
+    name: of the connection, with which each line begins.
+    """
+    problems: list[str] = []
+    has_answered = threading.Event()
+
+    def on_connect(_client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        if reason.is_failure:
+            problems.append(f"{name}: the broker refuses: {reason}; check username and password")
+        has_answered.set()
+
+    client.on_connect = on_connect
+    try:
+        client.connect(settings.host, settings.port, keepalive=settings.keepalive_s)
+    except ssl.SSLError as error:
+        return [f"{name}: no connection by TLS: {error.strerror or error}; {_of_tls(error)}"]
+    except OSError as error:
+        return [f"{name}: cannot be reached: {error.strerror or error}; check host and port"]
+    client.loop_start()
+    if not has_answered.wait(ANSWER_S):
+        problems.append(f"{name}: what listens there does not answer as a broker; check host, port and tls")
+    client.disconnect()
+    client.loop_stop()
+    return problems

@@ -1,0 +1,240 @@
+"""Samples from an MQTT broker, and commands back to it.
+
+All runs in the thread of paho's client, which also connects again when the broker was away. While acquisition is
+behind, that thread waits, so that the broker keeps what comes (with QoS 1 or 2). What the broker had retained is no new
+sample: it is counted and left out, but for the commands of fans, which hold until the next one.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from fantwin.pipeline.extras import require
+from fantwin.pipeline.sources.fan_values import FanValues
+from fantwin.pipeline.sources.json_samples import JsonSamplesError, batches_of, parse_samples
+from fantwin.pipeline.sources.mqtt.client import NOT_REACHED, connection_problems, new_client, refusal
+from fantwin.pipeline.sources.mqtt.config import FAN, MqttConfig
+from fantwin.pipeline.sources.source import (
+    LinkDown,
+    LinkUp,
+    Reading,
+    ReadingBatch,
+    Rejected,
+    SourceContext,
+    SourceEvent,
+)
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
+from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
+
+if TYPE_CHECKING:
+    from paho.mqtt.client import Client, MQTTMessage
+
+MOST_RECENT = 64
+"""messages by which one that the broker sends again is recognised"""
+LONGEST_NUMBER = 40
+"""characters"""
+
+
+class MqttSource:
+    """A `SampleSource`."""
+
+    def __init__(self, config: MqttConfig, context: SourceContext) -> None:
+        """Nothing is connected yet.
+
+        Raises:
+            UserError: the extra is not installed, or a password or certificate cannot be read.
+        """
+        require("source mqtt", "devices", "paho")
+        self._config = config
+        self._deliver: Callable[[SourceEvent], None] = lambda _event: None
+        self._receipts = ReceiptTimes()
+        self._values = FanValues(context.fans)
+        self._topics = {
+            config.of_fan(pattern, fan): (fan, pattern == config.speed_topic)
+            for pattern in config.patterns
+            for fan in range(context.fans if config.has_values else 1)
+        }
+        """what is subscribed to; of numbers, which fan a topic is of, and whether it is its speed"""
+        self._foreign: deque[str] = deque(maxlen=MOST_RECENT)
+        """topics that are not of this tray, and were unsubscribed"""
+        self._recent: deque[tuple[str, bytes]] = deque(maxlen=MOST_RECENT)
+        self._is_up = False
+        self._is_refused = False
+        """by the broker, which ends the connection next"""
+        self._stopping = False
+        self._context = context
+        self._client = self._new_client(config.client_id)
+
+    @property
+    def name(self) -> str:
+        """The broker and the topics."""
+        return f"mqtt {self._config.host}:{self._config.port} {' and '.join(self._config.patterns)}"
+
+    @property
+    def settings_to_check(self) -> str:
+        """What may differ from what is published."""
+        names = ("speed_topic", "command_topic") if self._config.has_values else ("topic",)
+        return ", ".join(f"{name} = {getattr(self._config, name)!r}" for name in names)
+
+    def start(self, deliver: Callable[[SourceEvent], None]) -> None:
+        """Connect in a thread of its own, again and again where it fails."""
+        self._deliver = deliver
+        self._client.connect_async(self._config.host, self._config.port, keepalive=self._config.keepalive_s)
+        self._client.loop_start()
+
+    def stop(self) -> None:
+        """Leave the broker."""
+        self._stopping = True
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        """Publish a command, if the configuration has a topic for it and the broker is there. Set-points only go as
+        JSON."""
+        topic = self._config.send_topic
+        if not topic:
+            return self._config.why_no_commands
+        if not self._is_up:
+            return f"{self.name} is not connected"
+        if FAN not in topic:
+            given = {"command": command, "set_point": set_point}
+            values = {name: [None if math.isnan(x) else x for x in each] for name, each in given.items() if each}
+            is_sent = self._publish(topic, json.dumps(values))
+        elif not all(map(math.isnan, set_point)):
+            return f"a send_topic with {FAN} in it takes commands, no set-points"
+        else:
+            is_sent = all(
+                self._publish(self._config.of_fan(topic, fan), f"{value:.9g}")
+                for fan, value in enumerate(command)
+                if not math.isnan(value)
+            )
+        return "" if is_sent else f"{self.name} did not take it"
+
+    def check(self) -> list[str]:
+        """Whether the broker answers and accepts this client."""
+        # with an id of its own: the broker ends the connection of another client with the same one
+        client = new_client(self._config, self._context.folder, "source mqtt", "acquisition")
+        return connection_problems(client, self._config, self.name)
+
+    def _new_client(self, client_id: str) -> Client:
+        folder, is_kept = self._context.folder, bool(client_id)
+        client = new_client(self._config, folder, "source mqtt", "acquisition", client_id, is_kept=is_kept)
+        client.on_connect = self._on_connect
+        client.on_connect_fail = self._on_connect_fail
+        client.on_disconnect = self._on_disconnect
+        client.on_subscribe = self._on_subscribe
+        client.on_message = self._on_message
+        return client
+
+    def _publish(self, topic: str, text: str) -> bool:
+        return self._client.publish(topic, text, qos=self._config.qos).rc == 0
+
+    def _down(self, reason: str) -> None:
+        self._is_up = False
+        if not self._stopping:
+            self._deliver(LinkDown(reason))
+
+    def _on_connect(self, client: Client, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        if reason.is_failure:
+            self._is_refused = True
+            self._down(refusal(reason))
+            return
+        client.subscribe([(topic, self._config.qos) for topic in self._topics])
+
+    def _on_subscribe(self, _client: Any, _data: Any, _mid: Any, reasons: Any, _properties: Any) -> None:
+        failures = [str(reason) for reason in reasons if reason.is_failure]
+        if failures:
+            self._down(f"the broker refuses the subscription: {failures[0]}; check the rights of this user")
+            return
+        self._is_up = True
+        self._deliver(LinkUp())
+
+    def _on_connect_fail(self, _client: Any, _data: Any) -> None:
+        self._down(NOT_REACHED)
+
+    def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        if not self._is_refused:
+            self._down(f"the connection to the broker ended: {reason}; it is opened again")
+        self._is_refused = False
+
+    def _on_message(self, _client: Any, _data: Any, message: MQTTMessage) -> None:
+        received_t_ns, payload = HOST_CLOCK.now_ns(), bytes(message.payload)
+        try:
+            topic = message.topic
+            batches = self.batches(topic, payload, received_t_ns, message.retain, message.dup)
+            if not self._is_own(topic) and topic not in self._foreign:
+                self._foreign.append(topic)
+                self._client.unsubscribe(topic)
+        except Exception as error:  # noqa: BLE001  it would end the thread, and with it the source
+            detail = f"unexpected {type(error).__name__}: {error}"
+            batches = [_refused(received_t_ns, payload, Rejected("malformed", detail, is_sample=True))]
+        for batch in batches:
+            self._deliver(batch)
+
+    def _is_own(self, topic: str) -> bool:
+        """Whether this tray subscribes to a topic. With a client_id, the broker keeps earlier subscriptions."""
+        from paho.mqtt.client import topic_matches_sub  # noqa: PLC0415  an extra
+
+        return topic in self._topics or any(topic_matches_sub(_unshared(each), topic) for each in self._topics)
+
+    def batches(
+        self, topic: str, payload: bytes, received_t_ns: int, is_retained: bool = False, is_again: bool = False
+    ) -> list[ReadingBatch]:
+        """What a message has. is_retained: the broker had kept it. is_again: the broker may have sent it before."""
+        if not self._is_own(topic):
+            detail = f"{topic} is not a topic of this tray: the earlier subscription of client_id is ended"
+            return [_refused(received_t_ns, payload, Rejected("foreign_topic", detail, harmless=True))]
+        if self._config.has_values:
+            items = self._items_of_value(topic, payload, is_retained)
+            return [ReadingBatch(received_t_ns, tuple(items), len(payload))]
+        if is_retained:
+            return [_refused(received_t_ns, payload, Rejected("retained", "a sample of before", harmless=True))]
+        if is_again and (topic, payload) in self._recent:
+            return [_refused(received_t_ns, payload, Rejected("repeated", "sent twice by the broker", harmless=True))]
+        self._recent.append((topic, payload))
+        try:
+            found = parse_samples(payload)
+        except JsonSamplesError as error:
+            return [_refused(received_t_ns, payload, Rejected("malformed", f"{topic}: {error}", is_sample=True))]
+        return batches_of(found, received_t_ns, self._receipts, len(payload))
+
+    def _items_of_value(self, topic: str, payload: bytes, is_retained: bool) -> list[Reading | Rejected]:
+        value = _number(payload)
+        if value is None:
+            return [Rejected("malformed", f"{topic} has {payload[:LONGEST_NUMBER]!r}, which is no number")]
+        fan, is_speed = self._topics[topic]
+        if not is_speed:
+            ended = self._values.set_command(fan, value)
+            return [ended] if ended else []
+        if is_retained:
+            return [Rejected("retained", "a speed of before", harmless=True)]
+        readings = self._values.set_speed(fan, value)
+        if not readings and self._values.lacks_commands:
+            return [Rejected("no_command", "the command of a fan is not known yet", harmless=True)]
+        return list(readings)
+
+
+def _unshared(pattern: str) -> str:
+    """The topics that a subscription is for: one that is shared ($share/GROUP/...) begins with its group."""
+    return pattern.split("/", 2)[-1] if pattern.startswith("$share/") else pattern
+
+
+def _refused(received_t_ns: int, payload: bytes, rejected: Rejected) -> ReadingBatch:
+    return ReadingBatch(received_t_ns, (rejected,), len(payload))
+
+
+def _number(payload: bytes) -> float | None:
+    """The number that a payload has; NaN where it says that there is none, None where it is no number."""
+    text = payload[: LONGEST_NUMBER + 1].decode(errors="replace").strip()
+    if len(text) > LONGEST_NUMBER:
+        return None
+    if text.lower() in ("", "null", "nan", "none"):
+        return math.nan
+    try:
+        return float(text)
+    except ValueError:
+        return None

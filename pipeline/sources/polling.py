@@ -1,0 +1,292 @@
+"""Sources that are asked: a thread that reads a device at a period of its own, and everything that can go wrong in it.
+
+A poll is due each `period_s` from the first one on, by the monotonic clock. The time of a reading is the middle of its
+request: it is given as the device clock (the host's monotonic clock, us), so that readings keep their distances however
+long each request takes; docs/explanation/time.md says how times of samples follow from that. The sequence counts the
+polls that were due while the device was connected: one that failed or was left out is a gap, so that acquisition counts
+it as lost. Failures and late polls are counted by kind, too (`failed_polls`, `skipped_polls`).
+
+Nothing ends this thread but `stop`: an error of the device, or in the code that asks it, is a LinkDown with one line,
+and the device is connected again, at growing intervals.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+from pydantic import Field
+
+from fantwin.pipeline.sources.source import (
+    LinkDown,
+    LinkUp,
+    Reading,
+    ReadingBatch,
+    Rejected,
+    SourceConfig,
+    SourceEvent,
+)
+from fantwin.pipeline.timebase.device_clock import UINT32
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
+
+SLOWEST_S = 1.0
+"""between two samples that can be scored (resampler)"""
+MOST_FAILURES = 3
+"""in a row; the device is then taken for lost"""
+RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 0.5, 10.0
+"""the first delay doubles with every attempt, up to the second"""
+STOP_LIMIT_S = 5.0
+"""a request that takes longer does not delay the end"""
+WRITE_WAIT_S = 0.05
+"""for the outcome of a write; a device that is being asked takes it afterwards"""
+
+
+class PolledConfig(SourceConfig, frozen=True):
+    """Base of the settings of a source that is asked."""
+
+    period_s: float = Field(default=0.5, gt=0, le=SLOWEST_S, description="time between two readings")
+
+
+class DeviceError(Exception):
+    """A request that failed: one line that says why, and what to do. is_lost: there is no connection any more."""
+
+    def __init__(self, reason: str, *, is_lost: bool = False) -> None:
+        super().__init__(reason)
+        self.is_lost = is_lost
+
+
+class PolledDevice(Protocol):
+    """What is asked. All is called in one thread, but `name`, `settings_to_check` and `check`."""
+
+    @property
+    def name(self) -> str:
+        """What people call it."""
+        ...
+
+    @property
+    def settings_to_check(self) -> str:
+        """See SampleSource."""
+        ...
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether it takes commands."""
+        ...
+
+    def connect(self) -> None:
+        """Find it, or open a connection. Raises DeviceError."""
+        ...
+
+    def read(self) -> Reading | Rejected:
+        """One reading, NaN for a value that cannot be read; what is not to be taken for one, with the reason.
+
+        Raises DeviceError where nothing can be read.
+        """
+        ...
+
+    def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
+        """See SampleSource.send. Raises DeviceError."""
+        ...
+
+    def disconnect(self) -> None:
+        """Leave it as it was found. Raises DeviceError, or nothing."""
+        ...
+
+    def check(self) -> list[str]:
+        """What would keep it from being read now, one line each."""
+        ...
+
+
+class _Write:
+    """A command on its way to the thread, and what came of it."""
+
+    def __init__(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
+        self.command, self.set_point = command, set_point
+        self.is_done = threading.Event()
+        self.failure = ""
+        """why the command could not be written; empty if it was"""
+        self.is_awaited = True
+        """its sender still waits for the outcome"""
+
+
+class PollingSource:
+    """A `SampleSource` made of a device that is asked."""
+
+    def __init__(self, device: PolledDevice, period_s: float) -> None:
+        self.device = device
+        self._period_s = period_s
+        self._deliver: Callable[[SourceEvent], None] = lambda _event: None
+        self._stopping = False
+        self._wake = threading.Condition()
+        self._writes: list[_Write] = []
+        self._is_connected = False
+        self._thread: threading.Thread | None = None
+        self._sequence = 0
+
+    @property
+    def name(self) -> str:
+        """That of the device."""
+        return self.device.name
+
+    @property
+    def settings_to_check(self) -> str:
+        """Those of the device."""
+        return self.device.settings_to_check
+
+    def start(self, deliver: Callable[[SourceEvent], None]) -> None:
+        """Poll in a thread; wait for a device that is not there yet."""
+        self._deliver = deliver
+        self._thread = threading.Thread(target=self._run, name=f"poll {self.name}", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End after the request that is under way, and leave the device as it was found."""
+        with self._wake:
+            self._stopping = True
+            self._wake.notify_all()
+        if self._thread:
+            self._thread.join(STOP_LIMIT_S)
+
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        """Pass a command to the thread. Returns why the device did not take it.
+
+        A write that fails after WRITE_WAIT_S is counted as `failed_writes`.
+        """
+        write = _Write(command, set_point)
+        with self._wake:
+            if not self.device.is_writable:
+                return f"{self.name} takes no commands"
+            if not self._is_connected or self._stopping:
+                return f"{self.name} is not connected"
+            self._writes.append(write)
+            self._wake.notify_all()
+        write.is_done.wait(WRITE_WAIT_S)
+        with self._wake:
+            write.is_awaited = False
+            return write.failure
+
+    def check(self) -> list[str]:
+        """What would keep the device from being read."""
+        return self.device.check()
+
+    def _run(self) -> None:
+        delay_s, reported = RECONNECT_DELAY_S, ""
+        while not self._stopping:
+            try:
+                self.device.connect()
+                first = self._read()  # connected is what can be read
+            except Exception as error:  # noqa: BLE001  a library may raise anything, and no thread may end silently
+                reason = _reason(error)
+                self._disconnect()
+            else:
+                delay_s, reported = RECONNECT_DELAY_S, ""
+                reason = self._poll_until_lost(first)
+                self._disconnect()
+            if self._stopping:
+                return
+            if reason != reported:
+                self._deliver(LinkDown(reason))
+                reported = reason
+            with self._wake:
+                self._wake.wait_for(lambda: self._stopping, delay_s)
+            delay_s = min(2.0 * delay_s, RECONNECT_DELAY_MAX_S)
+
+    def _disconnect(self) -> None:
+        with self._wake:
+            self._is_connected = False
+            writes, self._writes = self._writes, []
+        for write in writes:
+            self._finish(write, "the connection was lost before it was written")
+        try:
+            self.device.disconnect()
+        except Exception as error:  # noqa: BLE001
+            self._count("failed_writes", f"it could not be left as it was found: {_reason(error)}")
+
+    def _read(self) -> Reading | Rejected:
+        """A reading with the time of the middle of its request."""
+        began_s = time.monotonic()
+        reading = self.device.read()
+        if isinstance(reading, Rejected):
+            return reading
+        return replace(reading, clock_us=round((began_s + time.monotonic()) / 2.0 * 1e6) % UINT32)
+
+    def _poll_until_lost(self, first: Reading | Rejected) -> str:
+        """Deliver readings until the device is lost, or `stop` is called; returns why it is lost."""
+        with self._wake:
+            self._is_connected = True
+        self._deliver(LinkUp())
+        due_s = time.monotonic()
+        self._deliver_reading(first)
+        failures = 0
+        while True:
+            due_s = self._next_due_s(due_s)
+            if not self._wait_until(due_s):
+                return ""
+            try:
+                reading = self._read()
+            except Exception as error:  # noqa: BLE001
+                failures += 1
+                self._sequence += 1
+                if failures == MOST_FAILURES or not isinstance(error, DeviceError) or error.is_lost:
+                    return _reason(error)
+                self._count("failed_polls", _reason(error))
+            else:
+                failures = 0
+                self._deliver_reading(reading)
+
+    def _next_due_s(self, due_s: float) -> float:
+        """When the poll after the one at due_s is to begin. Those that are over are left out, and counted."""
+        late_s = time.monotonic() - due_s
+        skipped = max(0, math.ceil(late_s / self._period_s) - 1)
+        self._sequence += skipped
+        if skipped:
+            took = (
+                f"{late_s:.2g} s passed since the last one was due, period_s = {self._period_s:g}: choose a longer one"
+            )
+            self._count("skipped_polls", took, skipped)
+        return due_s + (skipped + 1) * self._period_s
+
+    def _wait_until(self, due_s: float) -> bool:
+        """Write what is sent until a poll is due; returns whether to go on."""
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._stopping or self._writes, max(0.0, due_s - time.monotonic()))
+                if self._stopping:
+                    return False
+                if not self._writes:
+                    return True
+                write = self._writes.pop(0)
+            try:
+                self.device.write(write.command, write.set_point)
+            except Exception as error:  # noqa: BLE001
+                self._finish(write, _reason(error))
+            else:
+                self._finish(write, "")
+
+    def _finish(self, write: _Write, failure: str) -> None:
+        with self._wake:
+            write.failure = failure
+            write.is_done.set()
+            is_known = write.is_awaited
+        if failure and not is_known:
+            self._count("failed_writes", failure)
+
+    def _deliver_reading(self, reading: Reading | Rejected) -> None:
+        item = replace(reading, sequence=self._sequence % UINT32) if isinstance(reading, Reading) else reading
+        self._sequence += 1
+        self._deliver(ReadingBatch(HOST_CLOCK.now_ns(), (item,)))
+
+    def _count(self, kind: str, detail: str, times: int = 1) -> None:
+        settings = "period_s" if kind == "skipped_polls" else ""
+        rejected = Rejected(kind, detail, setting=settings)
+        self._deliver(ReadingBatch(HOST_CLOCK.now_ns(), (rejected,) * times))
+
+
+def _reason(error: Exception) -> str:
+    """One line."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, DeviceError) else f"unexpected {type(error).__name__}: {text}; waiting for it"

@@ -1,0 +1,1 @@
+"""Samples that a Python program pushes over the bus."""

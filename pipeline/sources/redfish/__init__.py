@@ -1,0 +1,1 @@
+"""Samples of the fans of a server, from its baseboard controller."""

@@ -1,0 +1,246 @@
+"""Fans of a server by Redfish: the objects of the fans, in the older schema (Thermal) or the newer (ThermalSubsystem).
+
+A speed is what is given in rpm. Redfish has no standard duty: the command is what `command` points to, by default the
+percentage that the newer schema gives beside the speed. Nothing is written.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import stat
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from fantwin.pipeline.extras import require
+from fantwin.pipeline.sources.polling import DeviceError, PollingSource
+from fantwin.pipeline.sources.redfish.config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
+from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
+from fantwin.schemas.units import RAD_S_PER_UNIT
+
+if TYPE_CHECKING:
+    from sushy.main import Sushy
+
+Json = Mapping[str, Any]
+OTHERS_MAY_READ = stat.S_IRWXG | stat.S_IRWXO
+
+
+class RedfishSource(PollingSource):
+    """A `SampleSource`."""
+
+    def __init__(self, config: RedfishConfig, context: SourceContext) -> None:
+        """Raises UserError if the extra is missing, or a password would be sent in the clear."""
+        super().__init__(RedfishDevice(config, context), config.period_s)
+
+
+class RedfishDevice:
+    """A `PolledDevice`."""
+
+    is_writable = False
+
+    def __init__(self, config: RedfishConfig, context: SourceContext) -> None:
+        require("source redfish", "devices", "sushy")
+        self._config = config
+        self._fans = context.fans
+        self._folder = context.folder
+        self._unit_per_rpm = RAD_S_PER_UNIT["rpm"] / RAD_S_PER_UNIT[context.speed_unit]
+        self._root: Sushy | None = None
+        self._chassis: Json = {}
+
+    @property
+    def name(self) -> str:
+        """The address."""
+        return self._config.url
+
+    @property
+    def settings_to_check(self) -> str:
+        """What may not fit the controller."""
+        return "source.fans, source.command"
+
+    def connect(self) -> None:
+        """Log in, and find the chassis."""
+        import sushy  # noqa: PLC0415  slow to import
+        from sushy.auth import BasicAuth, SessionOrBasicAuth  # noqa: PLC0415
+
+        config = self._config
+        logging.getLogger("sushy").setLevel(logging.CRITICAL)  # a failure is a line of this source already
+        user, password = self._credentials()
+        if user and config.url.startswith("http:"):
+            raise DeviceError(f"{config.url} would send the password in the clear: use https", is_lost=True)
+        # sushy takes 0 for its own number of attempts, and waits between them; the poller tries again by itself
+        options: dict[str, Any] = {
+            "verify": str(self._folder / config.ca) if config.ca and config.verify else config.verify,
+            "read_timeout": config.timeout_s,
+            "connect_timeout": config.timeout_s,
+            "server_side_retries": 1,
+            "server_side_retries_delay": 0.01,
+        }
+
+        def log_in() -> Any:
+            return sushy.Sushy(
+                config.url,
+                auth=SessionOrBasicAuth(user, password) if user else BasicAuth("", ""),
+                **options,
+            )
+
+        self._root = self._asked(log_in)
+        self._chassis = self._find_chassis()
+
+    def read(self) -> Reading | Rejected:
+        """Speeds and commands of the fans, and the temperature if asked for."""
+        fans = self._chosen(self._fan_objects())
+        command = tuple(_number(fan, self._config.command) for fan in fans)
+        if all(map(math.isnan, command)):
+            return Rejected(
+                "unknown_command",
+                f"no fan has a number at {self._config.command}: say where its command is",
+                is_sample=True,
+                setting="source.command",
+            )
+        temperature_c = (self._temperature_c(),) * len(fans) if self._config.temperature else ()
+        speed = tuple(_rpm(fan) * self._unit_per_rpm for fan in fans)
+        return Reading(command=command, speed=speed, temperature_c=temperature_c)
+
+    def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
+        """Redfish has no standard command."""
+        del command, set_point
+        raise DeviceError("redfish fans take no commands")
+
+    def disconnect(self) -> None:
+        """Log out."""
+        root, self._root = self._root, None
+        connector = getattr(root, "_conn", None)
+        if connector is not None:
+            auth = getattr(connector, "_auth", None)
+            if auth is not None:
+                auth.close()
+            connector.close()
+
+    def check(self) -> list[str]:
+        """Whether the credentials can be read; the controller is not asked."""
+        try:
+            self._credentials()
+        except DeviceError as error:
+            return [str(error)]
+        return []
+
+    def _credentials(self) -> tuple[str, str]:
+        """User and password; both empty if there are none."""
+        if self._config.credentials is None:
+            return os.environ.get(USER_VARIABLE, ""), os.environ.get(PASSWORD_VARIABLE, "")
+        path = self._folder / self._config.credentials
+        try:
+            if path.stat().st_mode & OTHERS_MAY_READ:
+                raise DeviceError(f"{path}: others may read it; chmod 600 {path}", is_lost=True)
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except OSError as error:
+            raise DeviceError(f"{path}: {error.strerror}; correct source.credentials", is_lost=True) from error
+        except UnicodeDecodeError as error:
+            raise DeviceError(f"{path}: is no text in UTF-8: save it as such", is_lost=True) from error
+        if len(lines) < 2:
+            raise DeviceError(f"{path}: write the user in its first line and the password in its second", is_lost=True)
+        return lines[0].strip(), lines[1]
+
+    def _asked(self, request: Any) -> Any:
+        """What a request gives. Raises DeviceError, whose text has no credentials."""
+        from sushy import exceptions  # noqa: PLC0415
+
+        try:
+            return request()
+        except exceptions.AccessError as error:
+            raise DeviceError("user or password is refused, or lacks rights", is_lost=True) from error
+        except exceptions.HTTPError as error:
+            raise DeviceError(f"refused with HTTP status {error.status_code}") from error
+        except exceptions.ConnectionError as error:
+            text = str(error)
+            if "CERTIFICATE_VERIFY_FAILED" in text or "certificate" in text.lower():
+                why = "its certificate cannot be verified: name the authority by source.ca"
+            else:
+                why = f"does not answer within {self._config.timeout_s:g} s, or cannot be reached"
+            raise DeviceError(f"{why}; waiting for it", is_lost=True) from error
+        except (exceptions.SushyError, ValueError) as error:
+            raise DeviceError(f"no Redfish service: {type(error).__name__}") from error
+
+    def _get(self, path: str) -> Json:
+        root = self._root
+        if root is None:
+            raise DeviceError("not connected", is_lost=True)
+        # The connection of sushy, which knows the fans of the older schema only.
+        found = self._asked(lambda: root._conn.get(path).json())
+        if not isinstance(found, Mapping):
+            raise DeviceError(f"{path} is no object")
+        return found
+
+    def _find_chassis(self) -> Json:
+        members = [_link(each) for each in _list(self._get("/redfish/v1/Chassis"), "Members")]
+        found = {}
+        for path in filter(None, members):
+            chassis = self._get(path)
+            if "ThermalSubsystem" in chassis or "Thermal" in chassis:
+                found[str(chassis.get("Id", path))] = chassis
+        wanted = self._config.chassis
+        if wanted and wanted in found:
+            return found[wanted]
+        names = ", ".join(found) or "none"
+        if not wanted and len(found) == 1:
+            return next(iter(found.values()))
+        which = f"no chassis {wanted!r} with fans" if wanted else f"{len(found)} chassis with fans"
+        raise DeviceError(f"{which}; there are: {names}; name one by source.chassis", is_lost=True)
+
+    def _fan_objects(self) -> list[Json]:
+        subsystem = _link(self._chassis.get("ThermalSubsystem"))
+        if not subsystem:
+            return _list(self._get(_link(self._chassis.get("Thermal"))), "Fans")
+        fans = _list(self._get(_link(self._get(subsystem).get("Fans"))), "Members")
+        return [fan if len(fan) > 1 else self._get(_link(fan)) for fan in fans]  # some controllers expand the members
+
+    def _chosen(self, fans: Sequence[Json]) -> list[Json]:
+        wanted = self._config.fans
+        by_name: dict[str, Json] = {}
+        for fan in fans:
+            for key in ("Name", "FanName", "MemberId", "Id"):
+                if name := fan.get(key):
+                    by_name.setdefault(str(name), fan)
+        if lacking := [name for name in wanted if name not in by_name]:
+            raise DeviceError(f"no fan {lacking[0]!r}; there are: {', '.join(by_name)}")
+        chosen = [by_name[name] for name in wanted] if wanted else list(fans)
+        if len(chosen) != self._fans:
+            raise DeviceError(f"{len(chosen)} fans, this tray has {self._fans}: correct fans, or source.fans")
+        return chosen
+
+    def _temperature_c(self) -> float:
+        wanted = self._config.temperature
+        subsystem = _link(self._chassis.get("ThermalSubsystem"))
+        if not subsystem:
+            sensors = _list(self._get(_link(self._chassis.get("Thermal"))), "Temperatures")
+            return next((_number(each, "/ReadingCelsius") for each in sensors if each.get("Name") == wanted), math.nan)
+        metrics = self._get(_link(self._get(subsystem).get("ThermalMetrics")))
+        return _number(metrics, f"/TemperatureSummaryCelsius/{wanted}/Reading")
+
+
+def _link(value: Any) -> str:
+    return str(value.get("@odata.id", "")) if isinstance(value, Mapping) else ""
+
+
+def _list(value: Json, key: str) -> list[Json]:
+    found = value.get(key)
+    return [each for each in found if isinstance(each, Mapping)] if isinstance(found, list) else []
+
+
+def _number(value: Any, pointer: str) -> float:
+    """The number at a JSON pointer; NaN if there is none."""
+    for part in pointer.strip("/").split("/"):
+        value = value.get(part.replace("~1", "/").replace("~0", "~")) if isinstance(value, Mapping) else None
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if is_number else math.nan
+
+
+def _rpm(fan: Json) -> float:
+    """NaN where a fan gives no rpm, or is absent."""
+    status = fan.get("Status")
+    if isinstance(status, Mapping) and status.get("State") in ("Absent", "Disabled"):
+        return math.nan
+    if not math.isnan(rpm := _number(fan, "/SpeedPercent/SpeedRPM")):
+        return rpm
+    return _number(fan, "/Reading") if fan.get("ReadingUnits") == "RPM" else math.nan

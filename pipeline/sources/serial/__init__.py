@@ -1,0 +1,1 @@
+"""Samples from a serial line, in frames or as lines of text."""

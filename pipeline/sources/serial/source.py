@@ -1,0 +1,130 @@
+"""The serial line as a source of samples: the wire protocol of docs/reference/wire-protocol.md on a serial port."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from collections.abc import Callable
+from typing import Protocol
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.serial.config import SerialConfig
+from fantwin.pipeline.sources.serial.counters import DeviceCounterSteps
+from fantwin.pipeline.sources.serial.port import ReceivedBytes, SerialPort
+from fantwin.pipeline.sources.source import (
+    LinkDown,
+    LinkUp,
+    Reading,
+    ReadingBatch,
+    Rejected,
+    SourceContext,
+    SourceEvent,
+    too_many_fans,
+)
+from fantwin.schemas import wire
+
+_HARMLESS = (wire.FaultKind.RESYNC, wire.FaultKind.UNKNOWN_TYPE)
+_REFUSED_SAMPLES = (wire.FaultKind.WRONG_FAN_COUNT, wire.FaultKind.BAD_COMMAND)
+
+
+class ByteLink(Protocol):
+    """Carries bytes both ways and knows no protocol. `SerialPort` says what each method does."""
+
+    def start(self, deliver: Callable[[LinkUp | LinkDown | ReceivedBytes], None]) -> None: ...  # noqa: D102
+    def stop(self) -> None: ...  # noqa: D102
+    def write(self, data: bytes) -> bool: ...  # noqa: D102
+
+
+class SerialSource:
+    """A `SampleSource`. Frames are decoded in the thread that reads the port."""
+
+    def __init__(self, config: SerialConfig, context: SourceContext, link: ByteLink | None = None) -> None:
+        """The port is not opened yet; a test may give another `link`.
+
+        Raises:
+            UserError: no port is given, or a frame cannot carry so many fans.
+        """
+        if context.fans > wire.MAX_FANS:
+            raise UserError(too_many_fans(config.kind, context.fans, wire.MAX_FANS))
+        if not config.port:
+            raise UserError('port is missing; add for example port = "/dev/ttyUSB0"')
+        self._path = context.folder / config.port
+        self._config = config
+        self._link = link or SerialPort(str(self._path), config.baud)
+        self._decoder = wire.Decoder(config.protocol, context.fans)
+        self._device_counters = DeviceCounterSteps()
+        self._fans = context.fans
+
+    @property
+    def name(self) -> str:
+        """The port as the configuration names it."""
+        return self._config.port
+
+    @property
+    def settings_to_check(self) -> str:
+        """What may differ between the two ends of the line."""
+        return f"baud = {self._config.baud}, protocol = {self._config.protocol!r}"
+
+    def start(self, deliver: Callable[[SourceEvent], None]) -> None:
+        """Open and read the port in a thread of its own."""
+        self._link.start(lambda item: deliver(self.decode(item)))
+
+    def stop(self) -> None:
+        """Deliver what has already arrived, then end."""
+        self._link.stop()
+
+    def decode(self, item: LinkUp | LinkDown | ReceivedBytes) -> SourceEvent:
+        """The readings that these bytes complete. Pieces of the stream that are not frames are `Rejected`."""
+        if not isinstance(item, ReceivedBytes):
+            self._decoder.reset()
+            self._device_counters.connection_interrupted()
+            return item
+        readings: list[Reading | Rejected] = []
+        device_counts: Counter[str] = Counter()
+        for found in self._decoder.feed(item.data):
+            if isinstance(found, wire.DeviceCounters):
+                device_counts.update(self._device_counters.steps(found))
+            else:
+                readings.append(self._reading_of(found))
+        return ReadingBatch(item.received_t_ns, readings, len(item.data), device_counts=device_counts)
+
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
+        """Write one frame for commands and one for set-points, where a value is given."""
+        frames = ((command, wire.CommandFrame(command)), (set_point, wire.SetPointFrame(set_point)))
+        is_written = self._link.write(
+            b"".join(
+                wire.encode(self._config.protocol, frame)
+                for values, frame in frames
+                if not all(map(math.isnan, values))
+            )
+        )
+        return "" if is_written else f"{self.name} is not connected, or accepted no bytes"
+
+    def check(self) -> list[str]:
+        """Whether the port exists and may be opened."""
+        if not self._path.exists():
+            return [f"{self._path}: no such port; connect the device, or correct [[tray]] port"]
+        if not os.access(self._path, os.R_OK | os.W_OK):
+            return [f"{self._path}: this user may not read and write it; join its group (often dialout)"]
+        return []
+
+    def _reading_of(self, found: wire.Frame | wire.Fault) -> Reading | Rejected:
+        if isinstance(found, wire.Sample):
+            return Reading(
+                found.command,
+                found.speed,
+                found.clock_us,
+                found.sequence,
+                found.supply_voltage_v,
+                found.current_a,
+                found.temperature_c,
+            )
+        assert isinstance(found, wire.Fault), "commands and set-points are not for the decoder of a host"
+        return Rejected(
+            found.kind.value,
+            found.detail,
+            harmless=found.kind in _HARMLESS,
+            is_sample=found.kind in _REFUSED_SAMPLES,
+            setting=f"fans = {self._fans}" if found.kind is wire.FaultKind.WRONG_FAN_COUNT else "",
+        )

@@ -1,0 +1,1 @@
+"""Tables of measured samples, and how their columns become samples of fans."""

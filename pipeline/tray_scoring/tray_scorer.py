@@ -1,0 +1,263 @@
+"""How one tray is scored: a block of predictions in, its scores and the messages on alarms out.
+
+Samples become bins (scoring.model.bins). At the end of each, the model of a healthy fan and the evidence for its faults
+are brought up to date (scoring.model.decision), fans that stand or turn against their command are looked for
+(scoring.standing), and so is slow wear (scoring.wear). Whatever is wrong becomes one alarm of the fan, with a state
+after OPC UA Part 9 (scoring.alarms) and causes (scoring.diagnosis). They are built and connected here.
+See docs/explanation/deciding.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin, ScorerConfig
+from fantwin.schemas.enums import Severity, Statistic
+from fantwin.schemas.messages import Alarm, Array, Diagnosis, Prediction, Score
+from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_manager import AlarmManager, Measured
+from fantwin.scoring.alarms.alarm_text import AlarmText
+from fantwin.scoring.alarms.fan_condition import ConditionSettings
+from fantwin.scoring.alarms.tray_conditions import Decided
+from fantwin.scoring.diagnosis.advice import KNOWN_SOON, SeenSinceOnset
+from fantwin.scoring.diagnosis.cause_words import CauseWords, PossibleCause
+from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE, is_of_standstill
+from fantwin.scoring.diagnosis.standstill_causes import Standing, standstill_causes
+from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
+from fantwin.scoring.model.decision import Decision
+from fantwin.scoring.model.saved import as_json, from_json, part, within
+from fantwin.scoring.samples import IDLE, among, arrived
+from fantwin.scoring.score_message import ScoreColumns, score_of
+from fantwin.scoring.standing.against_command import KINDS, AgainstCommand
+from fantwin.scoring.standing.falls import Falls
+from fantwin.scoring.wear.wear_monitor import WearMonitor
+
+NO_READING = KINDS.index(Standing.NO_READING)
+NAMED_AFTER_S, FALLING_S = 3.0, 4.0
+"""an onset is so old before a cause is named; so long after an alarm a fan that has lost much speed may come to rest"""
+
+
+class TrayScorer:
+    """The scores, alarms and wear of one tray's fans. What it tells of a fan is that of the end of the last bin."""
+
+    def __init__(self, fans: int, text: AlarmText, config: ScorerConfig, twin: HealthyTwin) -> None:
+        """Begin with fans of which nothing is known but their twin, and without an alarm."""
+        self.fans, self.twin = fans, twin
+        self._alarm_share = config.alarm_share
+        self._words = CauseWords(twin.advice, has_supply=twin.has_supply)
+        self.wear = WearMonitor(fans, config.wear_every_s)
+        self._against = AgainstCommand(twin.standstill, twin.tachos) if twin.standstill else None
+        self.alarms = AlarmManager(fans, ConditionSettings(config.latching, config.confirming), text)
+        self._period_ns = 0
+        self._open(NS_PER_S)
+        self._period_ns = 0  # of no sample yet
+        self._stands = np.zeros(fans, np.bool_)
+        """(fans,) against its command"""
+        self._kind = np.zeros(fans, np.int64)
+        """(fans,) what it does against its command, number in KINDS"""
+        self._seen = np.zeros((4, fans))
+        """(4, fans) lowest and highest speed, lowest and highest command since an alarm was raised"""
+        self._now = ScoreColumns.empty(fans)
+
+    def _open(self, period_ns: int) -> None:
+        """Begin with samples of this period; what was learned of the fans goes on."""
+        twin, before = self.twin, self._decision if self._period_ns else None
+        bin_ns = bin_ns_of(period_ns, float(twin.fans.held_s.min()))
+        self._period_ns = period_ns
+        self._bins = Bins(bin_ns, twin.fans.top_rad_s, twin.unseen_error)
+        period_s = period_ns / NS_PER_S
+        self._decision = Decision(twin.fans, bin_ns, period_s, twin.declared_s, twin.priors, twin.limit_factor)
+        self._falls = Falls(twin.fans, self._decision.bin_s)
+        if before is not None:
+            self._decision.go_on_from(before)
+
+    def score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
+        """The score of a block of new samples, and the messages on alarms."""
+        if item.period_ns != self._period_ns:
+            self._open(item.period_ns)
+        if self._against:
+            self._against.take(item)
+        columns = ScoreColumns.empty(len(item.t_ns), self.fans)
+        alarms: list[Alarm] = []
+        begin = 0
+        for one in self._bins.take(item):
+            columns.fill(slice(begin, one.row), self._now)
+            begin = one.row
+            alarms += self._decide(one, item)
+        columns.fill(slice(begin, len(item.t_ns)), self._now)
+        return score_of(item, columns, self._bins.unseen_rad_s), alarms
+
+    def recommission(self, fans: Array, t_ns: int) -> None:
+        """Forget what was learned of some fans, (fans,) of bool, after the sample at t_ns."""
+        if fans.any():
+            self._decision.begin_again(fans)
+            self.wear.forget(fans, t_ns)
+            if self._against:
+                self._against.forget(fans)
+
+    def measured(self, fan: int) -> Measured:
+        """See FanFacts."""
+        decision = self._decision
+        residual, std = float(decision.deviation_rad_s[fan]), float(decision.deviation_std_rad_s[fan])
+        statistic = Statistic(int(self._now.statistic[fan]))
+        speed = float(decision.now.speed_rad_s[fan]) if decision.now else 0.0
+        slow = self.wear.of(fan)
+        if statistic == Statistic.WEAR and slow:
+            residual, std = slow.change * speed, slow.std_error * speed
+        torque = float(self.twin.fans.slope(np.full(self.fans, speed))[fan]) if decision.in_balance[fan] else 0.0
+        as_speed = 0.0 if decision.in_balance[fan] else 1.0
+        return Measured(
+            residual_rad_s=as_speed * residual,
+            residual_std_rad_s=as_speed * std,
+            torque_balance_command=-torque * residual,
+            torque_balance_std_command=torque * std,
+            statistic=statistic,
+            score=float(np.nan_to_num(self._now.score[fan])),
+        )
+
+    def causes(self, fan: int, known: tuple[Diagnosis, ...] = ()) -> tuple[Diagnosis, ...]:
+        """See FanFacts."""
+        decision, falls, command = self._decision, self._falls, float(self._seen[3, fan])
+        kind = KINDS[self._kind[fan]]
+        if kind == Standing.NOT_STARTED and known and is_of_standstill(known[0]):
+            return known  # how it came to rest says more than that it does not start
+        if self._stands[fan] and kind is not None:
+            fall = falls.of(fan) if kind == Standing.CAME_TO_REST and falls.is_falling[fan] else None
+            return standstill_causes(kind, fall, command)
+        if decision.active[fan]:
+            return self._causes_of_deviation(fan, command)
+        words, seen, fan_of_twin = self._words, self._seen_since(fan, 0.0), self.twin.steady_fans[fan]
+        if decision.missing.is_active[fan]:
+            dropout = PossibleCause(SENSOR_DROPOUT, 1.0, float(decision.missing.share[fan]), np.nan)
+            return words.of([dropout], seen, fan_of_twin)
+        slow = self.wear.of(fan)
+        if slow and self.wear.is_over[fan]:
+            return words.of([PossibleCause(SLOW_CHANGE, 1.0, slow.change, slow.std_error)], seen, fan_of_twin)
+        return ()
+
+    @property
+    def stands_against_command(self) -> Array:
+        """See FanFacts."""
+        return self._stands | (self._decision.active & self._falls.stands)
+
+    def _causes_of_deviation(self, fan: int, command: float) -> tuple[Diagnosis, ...]:
+        decision, falls = self._decision, self._falls
+        if falls.stands[fan]:
+            return standstill_causes(Standing.CAME_TO_REST, falls.of(fan), command)
+        alarm = decision.alarms.get(fan)
+        if alarm is None:  # it is of before a gap
+            return ()
+        is_new = decision.raised_s(fan) < FALLING_S
+        if alarm.age_s < NAMED_AFTER_S or (is_new and falls.is_falling[fan]):
+            return (Diagnosis(cause=CANNOT_TELL, probability=1.0, evidence=f"{CAUSES[CANNOT_TELL]}: {KNOWN_SOON}"),)
+        return self._words.of(alarm.causes(), self._seen_since(fan, alarm.age_s), self.twin.steady_fans[fan])
+
+    def _seen_since(self, fan: int, age_s: float) -> SeenSinceOnset:
+        slowest, fastest, lowest, highest = self._seen[:, fan].tolist()
+        return SeenSinceOnset(age_s, slowest, fastest, lowest, highest, bool(self._falls.stands[fan]))
+
+    def _decide(self, one: Bin, item: Prediction) -> list[Alarm]:
+        """Bring all up to date with the end of a bin; returns the messages on alarms."""
+        decision, against, row = self._decision, self._against, one.row
+        decision.take(one)
+        assert decision.now is not None
+        self._falls.take(decision.now)
+        nothing = np.zeros(self.fans, np.bool_)
+        self._stands = nothing
+        if against:
+            self._kind = np.where(against.kind[row] > 0, against.kind[row], self._kind)
+            is_loose = (self._kind == NO_READING) & decision.missing.explains_silence
+            self._stands = against.active[row] & ~is_loose
+        score = decision.score
+        is_steady = one.judged & ~self._stands & ~decision.has_alarm & (score < ScoreColumns.SUSPECT_FROM)
+        self.wear.update(one.t_ns, is_steady, lambda: decision.model.age)
+        is_worn = self.wear.is_over
+        active = decision.has_alarm | self._stands | is_worn
+        idle = among(item.invalid_reason[row], *IDLE)
+        is_silent = (decision.missing.is_active | self._stands) & arrived(item.invalid_reason[row])
+        judged = one.judged | idle | is_silent
+        self._see(one, self.alarms.active)
+        self._now = self._columns(score, active, is_worn, against.score[row] if against else np.zeros(self.fans))
+        is_large = self._stands | (np.abs(decision.fault[0]) >= self._alarm_share)
+        began_ns = np.where(decision.active, decision.number - decision.onset + 1, 1)
+        decided = Decided(
+            one.t_ns,
+            judged,
+            active,
+            np.where(is_large, int(Severity.ALARM), int(Severity.WARNING)),
+            one.t_ns - began_ns * round(decision.bin_s * NS_PER_S),
+            round(decision.bin_s * NS_PER_S),
+        )
+        return self.alarms.update(decided, self)
+
+    def _columns(self, score: Array, active: Array, is_worn: Array, against: Array) -> ScoreColumns:
+        """What the score message says of the fans until the end of the next bin."""
+        decision = self._decision
+        assert decision.now is not None
+        expected = decision.model.expected_rad_s
+        is_missing = ~decision.active & (decision.missing.score > decision.deviation_score)
+        statistic = np.where(is_missing, int(Statistic.MISSING_READINGS), int(Statistic.DEVIATION))
+        statistic = np.where(is_worn & ~decision.has_alarm, int(Statistic.WEAR), statistic)
+        statistic = np.where(self._stands, int(Statistic.STANDSTILL), statistic)
+        return ScoreColumns(
+            score=np.maximum(score, np.where(self._stands, against.clip(1.0), 0.0)),
+            statistic=statistic.astype(np.uint8),
+            is_active=active,
+            is_returning=active & ~self._stands & ~is_worn & ~decision.missing.is_active & decision.is_returning,
+            expected_residual_rad_s=expected,
+            expected_balance_command=-expected * self.twin.fans.slope(decision.now.speed_rad_s),
+        )
+
+    def _see(self, one: Bin, was_active: Array) -> None:
+        """Keep what speeds and commands there were since an alarm; before one, those of now."""
+        speed = np.where(np.isfinite(one.measured_rad_s), np.abs(one.measured_rad_s), np.abs(one.predicted_rad_s))
+        now = np.stack((speed, speed, one.command, one.command))
+        lowest, highest = np.fmin(self._seen[::2], now[::2]), np.fmax(self._seen[1::2], now[1::2])
+        self._seen[::2] = np.where(was_active, lowest, now[::2])
+        self._seen[1::2] = np.where(was_active, highest, now[1::2])
+
+    def snapshot(self) -> dict[str, Any]:
+        """The state to continue from, as JSON values."""
+        times, arrays = self._decision.snapshot()
+        open_t_ns, of_bins = self._bins.snapshot()
+        arrays |= {
+            **within("bins", of_bins),
+            **within("falls", self._falls.arrays()),
+            **within("now", vars(self._now)),
+            "seen": self._seen,
+            "kind": self._kind,
+        }
+        if self._against:
+            arrays |= within("against", self._against.kept())
+        return {
+            "model": {
+                "period_ns": self._period_ns,
+                "open_t_ns": open_t_ns,
+                **times,
+                "arrays": as_json(arrays),
+            },
+            "alarms": self.alarms.snapshot(),
+            "wear": self.wear.snapshot(),
+        }
+
+    def restore_model(self, state: Mapping[str, Any]) -> None:
+        """Restore what was learned, of a snapshot of the same twin: all but the alarms' conditions.
+
+        Raises:
+            ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError: it cannot be read. Then
+                a part may have been restored.
+        """
+        self.wear.restore(state["wear"])
+        of_model = state["model"]
+        stored = from_json(of_model["arrays"])
+        self._open(int(of_model["period_ns"]) or NS_PER_S)
+        self._decision.restore(stored, int(of_model["t_ns"]))
+        self._bins.restore(int(of_model["open_t_ns"]), part("bins", stored))
+        self._falls.restore(part("falls", stored))
+        if self._against:
+            self._against.restore(part("against", stored))
+        self._now = ScoreColumns(**part("now", stored))
+        self._seen, self._kind = stored["seen"], stored["kind"]

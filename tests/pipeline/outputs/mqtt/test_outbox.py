@@ -1,0 +1,132 @@
+"""What waits for the broker: one text a topic, urgent ones first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.outputs.mqtt.fan_states import FanStates
+from fantwin.pipeline.outputs.mqtt.outbox import MOST_ANSWERS, Outbox, Outgoing
+from fantwin.pipeline.outputs.mqtt.topics import do_overlap
+from fantwin.pipeline.outputs.mqtt.transition_queue import TransitionQueue
+from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.messages import Score
+from fantwin.schemas.topics import tray_key
+from tests.stages.test_gateway import alarm, score
+from tests.support.running_core import FANS, SITE, TRAY
+
+
+def texts(outbox: Outbox, most: int = 100) -> list[str]:
+    return [f"{message.topic} {message.text}" for message in outbox.take(most)]
+
+
+def test_only_the_newest_text_of_a_topic_is_sent_and_urgent_ones_first():
+    outbox = Outbox()
+    for text in "123":
+        outbox.retain("a", text)
+        outbox.retain("b", text)
+    outbox.retain("c", "1", is_urgent=True)
+    outbox.retain("b", "4", is_urgent=True)
+    outbox.answer("d", "1")
+    assert texts(outbox, 2) == ["c 1", "b 4"]
+    assert texts(outbox) == ["d 1", "a 3"]
+    outbox.retain("a", "3")
+    assert texts(outbox) == [], "it has not changed"
+
+
+def test_after_a_new_connection_all_that_is_retained_is_sent_again_and_what_was_removed_is_not():
+    outbox = Outbox()
+    outbox.retain("a", "1")
+    outbox.retain("b", "1")
+    outbox.answer("c", "1")
+    outbox.take(100)
+    outbox.remove("b")
+    assert outbox.take(100) == [Outgoing("b", "", is_retained=True)]
+    outbox.renew()
+    assert texts(outbox) == ["a 1"]
+
+
+def test_answers_do_not_pile_up():
+    outbox = Outbox()
+    for number in range(2 * MOST_ANSWERS):
+        outbox.answer("a", str(number))
+    assert len(outbox) == MOST_ANSWERS
+    assert texts(outbox)[0] == f"a {MOST_ANSWERS}"
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ("fantwin/hall/#", "fantwin/hall/tray1/0/state", True),
+        ("fantwin/hall/#", "fantwin/hall", True),
+        ("fantwin/hall/#", "#", True),
+        ("fantwin/hall/#", "+/+/tray1", True),
+        ("fantwin/hall/#", "fantwin/+/tray1/+/rpm", True),
+        ("fantwin/hall/#", "fantwin/hall2/tray1", False),
+        ("fantwin/hall/#", "fantwin", False),
+        ("fantwin/hall/#", "plant/#", False),
+        ("a/b", "a/b/c", False),
+    ],
+)
+def test_whether_patterns_have_a_topic_in_common(first, second, expected):
+    assert do_overlap(first, second) == do_overlap(second, first) == expected
+
+
+def test_the_state_of_a_fan_is_published_again_only_when_it_has_changed(tmp_path):
+    trays = (TrayConfig(name=TRAY, fans=FANS),)
+    model = SiteModel(SITE, trays, AlarmStore(tmp_path / "alarms.sqlite"), keeps_curves=False)
+    states = FanStates(model)
+
+    def changed(made: Score, *, is_full: bool = False) -> list[int]:
+        model.add_score(Envelope.of(tray_key(SITE, TRAY, "score"), made, 0))
+        return [fan.number for fan in states.changed(is_full=is_full, with_silent=False)]
+
+    assert changed(score()) == list(range(FANS))
+    assert changed(score(1.0), is_full=True) == []
+    assert changed(score(2.0, state=FanState.SUSPECT)) == [2]
+    faster = replace(score(3.0, state=FanState.SUSPECT), measured_speed_rad_s=np.full((5, FANS), 200.0))
+    assert changed(faster) == [], "a number alone waits for the period"
+    assert len(changed(replace(faster, t_ns=faster.t_ns + 1), is_full=True)) == FANS
+
+
+def filled(folder: Path, count: int) -> AlarmStore:
+    store = AlarmStore(folder / "alarms.sqlite")
+    for number in range(count):
+        store.add(alarm(sequence=number))
+    return store
+
+
+def test_transitions_are_done_without_a_gap_only(tmp_path):
+    store = filled(tmp_path, 5)
+    queue = TransitionQueue(store, 100)
+    assert [number for number, _ in queue.take(3)] == [1, 2, 3]
+    queue.acknowledge(3)
+    queue.acknowledge(2)
+    assert queue.waiting == 5
+    again = TransitionQueue(store, 100)
+    assert [number for number, _ in again.take(9)] == [1, 2, 3, 4, 5], "after a crash all that may be missing"
+    queue.acknowledge(1)
+    assert queue.waiting == 2
+    assert [number for number, _ in TransitionQueue(store, 100).take(9)] == [4, 5]
+    queue.acknowledge(77)
+    assert [number for number, _ in queue.take(9)] == [4, 5]
+
+
+def test_of_too_many_that_wait_the_oldest_are_lost(tmp_path):
+    store = filled(tmp_path, 2)
+    queue = TransitionQueue(store, 3)
+    queue.take(1)
+    for number in range(2, 8):
+        store.add(alarm(sequence=number))
+        queue.notice_new()
+    assert queue.lost == 4
+    assert [number for number, _ in queue.take(9)] == [6, 7, 8]
+    queue.acknowledge(1)
+    assert queue.waiting == 3

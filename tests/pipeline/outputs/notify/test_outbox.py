@@ -1,0 +1,120 @@
+"""The outbox: what survives, what is lost, and what a file that cannot be understood does."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.outputs.notify.deciding import Announced, Event, Kind
+from fantwin.pipeline.outputs.notify.fan_alarm import after
+from fantwin.pipeline.outputs.notify.gathering import Gathered, Happened
+from fantwin.pipeline.outputs.notify.notifications import Basket, Changes, Outgoing, Saved
+from fantwin.pipeline.outputs.notify.outbox import Outbox
+from fantwin.pipeline.outputs.notify.wording import Level, Text
+from fantwin.schemas.units import NS_PER_S
+from tests.support.notified_alarms import START_NS, alarm
+
+TEXT = Text("WARNING, fan 2", "fan 2 of tray1", Level.WARNING)
+FAN = ("tray1", 2)
+EVENT = Event("tray1", 2, START_NS, Kind.RAISED)
+
+
+def save(outbox: Outbox, saved: Saved, changes: Changes, *, seconds: float = 0.0, most_messages: int = 10) -> None:
+    now_ns = START_NS + round(seconds * NS_PER_S)
+    outbox.save(saved, changes, most_messages=most_messages, kept_s=60.0, now_ns=now_ns)
+
+
+def texts(*targets: str) -> Changes:
+    return Changes(outgoing=[Outgoing(target, TEXT, START_NS) for target in targets])
+
+
+@pytest.fixture
+def outbox(tmp_path: Path) -> Outbox:
+    return Outbox(tmp_path / "outbox", ["mail", "chat"])
+
+
+def test_all_that_was_decided_is_there_again(outbox, tmp_path):
+    assert outbox.load() == Saved()
+    heard = after(None, alarm(), START_NS)
+    assert heard
+    saved = Saved(
+        is_first=False,
+        alarms={FAN: heard},
+        announced={("mail", FAN): Announced(START_NS, 1, True, START_NS)},
+        gathered={("mail", Basket.HELD): Gathered(1, 2, 3, {FAN: Happened((Kind.RAISED, Kind.AGAIN), 4)})},
+    )
+    changes = Changes({FAN}, {("mail", FAN)}, {("mail", Basket.HELD)}, {("mail", EVENT)}, texts("mail").outgoing)
+    save(outbox, saved, changes)
+    outbox.close()
+    again = Outbox(tmp_path / "outbox", ["mail", "chat"])
+    assert again.load() == saved
+    assert again.was_sent("mail", EVENT) and not again.was_sent("chat", EVENT)
+    waiting = again.next_for("mail")
+    assert waiting and waiting.text == TEXT and not waiting.may_be_repeated
+    assert again.next_for("chat") is None
+
+
+def test_a_delivery_that_was_under_way_may_be_repeated(outbox, tmp_path):
+    save(outbox, Saved(), texts("mail", "mail"))
+    first = outbox.next_for("mail")
+    outbox.begin(first)
+    outbox.close()
+    again = Outbox(tmp_path / "outbox", ["mail"])
+    found = again.next_for("mail")
+    assert found and (found.number, found.may_be_repeated) == (first.number, True)
+    again.delivered("mail", found)
+    second = again.next_for("mail")
+    assert second and not second.may_be_repeated
+
+
+def test_the_oldest_are_lost_and_the_next_one_knows_how_many(outbox):
+    save(outbox, Saved(), texts(*["mail"] * 5), most_messages=3)
+    assert (outbox.count(), outbox.lost) == (3, {"mail": 2})
+    save(outbox, Saved(), Changes(), seconds=50)
+    assert outbox.count() == 3
+    outbox.begin(outbox.next_for("mail"))
+    save(outbox, Saved(), Changes(), seconds=61)
+    assert (outbox.count(), outbox.lost) == (1, {"mail": 4}), "what is under way is not lost"
+    last = outbox.next_for("mail")
+    assert last.lost == 4
+    outbox.delivered("mail", last)
+    save(outbox, Saved(), texts("mail"))
+    assert outbox.next_for("mail").lost == 0, "it was said once"
+
+
+def test_messages_of_a_target_that_is_gone_are_lost_and_counted(outbox, tmp_path):
+    save(outbox, Saved(), texts("mail", "chat", "chat"))
+    outbox.close()
+    again = Outbox(tmp_path / "outbox", ["mail"])
+    assert (again.count(), again.lost) == (1, {"chat": 2})
+
+
+def test_nothing_is_saved_by_halves(outbox):
+    with pytest.raises(KeyError):
+        save(outbox, Saved(), Changes(alarms={FAN}, outgoing=texts("mail").outgoing))
+    heard = after(None, alarm(), START_NS)
+    assert heard
+    outbox._file.execute("DROP TABLE event")
+    with pytest.raises(sqlite3.Error):
+        save(outbox, Saved(alarms={FAN: heard}), Changes({FAN}, events={("mail", EVENT)}))
+    assert outbox._file.execute("SELECT COUNT(*) FROM alarm").fetchone() == (0,)
+
+
+def test_a_file_that_cannot_be_understood_is_named(outbox, tmp_path):
+    outbox._file.execute("INSERT INTO alarm VALUES ('tray1', 2, 'nonsense')")
+    with pytest.raises(UserError, match="move it away"):
+        outbox.load()
+    (tmp_path / "text").write_text("this is no database, and long enough to be seen as such\n" * 20)
+    with pytest.raises(UserError, match="messages cannot be kept there"):
+        Outbox(tmp_path / "text", ["mail"])
+
+
+def test_a_file_that_is_damaged_while_it_is_used_ends_nothing(outbox):
+    outbox._file.execute("DROP TABLE event")
+    assert not outbox.was_sent("mail", EVENT)
+    with pytest.raises(sqlite3.Error):
+        save(outbox, Saved(), texts("mail"))
+    assert outbox.next_for("mail") is None, "what cannot be decided for good is not sent"

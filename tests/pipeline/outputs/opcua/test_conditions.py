@@ -1,0 +1,92 @@
+"""Alarms as conditions of Part 9, and that the library can send each of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+pytest.importorskip("asyncua")
+
+from asyncua.ua.ua_binary import variant_to_binary
+
+from fantwin.pipeline.outputs.opcua.conditions import ALL_FIELDS, Condition, ConditionBook, event_id, past_condition
+from fantwin.pipeline.outputs.opcua.events import condition_event, system_event
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.schemas.enums import Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.scoring.alarms.current_alarms import current_alarms
+from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from tests.stages.test_gateway import NOW_NS, TRAY, alarm
+
+
+def after(*alarms: Alarm) -> Condition:
+    """The condition of fan 2 after these messages."""
+    book, heard = ConditionBook(), list[Alarm]()
+    condition = Condition(Fan(TRAY, 2))
+    for each in alarms:
+        heard.append(each)
+        condition = book.add(each, current_alarms(heard)[0])
+    assert book.of(Fan(TRAY, 2)) is condition
+    return condition
+
+
+def test_raised_worse_acknowledged_and_cleared():
+    raised = after(alarm(severity=Severity.WARNING)).fields(NOW_NS)
+    assert (raised["ActiveState/Id"], raised["AckedState/Id"], raised["Retain"]) == (True, False, True)
+    assert (raised["Severity"], raised["LastSeverity"]) == (500, 0)
+    worse = after(alarm(severity=Severity.WARNING), alarm(Transition.SEVERITY, 1)).fields(NOW_NS)
+    assert (worse["Severity"], worse["LastSeverity"]) == (900, 500)
+    over = after(alarm(), alarm(Transition.CLEARED, 1, active=False)).fields(NOW_NS)
+    assert (over["ActiveState/Id"], over["Retain"]) == (False, True), "until it is acknowledged"
+    done = after(alarm(), alarm(Transition.ACKNOWLEDGED, 1, active=False, acknowledged=True, confirmed=True))
+    assert done.retain is False
+
+
+def test_a_comment_stays_until_the_next_and_that_of_a_refused_request_does_not_count():
+    said = alarm(Transition.ACKNOWLEDGED, 1, acknowledged=True, operator_name="ann", comment="seen")
+    refused = alarm(Transition.REFUSED, 2, acknowledged=True, operator_name="bob", comment="no")
+    cleared = alarm(Transition.CLEARED, 3, active=False, acknowledged=True)
+    of_earlier = {"marked_onset_t_ns": 5, "comment": "a door was open"}
+    marked = alarm(Transition.MARKED_FALSE, 4, active=False, acknowledged=True, **of_earlier)
+    fields = after(alarm(), said, refused, cleared, marked).fields(NOW_NS)
+    assert (fields["Comment"], fields["ClientUserId"]) == ("seen", "ann")
+
+
+def test_the_cause_names_all_that_are_as_likely():
+    tie = (Diagnosis(cause="blocked", probability=0.4), Diagnosis(cause="no_power", probability=0.4))
+    fields = after(alarm(causes=tie)).fields(NOW_NS)
+    assert (fields["Cause"], fields["CauseProbability"]) == ("blocked or no power", 0.4)
+
+
+def test_shelving_counts_down():
+    shelved = after(alarm(Transition.SHELVED, shelved_until_t_ns=NOW_NS + 60 * 10**9))
+    fields = shelved.fields(NOW_NS + 10 * 10**9)
+    assert (fields["ShelvingState/CurrentState"], fields["ShelvingState/UnshelveTime"]) == ("Timed Shelved", 50_000.0)
+    assert fields["SuppressedOrShelved"] is True
+    once = after(alarm(Transition.SHELVED, shelved_until_t_ns=UNTIL_IT_CLEARS_T_NS)).fields(NOW_NS)
+    assert once["ShelvingState/CurrentState"] == "One Shot Shelved"
+
+
+def test_events_have_different_names_which_a_restart_does_not_change():
+    first, second = alarm(), alarm(Transition.CLEARED, 1)
+    assert event_id(first) != event_id(second)
+    assert event_id(first) == event_id(alarm())
+    assert event_id(replace(first, header=Header("another", 0, TRAY))) != event_id(first)
+
+
+@pytest.mark.parametrize(
+    "condition",
+    [
+        Condition(Fan(TRAY, 1)),
+        past_condition(alarm(causes=())),
+        after(alarm(), alarm(Transition.ACKNOWLEDGED, 1, acknowledged=True, operator_name="ann", comment="x")),
+        after(alarm(Transition.DATA_LOST, stale=True, t_ns=0)),
+    ],
+)
+def test_every_field_can_be_sent(condition):
+    event = condition_event(condition, 2)
+    assert event.fields.keys() == {*ALL_FIELDS, "NodeId"}
+    for path, value in [*event.fields.items(), *system_event("RefreshStartEventType", "x").fields.items()]:
+        assert variant_to_binary(value), path

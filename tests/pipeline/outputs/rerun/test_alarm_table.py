@@ -1,0 +1,88 @@
+"""The table of alarms in the view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fantwin.pipeline.outputs.rerun.alarm_table import ALARMS_LISTED, AlarmTable
+from fantwin.schemas.enums import Severity, Statistic, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis
+from tests.stages.test_viewer import FLUSH_PERIOD_NS, REPEAT_STATES_NS, FakeSink, core_of, sent
+from tests.support.score_data import START_NS, made_up_tray
+
+
+class Transitions:
+    """Makes alarms with rising sequence numbers."""
+
+    def __init__(self, table: AlarmTable) -> None:
+        self._table = table
+        self._count = 0
+
+    def add(self, fan: int, transition: Transition, **more: Any) -> None:
+        self._count += 1
+        onset_t_ns = START_NS + fan * 1_000_000_000
+        fields = {"active": True, "severity": Severity.ALARM, "confirmed": True, "t_ns": onset_t_ns, "score": 2.0}
+        fields |= {"residual_rad_s": 0.0, "residual_std_rad_s": 1.0, "statistic": Statistic.DEVIATION, "message": "so"}
+        header = Header("scorer", self._count, "tray1")
+        self._table.add(
+            Alarm(header=header, fan=fan, onset_t_ns=onset_t_ns, transition=transition, **{**fields, **more})
+        )
+
+
+def rows(table: AlarmTable) -> list[str]:
+    return [line for line in table.text().splitlines() if line.startswith("| ")][1:]
+
+
+def test_active_alarms_come_first_with_cause_and_who_has_seen_them_and_those_over_and_seen_are_gone() -> None:
+    table = AlarmTable()
+    assert rows(table) == [] and table.text().startswith("#### No alarms")
+    alarms = Transitions(table)
+    alarms.add(1, Transition.RAISED)
+    alarms.add(1, Transition.DIAGNOSED, causes=(Diagnosis(cause="drag_up", probability=0.9),))
+    alarms.add(2, Transition.RAISED, severity=Severity.WARNING)
+    alarms.add(3, Transition.RAISED)
+    alarms.add(3, Transition.CLEARED, active=False)
+    alarms.add(1, Transition.ACKNOWLEDGED, acknowledged=True, operator_name="ann|b")
+    assert rows(table) == [
+        r"| **tray1/1** | alarm | 22:13:21 | more drag 90 % | ann\|b |",
+        "| **tray1/2** | warning | 22:13:22 | speed off, evidence 2 x its limit | nobody |",
+        "| tray1/3 | over | 22:13:23 |  | nobody |",
+    ]
+    assert table.text().startswith("#### 2 active, 1 over")
+    alarms.add(3, Transition.ACKNOWLEDGED, active=False, acknowledged=True)
+    alarms.add(2, Transition.SUPPRESSED, severity=Severity.WARNING, suppressed=True)
+    alarms.add(1, Transition.DATA_LOST, stale=True)
+    assert [row.split(" | ")[1] for row in rows(table)] == ["alarm, no data", "warning, silenced"]
+
+
+def test_of_many_alarms_the_newest_are_listed_and_the_rest_counted() -> None:
+    table = AlarmTable()
+    alarms = Transitions(table)
+    for fan in range(ALARMS_LISTED + 5):
+        alarms.add(fan, Transition.RAISED)
+    assert len(rows(table)) == ALARMS_LISTED and rows(table)[0].startswith(f"| **tray1/{ALARMS_LISTED + 4}**")
+    assert "and 5 more: `fantwin alarms` lists them" in table.text()
+
+
+def test_the_table_is_shown_when_it_changes_and_repeated_for_viewers_that_join_late() -> None:
+    sink = FakeSink()
+    scores, alarms = made_up_tray(seconds=20)
+    core = core_of(sink)
+    alarms = [replace(alarm, header=replace(alarm.header, sequence=n)) for n, alarm in enumerate(alarms)]
+    for number, item in enumerate(sorted([*scores, *alarms], key=lambda item: int(max_of(item)))):
+        core.step(sent(item))
+        core.tick(number * FLUSH_PERIOD_NS)
+    heads = [((t_ns - START_NS) / 1e9, table.splitlines()[0]) for t_ns, table in sink.tables]
+    changes = [head for before, head in zip(["", *(h for _, h in heads)], (h for _, h in heads), strict=False)]
+    assert list(dict.fromkeys(changes)) == ["#### No alarms", "#### 1 active, 0 over", "#### 0 active, 1 over"]
+    times = [at_s for at_s, _ in heads]
+    assert times[0] < 1.0 and times[-1] > 14.5 and max(np.diff(times)) < REPEAT_STATES_NS / 1e9 + 0.6
+    assert len(times) <= 8
+
+
+def max_of(item: Any) -> int:
+    return item.t_ns if isinstance(item.t_ns, int) else int(item.t_ns[-1])

@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+
+import matplotlib.image
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from typer.testing import CliRunner
+
+from fantwin.pipeline.cli.main import app
+from fantwin.pipeline.cli.recordings.plot import plot
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.outputs.rerun import band_plot
+from fantwin.pipeline.outputs.rerun.band_plot import Fault, plot_bands, plot_recording, read_trace
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.site.trace import SILENT, trace_of
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.messages import Alarm, Score
+from fantwin.schemas.topics import tray_key
+from tests.support.score_data import START_NS, made_up_tray
+
+FAULT = Fault("covered-inlet", 2, START_NS + 8_000_000_000, START_NS + 14_000_000_000)
+
+
+def test_every_state_has_a_colour_of_its_own() -> None:
+    names = {state.words for state in FanState} - {FanState.UNKNOWN.words}
+    assert set(band_plot.STATE_COLORS) == names
+    assert len({*band_plot.STATE_COLORS.values(), band_plot.UNKNOWN_COLOR}) == len(names) + 1
+    styles = pytest.importorskip("fantwin.pipeline.outputs.rerun.rerun_styles", exc_type=ModuleNotFoundError)
+    assert set(styles.STATE_COLORS) == {*names, SILENT}
+    assert len({*styles.STATE_COLORS.values(), styles.UNKNOWN_COLOR}) == len(names) + 2
+
+
+def luminance(color: tuple[int, int, int]) -> float:
+    """Relative luminance of an sRGB colour (WCAG 2)."""
+    linear = [c / 3294.6 if c <= 10 else ((c / 255 + 0.055) / 1.055) ** 2.4 for c in color]
+    return float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
+
+
+@pytest.mark.parametrize("background", [(13, 16, 17), (255, 255, 255)], ids=["dark", "light"])
+def test_every_line_is_legible_on_the_dark_and_on_the_light_background(background: tuple[int, int, int]) -> None:
+    styles = pytest.importorskip("fantwin.pipeline.outputs.rerun.rerun_styles", exc_type=ModuleNotFoundError)
+    for color in (styles.RED, *styles.FAN_COLORS):
+        lighter, darker = sorted((luminance(color), luminance(background)), reverse=True)
+        assert (lighter + 0.05) / (darker + 0.05) > 3.0, f"contrast of {color}, as WCAG asks of graphics"
+
+
+def test_the_band_is_green_and_red_zones_appear_only_during_an_alarm(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(fans=3)
+    trace = trace_of("tray1", scores, "rad/s")
+    share = {}
+    for fan in (0, 2):
+        plot_bands(trace, tmp_path / "bands.png", fans=[fan])
+        share[fan] = {color: coverage(tmp_path / "bands.png", color) for color in (band_plot.BAND, ZONE_ON_WHITE)}
+    assert share[0][band_plot.BAND] > 0.02 and share[2][band_plot.BAND] > 0.02
+    assert share[2][ZONE_ON_WHITE] > 0.05
+    assert share[0][ZONE_ON_WHITE] < 0.005  # its key in the legend
+
+
+def test_what_was_measured_beside_has_a_panel_with_its_unit_below_each_fan() -> None:
+    scores, _ = made_up_tray(fans=3)
+    volts = [replace(score, supply_voltage_v=np.full(score.command.shape, 12.0, np.float32)) for score in scores]
+    figure = band_plot._figure(trace_of("tray1", volts, "rpm"), [1, 2], [FAULT])
+    assert [axes.get_ylabel() for axes in figure.axes] == ["speed (rpm)", "supply\n(V)", ""] * 2
+    (line,) = figure.axes[1].lines
+    assert np.nanmax(np.asarray(line.get_ydata(), float)) == 12.0
+    unknown = [replace(score, supply_voltage_v=np.full(score.command.shape, np.nan, np.float32)) for score in scores]
+    assert len(band_plot._figure(trace_of("tray1", unknown, "rpm"), [1, 2], [FAULT]).axes) == 4
+
+
+def test_a_title_has_the_time_of_each_alarm_once_however_often_it_begins_to_return() -> None:
+    scores, _ = made_up_tray(fans=1, faulty_fan=None, gap_fan=None)
+    trace = trace_of("tray1", scores, "rad/s")
+    state = np.full(trace.state.shape, int(FanState.NORMAL), trace.state.dtype)
+    for first, last in ((100, 160), (170, 200), (300, 310)):
+        state[first:last] = int(FanState.ALARM)
+    state[160:170] = int(FanState.RETURNING)
+    in_alarm = state != int(FanState.NORMAL)
+    figure = band_plot._figure(replace(trace, state=state, in_alarm=in_alarm), [0], [])
+    raised_s = (trace.t_ns[[100, 300]] - trace.t_ns[0]) / 1e9
+    assert f"alarm at {raised_s[0]:.1f} s, {raised_s[1]:.1f} s" in figure.axes[0].get_title(loc="left")
+
+
+def test_no_line_is_drawn_across_missing_samples() -> None:
+    scores, _ = made_up_tray(fans=1, faulty_fan=None, gap_fan=None, block=10)
+    del scores[100:110]
+    trace = trace_of("tray1", scores, "rad/s")
+    panel = band_plot._figure(trace, [0], []).axes[0]
+    for line in panel.lines[:2]:
+        y = np.asarray(line.get_ydata(), float)
+        assert np.flatnonzero(np.isnan(y)).tolist() == [1000]
+
+
+def test_a_recording_in_two_parts_is_one_trace_in_time_order_in_its_unit_of_speed(tmp_path: Path) -> None:
+    scores, alarms = made_up_tray(seconds=4)
+    second = record(tmp_path / "b.mcap", scores[20:], alarms)
+    first = record(tmp_path / "a.mcap", scores[:20], [])
+    trace, _ = read_trace([second, first], None, "rpm")
+    whole = trace_of("tray1", scores, "rpm")
+    assert trace.t_ns.tolist() == whole.t_ns.tolist()
+    np.testing.assert_array_equal(trace.measured, whole.measured)
+    for metadata in ({"speed_unit": "rpm"}, {"speed_unit.tray1": "rpm"}):
+        path = record(tmp_path / "rec.mcap", scores, [], metadata)
+        assert read_trace([path], None, None)[0].speed_unit == "rpm"
+        assert read_trace([path], None, "rad/s")[0].speed_unit == "rad/s"
+
+
+def test_the_command_plots_a_recording_with_its_true_faults(tmp_path: Path) -> None:
+    scores, alarms = made_up_tray()
+    recording = record(tmp_path / "rec.mcap", scores, alarms)
+    truth = tmp_path / "truth.json"
+    truth.write_text(json.dumps({"faults": [vars(FAULT)]}))
+    app.command("plot")(plot)
+    app.command("other")(lambda: None)
+    output = tmp_path / "bands.png"
+    arguments = ["plot", str(recording), "-o", str(output), "--truth", str(truth), "--json"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    drawn = {"plot": str(output), "fans": [0, 2], "damage": []}
+    assert json.loads(result.stdout) == drawn, "the fan with an alarm and a healthy one"
+    assert coverage(output, band_plot.FAULT) > 0.001
+
+
+def test_a_plot_that_cannot_be_drawn_is_a_one_line_error(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(seconds=1)
+    others, _ = made_up_tray(seconds=1, tray="tray2")
+    both = record(tmp_path / "both.mcap", [*scores, *others], [])
+    empty = record(tmp_path / "empty.mcap", [], [])
+    output = tmp_path / "bands.png"
+    for expected, call in {
+        "holds no scores": lambda: plot_recording([empty], output),
+        "choose one with --tray: tray1, tray2": lambda: plot_recording([both], output),
+        "no tray called 'x'; there are tray1, tray2": lambda: plot_recording([both], output, tray="x"),
+        "has no fan 9": lambda: plot_recording([both], output, tray="tray1", fans=[9]),
+        "not a truth file": lambda: plot_recording([both], output, tray="tray1", truth=tmp_path / "none.json"),
+        "cannot write the plot": lambda: plot_recording([both], tmp_path / "bands.wrong", tray="tray1"),
+    }.items():
+        with pytest.raises(UserError, match=expected) as caught:
+            call()
+        assert "\n" not in str(caught.value)
+    assert not output.exists()
+
+
+ZONE_ON_WHITE = tuple(1 - 0.6 * (1 - part) for part in to_rgb(band_plot.ZONE))
+
+
+def coverage(path: Path, color: str | tuple[float, ...]) -> float:
+    """The share of a picture that has a colour."""
+    pixels = matplotlib.image.imread(path)[..., :3]
+    return float((np.abs(pixels - np.array(to_rgb(color))).max(axis=-1) < 0.02).mean())  # pyright: ignore[reportArgumentType]
+
+
+def record(
+    path: Path, scores: Sequence[Score], alarms: Sequence[Alarm], metadata: Mapping[str, str] = MappingProxyType({})
+) -> Path:
+    with RecordingWriter(path, metadata) as writer:
+        for score in scores:
+            writer.add_message(tray_key("site", score.header.tray, "score"), score, int(score.t_ns[-1]))
+        for alarm in alarms:
+            writer.add_message(tray_key("site", alarm.header.tray, "alarm"), alarm, alarm.t_ns)
+    return path

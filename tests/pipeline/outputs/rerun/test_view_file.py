@@ -1,0 +1,91 @@
+"""The file of a view never keeps the viewer waiting: a disk that is full or hangs is reported."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.outputs.rerun import view_file
+from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink
+from fantwin.pipeline.outputs.rerun.view_file import ViewFile
+from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
+from fantwin.schemas.units import NS_PER_S
+from tests.stages.test_viewer import sent
+from tests.support.score_data import START_NS, made_up_tray
+
+
+def test_what_is_written_is_in_the_file_after_a_flush(tmp_path: Path) -> None:
+    path = tmp_path / "view.rrd"
+    path.touch()
+    content = np.random.default_rng(1).bytes(300_000)
+    file = ViewFile(path)
+    with file.pipe.open("wb", buffering=0) as pipe:
+        file.release_pipe()
+        for start in range(0, len(content), 1000):
+            pipe.write(content[start : start + 1000])
+        file.flush()
+        assert path.read_bytes() == content
+    file.close()
+    assert file.problem == ""
+
+
+def test_row_09_a_view_on_a_full_disk_is_reported_and_the_viewer_goes_on_and_ends(small_disk: Path) -> None:
+    trays = (TrayConfig(name="tray1", fans=3),)
+    sink = RerunSink(
+        name="x",
+        trays=trays,
+        fleet=None,
+        started_t_ns=START_NS,
+        layout="all",
+        window_s=30.0,
+        file=small_disk / "view.rrd",
+        grpc_port=None,
+        web_port=None,
+        memory_limit="256MB",
+    )
+    core = ViewerCore(trays, sink)
+    with (small_disk / "ballast").open("wb", buffering=0) as ballast, pytest.raises(OSError, match="No space"):
+        while True:
+            ballast.write(bytes(4096))
+    scores, _ = made_up_tray()
+    half = len(scores) // 2
+    for second, some in enumerate((scores[:half], scores[half:])):
+        for score in some:
+            core.step(sent(score))
+        core.tick(START_NS + second * NS_PER_S)
+        assert "view.rrd: the view is not written any more: No space left on device; what is in" in core.problem()
+    core.close()
+    assert core.counters()["samples_drawn"] == sum(len(score.t_ns) for score in scores)
+
+
+def test_the_file_ends_before_it_exceeds_its_limit(tmp_path: Path) -> None:
+    path = tmp_path / "view.rrd"
+    path.touch()
+    file = ViewFile(path, limit_bytes=200_000)
+    with file.pipe.open("wb", buffering=0) as pipe:
+        file.release_pipe()
+        for _ in range(300):
+            pipe.write(bytes(1000))
+    file.close()
+    assert 100_000 < path.stat().st_size <= 200_000
+    assert "it has the size of viewer.file_bytes" in file.problem
+
+
+def test_row_09_a_disk_that_hangs_keeps_nobody_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(view_file, "HELD_BYTES", 1 << 20)
+    monkeypatch.setattr(view_file, "CLOSE_LIMIT_S", 0.2)
+    path = tmp_path / "view.rrd"
+    os.mkfifo(path)  # nobody reads from it: a write of more than it holds never returns
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    file = ViewFile(path)
+    with file.pipe.open("wb", buffering=0) as pipe:
+        file.release_pipe()
+        for _ in range(50):
+            pipe.write(bytes(100_000))
+        assert "view.rrd: the view is not written any more: the disk is too slow" in file.problem
+    file.close()
+    os.close(reader)

@@ -1,0 +1,48 @@
+"""The wear of fans in the view."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fantwin.pipeline.outputs.rerun.wear_points import wear_points
+from fantwin.schemas.messages import ScorerSnapshot
+from tests.stages.test_viewer import FLUSH_PERIOD_NS, FakeSink, core_of
+from tests.support.score_data import START_NS
+from tests.support.wear_data import LOSS, worn_snapshot
+
+FANS, WORN = 3, 2
+
+
+@pytest.fixture(scope="module")
+def snapshot() -> ScorerSnapshot:
+    return worn_snapshot("tray1", FANS, WORN, START_NS)
+
+
+def test_the_points_of_every_fan_are_read_as_they_are_shown(snapshot: ScorerSnapshot) -> None:
+    found = wear_points(snapshot)
+    assert [each.fan for each in found] == [0, 1, 2]
+    worn, stored = found[WORN], json.loads(snapshot.state_json)["wear"]["fans"][WORN]
+    assert worn.t_ns.tolist() == stored["series"]["t_ns"]
+    assert worn.change[-1] == pytest.approx(-100.0 * LOSS, abs=1.5) and abs(worn.change[0]) < 1.0, "per cent"
+    assert worn.change[-1] == pytest.approx(100.0 * stored["change"], abs=1.0)
+    np.testing.assert_allclose(worn.std_error, 100.0 * np.array(stored["series"]["std_error"]))
+    assert len(worn.after(int(worn.t_ns[-3])).t_ns) == 2
+
+
+def test_a_snapshot_without_wear_or_of_an_unknown_version_has_no_points(snapshot: ScorerSnapshot) -> None:
+    for text in ("{}", '{"wear": {"fans": [{}], "state": {"value": [0]}}}', '{"wear": {"fans": 3}}', "not JSON"):
+        assert wear_points(replace(snapshot, state_json=text)) == []
+
+
+def test_the_wear_is_drawn_once_with_each_snapshot(snapshot: ScorerSnapshot) -> None:
+    sink = FakeSink()
+    core = core_of(sink)
+    for number in range(4):
+        if number % 2 == 0:
+            core.step(replace(snapshot, t_ns=START_NS + number))
+        core.tick((number + 1) * FLUSH_PERIOD_NS)
+    assert len(sink.wear) == 2 * FANS and {tray for tray, _ in sink.wear} == {"tray1"}

@@ -1,0 +1,93 @@
+"""The history of alarms on a disk that is full, and in a file that is damaged."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.outputs.mqtt.transition_queue import TransitionQueue
+from fantwin.pipeline.site import alarm_store
+from fantwin.pipeline.site.alarm_store import AlarmStore
+from tests.support.notified_alarms import alarm
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> AlarmStore:
+    return AlarmStore(tmp_path / "alarms.sqlite")
+
+
+def fill(store: AlarmStore, *, is_full: bool) -> None:
+    """Let the disk have no room for another page, or again enough."""
+    pages = store._file.execute("PRAGMA page_count").fetchone()[0]
+    store._file.execute(f"PRAGMA max_page_count = {pages if is_full else 1 << 30}")
+
+
+def kept(store: AlarmStore) -> list[int]:
+    return [found.header.sequence for _, found in store.after(0, 100_000)]
+
+
+def test_what_a_full_disk_has_no_room_for_is_kept_in_its_order_once_there_is_room(store, monkeypatch):
+    monkeypatch.setattr(alarm_store, "MOST_UNSAVED", 150)
+    added = [alarm(sequence=number, comment="x" * 500) for number in range(300)]
+    assert all(map(store.add, added[:50]))
+    fill(store, is_full=True)
+    assert all(map(store.add, added[50:250]))
+    assert "disk is full" in store.problem
+    assert not store.add(added[249]), "it has been heard before"
+    before = kept(store)
+    assert store.lost == 250 - len(before) - 150 > 0
+    queue = TransitionQueue(store, 10_000)
+    fill(store, is_full=False)
+    assert store.save_again()
+    assert not store.problem
+    assert store.add(added[250])
+    expected = [*before, *range(100, 251)]
+    assert kept(store) == expected, "the oldest of those that waited are lost"
+    queue.notice_new()
+    assert [found.header.sequence for _, found in queue.take(1000)] == expected
+    fill(store, is_full=True)
+    assert all(map(store.add, added[251:290]))
+    fill(store, is_full=False)
+    assert store.add(added[290])
+    assert kept(store) == [*expected, *range(251, 291)], "those that waited come before the one that found room"
+
+
+def test_a_damaged_file_is_named_in_one_line_and_holds_up_no_alarm(store, tmp_path):
+    for number in range(300):
+        store.add(alarm(sequence=number))
+    store._file.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    store.close()
+    path = tmp_path / "alarms.sqlite"
+    with path.open("r+b") as file:
+        file.seek(4096)
+        file.write(os.urandom(path.stat().st_size - 4096))
+    damaged = AlarmStore(path)
+    with pytest.raises(UserError, match="move it away"):
+        damaged.newest(10)
+    with pytest.raises(UserError, match="move it away"):
+        TransitionQueue(damaged, 100)
+    assert damaged.add(alarm(sequence=1000)), "it is shown all the same"
+    assert str(path) in damaged.problem
+    damaged.close()
+    path.write_bytes(b"no database" * 100)
+    with pytest.raises(UserError, match=r"alarms\.sqlite"):
+        AlarmStore(path)
+
+
+def test_a_queue_goes_on_where_its_history_cannot_be_read_for_a_while(store, monkeypatch):
+    queue = TransitionQueue(store, 100)
+    store.add(alarm(sequence=1))
+    queue.notice_new()
+
+    def fail(*_rest: object) -> None:
+        raise UserError("it cannot be read")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "after", fail)
+        patched.setattr(store, "newest_number", fail)
+        queue.notice_new()
+        assert queue.take(10) == ()
+    assert [found.header.sequence for _, found in queue.take(10)] == [1]

@@ -1,0 +1,201 @@
+"""Fans of this computer, on trees of files: which chip, what is read, what is written, and what goes wrong."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.hwmon.config import HwmonConfig
+from fantwin.pipeline.sources.hwmon.source import HwmonDevice, HwmonSource
+from fantwin.pipeline.sources.polling import DeviceError
+from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
+from fantwin.schemas.tacho import Tacho
+from tests.support.hwmon_trees import add_chip, board
+
+NAN = float("nan")
+
+
+def device(root: Path, count: int = 2, unit: str = "rpm", **settings: Any) -> HwmonDevice:
+    config = HwmonConfig.model_validate({"chip": "nct6798", "root": root, **settings})
+    return HwmonDevice(config, SourceContext(count, unit, Path()))
+
+
+def connected(root: Path, count: int = 2, **settings: Any) -> HwmonDevice:
+    made = device(root, count, **settings)
+    made.connect()
+    return made
+
+
+def reading(made: HwmonDevice) -> Reading:
+    found = made.read()
+    assert isinstance(found, Reading)
+    return found
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return tmp_path / "hwmon"
+
+
+def test_speeds_commands_and_what_is_asked_for_are_read_in_units_of_the_tray(root: Path) -> None:
+    board(root)
+    made = connected(root, fans=[2, 1], temperatures=[2, 3], voltages=[0], voltage_scale=12)
+    found = reading(made)
+    assert found.speed == (1200.0, 900.0) and found.command == (140.0, 120.0)
+    assert found.temperature_c[0] == 31.5 and math.isnan(found.temperature_c[1]), "a sensor that is not connected"
+    assert found.supply_voltage_v == pytest.approx((12.096, 12.096)) and found.current_a == ()
+    in_rad_s = device(root, unit="rad/s")
+    in_rad_s.connect()
+    assert reading(in_rad_s).speed[1] == pytest.approx(1200 * math.pi / 30)
+
+
+def test_a_chip_is_found_by_its_name_whatever_its_number_is(root: Path) -> None:
+    add_chip(root, 0, "acpitz", "virtual/thermal", {"temp1_input": 1})
+    board(root, 4)
+    made = connected(root)
+    assert reading(made).speed == (900.0, 1200.0)
+    # The driver is loaded again: another chip has its number now.
+    (root / "hwmon4").rename(root / "hwmon5")
+    add_chip(root, 4, "k10temp", "pci/0", {"temp1_input": 1})
+    with pytest.raises(DeviceError, match="hwmon4 is k10temp now, no longer nct6798") as caught:
+        made.read()
+    assert caught.value.is_lost
+    made.disconnect()
+    made.connect()
+    assert reading(made).speed == (900.0, 1200.0)
+
+
+def test_two_chips_of_one_name_are_told_apart_by_their_devices(root: Path) -> None:
+    board(root, 0, "i2c-1/1-002f")
+    other = board(root, 1, "i2c-1/1-0020")
+    (other / "fan1_input").write_text("450\n")
+    with pytest.raises(DeviceError, match="2 chips are called nct6798: name one by device = '1-0020', '1-002f'"):
+        connected(root)
+    assert reading(connected(root, device="1-0020")).speed[0] == 450.0
+    with pytest.raises(DeviceError, match="no chip is called nct6798 with device 1-00 in"):
+        connected(root, device="1-00")
+
+
+def test_files_that_cannot_be_read_are_nan_but_without_its_command_a_reading_is_refused(root: Path) -> None:
+    folder = board(root)
+    made = connected(root)
+    (folder / "fan1_input").write_text("\n")  # as a driver whose measurement failed
+    assert math.isnan(reading(made).speed[0]) and reading(made).speed[1] == 1200.0
+    (folder / "fan2_fault").write_text("1\n")
+    assert math.isnan(reading(made).speed[1]), "the chip does not trust it"
+    (folder / "fan2_input").write_text("0\n")
+    assert reading(made).speed[1] == 0.0, "a fan that stands is measured"
+    (folder / "pwm1").write_text("\n")
+    with pytest.raises(DeviceError, match="pwm1 of nct6798 cannot be read") as caught:
+        made.read()
+    assert not caught.value.is_lost
+
+
+def test_a_commanded_fan_is_taken_over_and_given_back(root: Path) -> None:
+    folder = board(root)
+    made = connected(root, 3, writable=True)
+    made.write((200.4, NAN, 90.0), ())
+    written = {
+        file: int((folder / file).read_text()) for file in ("pwm1", "pwm1_enable", "pwm2", "pwm2_enable", "pwm3")
+    }
+    assert written == {"pwm1": 200, "pwm1_enable": 1, "pwm2": 140, "pwm2_enable": 5, "pwm3": 90}
+    made.disconnect()
+    assert (folder / "pwm1_enable").read_text().strip() == "5"
+    assert (folder / "pwm3").read_text().strip() == "255", "a fan that was manual gets its former pwm"
+    made.connect()
+    with pytest.raises(DeviceError, match="take commands, no set-points"):
+        made.write((NAN, NAN, NAN), (900.0, NAN, NAN))
+
+
+def test_what_a_killed_process_took_over_is_given_back_by_the_next_one(root: Path, tmp_path: Path) -> None:
+    folder = board(root)
+    config = HwmonConfig(chip="nct6798", root=root, writable=True)
+    context = SourceContext(3, "rpm", Path(), "a", run_folder=tmp_path / "runs")
+    modes = [folder / f"pwm{number}_enable" for number in (1, 2)]
+
+    def started() -> HwmonDevice:
+        made = HwmonDevice(config, context)
+        made.connect()
+        return made
+
+    started().write((30.0, 40.0, 50.0), ())  # killed: it does not disconnect
+    second = started()
+    second.write((60.0, NAN, NAN), ())
+    assert [mode.read_text() for mode in modes] == ["1", "1"]
+    second.disconnect()
+    assert [mode.read_text() for mode in modes] == ["5", "5"], "also the one that it did not write"
+    assert (folder / "pwm3").read_text() == "255"
+    assert list(context.run_folder.iterdir() if context.run_folder else ()) == []
+
+    started().write((30.0, NAN, NAN), ())
+    modes[0].write_text("2")  # the driver is loaded again
+    third = started()
+    third.disconnect()
+    assert modes[0].read_text() == "2"
+    third.connect()
+    third.write((30.0, NAN, NAN), ())
+    third.disconnect()
+    assert modes[0].read_text() == "2", "as it was found last"
+
+
+def test_fans_that_share_a_pwm_take_one_command(root: Path) -> None:
+    folder = board(root)
+    made = connected(root, 3, pwms=[1], writable=True)
+    for command, pwm in (((200.0, NAN, NAN), "200"), ((NAN, 90.0, NAN), "90"), ((80.0, NAN, 80.0), "80")):
+        made.write(command, ())
+        assert (folder / "pwm1").read_text() == pwm
+    with pytest.raises(DeviceError, match="pwm1 moves several fans: give them one command, not 10 and 20"):
+        made.write((10.0, NAN, 20.0), ())
+    assert (folder / "pwm1").read_text() == "80"
+
+
+def test_chips_that_say_less_than_others_are_known(root: Path) -> None:
+    dell = {"fan1_input": 2500, "pwm1": 128, "pwm1_enable": ""}
+    folder = add_chip(root, 0, "dell_smm", "platform/dell_smm_hwmon", dell)
+    made = connected(root, 1, chip="dell_smm", writable=True)
+    made.write((255.0,), ())
+    assert (folder / "pwm1_enable").read_text() == "1"
+    made.disconnect()
+    assert (folder / "pwm1_enable").read_text() == "2", "its automatic mode, which cannot be read"
+    add_chip(root, 1, "corsaircpro", "usb/1-4", {"fan1_input": 800, "pwm1": 0})
+    made = connected(root, 1, chip="corsaircpro", writable=True)
+    refused = made.read()
+    assert isinstance(refused, Rejected) and refused.kind == "unknown_command" and refused.is_sample
+    made.write((0.0,), ())
+    assert reading(made).command == (0.0,), "known once it was set"
+
+
+def test_what_a_source_cannot_do_is_said_before_it_starts(root: Path) -> None:
+    board(root)
+    assert device(root).check() == []
+    made = device(root, 3, fans=[1, 2, 7], temperatures=[9], pwms=[1])
+    assert made.check() == [
+        "nct6798 has no fan7_input: correct fans",
+        "nct6798 has no temp9_input: correct temperatures",
+    ]
+    assert device(root, chip="it8728").check()[0].startswith("no chip is called it8728")
+    with pytest.raises(UserError, match=r"fans = 3, and source.fans names 2"):
+        device(root, 3, fans=[1, 2])
+    with pytest.raises(UserError, match=r"source.pwms names 2: give one for all fans, or 3"):
+        device(root, 3, pwms=[1, 2])
+    source = HwmonSource(HwmonConfig(chip="nct6798", root=root), SourceContext(2, "rpm", Path()))
+    assert not source.device.is_writable and "takes no commands" in source.send((10.0, 10.0), ()), "unless it may"
+
+
+@pytest.mark.parametrize(
+    ("chip", "tacho"),
+    [
+        ("pwmfan", Tacho(kind="count", pulses=2, window_s=1.0)),
+        ("nct6798", Tacho(kind="average", window_s=0.05, update_s=1.5)),
+        ("max31790", Tacho(kind="average", window_s=0.05, update_s=1.0)),
+        ("unheard-of", Tacho()),
+    ],
+)
+def test_the_driver_says_what_is_measured(chip: str, tacho: Tacho) -> None:
+    text = f'[[tray]]\nname = "a"\nfans = 2\nsource = {{ kind = "hwmon", chip = "{chip}" }}\n'
+    assert parse_config(text, Path("fantwin.toml")).trays[0].tachos == (tacho,)

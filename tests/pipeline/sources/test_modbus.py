@@ -1,0 +1,165 @@
+"""Fans behind Modbus, against pymodbus's own server with a simulated rotor behind its registers."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.sources.modbus.config import ModbusConfig
+from fantwin.pipeline.sources.modbus.source import ModbusDevice
+from fantwin.pipeline.sources.polling import DeviceError
+from fantwin.pipeline.sources.source import SourceContext
+from fantwin.schemas.tacho import Tacho
+from fantwin.simulation.tray import SimulatedTray, TraySettings
+from tests.support.modbus_server import (
+    COMMAND,
+    CURRENT,
+    REFUSED,
+    SPEED,
+    TEMPERATURE,
+    VOLTAGE,
+    WANTED,
+    Drive,
+    SerialLine,
+    modbus_line,
+    modbus_server,
+)
+from tests.support.running_chain import eventually
+
+FAN: dict[str, Any] = {
+    "unit": 3,
+    "speed": {"address": SPEED, "scale": 2.0},
+    "command": {"address": COMMAND, "scale": 0.001},
+    "write": {"address": WANTED, "scale": 0.001},
+    "current": {"address": CURRENT, "type": "f32"},
+    "supply_voltage": {"address": VOLTAGE, "type": "u32", "word_order": "little", "scale": 0.001},
+    "temperature": {"address": TEMPERATURE, "type": "s16", "scale": 0.1, "offset": 30.0},
+}
+
+
+def drive() -> Drive:
+    return Drive(SimulatedTray(TraySettings(fans=1, rate_hz=100.0)))
+
+
+def config(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusConfig:
+    return ModbusConfig.model_validate(
+        {"host": "127.0.0.1", "tcp_port": port, "timeout_s": 5.0, "fan": fans or (FAN,), **settings}
+    )
+
+
+def device(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusDevice:
+    made = ModbusDevice(config(port, *fans, **settings), SourceContext(len(fans) or 1, "rpm", Path()))
+    made.connect()
+    return made
+
+
+def test_registers_of_all_types_are_read_by_one_request_and_a_command_moves_the_rotor() -> None:
+    with modbus_server({3: drive()}) as port:
+        made = device(port)
+        assert [(each.first.address, each.count) for each in made._requests] == [(SPEED, 7)]
+        first = made.read()
+        assert first.current_a == (1.5,) and first.supply_voltage_v == pytest.approx((540.25,))
+        assert first.temperature_c == pytest.approx((24.5,))
+        made.write((0.9,), ())
+        time.sleep(0.8)
+        second = made.read()
+        assert second.command == (0.9,) and second.speed[0] > first.speed[0] + 500.0
+        assert second.speed[0] % 2.0 == 0.0
+        made.disconnect()
+
+
+def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -> None:
+    without = {key: value for key, value in FAN.items() if key != "write"}
+    with modbus_server({3: drive()}) as port:
+        made = device(port, FAN | {"speed": {"address": REFUSED}})
+        assert math.isnan(made.read().speed[0])
+        made.disconnect()
+        made = device(port, FAN | {"command": {"address": REFUSED, "table": "input"}})
+        with pytest.raises(DeviceError, match=r"command of fan 0 cannot be read: unit 3 refuses input register 200"):
+            made.read()
+        made.disconnect()
+        made = device(port)
+        with pytest.raises(DeviceError, match=r"unit 3 refuses 1.5 for register 100 \(exception 3\)"):
+            made.write((1.5,), ())
+        with pytest.raises(DeviceError, match=r"-10 does not fit into u16 of register 100"):
+            made.write((-0.01,), ())
+        made.disconnect()
+        closed = device(port, without)
+        assert not closed.is_writable
+        closed.disconnect()
+
+
+def over_serial(line: SerialLine, **settings: Any) -> tuple[ModbusConfig, SourceContext]:
+    values = {"port": line.host, "parity": "N", "timeout_s": 5.0, "fan": (FAN,), **settings}
+    return ModbusConfig.model_validate(values), SourceContext(1, "rpm", Path())
+
+
+def test_frames_of_modbus_rtu_go_over_a_serial_line_both_ways() -> None:
+    with modbus_line({3: drive()}) as line:
+        made = ModbusDevice(*over_serial(line))
+        made.connect()
+        first = made.read()
+        assert (first.current_a, first.supply_voltage_v) == ((1.5,), pytest.approx((540.25,)))
+        made.write((0.9,), ())
+        time.sleep(0.8)
+        second = made.read()
+        assert second.command == (0.9,) and second.speed[0] > first.speed[0] + 500.0
+        with pytest.raises(DeviceError, match=r"unit 3 refuses 1.5 for register 100 \(exception 3\)"):
+            made.write((1.5,), ())
+        made.disconnect()
+    # unit, function, address, count or value, CRC: seven registers from 10 on, and 900 to register 100
+    read, write = bytes.fromhex("0303000a000725e8"), bytes.fromhex("031000640001020384b787")
+    assert line.transferred["device"].startswith(read + write + read)
+    assert (
+        line.transferred["host"].startswith(bytes.fromhex("03030e")) and len(line.transferred["host"]) == 2 * 19 + 8 + 5
+    )
+
+
+def test_the_registers_say_what_is_measured_where_the_averaging_time_is_known() -> None:
+    tray = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "modbus", host = "drive", %s fan = [ %s ] }\n'
+    fan = "{ speed = { address = 1, scale = 2.0 }, command = { address = 2 } }"
+    (known,) = parse_config(tray % ("average_s = 0.5,", fan), Path("fantwin.toml")).trays
+    assert known.tachos == (Tacho(kind="average", window_s=0.5, step_rad_s=2.0 * math.pi / 30.0),)
+    assert parse_config(tray % ("", fan), Path("fantwin.toml")).trays[0].tachos == (Tacho(),)
+    for change, words in (
+        (("address = 1,", "adress = 1,"), r"fan.0.speed.adress'; did you mean 'address'\?"),
+        (("scale = 2.0", "scale = 0"), "scale is 0"),
+        (('host = "drive",', ""), "give either host"),
+        (("fans = 1", "fans = 2"), "carries at most 1 fans"),
+    ):
+        with pytest.raises(ConfigError, match=words) as caught:
+            parse_config((tray % ("", fan)).replace(*change), Path("fantwin.toml"))
+        assert "\n" not in str(caught.value)
+
+
+def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_one_works() -> None:
+    slow = drive()
+    with modbus_line({3: slow}) as line:
+        made = ModbusDevice(*over_serial(line))
+        made.connect()
+        made.read()
+        slow.is_silent = True
+        with pytest.raises(DeviceError, match=r"unit 3 does not answer within 5 s; check unit and wiring") as caught:
+            made.read()
+        assert not caught.value.is_lost
+        received = len(line.transferred["host"])
+        slow.is_silent = False
+        eventually(lambda: len(line.transferred["host"]) == received + 19, "the answer comes, too late")
+        assert made.read().supply_voltage_v == pytest.approx((540.25,))
+        made.disconnect()
+
+
+def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line() -> None:
+    settings = {"port": "/dev/ttyUSB7", "baud": 9600, "parity": "O", "stop_bits": 2, "fan": (FAN,)}
+    made = ModbusDevice(ModbusConfig.model_validate(settings), SourceContext(1, "rpm", Path()))
+    line = made._made_client().comm_params
+    assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 2)
+    assert made.check()[0].startswith("/dev/ttyUSB7: no such port")
+    with pytest.raises(DeviceError, match=r"^no such port, is it unplugged\?; waiting for it$"):
+        made.connect()

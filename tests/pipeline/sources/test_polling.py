@@ -1,0 +1,174 @@
+"""Sources that are asked: times, failures, lateness, reconnection, and writing, with devices that misbehave."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import pytest
+
+from fantwin.pipeline.sources import polling
+from fantwin.pipeline.sources.polling import DeviceError, PollingSource
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceEvent
+
+PERIOD_S = 0.02
+
+
+class Device:
+    """Does what a list of actions says, one for each reading; the last one goes on."""
+
+    name, settings_to_check, is_writable = "device", "unit", True
+
+    def __init__(self, *actions: Callable[[], float]) -> None:
+        self.actions = list(actions) or [lambda: 1.0]
+        self.connected = self.disconnected = 0
+        self.written: list[tuple[float, ...]] = []
+
+    def connect(self) -> None:
+        self.connected += 1
+
+    def read(self) -> Reading:
+        action = self.actions.pop(0) if len(self.actions) > 1 else self.actions[0]
+        return Reading((0.5,), (action(),))
+
+    def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
+        if math.isinf(command[0]):
+            raise DeviceError("not allowed")
+        self.written.append(command)
+
+    def disconnect(self) -> None:
+        self.disconnected += 1
+
+    def check(self) -> list[str]:
+        return []
+
+
+def failing(reason: str = "timeout", *, is_lost: bool = False) -> Callable[[], float]:
+    def fail() -> float:
+        raise DeviceError(reason, is_lost=is_lost)
+
+    return fail
+
+
+def polled(device: Device, until: Callable[[list[SourceEvent]], bool], limit_s: float = 5.0) -> list[SourceEvent]:
+    """The events up to the one with which `until` holds."""
+    events: list[SourceEvent] = []
+    is_there = threading.Event()
+
+    def deliver(event: SourceEvent) -> None:
+        events.append(event)
+        if until(events):
+            is_there.set()
+
+    source = PollingSource(device, PERIOD_S)
+    source.start(deliver)
+    assert is_there.wait(limit_s)
+    source.stop()
+    assert device.connected == device.disconnected, "each connection is left in order"
+    return events
+
+
+def readings(events: list[SourceEvent]) -> list[Reading]:
+    batches = (event for event in events if isinstance(event, ReadingBatch))
+    return [item for batch in batches for item in batch.items if isinstance(item, Reading)]
+
+
+def rejected(events: list[SourceEvent]) -> list[Rejected]:
+    batches = (event for event in events if isinstance(event, ReadingBatch))
+    return [item for batch in batches for item in batch.items if isinstance(item, Rejected)]
+
+
+@pytest.fixture(autouse=True)
+def _short_delays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(polling, "RECONNECT_DELAY_S", 0.01)
+
+
+def test_the_time_of_a_reading_is_the_middle_of_its_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    ahead_s = 0.0
+    monkeypatch.setattr(polling, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + ahead_s))
+    asked_s: list[float] = []
+
+    def slow() -> float:
+        nonlocal ahead_s
+        asked_s.append(time.monotonic() + ahead_s)
+        ahead_s += 100.0
+        return 2.0
+
+    events = polled(Device(slow), lambda found: len(readings(found)) == 2)
+    for reading, began_s in zip(readings(events), asked_s, strict=False):
+        assert reading.clock_us is not None
+        after_s = ((reading.clock_us - began_s * 1e6) % 2**32) / 1e6
+        assert 49.0 < after_s < 60.0, "half of 100 s, on any machine"
+
+
+def test_a_poll_that_fails_is_a_gap_in_the_sequence_and_counted() -> None:
+    device = Device(lambda: 1.0, failing(), failing(), lambda: 3.0)
+    events = polled(device, lambda found: len(readings(found)) == 2)
+    assert [each.kind for each in rejected(events)].count("failed_polls") == 2
+    first, second = readings(events)[:2]
+    assert first.sequence == 0 and second.sequence is not None and second.sequence >= 3
+
+
+def test_a_device_that_keeps_failing_is_lost_or_fails_unexpectedly_is_a_link_down_with_one_line_and_comes_back() -> (
+    None
+):
+    def broken() -> float:
+        raise KeyError("Fans")
+
+    three = [failing("no answer")] * 3
+    lost = (failing("gone", is_lost=True), lambda: 3.0, broken, lambda: 4.0)
+    device = Device(lambda: 1.0, *three, failing("still none"), lambda: 2.0, *lost)
+    events = polled(device, lambda found: len(readings(found)) == 4)
+    links = [event for event in events if not isinstance(event, ReadingBatch)]
+    assert links == [
+        LinkUp(),
+        LinkDown("no answer"),
+        LinkDown("still none"),
+        LinkUp(),
+        LinkDown("gone"),
+        LinkUp(),
+        LinkDown("unexpected KeyError: 'Fans'; waiting for it"),
+        LinkUp(),
+    ]
+
+
+def test_polls_that_are_late_are_left_out_and_counted_as_lost() -> None:
+    def slow() -> float:
+        time.sleep(3.5 * PERIOD_S)
+        return 2.0
+
+    events = polled(Device(lambda: 1.0, slow, lambda: 3.0), lambda found: len(readings(found)) == 3)
+    assert len([each for each in rejected(events) if each.kind == "skipped_polls"]) >= 3
+    sequences = [each.sequence for each in readings(events)]
+    assert sequences[2] is not None and sequences[2] >= 5
+
+
+def test_commands_are_written_between_polls_and_the_sender_sees_a_refusal() -> None:
+    device = Device()
+    source = PollingSource(device, 10.0)
+    assert "not connected" in source.send((0.3,), ())
+    up = threading.Event()
+    source.start(lambda event: up.set() if isinstance(event, ReadingBatch) else None)
+    assert up.wait(5.0)
+    assert source.send((0.3,), ()) == ""
+    assert source.send((math.inf,), ()) == "not allowed"
+    device.is_writable = False
+    assert "takes no commands" in source.send((0.4,), ())
+    source.stop()
+    assert device.written == [(0.3,)]
+
+
+def test_stop_does_not_wait_for_the_next_poll_and_delivers_nothing_afterwards() -> None:
+    device = Device()
+    events: list[SourceEvent] = []
+    source = PollingSource(device, 30.0)
+    source.start(events.append)
+    while len(events) < 2:
+        time.sleep(0.001)
+    began_s = time.monotonic()
+    source.stop()
+    assert time.monotonic() - began_s < 1.0 and device.disconnected == 1
+    assert len(events) == 2

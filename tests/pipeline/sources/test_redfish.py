@@ -1,0 +1,146 @@
+"""Fans by Redfish, against a real HTTP server with the older and the newer schema."""
+
+from __future__ import annotations
+
+import math
+import ssl
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trustme
+
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.sources.polling import DeviceError
+from fantwin.pipeline.sources.redfish.config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
+from fantwin.pipeline.sources.redfish.source import RedfishDevice
+from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
+from fantwin.schemas.tacho import Tacho
+from tests.support.redfish_server import Controller, redfish_server
+
+SECRET = "correct-horse"
+
+
+def device(url: str, count: int = 2, folder: Path = Path(), **settings: Any) -> RedfishDevice:
+    config = RedfishConfig.model_validate({"url": url, **settings})
+    return RedfishDevice(config, SourceContext(count, "rpm", folder))
+
+
+def connected(url: str, count: int = 2, folder: Path = Path(), **settings: Any) -> RedfishDevice:
+    made = device(url, count, folder, **settings)
+    made.connect()
+    return made
+
+
+def reading(made: RedfishDevice) -> Reading:
+    found = made.read()
+    assert isinstance(found, Reading)
+    return found
+
+
+@pytest.fixture(autouse=True)
+def _no_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (USER_VARIABLE, PASSWORD_VARIABLE):
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_the_newer_schema_gives_speed_and_percent() -> None:
+    controller = Controller(is_new=True)
+    with redfish_server(controller) as url:
+        made = connected(url, temperature="Intake")
+        assert reading(made) == Reading((40.0, 42.0), (4000.0, 4200.0), temperature_c=(22.0, 22.0))
+        controller.rpm[1], controller.percent[1] = 0, 100
+        assert reading(made).speed == (4000.0, 0.0)
+        chosen = connected(url, 1, fans=["FAN2"], chassis="1U")
+        assert reading(chosen).command == (100.0,)
+        made.disconnect()
+        chosen.disconnect()
+
+
+def test_the_older_schema_gives_speeds_and_the_command_of_the_vendor() -> None:
+    controller = Controller(is_new=False)
+    with redfish_server(controller) as url:
+        made = connected(url, command="/Oem/Vendor/PWM", temperature="Inlet Temp")
+        assert reading(made) == Reading((40.0, 42.0), (4000.0, 4200.0), temperature_c=(23.5, 23.5))
+        unknown = connected(url)
+        refused = unknown.read()
+        assert isinstance(refused, Rejected) and refused.kind == "unknown_command" and refused.is_sample
+        assert "no fan has a number at /SpeedPercent/Reading" in refused.detail
+        unread = connected(url, 1, fans=["FAN1"], command="/Oem/Vendor/PWM", temperature="Exhaust")
+        assert math.isnan(reading(unread).temperature_c[0])
+
+
+def test_what_does_not_fit_the_controller_is_one_line() -> None:
+    with redfish_server(Controller(is_new=True)) as url:
+        with pytest.raises(DeviceError, match=r"^no fan 'FAN9'; there are: FAN1, 1, FAN2, 2"):
+            connected(url, fans=["FAN9", "FAN1"]).read()
+        with pytest.raises(DeviceError, match="^2 fans, this tray has 3"):
+            connected(url, 3).read()
+        with pytest.raises(DeviceError, match="^no chassis 'Rack' with fans; there are: 1U"):
+            connected(url, chassis="Rack")
+
+
+def test_a_controller_that_fails_or_is_slow_is_a_failed_poll_and_one_that_is_gone_is_lost() -> None:
+    controller = Controller(is_new=True)
+    with redfish_server(controller) as url:
+        made = connected(url)
+        controller.status = 503
+        with pytest.raises(DeviceError, match="^refused with HTTP status 503") as caught:
+            made.read()
+        assert not caught.value.is_lost
+        controller.status = 200
+        made.disconnect()
+        made = connected(url, timeout_s=0.3)
+        controller.delay_s = 1.0
+        with pytest.raises(DeviceError, match="^does not answer within 0.3 s") as caught:
+            made.read()
+        controller.delay_s = 0.0
+        made.disconnect()
+    with pytest.raises(DeviceError, match="cannot be reached; waiting for it") as caught:
+        connected(url)
+    assert caught.value.is_lost
+
+
+def test_credentials_come_from_a_file_or_the_environment_over_a_verified_line_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    authority = trustme.CA()
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    authority.issue_cert("127.0.0.1").configure_cert(tls)
+    authority.cert_pem.write_to_path(str(tmp_path / "ca.pem"))
+    file = tmp_path / "bmc.secret"
+    file.write_text(f"operator\n{SECRET}\n")
+    controller = Controller(is_new=True, user="operator", password=SECRET)
+    with redfish_server(controller, tls) as url:
+        settings = {"folder": tmp_path, "ca": "ca.pem", "credentials": "bmc.secret"}
+        with pytest.raises(DeviceError, match="others may read it; chmod 600"):
+            connected(url, **settings)
+        assert "others may read it" in device(url, **settings).check()[0]
+        file.chmod(0o600)
+        file.write_bytes("root\nGeh\xe4im\n".encode("latin-1"))
+        assert device(url, **settings).check() == [f"{file}: is no text in UTF-8: save it as such"]
+        file.write_text(f"operator\n{SECRET}\n")
+        made = connected(url, **settings)
+        assert reading(made).speed == (4000.0, 4200.0)
+        made.disconnect()
+        with pytest.raises(DeviceError, match="^its certificate cannot be verified: name the authority by source.ca"):
+            connected(url, folder=tmp_path, credentials="bmc.secret")
+        monkeypatch.setenv(USER_VARIABLE, "operator")
+        monkeypatch.setenv(PASSWORD_VARIABLE, f"{SECRET}-not")
+        with pytest.raises(DeviceError, match="^user or password is refused") as caught:
+            connected(url, folder=tmp_path, ca="ca.pem")
+        assert SECRET not in str(caught.value)
+    with pytest.raises(DeviceError, match="would send the password in the clear"):
+        connected("http://127.0.0.1:9")
+    assert SECRET not in caplog.text
+
+
+def test_the_configuration_keeps_no_password_and_states_what_is_known() -> None:
+    tray = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "redfish", url = "%s" %s }\n'
+    (known,) = parse_config(tray % ("https://bmc1", ", average_s = 1, update_s = 3, delay_s = 0.5"), Path("f")).trays
+    assert known.tachos == (Tacho(kind="average", window_s=1.0, update_s=3.0, delay_s=0.5),)
+    assert known.source.stated_tachos(1) is not None
+    for url, words in (("https://a:b@bmc1", "a configuration is recorded"), ("bmc1", "write the address")):
+        with pytest.raises(ConfigError, match=words):
+            parse_config(tray % (url, ""), Path("f"))
