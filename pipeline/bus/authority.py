@@ -5,9 +5,7 @@ half written, and none is replaced unless asked.
 from __future__ import annotations
 
 import ipaddress
-import os
 import re
-import secrets
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
@@ -26,6 +24,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fantwin.pipeline.bus.certificates import in_words
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.files import PRIVATE, PUBLIC, replace_file
 
 LONGEST_ROLE = 64
 """characters of a common name"""
@@ -34,7 +33,6 @@ CLOCK_SKEW = timedelta(minutes=5)
 _LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
 _HOST_NAME = re.compile(rf"(\*\.)?{_LABEL}(\.{_LABEL})*")
 _LONGEST_HOST = 253
-_PRIVATE, _PUBLIC = 0o600, 0o644
 
 
 class Authority:
@@ -142,19 +140,10 @@ def write_file(path: Path, content: bytes, *, is_private: bool) -> None:
     Raises:
         UserError: it cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
         path.parent.mkdir(mode=0o700 if is_private else 0o755, parents=True, exist_ok=True)
-        file = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _PRIVATE if is_private else _PUBLIC)
-        try:
-            os.write(file, content)
-            os.fsync(file)
-        finally:
-            os.close(file)
-        temporary.replace(path)
+        replace_file(path, content, PRIVATE if is_private else PUBLIC)
     except OSError as error:
-        with suppress(OSError):
-            temporary.unlink()
         raise UserError(f"{path}: cannot be written: {error.strerror}") from error
 
 

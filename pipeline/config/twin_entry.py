@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import tomllib
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.config.models import Config, ConfigError
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.files import replace_file
 
 _HEADER = re.compile(r"^([ \t]*)\[\[[ \t]*tray[ \t]*\]\][^\r\n]*(\r?)$", re.MULTILINE)
 
@@ -41,22 +40,12 @@ def write_twin(settings: Config, tray: str, twin: Path) -> str:
     resolved, folder = twin.resolve(), settings.folder.resolve()
     entry = str(resolved.relative_to(folder)) if resolved.is_relative_to(folder) else str(resolved)
     path = settings.path.resolve()
-    unfinished = path.with_name(f"{path.name}.part")
     try:
         text = with_twin(
             path.read_bytes().decode(), tray, entry, settings.path
         )  # its user may have edited it meanwhile
-        before = path.stat()
-        with unfinished.open("wb") as file:
-            file.write(text.encode())
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.chmod(before.st_mode)
-        with suppress(PermissionError):
-            os.chown(unfinished, before.st_uid, before.st_gid)
-        unfinished.replace(path)
+        replace_file(path, text.encode())
     except (OSError, UnicodeDecodeError) as error:
-        unfinished.unlink(missing_ok=True)
         raise UserError(f'{settings.path}: cannot be changed ({error}): add twin = "{entry}" to tray {tray}') from error
     return entry
 

@@ -16,6 +16,7 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.files import replace_file
 from fantwin.schemas.units import NS_PER_S
 
 LIST_NAME = "versions.json"
@@ -336,13 +337,8 @@ class TwinVersions:
             os.close(descriptor)
 
     def _write(self, listed: VersionList) -> None:
-        unfinished = self._path.with_suffix(".new")
         try:
-            with unfinished.open("w", encoding="utf-8") as file:
-                file.write(listed.model_dump_json(indent=1))
-                file.flush()
-                os.fsync(file.fileno())
-            unfinished.replace(self._path)
+            replace_file(self._path, listed.model_dump_json(indent=1).encode())
         except OSError as error:
             raise self._cannot_write(error) from error
 

@@ -156,15 +156,6 @@ def is_being_written(path: Path) -> bool:
         return False
 
 
-def sync_folder(folder: Path) -> None:
-    """Flush a folder to the disk: its file names then survive a power cut. OSError if that fails."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 class Disk:
     """The disk that a folder is on. Its mount point is not mistaken for it after it was unmounted."""
 

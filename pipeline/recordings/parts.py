@@ -13,8 +13,9 @@ from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
+from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.contents import Contents, contents_of
-from fantwin.pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
+from fantwin.pipeline.recordings.disk import Disk, DiskError, refused
 from fantwin.pipeline.recordings.rare_messages import last_messages
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata
 from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX, UnreadableError

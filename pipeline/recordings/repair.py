@@ -19,8 +19,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.writer import MCAP0_MAGIC, Writer
 
+from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.contents import NOT_A_RECORD, losses_outside_counts
-from fantwin.pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused, sync_folder
+from fantwin.pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused
 from fantwin.pipeline.recordings.index import SHORT_ENDING, write_ending
 from fantwin.pipeline.recordings.records import (
     ACTIVE_SUFFIX,

@@ -21,8 +21,9 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.chunk import FillingChunk
-from fantwin.pipeline.recordings.disk import AtomicAppendFile, Disk, refused, sync_folder
+from fantwin.pipeline.recordings.disk import AtomicAppendFile, Disk, refused
 from fantwin.pipeline.recordings.index import SHORT_ENDING, Index, PartIndex, write_ending
 from fantwin.pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,

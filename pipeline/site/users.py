@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.files import PRIVATE, replace_file
 
 if TYPE_CHECKING:
     from argon2 import PasswordHasher
@@ -134,14 +135,8 @@ def write_users(path: Path, users: Mapping[str, User]) -> None:
     for name, user in sorted(users.items()):
         lines.append(f"\n[{json.dumps(name)}]\nrole = {json.dumps(user.role)}\n")
         lines.append(f"password_hash = {json.dumps(user.password_hash)}\n")
-    beside = path.with_name(f".{path.name}.new")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
-            file.writelines(lines)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
+        replace_file(path, "".join(lines).encode(), PRIVATE)
     except OSError as error:
         raise UserError(f"{path}: the users cannot be written: {error.strerror}") from error
 

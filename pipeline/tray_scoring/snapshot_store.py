@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.runtime.stage import StageError
 from fantwin.schemas.codec import CodecError, decode, encode
 from fantwin.schemas.formats import SNAPSHOT
@@ -119,13 +120,7 @@ class SnapshotStore:
     def save(self, snapshot: ScorerSnapshot) -> None:
         """Replace the snapshot. A full disk is reported in `problem` and does not stop the scorer."""
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = self.path.with_suffix(".new")
-            with temporary.open("wb") as file:
-                file.write(encode(snapshot))
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(self.path)
+            replace_file(self.path, encode(snapshot))
             self.problem = ""
         except OSError as error:
             self.problem = (

@@ -23,6 +23,7 @@ from fantwin.pipeline.cli.twins.marked_running import marked_running
 from fantwin.pipeline.cli.twins.outlier_run_check import outlier_warnings
 from fantwin.pipeline.cli.twins.training_data import FromOption, ToOption, twin_errors
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.pipeline.replay.offline.calibration_of_twin import (
@@ -245,10 +246,8 @@ def _write(twin: Path, output: Path, calibration: Calibration) -> None:
         from fantwin.twin.export.card_entries import with_card_entries  # noqa: PLC0415  the command line loads twin only when needed
 
         content = with_card_entries(twin.read_bytes(), {"calibration": json.loads(calibration.model_dump_json())})
-    beside = output.with_name(output.name + ".new")
     try:
-        beside.write_bytes(content)
-        beside.replace(output)
+        replace_file(output, content)
     except OSError as error:
         raise UserError(f"{output}: cannot write the twin: {error.strerror}") from error
 

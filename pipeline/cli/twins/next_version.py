@@ -10,7 +10,6 @@ new version is the twin in force with a new calibration.
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -37,6 +36,7 @@ from fantwin.pipeline.cli.twins.train import fit_twin
 from fantwin.pipeline.cli.twins.training_data import TrainingData, twin_errors
 from fantwin.pipeline.cli.twins.version_data import Split, newest_long, newest_recordings, split, spread_parts
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
 from fantwin.pipeline.learning.history_recordings import HistoryRecording
 from fantwin.pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList, overlap
@@ -126,14 +126,9 @@ def _is_too_little_new(healthy: Sequence[HistoryRecording], listed: VersionList)
 
 
 def _write(path: Path, content: bytes) -> None:
-    """The whole file or none, also after a power cut: the list must never name a file that is not there."""
-    unfinished = path.with_name(f"{path.name}.new")
+    """The list must never name a file that is not there."""
     try:
-        with unfinished.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(path)
+        replace_file(path, content)
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -17,10 +17,11 @@ from datetime import UTC, datetime
 from itertools import takewhile
 from pathlib import Path
 
+from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.clips.clip import CLIP_KEY, CLIP_SNAPSHOT_KEY, Clip
 from fantwin.pipeline.recordings.clips.part_chunks import PartChunks, parts_backwards
 from fantwin.pipeline.recordings.clips.tracker import SET_BACK_NS, CutResult
-from fantwin.pipeline.recordings.disk import DiskError, is_being_written, refused, sync_folder
+from fantwin.pipeline.recordings.disk import DiskError, is_being_written, refused
 from fantwin.pipeline.recordings.index import PartIndex
 from fantwin.pipeline.recordings.reading import TACHO_KEY, RecordingMetadata
 from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, active_path

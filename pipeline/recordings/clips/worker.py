@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -10,10 +9,11 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
 
+from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.recordings.clips.clip import Clip, clip_folder, clips_as_text, list_path
 from fantwin.pipeline.recordings.clips.cutting import cut_clips, remove_unfinished
 from fantwin.pipeline.recordings.clips.tracker import CutResult
-from fantwin.pipeline.recordings.disk import DiskError, refused, sync_folder
+from fantwin.pipeline.recordings.disk import DiskError, refused
 from fantwin.pipeline.recordings.index import PartIndex
 from fantwin.pipeline.recordings.records import RecordingError
 
@@ -134,14 +134,7 @@ class ClipWorker(ClipMaker):
         clips, self._to_save = self._to_save, None
         if clips is None:
             return
-        self._folder.mkdir(parents=True, exist_ok=True)
-        unfinished = self._list.with_name(f"{self._list.name}.new")
-        with unfinished.open("w") as file:
-            file.write(clips_as_text(clips))
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(self._list)
-        sync_folder(self._folder)
+        replace_file(self._list, clips_as_text(clips).encode())
         self._problem = ""
 
     def _cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.sources.hwmon.tree import ChipFolder
 
 
@@ -50,10 +51,7 @@ class FoundModes:
         """Replace what is kept. Raises OSError."""
         if self._path is None:
             return
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        new = self._path.with_suffix(".new")
-        new.write_text(json.dumps(_FOUND.dump_python(_Found(chip.name, chip.device, dict(pwms)))), encoding="ascii")
-        new.replace(self._path)
+        replace_file(self._path, json.dumps(_FOUND.dump_python(_Found(chip.name, chip.device, dict(pwms)))).encode())
 
     def forget(self) -> None:
         """All was given back. Raises OSError."""

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fantwin.pipeline.sources.logs import formats
 
 from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.sources.logs import formats
 from fantwin.pipeline.sources.logs.formats import LogFormat
 from fantwin.pipeline.sources.logs.log_file import LogFile, Series
 from fantwin.schemas.units import NS_PER_S

@@ -1,0 +1,53 @@
+"""Files that are written whole: a reader finds the file of before or the new one, also after a power cut."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+PRIVATE, PUBLIC = 0o600, 0o644
+
+
+def replace_file(path: Path, content: bytes, mode: int | None = None) -> None:
+    """Put a file in its place, with its folders.
+
+    Args:
+        path: the file; one that is there is replaced.
+        content: all of it.
+        mode: who may read and write it, from its first moment on. None: as the one that it replaces, which also gives
+            its owner; a new one is public.
+
+    Raises:
+        OSError: it cannot be written; the file of before is still there.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    before = path.stat() if mode is None and path.exists() else None
+    unfinished = path.with_name(f".{path.name}.new")  # always the same: one that a crash left is used again
+    try:
+        descriptor = os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode or PUBLIC)
+        with os.fdopen(descriptor, "wb") as file:
+            if mode is not None:
+                os.fchmod(descriptor, mode)
+            if before is not None:
+                os.fchmod(descriptor, before.st_mode)
+                with suppress(PermissionError):
+                    os.fchown(descriptor, before.st_uid, before.st_gid)
+            file.write(content)
+            file.flush()
+            os.fsync(descriptor)
+        unfinished.replace(path)
+    except OSError:
+        with suppress(OSError):
+            unfinished.unlink()
+        raise
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush a folder to the disk: its file names then survive a power cut. OSError if that fails."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
