@@ -27,6 +27,9 @@ OF_RATE = 0.8
 """share of the declared rate that the speed has; missing readings have the rest"""
 WALKS_PER_SQRT_S = 0.1
 """how fast the fault of an alarm may change, of its largest size"""
+TOLD_APART = 16.0
+"""square of that size over the largest variance that its changing gives it: with more, coarse readings could not tell a
+small fault from none, and its alarm would stay"""
 OVER_S, OVER_ODDS = 10.0, 100.0
 """time for which a healthy fan is likelier, by these odds, than the fault at its largest, until that is over"""
 PROBABLE = 0.05
@@ -236,7 +239,8 @@ class Decision(Saved):
         model, evidence = self.model, self._evidence
         evidence.begin(now.moved_to_rad_s - now.moves_rad_s2 * self.bin_s)
         largest = self._peak * self._shows
-        model.noise[:, FAULT] = np.where(self.active, np.square(WALKS_PER_SQRT_S * largest) * self.bin_s, 0.0)
+        walks = self.active & (model.covariance[:, FAULT, FAULT] < np.square(largest) / TOLD_APART)
+        model.noise[:, FAULT] = np.where(walks, np.square(WALKS_PER_SQRT_S * largest) * self.bin_s, 0.0)
         evidence.show(now.changes)
         model.predict(now)
         now = self.operation.read(one, now, self._counts(one, now))

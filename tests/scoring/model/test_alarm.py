@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from fantwin.schemas.tacho import Tacho
 from fantwin.scoring.model.decision import OVER_S, Decision
 from fantwin.scoring.model.faults import DRAG, DRAG_GROWS, DRIVE, FRICTION, GROWS_S
 from fantwin.scoring.model.healthy import SLOW, K
@@ -67,6 +68,20 @@ def test_an_alarm_stays_while_the_command_moves_and_clears_once_ten_seconds_afte
     cleared = plays(made, decision, 60.0)
     assert sorted(fan for _, fan, _ in cleared) == [0, 1]
     assert all(OVER_S <= time_s - ends_s < OVER_S + 4.0 and not is_raised for time_s, _, is_raised in cleared)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_small_fault_of_which_each_reading_of_a_coarse_tacho_says_little_does_not_outlive_its_end(seed: int) -> None:
+    """A count says 3 rad/s, the fault takes 4."""
+    tacho = Tacho(kind="count", pulses=2, window_s=1.0)
+    made = MadeFans(twin_of(FANS, tachos=(tacho,)).fans, 1.0, lambda _time_s: 100.0, seed=seed, own=0.3)
+    decision = made.decision(declared_s=86400.0)
+    assert plays(made, decision, 60.0) == []
+    made.fault_from_s, made.sizes[:, DRIVE] = 60.0, -0.016
+    raised = {fan for _, fan, is_raised in plays(made, decision, 300.0) if is_raised}
+    ends_s, made.sizes[:] = made.time_s, 0.0
+    cleared = {fan: time_s - ends_s for time_s, fan, is_raised in plays(made, decision, 300.0) if not is_raised}
+    assert raised and raised <= cleared.keys() and max(cleared.values()) < 200.0
 
 
 @pytest.mark.parametrize("period_s", [3.0, 10.0])
