@@ -157,8 +157,9 @@ def short_name(cause: str) -> str:
 
 
 def with_share(cause: Diagnosis) -> str:
-    """The short name and the probability."""
-    return f"{short_name(cause.cause)} {100 * cause.probability:.0f} %"
+    """The short name and the probability; that of none of them is left out, as it does not add up with the others."""
+    share = "" if cause.cause == CANNOT_TELL else f" {100 * cause.probability:.0f} %"
+    return f"{short_name(cause.cause)}{share}"
 
 
 def most_probable(causes: Sequence[Diagnosis]) -> list[str]:

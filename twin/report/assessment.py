@@ -112,9 +112,16 @@ def _about_the_fit(content: Summary) -> Iterable[str]:
             f"{_these(few, content).capitalize()}: {fewest:.0f} independent errors determine the rmse "
             f"to {_uncertainty(fewest):.0%} only; use longer recordings."
         )
-    yield from _of_fans(content, _biased, "on average faster or slower than the twin")
     yield from _of_fans(
-        content, _biased_at_a_speed, "the mean error exceeds sigma at some speeds; see Error over speed"
+        content, lambda fan: _biased(fan) and fan.residual.mean_rad_s > 0.0, "on average faster than the twin"
+    )
+    yield from _of_fans(
+        content, lambda fan: _biased(fan) and fan.residual.mean_rad_s < 0.0, "on average slower than the twin"
+    )
+    yield from _of_fans(
+        content,
+        _biased_at_a_speed,
+        "the mean error exceeds sigma at some speeds: see Error over speed in `fantwin report`",
     )
     yield from _of_fans(
         content,

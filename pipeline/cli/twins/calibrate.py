@@ -263,7 +263,7 @@ def _print(output: Path, calibration: Calibration, drops: Sequence[str]) -> None
         console.print("learned: nothing; the priors are those of a population of fans")
     for line in (*_rate_lines(calibration), *drops):
         console.print(line, markup=False)
-    console.print("test it on other healthy recordings: fantwin calibrate TWIN.onnx --verify OTHER.mcap")
+    console.print(f"test it on other healthy recordings: fantwin calibrate {output} --verify OTHER.mcap", markup=False)
 
 
 def _rate_lines(calibration: Calibration) -> list[str]:

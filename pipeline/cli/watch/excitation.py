@@ -116,11 +116,12 @@ class Excitation:
         self._settle(self.low, "to the lowest command")
         self._say_which_read_0()
         for row, (command, words) in enumerate(((self.high, "up"), (self.low, "down"))):
-            found[row] = self._settle(command, f"{words}, to measure the time constants")
+            found[row] = self._settle(command, f"{words}, to see how fast readings follow")
         slowest_s = np.where(np.isfinite(found), found, -np.inf).max(axis=0)
         constants = {fan: float(s) if s >= 0 else np.nan for fan, s in zip(self.fans, slowest_s, strict=True)}
         for fan, seconds in constants.items():
-            follows = f"time constant {seconds:.2g} s" if np.isfinite(seconds) else "does not follow its command"
+            shown = f"its readings show 63 % of a change after {seconds:.2g} s"
+            follows = shown if np.isfinite(seconds) else "does not follow its command"
             self.progress(f"fan {fan}: {follows}")
         if not np.isfinite(slowest_s).any():
             raise UserError(

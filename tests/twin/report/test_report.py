@@ -202,7 +202,7 @@ def test_a_fan_that_runs_slow_is_not_followed_and_the_page_says_by_how_much(twin
     judged = assess(content)
     assert judged.level == "not followed"
     assert f"rmse {content.fans[0].rmse_in_sigma:.2f} times the declared sigma" in judged.headline
-    assert any("on average faster or slower" in line for line in judged.warnings)
+    assert any("on average slower than the twin" in line for line in judged.warnings)
     assert "train it on them" in Page(report_page(content)).text
 
 
