@@ -1,4 +1,5 @@
-"""The kinds of sources: one row each, and the only place that lists them.
+"""The kinds of sources: one row each, and the only place that lists them. Other packages add theirs by entry points of
+the group `fantwin.sources`.
 
 A row holds import strings, so that a process imports the source that its configuration names and no other.
 """
@@ -7,19 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
+from fantwin.pipeline.plugins import SourceKind, rows_of_others
 from fantwin.pipeline.sources.source import SampleSource, SourceConfig, SourceContext
-
-
-class SourceKind(NamedTuple):
-    """Import strings, `module:class`. The settings are apart: every process reads them, only acquisition connects."""
-
-    config: str
-    """a `SourceConfig`"""
-    source: str
-    """a `SampleSource`, built from that configuration and a `SourceContext`"""
-
 
 SOURCE_KINDS: dict[str, SourceKind] = {
     "serial": SourceKind(
@@ -51,6 +43,7 @@ SOURCE_KINDS: dict[str, SourceKind] = {
         source="fantwin.pipeline.sources.redfish.source:RedfishSource",
     ),
 }
+SOURCE_KINDS |= rows_of_others("fantwin.sources", SourceKind, SOURCE_KINDS)
 
 
 def parse_source(values: Any) -> SourceConfig:

@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.config.registry import STAGES, StageRow
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.link import Received
 from fantwin.pipeline.outputs.mqtt.outbox import Outgoing
@@ -31,6 +31,7 @@ from fantwin.pipeline.outputs.notify.wording import Place
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
 from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots, PlotPlaces
 from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
+from fantwin.pipeline.plugins import StageRow
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import Context, Core, Stage, StageConfig, load_stage
 from fantwin.pipeline.site.alarm_store import AlarmStore

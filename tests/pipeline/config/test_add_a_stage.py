@@ -16,8 +16,9 @@ import pytest
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import ConfigError
-from fantwin.pipeline.config.registry import STAGES, StageRow
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.shards import process_list
+from fantwin.pipeline.plugins import StageRow
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, load_stage
 from fantwin.schemas.codec import decode, encode, type_name

@@ -11,8 +11,9 @@ import pytest
 from fantwin.pipeline.acquisition.sample_blocks import BlockEvent, SampleBlocks
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.plugins import SourceKind
 from fantwin.pipeline.runtime.stage import BuiltStage, Context
-from fantwin.pipeline.sources.kinds import SOURCE_KINDS, SourceKind
+from fantwin.pipeline.sources.kinds import SOURCE_KINDS
 from fantwin.pipeline.sources.serial.config import SerialConfig
 from fantwin.schemas.messages import Command, Raw, StatedTacho
 from fantwin.schemas.tacho import Tacho
