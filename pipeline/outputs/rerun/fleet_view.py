@@ -16,7 +16,7 @@ from fantwin.pipeline.outputs.rerun.plot_places import PlotPlaces
 from fantwin.pipeline.outputs.rerun.worst_page import worst_page
 from fantwin.pipeline.site.fleet import FLEET_COLUMNS, Fan, Fleet, last_sample
 from fantwin.pipeline.site.trace import MEASURED_COLUMNS
-from fantwin.schemas.messages import Alarm, Array, Score
+from fantwin.schemas.messages import Alarm, Score
 from fantwin.schemas.units import NS_PER_S
 
 SILENT_AFTER_NS = 5 * NS_PER_S
@@ -29,26 +29,20 @@ PAGE_PERIOD_NS = NS_PER_S
 """between two pages about the worst fans: faster than this nobody reads"""
 REPEAT_NS = 5 * NS_PER_S
 """what does not change is sent again for viewers that join late"""
-FANS_NAMED = 8
-"""fans in alarm that are named on the map"""
 COLUMNS = tuple(dict.fromkeys((*FLEET_COLUMNS, *MEASURED_COLUMNS)))
 
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """The overview at one time. A part is None if it has not changed.
+    """The overview at one time.
 
     Attributes:
         t_ns: time of the newest sample, ns since the epoch.
-        classes: (fans,) the class of each fan's cell, see `pipeline.site.fleet.class_names`.
-        alarms: the indexes of the fans in alarm, the worst first.
         counts: fans in alarm, suspect, not judged.
-        page: about the worst fans, in Markdown.
+        page: about the worst fans, in Markdown; None: it has not changed.
     """
 
     t_ns: int
-    classes: Array | None
-    alarms: Sequence[int] | None
     counts: Mapping[str, int]
     page: str | None
 
@@ -68,8 +62,6 @@ class FleetView:
         self.silent: set[str] = set()
         """the trays that have sent samples and do so no more"""
         self._t_ns = 0
-        self._classes = b""
-        self._alarms: list[int] = []
         self._repeated_ns = self._page_ns = -REPEAT_NS
         self._page = ""
 
@@ -114,20 +106,10 @@ class FleetView:
         repeat = now_ns - self._repeated_ns >= REPEAT_NS
         if repeat:
             self._repeated_ns = now_ns
-        classes = self._fleet.classes()
-        alarms = [self._fleet.index(fan) for fan in self._fleet.alarms()]
-        is_new, self._classes = repeat or classes.tobytes() != self._classes, classes.tobytes()
-        are_new, self._alarms = repeat or alarms != self._alarms, alarms
         page = None
         if now_ns - self._page_ns >= PAGE_PERIOD_NS:
             page = worst_page(self._site, self._fleet, self._places.place, self._t_ns)
             page = page if repeat or page != self._page else None
         if page is not None:
             self._page_ns, self._page = now_ns, page
-        return Overview(
-            t_ns=self._t_ns,
-            classes=classes if is_new else None,
-            alarms=alarms if are_new else None,
-            counts=self._fleet.counts(),
-            page=page,
-        )
+        return Overview(t_ns=self._t_ns, counts=self._fleet.counts(), page=page)

@@ -28,7 +28,7 @@ from rerun.experimental import View, ViewerClient
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots
-from fantwin.pipeline.outputs.rerun.rerun_fleet import CELLS, MAP, bounds_of
+from fantwin.pipeline.outputs.rerun.rerun_fleet import COUNTS
 from fantwin.pipeline.outputs.rerun.rerun_layout import LayoutName, TrayLayout, wear_blueprint
 from fantwin.pipeline.outputs.rerun.rerun_paths import DAYS, TIMELINE, WEAR, place_in
 from fantwin.pipeline.outputs.rerun.rerun_sink import APPLICATION, LOOPBACK, rerun_program
@@ -64,13 +64,13 @@ class _Rrd:
 
     Attributes:
         trays: by name, with the fans that have been drawn.
-        map_places: (n, 2) what is on the map of a fleet; None: it is no fleet.
+        is_fleet: it has an overview of a fleet.
         worn: the trays with wear; last_day_ns: time of its newest point, 0: there is none.
     """
 
     chunks: Sequence[Chunk]
     trays: dict[str, TrayLayout]
-    map_places: Array | None
+    is_fleet: bool
     first_ns: int
     last_ns: int
     worn: Sequence[str] = ()
@@ -159,7 +159,7 @@ def _read(rrd: Path) -> _Rrd:
     except (RuntimeError, ValueError, OSError) as error:
         raise PictureError(f"{rrd}: not a Rerun file: {error}") from error
     trays: dict[str, TrayLayout] = {}
-    on_map: list[Array] = []
+    is_fleet = False
     times: list[Array] = []
     auxiliary: set[tuple[str, str]] = set()
     alarmed: dict[tuple[str, int], None] = {}
@@ -169,11 +169,12 @@ def _read(rrd: Path) -> _Rrd:
         path, batch = chunk.entity_path.strip("/"), chunk.to_record_batch()
         if path.endswith("/speed") and chunk.is_static:
             _add_fan(trays, path, batch.column("Measurements:names")[0].as_py()[0])
-        elif path.startswith(MAP) and chunk.is_static and "Points2D:positions" in batch.schema.names:
-            on_map.append(np.array(batch.column("Points2D:positions")[0].as_py()))
         elif chunk.is_static:
             continue
-        elif path.endswith("/speed") or path == CELLS:
+        elif path.endswith("/speed"):
+            times.append(_times_ns(batch))
+        elif path.startswith(f"{COUNTS}/"):
+            is_fleet = True
             times.append(_times_ns(batch))
         elif path.endswith("/deviation"):
             alarmed[_fan_of(path)] = None
@@ -186,13 +187,12 @@ def _read(rrd: Path) -> _Rrd:
     if not times:
         raise PictureError(f"{rrd}: holds no speeds drawn by the viewer stage")
     all_times = np.concatenate(times)
-    map_places = np.concatenate(on_map) if on_map else None
     for name, layout in trays.items():
         beside = [column for column in AUXILIARY if (name, column.name) in auxiliary]
         in_alarm = [fan for tray, fan in alarmed if tray == name]
         trays[name] = replace(layout, auxiliary=beside, alarmed=in_alarm)
     first_ns, last_ns = int(all_times.min()), int(all_times.max())
-    return _Rrd(chunks, trays, map_places, first_ns, last_ns, tuple(worn), last_day_ns)
+    return _Rrd(chunks, trays, is_fleet, first_ns, last_ns, tuple(worn), last_day_ns)
 
 
 def _fan_of(path: str) -> tuple[str, int]:
@@ -243,11 +243,11 @@ def _blueprint(
             of = f" of {tray}" if tray else ""
             raise PictureError(f"{rrd}: no wear{of}: a fan has its first point about an hour after it was commissioned")
         return wear_blueprint([tray] if tray else contents.worn, for_picture=True)
-    if contents.map_places is not None and tray is None and fans is None:
+    if contents.is_fleet and tray is None and fans is None:
         count = max(
             (place for each in contents.trays.values() for of in each.places.values() for place in of), default=0
         )
-        site = SiteLayout((), window_s, FleetPlots((), count), bounds_of(contents.map_places))
+        site = SiteLayout((), window_s, FleetPlots((), count))
         return site.blueprint(layout, for_picture=True)
     if layout == "alarms" and tray is None and fans is None:
         trays = [*contents.trays.values()]

@@ -107,10 +107,9 @@ class RerunSink:
                 check_free(port, f"viewer.{key}", "viewer.serve = false")
         self._recording = rr.RecordingStream(APPLICATION)
         self._bands = RerunBands(self._recording)
-        self._fleet = RerunFleet(self._recording, trays) if fleet else None
+        self._fleet = RerunFleet(self._recording) if fleet else None
         layouts = [] if fleet else [TrayLayout(t.name, range(t.fans), t.speed_unit, t.fans) for t in trays]
-        bounds = self._fleet.bounds if self._fleet else None
-        self._layout = SiteLayout(tuple(layouts), window_s, fleet, bounds)
+        self._layout = SiteLayout(tuple(layouts), window_s, fleet)
         self._wear = RerunWear(self._recording)
         self._layout_name: LayoutName = layout
         self._late = False

@@ -27,25 +27,23 @@ class SiteLayout:
         trays: with every fan drawn; none of a fleet, but in a picture of some of its fans.
         window_s: length of time shown.
         plots: of a fleet; None: it is none.
-        bounds: of the map of a fleet.
         auxiliary: of a fleet, the columns beside command and speed that are drawn.
     """
 
     trays: tuple[TrayLayout, ...]
     window_s: float
     plots: FleetPlots | None = None
-    bounds: rrb.VisualBounds2D | None = None
     auxiliary: tuple[AuxiliaryColumn, ...] = ()
 
     def blueprint(self, name: LayoutName = "all", *, for_picture: bool = False) -> rrb.Blueprint:
         """One of the layouts."""
         if name == "wear":
             return wear_blueprint([tray.name for tray in self.trays], for_picture=for_picture)
-        if self.plots is None or self.bounds is None:
+        if self.plots is None:
             lays_out = trays_blueprint if name == "all" else alarms_blueprint
             return lays_out(self.trays, self.window_s, for_picture=for_picture)
         if name == "all":
-            return fleet_blueprint(self.bounds, self.plots, self.window_s, self.auxiliary, for_picture=for_picture)
+            return fleet_blueprint(self.plots, self.window_s, self.auxiliary, for_picture=for_picture)
         return fleet_alarms_blueprint(self.plots, self.window_s, self.auxiliary, for_picture=for_picture)
 
     def auxiliary_of(self, tray: str) -> Sequence[AuxiliaryColumn]:
