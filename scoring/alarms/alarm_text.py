@@ -31,6 +31,7 @@ TRANSITIONS = {
 }
 """transitions whose line depends on nothing else"""
 CONTINUES = "the alarm continues from before the restart"
+NOT_AS_COMMANDED = "does not turn or stop as commanded"
 
 
 class AlarmText:
@@ -52,6 +53,8 @@ class AlarmText:
             others = (
                 f"; {alike} other fans of the tray have the same: see what they share (supply, air)" if alike else ""
             )
+            if _is_against_command(alarm):  # by how much it is slower was said of it while it fell
+                return f"{fan}: {self._cause(alarm)}{others}"
             return f"{fan}: {self._deviation(alarm)}{self._cause_if_known(alarm)}{others}"
         if alarm.transition == Transition.REPUBLISHED:
             return f"{fan}: {_after_restart(alarm)}"
@@ -61,15 +64,13 @@ class AlarmText:
 
     def _deviation(self, alarm: Alarm) -> str:
         if alarm.statistic == Statistic.STANDSTILL:
-            return (alarm.causes[0].evidence if alarm.causes else "") or "does not turn or stop as commanded"
+            return (alarm.causes[0].evidence if alarm.causes else "") or NOT_AS_COMMANDED
         if alarm.statistic == Statistic.MISSING_READINGS:
             return "the tacho loses readings"
         deviation = self.units.deviation(alarm)
         return f"slowly, {deviation}" if alarm.statistic == Statistic.WEAR else deviation
 
     def _cause_if_known(self, alarm: Alarm) -> str:
-        if alarm.statistic == Statistic.STANDSTILL and _is_against_command(alarm):
-            return f": {_likely(alarm)}"
         known = alarm.causes and alarm.causes[0].cause != CANNOT_TELL
         return f"; {self._cause(alarm)}" if known else ""
 
@@ -78,7 +79,7 @@ class AlarmText:
             return "cause unknown"
         first = alarm.causes[0]
         if _is_against_command(alarm):
-            return f"{first.evidence}: {_likely(alarm)}"
+            return f"{first.evidence or NOT_AS_COMMANDED}: {_likely(alarm)}"
         name = CAUSES.get(first.cause, first.cause)
         if first.cause == CANNOT_TELL:
             return first.evidence or name  # the evidence begins with the name

@@ -78,6 +78,7 @@ def test_causes_of_a_fan_that_comes_to_rest_are_named_beside_those_of_one_that_t
     weak = Diagnosis(cause="gain_down", probability=0.2)
     found = line(Transition.DIAGNOSED, causes=(no_power, weak))
     assert found == "fan 2: slows down to 40 % of its speed: no power 50 %, less drive (supply, driver) 20 %"
+    assert line(causes=(no_power, weak)) == found, "how much slower it was some time ago would contradict it"
 
 
 def test_every_cause_that_can_be_found_has_words() -> None:
