@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import secrets
 from contextlib import suppress
 from pathlib import Path
 
 PRIVATE, PUBLIC = 0o600, 0o644
+_AS_THE_USER_WISHES = 0o666
+"""less what the umask takes"""
 
 
 def replace_file(path: Path, content: bytes, mode: int | None = None) -> None:
@@ -15,24 +18,24 @@ def replace_file(path: Path, content: bytes, mode: int | None = None) -> None:
     Args:
         path: the file; one that is there is replaced.
         content: all of it.
-        mode: who may read and write it, from its first moment on. None: as the one that it replaces, which also gives
-            its owner; a new one is public.
+        mode: who may read and write it, from its first moment on; None: as the one that it replaces, or as the process
+            makes files. The owner stays that of the one that it replaces, where the process may say so.
 
     Raises:
         OSError: it cannot be written; the file of before is still there.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    before = path.stat() if mode is None and path.exists() else None
-    unfinished = path.with_name(f".{path.name}.new")  # always the same: one that a crash left is used again
+    before = path.stat() if path.exists() else None
+    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        descriptor = os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode or PUBLIC)
+        descriptor = os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode or _AS_THE_USER_WISHES)
         with os.fdopen(descriptor, "wb") as file:
-            if mode is not None:
-                os.fchmod(descriptor, mode)
             if before is not None:
-                os.fchmod(descriptor, before.st_mode)
                 with suppress(PermissionError):
                     os.fchown(descriptor, before.st_uid, before.st_gid)
+            wanted = mode if mode is not None else before and before.st_mode
+            if wanted is not None:
+                os.fchmod(descriptor, wanted)
             file.write(content)
             file.flush()
             os.fsync(descriptor)
@@ -41,7 +44,8 @@ def replace_file(path: Path, content: bytes, mode: int | None = None) -> None:
         with suppress(OSError):
             unfinished.unlink()
         raise
-    sync_folder(path.parent)
+    with suppress(OSError):  # the new file is there; some file systems cannot do it
+        sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:

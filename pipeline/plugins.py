@@ -17,8 +17,12 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, NamedTuple, TypeVar
 
+from fantwin.pipeline.errors import UserError
+
 _LOG = logging.getLogger(__name__)
 Row = TypeVar("Row")
+LEFT_OUT: set[str] = set()
+"""names of what could not be used, which was said"""
 
 
 class SourceKind(NamedTuple):
@@ -63,9 +67,12 @@ class StageRow:
     needs_twin: bool = False
 
     def load(self) -> Any:
-        """Import the stage and return its declaration."""
-        module, _, attribute = self.declaration.partition(":")
-        return getattr(import_module(module), attribute)
+        """Import the stage and return its declaration.
+
+        Raises:
+            UserError: it cannot be imported.
+        """
+        return loaded(self.declaration)
 
     def topics(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """What it reads and what it writes; imports the stage only if its row does not say so."""
@@ -73,6 +80,21 @@ class StageRow:
             stage = self.load()
             return stage.reads, stage.writes
         return self.reads, self.writes
+
+
+def loaded(import_string: str) -> Any:
+    """What `module:attribute` names.
+
+    Raises:
+        UserError: it cannot be imported.
+    """
+    module, _, attribute = import_string.partition(":")
+    try:
+        return getattr(import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        if module.startswith("fantwin."):
+            raise
+        raise UserError(f"{import_string} cannot be imported ({error}): correct or uninstall its package") from error
 
 
 def rows_of_others(
@@ -93,7 +115,7 @@ def rows_of_others(
     for point in entry_points(group=group):
         try:
             row = point.load()
-        except Exception as error:  # noqa: BLE001  whatever a module of others raises when it is imported
+        except (Exception, SystemExit) as error:  # noqa: BLE001  whatever a module of others raises when it is imported
             problem = f"{type(error).__name__}: {error}"
         else:
             if not isinstance(row, kind):
@@ -103,6 +125,7 @@ def rows_of_others(
                 if not problem:
                     found[point.name] = row
                     continue
+        LEFT_OUT.add(point.name)
         _LOG.warning("%s %r is left out: %s; correct or uninstall %s", group, point.name, problem, _package(point))
     return found
 

@@ -68,17 +68,10 @@ IMPORT_TIME = """
 import sys, time
 from importlib import import_module
 start = time.perf_counter()
-try:
-    stage_main = import_module("fantwin.pipeline.cli.watch.run")
-except ImportError:
-    stage_main = import_module("pipeline.commands.run")
-try:
-    from fantwin.pipeline.config.loading import load_config
-    load_config(__import__("pathlib").Path(sys.argv[2]), (), (sys.argv[1],))
-except ImportError:
-    from fantwin.pipeline.config import load_config
-    load_config(__import__("pathlib").Path(sys.argv[2]))
-import_module(f"stages.{sys.argv[1]}")
+import_module("fantwin.pipeline.cli.watch.run")
+from fantwin.pipeline.config.loading import load_config
+load_config(__import__("pathlib").Path(sys.argv[2]), (), (sys.argv[1],))
+import_module(f"fantwin.stages.{sys.argv[1]}")
 print(time.perf_counter() - start)
 """
 

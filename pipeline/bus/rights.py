@@ -51,6 +51,12 @@ def awaited_rights(session: zenoh.Session, site: str, role: str, stop: threading
     return granted
 
 
+def claims_of(site: SiteRoles, role: str) -> list[tuple[str, str]]:
+    """All that a role may declare, by this process's own configuration."""
+    own = site.rights(role)
+    return [(message, key) for message in _WORDS for key in own.of_message.get(message, ())] if own else []
+
+
 def refused_in_words(claims: Collection[tuple[str, str]], role: str, site: SiteRoles) -> str:
     """What a role may not do by this process's own configuration, and what to do; empty if it may do all.
 

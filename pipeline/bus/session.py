@@ -30,7 +30,7 @@ from fantwin.pipeline.bus.opening import (
 )
 from fantwin.pipeline.bus.publisher import KeptBytes, Publisher
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
-from fantwin.pipeline.bus.rights import awaited_rights, granted_rights, refused_by_router, refused_in_words
+from fantwin.pipeline.bus.rights import awaited_rights, claims_of, granted_rights, refused_by_router, refused_in_words
 from fantwin.pipeline.config.models import BusConfig, Config
 from fantwin.pipeline.config.roles import READERS
 from fantwin.schemas.topics import Topic, key_in_words, largest_bytes
@@ -225,16 +225,20 @@ class Bus:
         """The messages that others keep for one key, and whether all of them have answered in time. Waits for it."""
         return ask_for_kept(self._session, key, timeout_s)
 
-    def require_rights(self, stop: threading.Event | None = None) -> None:
-        """Raises BusError if something that this session has declared is refused; waits a moment for the answer."""
+    def require_rights(self, stop: threading.Event | None = None, *, of_role: bool = False) -> None:
+        """Raises BusError if something that this session has declared is refused; waits a moment for the answer.
+
+        of_role: or anything else that its role may do, of what the router grants: it will be declared later.
+        """
         if not (self.credentials and self._site):
             return
         role, claims = self.credentials.role, tuple(self._claims)
         problem = refused_in_words(claims, role, self._site)
         if not problem and self._config.mode == "client":
             granted = awaited_rights(self._session, self._site.site, role, stop)
+            wanted = claims_of(self._site, role) if of_role else claims
             if granted or self._has_its_router():  # one that is gone refuses nothing
-                problem = refused_by_router(claims, role, self._site, granted)
+                problem = refused_by_router(wanted, role, self._site, granted)
         if problem and not (stop and stop.is_set()):
             raise BusError(problem)
 

@@ -29,6 +29,7 @@ from fantwin.pipeline.config.models import (
     nearest,
 )
 from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.plugins import LEFT_OUT
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS, source_config
 from fantwin.pipeline.sources.source import SourceConfig
 from fantwin.schemas.formats import CONFIGURATION
@@ -109,7 +110,7 @@ def _checked(
 ) -> Config:
     if refusal := CONFIGURATION.refusal(table.get("format", CONFIGURATION.written)):
         raise ConfigError(f"{path}: {refusal}")
-    own = {key: value for key, value in table.items() if key not in STAGES}
+    own = {key: value for key, value in table.items() if key not in STAGES and key not in LEFT_OUT}
     for key in own:
         if key not in _File.model_fields:
             raise ConfigError(f"{path}: unknown key {_shown(key)}{nearest(key, [*_File.model_fields, *STAGES])}")

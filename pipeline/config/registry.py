@@ -7,6 +7,8 @@ points of the group `fantwin.outputs`.
 
 from __future__ import annotations
 
+import re
+
 from fantwin.pipeline.plugins import StageRow, rows_of_others
 from fantwin.schemas.topics import TOPICS
 
@@ -98,10 +100,25 @@ STAGES: dict[str, StageRow] = {
 }
 
 
-def _why_no_output(name: str, row: StageRow) -> str:
+RESERVED = {
+    *("format", "site", "run_folder", "bus", "launcher", "tray"),
+    *("operator", "viewer", "source", "replay", "router"),
+}
+"""keys of the configuration and roles, which no stage may have for its name"""
+
+
+def why_no_output(name: str, row: StageRow) -> str:
+    """Why a row of another package cannot be used; empty if it can."""
+    known = {topic.name for topic in TOPICS}
     if row.name != name:
         return f"its row is called {row.name!r}"
-    return "" if row.enabled_by == "section" else "only a section of the configuration may enable it"
+    if name in RESERVED or not re.fullmatch("[a-z][a-z0-9_]*", name):
+        return "a stage may not have this name"
+    if row.enabled_by != "section" or row.scope != "site":
+        return "only a section of the configuration may enable it, once for the site"
+    if row.reads is None or row.writes is None or not known.issuperset((*row.reads, *row.writes)):
+        return f"its row does not say which topics it reads and writes, of {', '.join(sorted(known))}"
+    return "" if set(row.writes) <= {"request"} else "it may write requests and nothing else"
 
 
-STAGES |= rows_of_others("fantwin.outputs", StageRow, STAGES, _why_no_output)
+STAGES |= rows_of_others("fantwin.outputs", StageRow, STAGES, why_no_output)

@@ -197,7 +197,7 @@ class Runner:
     def _require_rights(self) -> None:
         """Refuse to start where nobody would hear what is published."""
         try:
-            self._bus.require_rights(self.stop)
+            self._bus.require_rights(self.stop, of_role=True)
         except UserError:
             abort(self._parts)
             self._bus.close()

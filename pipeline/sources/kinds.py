@@ -7,10 +7,9 @@ A row holds import strings, so that a process imports the source that its config
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
 from typing import Any
 
-from fantwin.pipeline.plugins import SourceKind, rows_of_others
+from fantwin.pipeline.plugins import SourceKind, loaded, rows_of_others
 from fantwin.pipeline.sources.source import SampleSource, SourceConfig, SourceContext
 
 SOURCE_KINDS: dict[str, SourceKind] = {
@@ -69,7 +68,7 @@ def parse_source(values: Any) -> SourceConfig:
 
 def source_config(kind: str) -> type[SourceConfig]:
     """The model of the settings of a kind."""
-    return _load(SOURCE_KINDS[kind].config)
+    return loaded(SOURCE_KINDS[kind].config)
 
 
 def build_source(config: SourceConfig, context: SourceContext) -> SampleSource:
@@ -78,9 +77,4 @@ def build_source(config: SourceConfig, context: SourceContext) -> SampleSource:
     Raises:
         UserError: a setting is missing or cannot be used.
     """
-    return _load(SOURCE_KINDS[config.kind].source)(config, context)
-
-
-def _load(import_string: str) -> Any:
-    module, _, name = import_string.partition(":")
-    return getattr(import_module(module), name)
+    return loaded(SOURCE_KINDS[config.kind].source)(config, context)

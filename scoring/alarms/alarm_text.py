@@ -53,9 +53,10 @@ class AlarmText:
             others = (
                 f"; {alike} other fans of the tray have the same: see what they share (supply, air)" if alike else ""
             )
-            if _is_against_command(alarm):  # by how much it is slower was said of it while it fell
-                return f"{fan}: {self._cause(alarm)}{others}"
-            return f"{fan}: {self._deviation(alarm)}{self._cause_if_known(alarm)}{others}"
+            what = f"{self._deviation(alarm)}{self._cause_if_known(alarm)}"
+            if _is_against_command(alarm):  # by how much it was slower while it fell is no news
+                what = self._cause(alarm)
+            return f"{fan}: {what}{others}"
         if alarm.transition == Transition.REPUBLISHED:
             return f"{fan}: {_after_restart(alarm)}"
         if alarm.marked_onset_t_ns != alarm.onset_t_ns and alarm.marked_onset_t_ns:

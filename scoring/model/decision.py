@@ -239,8 +239,9 @@ class Decision(Saved):
         model, evidence = self.model, self._evidence
         evidence.begin(now.moved_to_rad_s - now.moves_rad_s2 * self.bin_s)
         largest = self._peak * self._shows
-        walks = self.active & (model.covariance[:, FAULT, FAULT] < np.square(largest) / TOLD_APART)
-        model.noise[:, FAULT] = np.where(walks, np.square(WALKS_PER_SQRT_S * largest) * self.bin_s, 0.0)
+        room = (np.square(largest) / TOLD_APART - model.covariance[:, FAULT, FAULT]).clip(0.0)
+        walk = np.square(WALKS_PER_SQRT_S * largest) * self.bin_s
+        model.noise[:, FAULT] = np.where(self.active, np.minimum(walk, room), 0.0)
         evidence.show(now.changes)
         model.predict(now)
         now = self.operation.read(one, now, self._counts(one, now))

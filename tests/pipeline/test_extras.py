@@ -93,9 +93,10 @@ main._register(main.COMMANDS)
 from fantwin.pipeline.config.registry import STAGES
 for row in STAGES.values():
     row.load()
-from fantwin.pipeline.sources.kinds import SOURCE_KINDS, _load
+from fantwin.pipeline.plugins import loaded
+from fantwin.pipeline.sources.kinds import SOURCE_KINDS
 for row in SOURCE_KINDS.values():
-    _load(row.config), _load(row.source)
+    loaded(row.config), loaded(row.source)
 import fantwin.pipeline.outputs.web.app, fantwin.pipeline.outputs.web.server, fantwin.pipeline.site.users
 import fantwin.twin.build, fantwin.twin.comparison, fantwin.twin.report.assessment, fantwin.twin.export.onnx_twin
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -38,13 +39,19 @@ def test_what_cannot_be_written_leaves_the_file_of_before_and_nothing_else(faili
 def test_a_file_keeps_who_may_read_it_unless_told_and_a_private_one_never_had_others(tmp_path, monkeypatch):
     path = tmp_path / "new" / "folder" / "kept"
     replace_file(path, b"1")
-    assert mode_of(path) & 0o044, "a new one is public"
     path.chmod(0o640)
     replace_file(path, b"2")
     assert (path.read_bytes(), mode_of(path)) == (b"2", 0o640)
-    left_by_a_crash = path.with_name(f".{path.name}.new")
-    left_by_a_crash.write_bytes(b"a part of it, and longer than what follows")
     seen: list[int] = []
     monkeypatch.setattr("fantwin.pipeline.files.os.fsync", lambda file: seen.append(os.fstat(file).st_mode & 0o777))
     replace_file(path, b"3", PRIVATE)
     assert (path.read_bytes(), mode_of(path), seen[0]) == (b"3", PRIVATE, PRIVATE)
+
+
+def test_writers_of_one_file_do_not_disturb_one_another(tmp_path):
+    path, wholes = tmp_path / "kept", [bytes([number]) * 10_000 for number in range(4)]
+    with ThreadPoolExecutor(len(wholes)) as pool:
+        written = [pool.submit(lambda whole=whole: [replace_file(path, whole) for _ in range(50)]) for whole in wholes]
+        while not all(each.done() for each in written):
+            assert not path.exists() or path.read_bytes() in wholes
+    assert all(each.exception() is None for each in written) and list(tmp_path.iterdir()) == [path]

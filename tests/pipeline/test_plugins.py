@@ -10,6 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from fantwin.pipeline.config.loading import top_level
+from fantwin.pipeline.config.models import OWN_ROLES
+from fantwin.pipeline.config.registry import RESERVED, why_no_output
+from fantwin.pipeline.plugins import StageRow
 from tests.support.running_chain import RunningCommand, eventually
 
 PROJECT = """
@@ -22,6 +26,7 @@ serial = "toy_fan:KIND"
 broken = "toy_fan_broken:KIND"
 [project.entry-points."fantwin.outputs"]
 toy_log = "toy_fan:ROW"
+toy_pager = "toy_fan_broken:PAGER"
 [tool.setuptools]
 py-modules = ["toy_fan", "toy_fan_source", "toy_fan_log", "toy_fan_broken"]
 """
@@ -103,6 +108,8 @@ speed_unit = "rad/s"
 source = {{ kind = "toy", speed = 123.0 }}
 [toy_log]
 file = "newest.json"
+[toy_pager]
+number = "112"
 """
 
 
@@ -112,7 +119,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     source = tmp_path / "toy-fan"
     source.mkdir()
     files = {"pyproject.toml": PROJECT, "toy_fan.py": ROWS, "toy_fan_source.py": SOURCE, "toy_fan_log.py": OUTPUT}
-    for name, text in {**files, "toy_fan_broken.py": "import no_such_library\n"}.items():
+    for name, text in {**files, "toy_fan_broken.py": "raise SystemExit('needs python 4')\n"}.items():
         (source / name).write_text(text)
     build = "import sys, setuptools.build_meta as backend; print(backend.build_wheel(sys.argv[1]))"
     subprocess.run([sys.executable, "-c", build, tmp_path], cwd=source, capture_output=True, check=True)
@@ -136,6 +143,30 @@ def test_a_source_and_an_output_of_another_package_run_and_what_is_broken_is_lef
     said = {line for line in up.lines if "is left out" in line}
     assert {
         "fantwin.sources 'serial' is left out: this name is taken; correct or uninstall the package toy-fan",
-        "fantwin.sources 'broken' is left out: ModuleNotFoundError: No module named 'no_such_library'; correct or "
-        "uninstall the package toy-fan",
+        "fantwin.sources 'broken' is left out: SystemExit: needs python 4; correct or uninstall the package toy-fan",
     } <= said
+
+
+def test_no_stage_may_have_the_name_of_a_key_or_a_role():
+    assert {*top_level().model_fields, *OWN_ROLES} == RESERVED
+
+
+@pytest.mark.parametrize(
+    ("row", "why"),
+    [
+        (StageRow("pager", "x:STAGE", reads=("alarm",), writes=("request",)), ""),
+        (StageRow("pagr", "x:STAGE", reads=(), writes=()), "its row is called 'pagr'"),
+        (StageRow("pager", "x:STAGE"), "its row does not say which topics it reads and writes, of alarm, "),
+        (StageRow("pager", "x:STAGE", reads=("temperature",), writes=()), "its row does not say which topics"),
+        (StageRow("pager", "x:STAGE", reads=(), writes=("command",)), "it may write requests and nothing else"),
+        (StageRow("pager", "x:STAGE", enabled_by="default", reads=(), writes=()), "only a section"),
+        (StageRow("pager", "x:STAGE", scope="tray", reads=(), writes=()), "only a section"),
+    ],
+)
+def test_a_row_that_would_harm_the_plant_is_refused_with_the_reason(row, why):
+    assert why_no_output("pager", row).startswith(why) and bool(why_no_output("pager", row)) == bool(why)
+
+
+@pytest.mark.parametrize("name", ["bus", "operator", "acquisition.bench", "Pager"])
+def test_nor_may_it_have_the_name_of_something_else(name):
+    assert why_no_output(name, StageRow(name, "x:STAGE", reads=(), writes=())) == "a stage may not have this name"

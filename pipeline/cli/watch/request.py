@@ -39,11 +39,11 @@ def ask(
     """
     producer = f"alarms-{tray}-{secrets.token_hex(4)}"
     publisher = bus.publisher(tray_key(site, tray, "request"), BY_NAME["request"], type_name(Request), producer)
-    bus.require_rights(stop)
     name = f"{producer}/{publisher.published}"
     received: queue.Queue[bytes] = queue.Queue()
     key = tray_key(site, tray, "alarm")
     bus.subscribe(key, lambda _key, payload: received.put(payload))
+    bus.require_rights(stop)
     publisher.put(encode(replace(request, header=Header(producer, publisher.published, tray))))
     answers: dict[int, Alarm] = {}
     until_s = time.monotonic() + timeout_s
