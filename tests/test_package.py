@@ -5,12 +5,12 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
 
 import fantwin
+from tests.support.built_wheel import unpacked_wheel
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("fantwin", "pipeline", "schemas", "scoring", "simulation", "stages", "twin")
@@ -26,12 +26,7 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(ROOT / name, source)
     for name in FOLDERS:
         shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
-    build = "import sys, setuptools.build_meta as backend; print(backend.build_wheel(sys.argv[1]))"
-    subprocess.run([sys.executable, "-c", build, built], cwd=source, capture_output=True, check=True)
-    (wheel,) = built.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(built / "installed")
-    return built / "installed"
+    return unpacked_wheel(source, built)
 
 
 def test_the_wheel_holds_one_package_with_every_file_of_the_product(unpacked):

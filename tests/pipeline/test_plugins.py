@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -14,6 +11,7 @@ from fantwin.pipeline.config.loading import top_level
 from fantwin.pipeline.config.models import OWN_ROLES
 from fantwin.pipeline.config.registry import RESERVED, why_no_output
 from fantwin.pipeline.plugins import StageRow
+from tests.support.built_wheel import unpacked_wheel
 from tests.support.running_chain import RunningCommand, eventually
 
 PROJECT = """
@@ -121,12 +119,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     files = {"pyproject.toml": PROJECT, "toy_fan.py": ROWS, "toy_fan_source.py": SOURCE, "toy_fan_log.py": OUTPUT}
     for name, text in {**files, "toy_fan_broken.py": "raise SystemExit('needs python 4')\n"}.items():
         (source / name).write_text(text)
-    build = "import sys, setuptools.build_meta as backend; print(backend.build_wheel(sys.argv[1]))"
-    subprocess.run([sys.executable, "-c", build, tmp_path], cwd=source, capture_output=True, check=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(tmp_path / "installed")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "installed"), prepend=":")
+    monkeypatch.setenv("PYTHONPATH", str(unpacked_wheel(source, tmp_path)), prepend=":")
     return tmp_path
 
 
