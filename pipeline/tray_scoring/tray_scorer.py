@@ -165,12 +165,11 @@ class TrayScorer:
         decision.take(one)
         assert decision.now is not None
         self._falls.take(decision.now)
-        nothing = np.zeros(self.fans, np.bool_)
-        self._stands = nothing
         if against:
-            self._kind = np.where(against.kind[row] > 0, against.kind[row], self._kind)
+            is_now = against.kind[row] > 0
+            self._kind = np.where(is_now, against.kind[row], self._kind)
             is_loose = (self._kind == NO_READING) & decision.missing.explains_silence
-            self._stands = against.active[row] & ~is_loose
+            self._stands = against.active[row] & ~is_loose & (self._stands | (is_now & ~decision.wrong.may_be))
         score = decision.score
         is_steady = one.judged & ~self._stands & ~decision.has_alarm & (score < ScoreColumns.SUSPECT_FROM)
         self.wear.update(one.t_ns, is_steady, lambda: decision.model.age)

@@ -85,7 +85,7 @@ class Decision(Saved):
         self.log_limit = math.log(bins / OF_RATE) * limit_factor
         self.missing = MissingReadings(count, self.bin_s, math.log(bins / (1.0 - OF_RATE)) * limit_factor)
         self.log_statistic = np.full(count, -np.inf)
-        self._wrong = WrongReadings(fans, self.bin_s, period_s, math.log(bins / OF_RATE))
+        self.wrong = WrongReadings(fans, self.bin_s, period_s, math.log(bins / OF_RATE))
         self.alarms: dict[int, FanInAlarm] = {}
         """what speaks for the causes of each alarm"""
         self.active = np.zeros(count, np.bool_)
@@ -129,7 +129,7 @@ class Decision(Saved):
         was_active = self.active.copy()
         self.missing.take(one.missing)
         now = self.operation.inputs(one)
-        now = replace(now, is_new=now.is_new | (self._wrong.waits & (now.readings > 0)))  # what is far cannot wait
+        now = replace(now, is_new=now.is_new | (self.wrong.waits & (now.readings > 0)))  # what is far cannot wait
         now, pushes = self._weigh(one, now)
         self.now = now
         known = now.readings > 0
@@ -179,7 +179,7 @@ class Decision(Saved):
     def begin_again(self, fans: Array) -> None:
         """Forget what was learned of some fans, (fans,) of bool, and end their alarms."""
         self.missing.forget(fans)
-        self._wrong.begin_again(fans)
+        self.wrong.begin_again(fans)
         for fan in np.flatnonzero(fans).tolist():
             if self.active[fan]:
                 self._end(fan)
@@ -194,7 +194,7 @@ class Decision(Saved):
             **within("operation", self.operation.arrays()),
             **within("model", self.model.arrays()),
             **within("missing", self.missing.arrays()),
-            **within("wrong", self._wrong.arrays()),
+            **within("wrong", self.wrong.arrays()),
             **within("evidence", self._evidence.kept(kept)),
         }
         for fan, alarm in self.alarms.items():
@@ -211,7 +211,7 @@ class Decision(Saved):
         self.operation.restore(part("operation", stored))
         self.model.restore(part("model", stored))
         self.missing.restore(part("missing", stored))
-        self._wrong.restore(part("wrong", stored))
+        self.wrong.restore(part("wrong", stored))
         self._evidence.restore_kept(part("evidence", stored))
         self.operation.t_ns = t_ns
         self.alarms = {}
@@ -225,7 +225,7 @@ class Decision(Saved):
     def _rest(self, bins: int) -> None:
         """Let a gap pass."""
         self.model.rest(bins)
-        self._wrong.forget()
+        self.wrong.forget()
         self._evidence.number += bins
         for alarm in self.alarms.values():
             alarm.rest(bins, self.bin_s)
@@ -249,7 +249,7 @@ class Decision(Saved):
         root = np.sqrt(found.variance)
         gain = found.with_states * (counts / found.variance)[:, np.newaxis]
         gain[self.active, SLOW] = 0.0
-        farthest = np.where(self._wrong.agree, np.inf, FAR_SIGMAS) * root
+        farthest = np.where(self.wrong.agree, np.inf, FAR_SIGMAS) * root
         agreed = found.distance_rad_s.clip(-farthest, farthest)
         pushes = forces(self._fans, now, evidence.age_s, evidence.then_rad_s, self._hypotheses.columns)
         farthest = np.where(self.active, AGREED_SIGMAS, FAR_SIGMAS) * root
@@ -274,8 +274,10 @@ class Decision(Saved):
         is_known, is_held = np.isfinite(samples), fans.held_s > 0.0
         # what is not held is judged by the mean of its bin: a fan that vibrates is far on both sides in turn
         distance = np.where(is_known & ~is_held, found.distance_rad_s, samples - expected)
-        counts = self._wrong.counts(distance, std, one.another, learns=~self.active)
-        return is_known & counts & (~one.wrong | self._wrong.agree)
+        of_fault = np.where(self.active, expected - self.model.expected_rad_s, 0.0)
+        raised = np.where(self.active, (self.number - self._raised) * len(samples), -1)
+        counts = self.wrong.counts(np.stack((distance, distance + of_fault)), std, one.another, raised)
+        return is_known & counts & (~one.wrong | self.wrong.agree)
 
     def _raise(self, fan: int, pushes: Array, speed_rad_s: float) -> None:
         """Begin an alarm: what the filter has taken of the likeliest fault is given back, and the fault becomes a

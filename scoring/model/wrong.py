@@ -1,9 +1,9 @@
 """Wrong readings of a tacho: far from what is expected, and gone with the next.
 
-Boards show twice, half or an impossible speed, or none, for a reading or two. A fan with a fault stays far, so a far
-reading counts once others have agreed with it: as many as a healthy tacho does not show wrong, one after the other, in
-the declared time. Two are surely two readings where they differ, or where the second is shown for longer than one would
-be.
+Boards show twice, half or an impossible speed, or none, for a reading or some. A fan with a fault stays far, so a far
+reading counts once others have agreed with it: as many as healthy tachos do not show wrong, one after the other, in the
+declared time. How long wrong readings last is a matter of the board, so that all fans of a tray tell it. Two are surely
+two readings where they differ, or where the second is shown for longer than one would be.
 """
 
 from __future__ import annotations
@@ -17,7 +17,11 @@ from fantwin.scoring.model.saved import Saved
 FAR_SIGMAS = 4.5
 """a reading that is farther from what is expected is far"""
 PRIOR = (0.5, 1000.0)
-"""wrong readings, and readings, of a tacho of which nothing is known"""
+"""times that readings of a tacho of which nothing is known were wrong, and readings"""
+PRIOR_LONGER = 10.0
+"""such times of which no more went on than chance would have it"""
+LONGEST = 8
+"""wrong readings, one after the other; more are no tacho's"""
 FEWEST, ONE_MORE = 2, 2
 """readings that must agree at least; and samples more than they take where they are alike: a reading may be seen in one
 sample more than its time, and the last one has to be seen"""
@@ -26,7 +30,7 @@ sample more than its time, and the last one has to be seen"""
 class WrongReadings(Saved):
     """Follows the far readings of the fans of one tray."""
 
-    KEPT = ("_wrong", "_readings", "_side", "_long", "_different", "agree")
+    KEPT = ("_times", "_readings", "_lasted", "_side", "_long", "_different", "agree")
 
     def __init__(self, fans: Fans, bin_s: float, period_s: float, log_limit: float) -> None:
         """Begin without a reading. bin_s: within which samples of a reading that is not held count as one; period_s: of
@@ -37,55 +41,61 @@ class WrongReadings(Saved):
         self._holds = fans.held_s > 0.0
         """(fans,) whether a tacho holds its readings, so that they tell one from another"""
         self._log_limit = log_limit
-        self._wrong, self._readings = np.zeros((2, count))
+        self._times, self._readings = np.zeros((2, count))
+        """(fans,) how often they were wrong for a while, and how many there were"""
         self.begin_again(np.ones(count, np.bool_))
-        self._side = np.zeros(count)
-        """(fans,) on which side the newest reading is far; 0: it is not"""
-        self._long = np.zeros(count)
-        """(fans,) how many samples ago the first far one on this side was, itself included"""
-        self._different = np.zeros(count)
-        """(fans,) number of different readings since then, the first one included"""
+        self._lasted = np.zeros(LONGEST)
+        """how often those of the tray were wrong for at least 1, 2, ... readings"""
+        self._side, self._long, self._different = np.zeros((3, 2, count))
+        """(2, fans) from what is expected, and from a healthy fan: on which side the newest reading is far, 0: it is
+        not; how many samples ago the first far one on this side was, itself included; number of different readings
+        since then, the first one included"""
         self.agree = np.zeros(count, np.bool_)
         """(fans,) whether the newest reading is far, and enough before it were"""
 
     @property
     def waits(self) -> Array:
         """(fans,) whether the newest reading was far."""
-        return self._side != 0.0
+        return self._side[0] != 0.0
 
-    def counts(self, distance_rad_s: Array, std_rad_s: Array, another: Array, *, learns: Array) -> Array:
+    @property
+    def may_be(self) -> Array:
+        """(fans,) whether the newest reading is far, and too few before it were."""
+        return self.waits & ~self.agree
+
+    def counts(self, distances_rad_s: Array, std_rad_s: Array, another: Array, raised: Array) -> Array:
         """(n, fans) whether each sample of a bin counts.
 
-        distance_rad_s: (n, fans) from what is expected, NaN without a reading; std_rad_s: (fans,) of that;
-        another: (n, fans) whether a reading is another than the one before; learns: (fans,) whether what is far is the
-        tacho's, if it is gone soon.
+        distances_rad_s: (2, n, fans) from what is expected, and from a healthy fan, NaN without a reading; std_rad_s:
+        (fans,) of that; another: (n, fans) whether a reading is another than the one before; raised: (fans,) how many
+        samples ago an alarm was raised, -1: there is none.
         """
-        known = np.isfinite(distance_rad_s)
+        known = np.isfinite(distances_rad_s[0])
         with np.errstate(invalid="ignore"):
-            far = np.abs(distance_rad_s) > FAR_SIGMAS * std_rad_s
-        self._readings += learns * known.sum(axis=0) / self._held
+            far = np.abs(distances_rad_s) > FAR_SIGMAS * std_rad_s
+        self._readings += known.sum(axis=0) / self._held
         if not far.any() and not self._side.any():
             self.agree = np.zeros_like(self.agree)
             return known
-        side, agree_at = np.where(far, np.sign(distance_rad_s), 0.0), self._agree_at()
+        sides, agree_at = np.where(far, np.sign(distances_rad_s), 0.0), self._agree_at()
         began, waits = np.zeros(known.shape[1], np.int64), np.zeros(known.shape, np.bool_)
         for row in range(len(known)):
-            ends = known[row] & (side[row] != self._side)
-            was_wrong = ends & learns & (self._side != 0.0) & ~self._are_enough(agree_at)
-            self._wrong += was_wrong * np.ceil(self._long / self._held)
-            self._side, began[ends] = np.where(ends, side[row], self._side), row
+            ends = known[row] & (sides[:, row] != self._side)
+            is_first = np.where(raised < 0, ~self._are_enough(agree_at), self._long[1] > raised + row)
+            self._learn(ends[1] & (self._side[1] != 0.0) & is_first)
+            self._side, began[ends[0]] = np.where(ends, sides[:, row], self._side), row
             self._long = np.where(ends, 1.0, self._long + 1.0)
             self._different = np.where(ends, 1.0, self._different + (known[row] & self._holds & another[row]))
-            waits[row] = far[row]
-            agree = far[row] & self._are_enough(agree_at)
+            waits[row] = far[0, row]
+            agree = far[0, row] & self._are_enough(agree_at)
             if agree.any():
                 waits &= ~agree | (np.arange(len(known))[:, np.newaxis] < began)
-        self.agree = (self._side != 0.0) & self._are_enough(agree_at)
+        self.agree = self.waits & self._are_enough(agree_at)
         return known & ~waits
 
     def begin_again(self, fans: Array) -> None:
         """Forget what the tachos of some fans have shown wrong, (fans,) of bool."""
-        self._wrong[fans], self._readings[fans] = PRIOR
+        self._times[fans], self._readings[fans] = PRIOR
 
     def forget(self) -> None:
         """Nothing agrees with what was read before a gap."""
@@ -94,12 +104,19 @@ class WrongReadings(Saved):
     def _are_enough(self, agree_at: Array) -> Array:
         """(fans,) whether at least agree_at readings in a row are far."""
         samples = (agree_at - 1.0) * self._held + ONE_MORE
-        found: Array = (self._long >= samples) | (self._different >= agree_at)
-        return found
+        return (self._long[0] >= samples) | (self._different[0] >= agree_at)
+
+    def _learn(self, ends: Array) -> None:
+        """Where far readings end that were too few, or with which an alarm began, they were wrong. ends: (fans,)."""
+        readings = np.ceil(self._long[1] / self._held)
+        was_wrong = ends & (readings <= LONGEST)
+        self._times += was_wrong
+        self._lasted += (readings[was_wrong] > np.arange(LONGEST)[:, np.newaxis]).sum(axis=1)
 
     def _agree_at(self) -> Array:
         """(fans,) number of readings in a row that must be far before they count."""
-        share = self._wrong / self._readings
-        agree = np.ceil((self._log_limit + np.log(2.0)) / (np.log(2.0) - np.log(share)))
-        found: Array = np.maximum(agree, FEWEST)
-        return found
+        share = self._times / self._readings
+        times = self._lasted[:, np.newaxis] + PRIOR_LONGER * 0.5 * share  # on the same side
+        goes_on = times[1:] / (self._lasted[:-1, np.newaxis] + PRIOR_LONGER)
+        log_in_a_row = np.log(np.vstack((share, goes_on))).cumsum(axis=0)
+        return np.maximum((log_in_a_row > -self._log_limit).sum(axis=0) + 1.0, FEWEST)

@@ -155,10 +155,10 @@ STANDSTILL = Standstill(
 )
 
 
-def at_2_hz(missing: NDArray[np.bool_]) -> Prediction:
-    """A healthy fan, of whose raw samples, two a second, these have no reading."""
-    speed = np.where(missing[:, np.newaxis], np.nan, TWIN_SPEED + noise(len(missing), seed=3))
-    t_ns = EPOCH_NS + NS_PER_S // 2 * np.arange(len(missing))
+def at_2_hz(is_wrong: NDArray[np.bool_], shown: float) -> Prediction:
+    """A healthy fan, of whose raw samples, two a second, these show something else."""
+    speed = np.where(is_wrong[:, np.newaxis], shown, TWIN_SPEED + noise(len(is_wrong), seed=3))
+    t_ns = EPOCH_NS + NS_PER_S // 2 * np.arange(len(is_wrong))
     raw = Raw(fans=1, host_receive_t_ns=t_ns, command=np.full(speed.shape, NEEDED), speed_rad_s=speed)
     resampler = ResamplerCore(1, ResamplerConfig(rate_hz=2.0))
     grid = join([*resampler.step(raw), *resampler.close()])
@@ -169,10 +169,21 @@ def at_2_hz(missing: NDArray[np.bool_]) -> Prediction:
 def test_a_silence_that_a_loose_wire_makes_now_and_then_is_no_tacho_without_a_signal_and_a_long_one_is() -> None:
     missing = np.random.default_rng(5).random(800) < 0.35
     missing[:60], missing[300:310], missing[600:640] = False, True, True
-    _, alarms = feed(core_of(standstill=STANDSTILL), [at_2_hz(missing)])
+    _, alarms = feed(core_of(standstill=STANDSTILL), [at_2_hz(missing, np.nan)])
     named = [((each.t_ns - EPOCH_NS) / NS_PER_S, each.causes[0].cause) for each in alarms if each.causes]
     assert {cause for time_s, cause in named if time_s < 300.0} == {"sensor_dropout"}
     assert "no_tacho" in {cause for time_s, cause in named if 300.0 < time_s < 325.0}
+
+
+def test_readings_of_zero_now_and_then_are_no_fan_that_stands_and_a_fan_that_stands_is_found() -> None:
+    stands = np.zeros(800, np.bool_)
+    stands[[100, 200, 201, 300, 400, 401, 500]] = True
+    stands[700:] = True
+    core = core_of(standstill=STANDSTILL, tachos=(Tacho(kind="average", window_s=0.5),))
+    _, alarms = feed(core, [at_2_hz(stands, 0.0)])
+    raised = [(each.t_ns - EPOCH_NS) / NS_PER_S for each in alarms if each.transition == Transition.RAISED]
+    assert len(raised) == 1
+    assert 350.0 < raised[0] <= 353.0
 
 
 def test_an_alarm_is_not_lost_between_the_counts_of_a_slow_tacho() -> None:

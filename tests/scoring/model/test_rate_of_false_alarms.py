@@ -86,6 +86,28 @@ def test_one_wrong_reading_in_fifty_of_any_kind_raises_nothing() -> None:
     assert plays(made, made.decision(), 60.0, with_wrong) == []
 
 
+def test_a_tray_whose_wrong_readings_come_in_pairs_teaches_its_board_and_a_fault_is_still_found() -> None:
+    made = MadeFans(counting(twin_of(FANS).fans), 0.5, moved, seed=5)
+    decision, numbers = made.decision(86_400.0), itertools.count()
+
+    def in_pairs(one: Bin) -> Bin:
+        at = (next(numbers) + 11 * np.arange(FANS)) % 200
+        share = np.where(at == 50, 0.5, np.where(at == 51, 2.0 / 3.0, 1.0))
+        wrong = with_reading(one, one.measured_rad_s * share - one.predicted_rad_s)
+        return replace(wrong, another=one.another | (share < 1.0))
+
+    def slow(one: Bin) -> Bin:
+        return replace(with_reading(one, one.measured_rad_s * 0.5 - one.predicted_rad_s), another=one.another)
+
+    first = [fan for _, fan, is_raised in plays(made, decision, 100.0, in_pairs) if is_raised]
+    assert len(first) <= 2, "nobody knew that two may be wrong"
+    assert not any(is_raised for _, _, is_raised in plays(made, decision, 300.0, in_pairs))
+    began_s = made.time_s
+    raised = {fan: time_s - began_s for time_s, fan, is_raised in plays(made, decision, 10.0, slow) if is_raised}
+    assert len(raised) == FANS
+    assert max(raised.values()) <= 3.0
+
+
 @pytest.mark.parametrize(("shares", "raised_s"), [((0.4, 0.0, 0.0), 1.0), ((0.0, 0.0, 0.0), 1.5), ((0.0, 0.0), None)])
 def test_far_readings_of_a_counting_tacho_agree_where_they_differ_or_last_longer_than_one_may_be_shown(
     shares: tuple[float, ...], raised_s: float | None
