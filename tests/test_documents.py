@@ -1,0 +1,53 @@
+"""The documents: every link leads somewhere, no paragraph is too long, and together they can be read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted((*DOCS.rglob("*.md"), ROOT / "README.md"))
+MOST_WORDS_OF_A_PARAGRAPH = 90
+_LINK = re.compile(r"\]\(([^)\s]+)\)")
+_FENCE = re.compile(r"^(```|~~~).*?^\1", re.MULTILINE | re.DOTALL)
+
+
+def prose(page: Path) -> str:
+    """The text of a page without its blocks of code."""
+    return _FENCE.sub("", page.read_text(encoding="utf-8"))
+
+
+def anchors(page: Path) -> set[str]:
+    """What a link to a heading of the page may say after `#`, as GitHub makes it of the heading."""
+    titles = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def paragraphs(page: Path) -> Iterator[str]:
+    """The paragraphs and the items of lists; tables, headings and code are none."""
+    for block in re.split(r"\n\s*\n", prose(page)):
+        if not block.startswith(("    ", "|", "#", "![")):
+            yield from re.split(r"\n(?=\s*(?:[-*]|\d+\.) )", block)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_leads_to_a_file_and_a_heading(page: Path) -> None:
+    broken: list[str] = []
+    for link in _LINK.findall(prose(page).replace("\n", " ")):
+        target, _, anchor = link.partition("#")
+        file = (page.parent / target).resolve() if target else page
+        if re.match(r"\w+:", link):
+            continue
+        if not file.exists() or (anchor and anchor not in anchors(file)):
+            broken.append(link)
+    assert not broken
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_no_paragraph_is_longer_than_can_be_read_at_once(page: Path) -> None:
+    long = [text[:60] for text in paragraphs(page) if len(text.split()) > MOST_WORDS_OF_A_PARAGRAPH]
+    assert not long
