@@ -48,6 +48,13 @@ def test_every_link_leads_to_a_file_and_a_heading(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_file_of_the_repository_that_a_page_names_is_there(page: Path) -> None:
+    folders = {path.name for path in ROOT.iterdir() if path.is_dir()}
+    named = re.findall(r"`([a-z_]+/[a-z0-9_./-]*)`", prose(page))
+    assert not [path for path in named if path.split("/")[0] in folders and not (ROOT / path).exists()]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_no_paragraph_is_longer_than_can_be_read_at_once(page: Path) -> None:
     long = [text[:60] for text in paragraphs(page) if len(text.split()) > MOST_WORDS_OF_A_PARAGRAPH]
     assert not long
