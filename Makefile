@@ -6,6 +6,7 @@
 # make bench  measurements, as ratios
 # make schema regenerate the code of schemas/fan.proto
 # make configuration  write docs/reference/configuration.md again
+# make tables  write the tables of docs/reference that come from the code again
 # make twin   train the demo's twin again
 # make lock   pin the dependencies again
 # make rerun-bump VERSION=0.42  pin Rerun to this release, and run all tests that draw with it
@@ -24,7 +25,7 @@ BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_t
 unexport PYTHONDONTWRITEBYTECODE
 SOURCES := fantwin schemas scoring pipeline simulation stages twin tests bench
 
-.PHONY: demo test check selftest compose-test bench schema configuration twin lock rerun-bump clean
+.PHONY: demo test check selftest compose-test bench schema configuration tables twin lock rerun-bump clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.runtime
@@ -56,6 +57,9 @@ schema: $(VENV)/.development
 
 configuration: $(VENV)/.development
 	$(BIN)/python -m fantwin.pipeline.config.reference_page > docs/reference/configuration.md
+
+tables: $(VENV)/.development
+	$(BIN)/python -m fantwin.pipeline.config.reference_tables
 
 twin: $(VENV)/.development
 	sh pipeline/demo/train_twin.sh $(BIN)/fantwin

@@ -27,7 +27,7 @@ from fantwin.schemas.messages import (
     ScorerSnapshot,
 )
 
-ON_CHANGE, AT_BREAKS = "on change", "at each break, and each 10 s"
+ON_CHANGE, AT_BREAKS = "on change", "at each break, and every 2 minutes"
 KIB, MIB = 1 << 10, 1 << 20
 MOST_SAMPLES, MOST_FAN_SAMPLES = 4096, 4096 * 64
 """of a message, whatever its block: samples, and samples times fans"""

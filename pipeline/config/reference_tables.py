@@ -1,0 +1,79 @@
+"""The tables of docs/reference that are made of the code: the topics of messages.md, and the values of bounds.md.
+
+`make tables` writes both pages again. The words of bounds.md are its own; each row names a constant, whose value is
+filled in here.
+"""
+
+from __future__ import annotations
+
+import re
+from importlib import import_module
+from pathlib import Path
+
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.schemas.topics import KIB, MIB, TOPICS
+
+PAGES = Path("docs", "reference")
+_BOUND = re.compile(r"^\| `([\w.]+)\.([A-Z_]+)` \|[^|]*\|", re.MULTILINE)
+_TOPICS = re.compile(r"^\| topic \|.*?\n\n", re.MULTILINE | re.DOTALL)
+_BESIDE_PIPELINE = ("client", "schemas", "scoring")
+_OTHER_WRITERS = {
+    "health": "every stage",
+    "consumed": "stages that make samples from samples",
+    "clock": "`fantwin replay`",
+}
+_EXACT = 1 << 53  # from here on a power of two is easier to read
+_PER_SECOND = {"_S": 1, "_MS": 1_000, "_US": 1_000_000, "_NS": 1_000_000_000}
+
+
+def with_topics(page: str) -> str:
+    """The page of messages, with the table of topics as the code has it."""
+    return _TOPICS.sub(lambda _: _topics() + "\n", page, count=1)
+
+
+def with_values(page: str) -> str:
+    """The page of bounds, with the value of each constant that it names.
+
+    Raises:
+        ModuleNotFoundError, AttributeError: there is no such constant.
+    """
+    return _BOUND.sub(lambda row: f"| `{row[1]}.{row[2]}` | {_value(row[1], row[2])} |", page)
+
+
+def _topics() -> str:
+    rows = [
+        "| topic | message | | written by | read by | rate | longest | kept |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for topic in TOPICS:
+        writers = ", ".join(
+            [name for name, row in STAGES.items() if topic.name in row.topics()[1]] + ["programs"] * topic.is_of_people
+        )
+        readers = ", ".join(name for name, row in STAGES.items() if topic.name in row.topics()[0])
+        rows.append(
+            f"| `{topic.name}` | `{topic.message.__name__}` | {topic.about}{'' if topic.recorded else '; not recorded'} "
+            f"| {_OTHER_WRITERS.get(topic.name, writers)} | {readers or 'stages that a replay feeds'} "
+            f"| {topic.rate} | {_bytes(topic.largest_bytes)} | {topic.kept:,} |"
+        )
+    return "\n".join(rows) + "\n"
+
+
+def _value(module: str, name: str) -> str:
+    """The value of a constant, with the unit that is in its name."""
+    room = "fantwin" if module.partition(".")[0] in _BESIDE_PIPELINE else "fantwin.pipeline"
+    value = float(getattr(import_module(f"{room}.{module}"), name))
+    if "BYTES" in name:
+        return _bytes(round(value))
+    unit = name[name.rindex("_") :]
+    if unit in _PER_SECOND and not name.endswith("_PER_S"):
+        return f"{value / _PER_SECOND[unit]:,.10g} s"
+    return f"2^{round(value).bit_length() - 1}" if value >= _EXACT else f"{value:,.10g}"
+
+
+def _bytes(size: int) -> str:
+    return f"{size // MIB} MiB" if size % MIB == 0 else f"{size // KIB} KiB"
+
+
+if __name__ == "__main__":
+    for name, made in (("messages.md", with_topics), ("bounds.md", with_values)):
+        (PAGES / name).write_text(made((PAGES / name).read_text(encoding="utf-8")), encoding="utf-8")
