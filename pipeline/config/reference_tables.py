@@ -51,8 +51,8 @@ def _topics() -> str:
         )
         readers = ", ".join(name for name, row in STAGES.items() if topic.name in row.topics()[0])
         rows.append(
-            f"| `{topic.name}` | `{topic.message.__name__}` | {topic.about}{'' if topic.recorded else '; not recorded'} "
-            f"| {_OTHER_WRITERS.get(topic.name, writers)} | {readers or 'stages that a replay feeds'} "
+            f"| `{topic.name}` | `{topic.message.__name__}` | {topic.about}"
+            f"{'' if topic.recorded else '; not recorded'} | {_OTHER_WRITERS.get(topic.name, writers)} | {readers or 'stages that a replay feeds'} "
             f"| {topic.rate} | {_bytes(topic.largest_bytes)} | {topic.kept:,} |"
         )
     return "\n".join(rows) + "\n"
