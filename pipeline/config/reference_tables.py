@@ -50,10 +50,11 @@ def _topics() -> str:
             [name for name, row in STAGES.items() if topic.name in row.topics()[1]] + ["programs"] * topic.is_of_people
         )
         readers = ", ".join(name for name, row in STAGES.items() if topic.name in row.topics()[0])
+        about = topic.about if topic.recorded else f"{topic.about}; not recorded"
         rows.append(
-            f"| `{topic.name}` | `{topic.message.__name__}` | {topic.about}"
-            f"{'' if topic.recorded else '; not recorded'} | {_OTHER_WRITERS.get(topic.name, writers)} | {readers or 'stages that a replay feeds'} "
-            f"| {topic.rate} | {_bytes(topic.largest_bytes)} | {topic.kept:,} |"
+            f"| `{topic.name}` | `{topic.message.__name__}` | {about} "
+            f"| {_OTHER_WRITERS.get(topic.name, writers)} | {readers or 'stages that a replay feeds'} | {topic.rate} "
+            f"| {_bytes(topic.largest_bytes)} | {topic.kept:,} |"
         )
     return "\n".join(rows) + "\n"
 
