@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import struct
 import zlib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -328,3 +330,16 @@ def test_groups_of_a_text_line_have_one_value_for_all_fans_or_one_for_each(
     assert same(
         found, replace(Sample(1, 2, (0.5, 1.0), (100.0, 0.0)), **{k: tuple(map(float, v)) for k, v in expected.items()})
     )
+
+
+def test_the_worked_examples_of_the_reference_are_what_is_on_the_line():
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "wire-protocol.md").read_text(encoding="utf-8")
+    shown = [bytes.fromhex(line) for line in re.findall(r"on the line +([0-9a-f ]+)\n", page)]
+    sample = Sample(1_000_000, 42, (0.5,), (100.0,))
+    frames: list[Frame] = [
+        sample,
+        replace(sample, supply_voltage_v=(12.0,), temperature_c=(25.0,)),
+        DeviceCounters(60, (7, 0, 2, 0, 0, 0, 0, 0, 1, 0, 0, 0)),
+        CommandFrame((0.75, math.nan)),
+    ]
+    assert shown == [encode("binary", frame) for frame in frames]
