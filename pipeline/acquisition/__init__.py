@@ -1,1 +1,1 @@
-"""From readings of a source to messages on the bus, and from commands on the bus to the source."""
+"""Acquisition: readings of a source become messages on the bus, and commands on the bus go to the source."""

@@ -14,12 +14,12 @@ from fantwin.schemas.units import RAD_S_PER_UNIT
 
 REFUSED, LOST, SENT = "refused_commands", "lost_commands", "sent_commands"
 _NOT_SENT = {REFUSED: "refused", LOST: "not taken by the device"}
-"""by counter of commands that were not sent: what became of them, in notes"""
+"""words of the notes, by counter of commands that were not sent"""
 _NOTE = re.compile(rf"\d+ commands? (?:{'|'.join(_NOT_SENT.values())})(?:, the last one)?: (.+)")
 
 
 def not_sent(counters: Mapping[str, int]) -> int:
-    """How many commands an acquisition has not sent. counters: its own, by name."""
+    """Number of commands that an acquisition has not sent. counters: its own, by name."""
     return sum(counters.get(name, 0) for name in _NOT_SENT)
 
 
@@ -37,7 +37,7 @@ class DeviceCommands:
         self._source = source
         self.counts: Counter[str] = Counter()
         self._reasons: dict[str, str] = {}
-        """by counter: why the last command was not sent"""
+        """reason why the last command was not sent, by counter"""
 
     def send(self, wanted: Command, down_reason: str | None) -> None:
         """Send a command; one that this tray cannot carry out is refused as a whole.
@@ -56,7 +56,7 @@ class DeviceCommands:
             self.counts[SENT] += 1
 
     def notes(self) -> list[str]:
-        """How many commands were not sent, and why the last one was not: a line for each counter of them."""
+        """Lines on commands that were not sent, one for each counter, with the reason of the last one."""
         found: list[str] = []
         for counter, reason in self._reasons.items():
             count = self.counts[counter]

@@ -28,7 +28,8 @@ class DeviceSequence:
         self._recent.clear()
 
     def is_new(self, reading: Reading, counts: Counter[str]) -> bool:
-        """Whether the reading is new; counts `lost_on_line`, `lost_refused`, `repeated` and `device_restarts`."""
+        """Return whether the reading is new; counts `lost_on_line`, `lost_refused`, `repeated` and
+        `device_restarts`."""
         is_shown = False
         if reading.sequence is not None and self._last is not None:
             step = (reading.sequence - self._last) % UINT32

@@ -1,4 +1,4 @@
-"""Whether what a source delivers can be used, and what to look at if it cannot."""
+"""Quality of a source's input: whether it can be used, and what to look at if it cannot."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from fantwin.pipeline.sources.source import Rejected
 from fantwin.schemas.units import NS_PER_S
 
 WINDOW = 100
-"""pieces of input from which the quality is computed"""
+"""newest inputs from which the quality is computed"""
 JUDGED_FROM = WINDOW // 5
-"""so many are needed for a judgement"""
+"""inputs needed for a judgement"""
 GOOD_AGAIN = 0.25
 """a source whose input was mostly faulty is in order again below this share: a share near the limit is one problem"""
 
@@ -23,11 +23,11 @@ class InputQuality:
         self._silence_s = silence_s
         self._input_t_ns = self._valid_t_ns = started_t_ns
         self._recent: deque[str] = deque()
-        """kind of fault of each of the newest WINDOW pieces; empty: a valid sample"""
+        """kind of fault of each of the newest WINDOW inputs; empty: a valid sample"""
         self._faulty = 0
-        """number of faulty pieces in `_recent`"""
+        """number of faulty inputs in `_recent`"""
         self._examples: dict[str, Rejected] = {}
-        """by kind: the first since the source was last in order, so that the report of one problem stays the same"""
+        """first rejected input of each kind since the source was last in order, so that a problem keeps one wording"""
         self._mostly_faulty = False
 
     def connection_changed(self) -> None:
@@ -50,17 +50,17 @@ class InputQuality:
         self._input_t_ns = t_ns
 
     def add_valid(self) -> None:
-        """What arrived last has a valid sample."""
+        """Count a valid sample in the newest input."""
         self._valid_t_ns = self._input_t_ns
         self._add("")
 
     def add_fault(self, rejected: Rejected) -> None:
-        """What arrived last has a piece that cannot be used."""
+        """Count a fault in the newest input."""
         self._examples.setdefault(rejected.kind, rejected)
         self._add(rejected.kind)
 
     def problem(self, now_ns: int, settings: str) -> str:
-        """What is wrong now, and what to check; empty if nothing is.
+        """Problem of the source now, and what to check; empty if there is none.
 
         settings: of the tray, to be checked where the fault does not say which one it is.
         """

@@ -12,7 +12,7 @@ from fantwin.pipeline.sources.source import Reading, ReadingLimits, Rejected
 from fantwin.schemas.auxiliary import AUXILIARY, AuxiliaryColumn
 
 LONGEST_DETAIL = 120
-"""characters of what was wrong with a refused piece, which may quote the piece: each health names it"""
+"""characters of the fault of a refused input, which may quote it; each health contains it"""
 
 
 class Plausibility:
@@ -35,7 +35,7 @@ class Plausibility:
         self.auxiliary: list[AuxiliaryColumn] = []
         """the columns beside command and speed that the source has given"""
         self.first_refused: dict[str, str] = {}
-        """by kind of refused input: what was wrong with the first piece"""
+        """fault of the first refused input, by kind"""
 
     def plausible(self, item: Reading | Rejected) -> Reading | None:
         """The reading, without implausible speeds; None, and counted, if it cannot be used."""
@@ -57,7 +57,7 @@ class Plausibility:
         return None
 
     def _is_ordinary(self, reading: Reading) -> bool:
-        """Whether all values are there and plausible, as in nearly all readings; a sum shows any not finite."""
+        """Return whether all values are there and plausible, as in nearly all readings; a sum shows any not finite."""
         command, speed, limits = reading.command, reading.speed, self.limits
         return (
             len(command) == len(speed) == limits.fans

@@ -25,7 +25,7 @@ class ReceivedReading:
 
     @property
     def columns(self) -> tuple[bool, ...]:
-        """Which of the columns that may be missing it has: the samples of one message must agree."""
+        """Presence of each optional column: the samples of one message must agree."""
         reading = self.reading
         return (
             reading.clock_us is not None,
@@ -37,7 +37,7 @@ class ReceivedReading:
 
 
 def raw_message(block: Sequence[ReceivedReading], tray: TrayConfig, tachos: tuple[StatedTacho, ...] = ()) -> Raw:
-    """One message of samples that agree in their columns. tachos: what their source states to measure."""
+    """Make one message of samples that agree in their columns. tachos: what their source states to measure."""
     readings = [received.reading for received in block]
     auxiliary: dict[str, Any] = {
         column.name: _float32([getattr(r, column.name) for r in readings]) for column in AUXILIARY

@@ -1,4 +1,4 @@
-"""What a source delivers within the time of one message is handed to the stage together.
+"""Blocks of samples: what a source delivers within the time of one message reaches the stage together.
 
 So a stage with a line of 100 samples a second is woken 20 times a second, not 100 times. The rule is the same for all
 sources. Readings are handed over as soon as the next ones, by the time between
@@ -18,7 +18,7 @@ from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingBlock:
-    """What arrived within the time of one message; each batch keeps its own time of receipt."""
+    """Readings that arrived within the time of one message; each batch keeps its own time of receipt."""
 
     batches: tuple[ReadingBatch, ...]
 
@@ -37,9 +37,9 @@ class SampleBlocks:
         self._lock = threading.Lock()
         self._waiting: list[ReadingBatch] = []
         self._first_t_ns: int | None = None
-        """when the first readings that wait were received; None: none do"""
+        """time of receipt of the first readings that wait; None: none wait"""
         self._arrived_t_ns = 0
-        """when the last readings were received"""
+        """time of receipt of the last readings"""
         self._delivered: BlockEvent | None = None
         """the last event: what waits now comes after it"""
 
@@ -62,7 +62,7 @@ class SampleBlocks:
             self._deliver(block)
 
     def add(self, event: SourceEvent) -> list[BlockEvent]:
-        """What is to be delivered now that the source has delivered this event."""
+        """Take an event of the source; return what is to be delivered now."""
         with self._lock:
             if not isinstance(event, ReadingBatch):
                 due: list[BlockEvent] = [*self._end_block(), event]
@@ -78,7 +78,7 @@ class SampleBlocks:
             return self._end_block() if until_t_ns - first_t_ns >= self._block_ns else []
 
     def take_waiting(self, now_ns: int, processed: BlockEvent | None) -> ReadingBlock | None:
-        """What has waited for the time of a block by now and would come next, None if there is nothing.
+        """Take what has waited for the time of a block and would come next; None if there is nothing.
 
         processed: the event that the stage processed last. While another one is on its way to the stage, nothing is
         taken before it.

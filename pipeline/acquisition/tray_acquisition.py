@@ -17,7 +17,7 @@ from fantwin.schemas.topics import alive_key, health_key, sessions_key
 
 STAGE = "acquisition"
 MOST_SESSIONS = 64
-"""so many last healths are kept"""
+"""number of last healths that are kept"""
 
 
 def _nothing() -> None:
@@ -25,7 +25,7 @@ def _nothing() -> None:
 
 
 class TrayAcquisition:
-    """Which session has the tray, and what it says of itself."""
+    """Tracks which session of acquisition has the tray, and what it says of itself."""
 
     def __init__(self, bus: Bus, site: str, tray: str, on_change: Callable[[], None] = _nothing) -> None:
         """on_change: called from a thread of the bus after a token or a health has come; it must not block."""
@@ -36,16 +36,16 @@ class TrayAcquisition:
         self._lock = threading.Lock()
         self._sessions = Sessions()
         self._tokens: set[str] = set()
-        """of stages that are at work"""
+        """liveliness tokens of stages that are at work"""
         self._healths: dict[str, Health] = {}
-        """by producer, in the order heard"""
+        """last health of each producer, in the order heard"""
         self._watched: set[str] = set()
         """the keys of healths that are listened to"""
         self._ends = [
             bus.watch_alive(alive_key(site, STAGE, "*"), self._on_token),
             bus.watch_alive(sessions_key(site, STAGE), self._on_session),
         ]
-        """what ends each subscription"""
+        """functions that end the subscriptions"""
 
     def close(self) -> None:
         """Watch no longer. Not to be called from a thread of the bus."""

@@ -15,23 +15,23 @@ from fantwin.scoring.column_state import NEVER_NS, ColumnState
 
 @dataclass(frozen=True)
 class Ratios:
-    """Of a block, relative to the twin's reference conditions. All (n, fans)."""
+    """Ratios of a block to the twin's reference conditions. All (n, fans)."""
 
     torque: Array
-    """of a command"""
+    """torque of a command"""
     density: Array
-    """of the air"""
+    """density of the air"""
     known: Array
-    """whether all that the twin needs is known"""
+    """true where all that the twin needs is known"""
 
     @property
     def command(self) -> Array:
-        """What converts a command to the reference conditions."""
+        """Factor that converts a command to the reference conditions."""
         return self.torque * self.density
 
 
 SHOWN_NS = 5 * NS_PER_S
-"""for so long a problem names a fan that conditions took out of the twin's range"""
+"""time for which a problem names a fan that conditions took out of the twin's range"""
 
 
 class ConditionTracker(ColumnState):
@@ -41,7 +41,8 @@ class ConditionTracker(ColumnState):
         self.reference = reference
         self._ratios = ConditionRatios(reference, fans)
         self._beyond_t_ns = np.full(fans, NEVER_NS)
-        """of the last sample that the conditions alone took out of the twin's range, and the ratio of torque there"""
+        """time of the last sample that the conditions alone took out of the twin's range, and the ratio of torque
+        there"""
         self._beyond_torque = np.ones(fans)
 
     def columns(self) -> dict[str, Array]:
@@ -50,14 +51,15 @@ class ConditionTracker(ColumnState):
         return {**self._ratios.columns(), **beyond}
 
     def note_beyond(self, t_ns: Array, torque: Array, beyond: Array) -> None:
-        """Where the conditions alone take commands out of the twin's range: (n, fans) of bool; torque: the ratio."""
+        """Note where the conditions alone take commands out of the twin's range: (n, fans) of bool; torque: the
+        ratio."""
         fans = np.flatnonzero(np.any(beyond, axis=0))
         last = len(beyond) - 1 - np.argmax(beyond[::-1, fans], axis=0)
         self._beyond_t_ns[fans] = t_ns[last]
         self._beyond_torque[fans] = torque[last, fans]
 
     def problem(self, t_ns: int) -> str:
-        """Which fans the conditions have just taken out of the twin's range; empty for none."""
+        """Name the fans that the conditions have just taken out of the twin's range; empty for none."""
         fans = np.flatnonzero(self._beyond_t_ns > t_ns - SHOWN_NS)
         if not len(fans):
             return ""

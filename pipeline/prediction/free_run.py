@@ -14,7 +14,7 @@ from fantwin.scoring.column_state import NEVER_NS, ColumnState
 from fantwin.scoring.expected_reading import ExpectedReading
 
 MOST_STEPS = 1000
-"""of the twin in a sample: 10 s of a twin that was trained at 100 Hz"""
+"""steps of the twin in a sample: 10 s of a twin that was trained at 100 Hz"""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class FreeRunInputs:
     missing: Array
     """number of grid samples missing before this one"""
     ratios: Ratios | None = None
-    """of a twin that needs the conditions; `command` is converted by them"""
+    """ratios for a twin that needs the conditions; `command` is converted by them"""
 
     def next_event(self, after: int, running: Array) -> int:
         """The first row after `after` where a free run may start or stop, samples are missing or the density of the air
@@ -62,7 +62,7 @@ class FreeRun(ColumnState):
         fans = twin.fans
         self._knows_density = twin.card.conditions is not None
         self._density = np.ones(fans)
-        """of the air, relative to the twin's reference"""
+        """density of the air, relative to the twin's reference"""
         self.running = np.zeros(fans, np.bool_)
         self.started_t_ns = np.zeros(fans, np.int64)
         self.held_command = np.full(fans, twin.card.command_range[0])
@@ -116,14 +116,14 @@ class FreeRun(ColumnState):
         return command, before_t_ns
 
     def last_out_of_range(self, t_ns: Array, beyond: Array) -> Array:
-        """When the command was last out of range, (n, fans) ns: from then on the free run has to settle."""
+        """Time when the command was last out of range, (n, fans) ns: from then on the free run has to settle."""
         last = np.where(beyond, t_ns[:, np.newaxis], NEVER_NS)
         last = np.maximum(np.maximum.accumulate(last, axis=0), self._out_of_range_t_ns)
         self._out_of_range_t_ns = last[-1].copy()
         return last
 
     def set_density(self, ratio: Array) -> None:
-        """The density of the air, (fans,) relative to the twin's reference, is so from now on. A speed stays.
+        """Set the density of the air, (fans,) relative to the twin's reference, from now on; speeds do not jump.
 
         The state is that at the reference: speeds and commands times the ratio.
         """

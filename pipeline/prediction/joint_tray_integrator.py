@@ -15,14 +15,14 @@ MOST_KEPT = 16
 
 
 class JointTrayIntegrator:
-    """Of one process, for trays with any twins."""
+    """Predicts the trays of one process together, for any twins."""
 
     def __init__(self) -> None:
         self._kept = LatestKept[TrayIntegrator](MOST_KEPT)
-        """by twin, fans of a tray, and number of trays"""
+        """joint integrators, by twin, fans of a tray, and number of trays"""
 
     def predict(self, integrators: Sequence[TrayIntegrator], grids: Sequence[Grid]) -> list[Prediction]:
-        """As TrayIntegrator.predict of each; the keys of their blocks are equal (`joint_key`)."""
+        """Predict as TrayIntegrator.predict of each; the keys of their blocks are equal (`joint_key`)."""
         if len(integrators) == 1:
             return [integrators[0].predict(grids[0])]
         joint = self._of_trays(integrators)

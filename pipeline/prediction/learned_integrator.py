@@ -35,12 +35,12 @@ class LearnedTwinIntegrator(Core):
         self._core_of = core_of
         self._core: Core | None = None
         self._sha256 = ""
-        """of the twin in force"""
+        """hash of the twin in force"""
         self._coming: list[NewTwin] = []
         """those that are to take over, in the order of their first samples"""
         self._newest_t_ns = BEGINNING
         self._counts: Counter[str] = Counter()
-        """of the cores before the current one"""
+        """counters of the twins before the current one"""
         self._problem = ""
 
     def step(self, item: Grid | NewTwin) -> Sequence[Message]:
@@ -56,11 +56,11 @@ class LearnedTwinIntegrator(Core):
         return [message for block in self._cut(item) for message in self._predict(block)]
 
     def tick(self, now_ns: int) -> Sequence[Message]:
-        """What the core of the twin in force emits."""
+        """Messages of the twin in force."""
         return self._core.tick(now_ns) if self._core else []
 
     def counters(self) -> Mapping[str, int]:
-        """Of all twins so far."""
+        """Counters of all twins so far."""
         return self._counts + Counter(self._core.counters() if self._core else {})
 
     def problem(self) -> str:
@@ -80,7 +80,7 @@ class LearnedTwinIntegrator(Core):
             yield cut(grid, begin, end)
 
     def _predict(self, grid: Grid) -> Sequence[Message]:
-        """By one twin."""
+        """Predict a block by one twin."""
         if len(grid.t_ns) and grid.t_ns[0] > self._newest_t_ns:
             self._take_over(int(grid.t_ns[0]))
         new = self._new(grid)
@@ -91,7 +91,7 @@ class LearnedTwinIntegrator(Core):
         return [_without_twin(select(grid, new))] if new.any() else []
 
     def _new(self, grid: Grid) -> Array:
-        """(n,) of bool: which samples are newer than all before them."""
+        """Select the samples that are newer than all before them: (n,) of bool."""
         return grid.t_ns > np.maximum.accumulate(np.concatenate(([self._newest_t_ns], grid.t_ns)))[:-1]
 
     def _take_over(self, first_t_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""Notices input whose times have gone back for good: it is dropped as repeated, and nothing is judged.
+"""Detection of input whose times have gone back for good: it is dropped as repeated, and nothing is judged.
 
 A stage that restarts repeats what its producers have kept, and catches up at once. If the host clock was set back and
 the stages before this one were restarted, its input is older than what it has had and stays so.
@@ -28,7 +28,7 @@ class OldSamples:
         self._dropped_ns = self._behind_ns = 0
 
     def problem(self, input_name: str, stages: str) -> str:
-        """What to do, in one line; empty where nothing is wrong. stages: those to restart."""
+        """Advice in one line; empty if nothing is wrong. stages: those to restart."""
         if self._dropped_ns < REPORTED_AFTER_NS:
             return ""
         return (

@@ -13,7 +13,7 @@ START_TIME_CONSTANTS = 5.0  # of a fan that slows down: how long the start kick 
 
 
 class StartingFans(ColumnState):
-    """Of one tray. Blocks are given in the order of their times."""
+    """Start-up of the fans of one tray. Blocks are given in the order of their times."""
 
     def __init__(self, fans: int, standstill: Standstill, warm_up_ns: int, reach_s: float) -> None:
         """warm_up_ns: the least time after a stop. reach_s: how far back the tachos look."""
@@ -23,14 +23,15 @@ class StartingFans(ColumnState):
         self._starting = np.zeros(fans, np.bool_)
         """(fans,) stopped by the command before, and no free run has settled since"""
         self._stopped_t_ns = np.full(fans, NEVER_NS)
-        """(fans,) when the command stopped the fan last"""
+        """(fans,) time when the command stopped the fan last"""
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
         return {"starting": self._starting, "stopped_t_ns": self._stopped_t_ns}
 
     def has_started_up(self, t_ns: Array, stopped: Array) -> Array:
-        """(n, fans) whether the last stop is so long ago that a start would be over. t_ns: (n,). stopped: (n, fans)."""
+        """Return where the last stop is so long ago that a start would be over, (n, fans). t_ns: (n,). stopped: (n,
+        fans)."""
         last = np.maximum.accumulate(np.where(stopped, t_ns[:, np.newaxis], NEVER_NS), axis=0)
         last = np.maximum(last, self._stopped_t_ns)
         self._stopped_t_ns = last[-1].copy()
@@ -38,7 +39,7 @@ class StartingFans(ColumnState):
         return started_up
 
     def is_starting(self, stopped: Array, warm: Array) -> Array:
-        """(n, fans) whether no free run has become warm since the command stopped the fan. Both (n, fans)."""
+        """Return where no free run has become warm since the command stopped the fan, (n, fans). Both (n, fans)."""
         row = np.arange(1, len(stopped) + 1)[:, np.newaxis]
         last_stopped = np.maximum.accumulate(np.where(stopped, row, 0), axis=0)
         last_warm = np.maximum.accumulate(np.where(warm, row, 0), axis=0)

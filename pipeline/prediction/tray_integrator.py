@@ -1,4 +1,4 @@
-"""How the fans of a tray are predicted: a block of the grid in, the free runs and the torque balance of its fans out.
+"""Prediction of the fans of a tray: a block of the grid in, the free runs and the torque balance of its fans out.
 
 What a stage adds, samples that come again and the card of the twin, is in stages.twin_integrator.
 """
@@ -71,7 +71,7 @@ class TwinIntegratorConfig(StageConfig):
 
 
 class FanCounts(ColumnState):
-    """What is counted of each fan."""
+    """Counters of each fan."""
 
     def __init__(self, fans: int) -> None:
         self._columns = {name: np.zeros(fans, np.int64) for name in ("free_runs", "diverged", OUT_OF_RANGE_COUNT)}
@@ -81,7 +81,7 @@ class FanCounts(ColumnState):
         self._columns[name] += np.count_nonzero(counted.reshape(-1, counted.shape[-1]), axis=0)
 
     def totals(self) -> dict[str, int]:
-        """Of all fans."""
+        """Sums over all fans."""
         return {name: int(column.sum()) for name, column in self._columns.items()}
 
     def columns(self) -> dict[str, Array]:
@@ -214,13 +214,13 @@ class TrayIntegrator:
         return self._prediction(grid, predicted, reading_range, invalid_reason, ratios)
 
     def problem(self) -> str:
-        """What takes fans out of the twin's range now, other than their commands; empty for nothing."""
+        """Cause, other than their commands, that takes fans out of the twin's range now; empty for none."""
         if self._conditions is None or self._last_t_ns is None:
             return ""
         return self._conditions.problem(self._last_t_ns)
 
     def without_twin(self, grid: Grid) -> Prediction:
-        """Of a block for which the twin is not valid."""
+        """Prediction for a block for which the twin is not valid."""
         invalid_reason = np.where(grid.valid, NO_TWIN, grid.invalid_reason).astype(np.uint8)
         nothing = np.full(grid.command.shape, np.nan)
         return self._prediction(grid, nothing, nothing, invalid_reason, self._ratios(grid))
@@ -368,12 +368,12 @@ class TrayIntegrator:
 
 
 def _is_silent(grid: Grid) -> Array:
-    """(n, fans) where the line was silent."""
+    """Return where the line was silent, (n, fans)."""
     return (grid.invalid_reason == GAP) | (grid.invalid_reason == STALE)
 
 
 def _off_below(twin: TwinFile, standstill: Standstill) -> Array:
-    """(fans,) as TrayTwin.off_below, where the friction of a fan is not above a command that turns it."""
+    """TrayTwin.off_below (fans,), where the friction of a fan is not above a command that turns it."""
     return np.minimum(twin.off_below, standstill.turning_command)
 
 

@@ -19,11 +19,12 @@ from fantwin.schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, Dri
 from fantwin.scoring.unseen_error import UnseenError
 
 LARGEST_TWIN_BYTES = 64 << 20
-"""of a twin's file; the demo's has 28 kB"""
+"""size of a twin's file; the demo's has 28 kB"""
 RANGE_MARGIN, RANGE_MARGIN_OF_TABLE = 0.05, 0.25
-"""of the width of the training range: so far beyond it a twin is used; one whose card has a table of its own error"""
+"""share of the width of the training range by which a twin may leave it; the second if its card has a table of its own
+error"""
 DEAD_ZONE = 0.25
-"""of the command range; a larger friction is not taken for a dead zone"""
+"""share of the command range; a larger friction is not taken for a dead zone"""
 
 
 @dataclass(frozen=True)
@@ -43,13 +44,13 @@ class Balance:
     filter_rate_per_s: float
 
     def of_fans(self, rows: Sequence[int]) -> Balance:
-        """That of the fans in these rows."""
+        """Balance of the fans in these rows."""
         arrays = {name: values[rows] for name, values in vars(self).items() if name != "filter_rate_per_s"}
         return Balance(**arrays, filter_rate_per_s=self.filter_rate_per_s)
 
     @classmethod
     def from_card(cls, card: BalanceCard, fans: int) -> Balance:
-        """The balance of a card for a tray of so many fans."""
+        """Balance of a card for a tray of `fans` fans."""
         used = {name for name in cls.__dataclass_fields__ if name != "filter_rate_per_s"}
         arrays = {name: for_fans(values, fans) for name, values in card.per_fan.items() if name in used}
         return cls(**arrays, filter_rate_per_s=card.filter_rate_per_s)
@@ -96,7 +97,7 @@ class TrayTwin:
 
     @property
     def unseen_error(self) -> UnseenError | None:
-        """How far it may be wrong where it was not trained; None where the card says nothing about it."""
+        """Error that the twin may have where it was not trained; None where the card says nothing about it."""
         table = self.card.model_uncertainty
         if table is None or not table.seen_std_rad_s:
             return None
@@ -126,7 +127,7 @@ def read_file(path: Path) -> bytes:
 
 
 def tray_twin(path: Path, content: bytes, fans: int | None) -> TrayTwin:
-    """The twin in the content of a file, for a tray of so many fans; without `fans`, for as many as it has.
+    """Load the twin in the content of a file for a tray of `fans` fans; without `fans`, for as many as it has.
 
     Raises:
         StageError: it is not a twin, of another format, or for other fans.
@@ -156,7 +157,8 @@ def tray_twin(path: Path, content: bytes, fans: int | None) -> TrayTwin:
 
 
 def load_tray_twin(path: Path, fans: int | None = None) -> TrayTwin:
-    """The twin in a file, for a tray of so many fans; without `fans`, for as many as it has. Its graph is not loaded.
+    """Load the twin in a file for a tray of `fans` fans; without `fans`, for as many as it has. Its graph is not
+    loaded.
 
     Raises:
         StageError: the file cannot be read, is not a twin, of another format, or for other fans.
@@ -165,7 +167,7 @@ def load_tray_twin(path: Path, fans: int | None = None) -> TrayTwin:
 
 
 def twin_path(tray: TrayConfig, folder: Path) -> Path:
-    """Where the twin of a tray is. folder: of the configuration.
+    """Path of the twin of a tray. folder: of the configuration.
 
     Raises:
         StageError: the tray names none.

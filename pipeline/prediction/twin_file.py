@@ -27,7 +27,7 @@ from fantwin.schemas.twin_card import GRAPH_INPUTS, GRAPH_OUTPUTS, TwinCard
 Advance: TypeAlias = Callable[[Array, Array, Array], tuple[Array, Array]]
 """(state (fans, n_state), command (n, fans), step_s (n,)) -> (speed_rad_s (n, fans), state (fans, n_state))."""
 FIRST_RUN_LIMIT_S = 10.0
-"""how long the two samples that are run at load may take; they take about a millisecond"""
+"""limit on the time of the two samples that are run at load; they take about a millisecond"""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class TwinFile(TrayTwin):
         return self.advance_with(self.parameters)
 
     def of_trays(self, count: int) -> TwinFile:
-        """The same for the fans of so many trays."""
+        """Twin for the fans of `count` trays."""
         rows = [*range(self.fans)] * count
         return replace(
             self,
@@ -58,7 +58,7 @@ class TwinFile(TrayTwin):
         )
 
     def initial_state(self, speed_rad_s: Array, command: Array) -> Array:
-        """(fans, n_state) of fans that have run for long at speed_rad_s (fans,) under command (fans,)."""
+        """State (fans, n_state) of fans that have run for long at speed_rad_s (fans,) under command (fans,)."""
         return self.card.state_layout.initial_state(speed_rad_s, command)
 
     @classmethod

@@ -1,4 +1,4 @@
-"""The time of a sample: from the wrapping 32-bit clock of the device to host time.
+"""Device clock: from its wrapping 32-bit counter to the host time of a sample.
 
 The host time of receipt is the time of the sample plus a delay that is never negative, often milliseconds, sometimes
 far more. The offset `receipt - device clock` is therefore bounded from below by a straight line. Its slope is the drift
@@ -124,7 +124,7 @@ class DeviceClock:
         return self._from_t_ns + elapsed_ns + round(correction_ns)
 
     def _end_bucket(self, device_ns: int, t_ns: int) -> None:
-        """Start a new piece of the mapping at this sample, without a jump, with the slope of the new line."""
+        """Start a new segment of the mapping at this sample, without a jump, with the slope of the new line."""
         lowest_device_ns, lowest_offset_ns = self._lowest
         lateness_ns = lowest_offset_ns + lowest_device_ns - self._map(lowest_device_ns)
         late = lateness_ns > JUMP_NS
@@ -143,7 +143,7 @@ class DeviceClock:
         self._from_device_ns, self._from_t_ns = device_ns, t_ns
 
     def _is_shrinking(self, device_ns: int, lateness_ns: int) -> bool:
-        """Whether late samples become less late, as those of a backlog do and those after a set clock do not."""
+        """Return whether late samples become less late, as those of a backlog do and those after a set clock do not."""
         since_ns, first_ns = device_ns - self._first_lateness[0], self._first_lateness[1]
         return lateness_ns < first_ns - LATENESS_JITTER_NS - MAX_DRIFT * since_ns
 

@@ -1,4 +1,4 @@
-"""The host's time: a step of the wall clock is noticed, and never makes it go back.
+"""Host clock: a step of the wall clock is noticed, and never makes time go back.
 
 Durations come from the monotonic clock; the wall clock only labels them. The time follows the wall clock when that is
 set forward. When it is set back by less than a second, the time passes more slowly until the wall clock has caught up.
@@ -29,7 +29,7 @@ READ_ATTEMPTS = 10
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """The wall clock was set. step_ns: by how much, negative if it was set back. at_ns: when, in the time of HostClock.
+    """Step of the wall clock. step_ns: by how much, negative if it was set back. at_ns: when, in the time of HostClock.
     ahead_ns: by how much that time is now ahead of the wall clock."""
 
     step_ns: int
@@ -38,7 +38,7 @@ class ClockStep:
 
 
 class HostClock:
-    """One time for all threads of a process."""
+    """Clock for all threads of a process."""
 
     def __init__(
         self,
@@ -55,11 +55,11 @@ class HostClock:
         self._offset_ns = wall_ns() - self._monotonic_last_ns if offset_ns is None else offset_ns
         self._ahead_ns = 0
         self.steps = 0
-        """how often the wall clock was set"""
+        """number of times that the wall clock was set"""
         self.last_step: ClockStep | None = None
 
     def now_ns(self) -> int:
-        """Nanoseconds since the epoch, as the wall clock said before it was set back, if it was."""
+        """Time in nanoseconds since the epoch, as the wall clock said before it was set back, if it was."""
         with self._lock:
             wall_ns, monotonic_ns = self._read()
             now_ns = monotonic_ns + self._offset_ns
@@ -79,7 +79,7 @@ class HostClock:
             return now_ns
 
     def _read(self) -> tuple[int, int]:
-        """Both clocks at one moment: read again if this process was held up in between, which would be taken for a
+        """Read both clocks at one moment: again if this process was held up in between, which would be taken for a
         step."""
         attempt = 0
         while True:
@@ -96,7 +96,7 @@ class HostClock:
 
 
 def handed_on(environment: Mapping[str, str]) -> int | None:
-    """The offset of the time that whoever started this process has handed on; None if nobody has."""
+    """Offset of the time that the parent of this process has handed on; None if there is none."""
     try:
         return int(environment[VARIABLE])
     except (KeyError, ValueError):
@@ -104,4 +104,4 @@ def handed_on(environment: Mapping[str, str]) -> int | None:
 
 
 HOST_CLOCK = HostClock(offset_ns=handed_on(os.environ))
-"""of this process"""
+"""clock of this process"""

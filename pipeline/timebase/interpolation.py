@@ -41,7 +41,7 @@ class Samples(NamedTuple):
 
 
 def all_true(mask: Array) -> bool:
-    """As mask.all(), a few times faster for small masks."""
+    """Return mask.all(), a few times faster for small masks."""
     return np.count_nonzero(mask) == mask.size
 
 
@@ -96,7 +96,7 @@ class LastReadings:
         self._speed_rad_s = np.where(found, samples.speed_rad_s[rows, self._fans], self._speed_rad_s)
 
     def too_old(self, t_ns: int) -> Array:
-        """Which fans (fans,) have no reading within the limit before t_ns."""
+        """Return which fans (fans,) have no reading within the limit before t_ns."""
         return t_ns - self._t_ns > self._limit_ns
 
     def interpolate(self, t_ns: Array, at: Array, samples: Samples, newest_t_ns: int) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Decides which raw samples belong to the current line: samples of another time must not change its time.
+"""Guard of the line: samples of another time must not change the line's time.
 
 A line has one producer at a time, and its times of receipt advance. Samples of another producer whose times are
 more than a second away are *apart*. They come from a second acquisition whose clock is wrong, or from the next session
@@ -41,7 +41,7 @@ class LineGuard:
         self._clock = clock
         self._period_ns = period_ns
         self.producer: str | None = None
-        """of the line; None before the first sample"""
+        """producer of the line; None before the first sample"""
         self._newest_t_ns = 0  # time of receipt of the line's newest sample, as sent
         self._steps_ns: tuple[int, ...] = (0, 0)  # between the line's last three samples
         self._shift_ns = 0
@@ -84,7 +84,7 @@ class LineGuard:
         yield self._shifted(message)
 
     def close(self) -> list[Raw]:
-        """What is still held and may be of the line: what goes forward."""
+        """Release the samples that are still held and may be of the line: those whose time goes forward."""
         held = self._taken()
         if held and _time_of(held[0]) > self._newest_t_ns:
             return held
@@ -93,12 +93,12 @@ class LineGuard:
 
     @property
     def advance_ns(self) -> int | None:
-        """How much time the samples that were held since the line's last one cover, but no more than decides whether
-        samples are the next ones of the line; None: none were."""
+        """Time that the samples held since the line's last one cover, limited to what decides whether samples are the
+        next ones of the line; None: none were held."""
         return None if self._advance_ns is None else min(self._advance_ns, self._established_ns)
 
     def problem(self) -> str:
-        """What happened in the last minute of the line, in one line."""
+        """Event of the last minute of the line, in one line."""
         return self._report if self._newest_t_ns < self._report_until_t_ns else ""
 
     def _admit_sample(self, sample: Raw, is_of_ended: bool) -> list[Raw]:
@@ -169,7 +169,8 @@ class LineGuard:
         return [self._shifted(sample) for sample in held]
 
     def _is_put_right(self, sample: Raw) -> bool:
-        """Whether the host clock was set forward again: with the shift, the times would be ahead by all of it."""
+        """Return whether the host clock was set forward again: with the shift, the times would be ahead by all of
+        it."""
         expected_t_ns = self._by_device(sample)
         if expected_t_ns is None:
             expected_t_ns = self._newest_t_ns + self._shift_ns + self._period_ns

@@ -19,7 +19,7 @@ from fantwin.schemas.units import NS_PER_S
 RATES_HZ = (1, 2, 5, 10, 20, 25, 50, 100)
 """rates of a grid that follows from the line; a faster line gets the last one"""
 GAP_PERIODS = 5.0
-"""gaps of up to so many sample periods are bridged"""
+"""length of a gap that is bridged, in sample periods"""
 FEWEST_PERIODS = 1.5  # of a gap limit: with fewer, samples that are a little late are gaps
 SHORTEST_GAP_S = 0.1
 WATERMARK_S = 0.5
@@ -79,12 +79,12 @@ def grid_rate_hz(line_hz: float) -> int:
 
 
 def is_too_slow(line_hz: float) -> bool:
-    """Whether a line is slower than the slowest grid can be."""
+    """Return whether a line is slower than the slowest grid can be."""
     return line_hz < RATES_HZ[0] / math.sqrt(2.0)
 
 
 def leaves_gaps(line_hz: float, timing: GridTiming) -> bool:
-    """Whether the samples of a line are so far apart that many of the spans between them count as gaps."""
+    """Return whether the samples of a line are so far apart that many of the spans between them count as gaps."""
     return line_hz * timing.gap_limit_ns < FEWEST_PERIODS * NS_PER_S
 
 
@@ -95,7 +95,7 @@ class SampleTimes:
     """
 
     def __init__(self, most: int) -> None:
-        """most: how many times are kept."""
+        """most: number of times that are kept."""
         self._source: tuple[str, bool] | None = None  # producer, and whether its device has a clock
         self._most = most
         self._times_us: deque[int] = deque(maxlen=most)
@@ -134,12 +134,12 @@ class SampleTimes:
 
     @property
     def count(self) -> int:
-        """How many times there are."""
+        """Number of times."""
         return len(self._times_us)
 
     @property
     def span_us(self) -> int:
-        """From the first time to the last."""
+        """Time from the first to the last."""
         return self._times_us[-1] - self._times_us[0] if self._times_us else 0
 
     @property
@@ -163,7 +163,7 @@ class SampleTimes:
 
 
 def common_period_us(steps_us: Array) -> float | None:
-    """The period of which steps are multiples, most of them small ones; None if there is none, or too few steps.
+    """Find the period of which steps are multiples, most of them small ones; None if there is none, or too few steps.
 
     It begins with the shorter steps, and is the mean over all that are at most a few periods long.
     """
@@ -193,8 +193,8 @@ class LineRate:
         self._first_t_ns = self._last_t_ns = 0
         self._last_span_us = 0
         self.first_lateness_ns = 0
-        """how much later the first sample arrived than with the delay of the least delayed one of the first second;
-        0 if the device has no clock"""
+        """delay of the first sample beyond that of the least delayed one of the first second; 0 if the device has no
+        clock"""
 
     def add(self, message: Raw) -> bool:
         """Add the samples of a message; returns whether they are enough for `line_hz`."""
@@ -221,7 +221,7 @@ class LineRate:
 
     @property
     def is_enough(self) -> bool:
-        """Whether there are enough samples. After very many without a usable time they are, too."""
+        """Return whether there are enough samples. After very many without a usable time, there are."""
         count, span_us = self._times.count, self._times.span_us
         return (
             (count >= ENOUGH_SAMPLES and span_us >= SHORTEST_WAIT_US)

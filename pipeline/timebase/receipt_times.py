@@ -1,4 +1,4 @@
-"""When samples would have been received if each had been sent at once.
+"""Times of receipt as they would be if each sample had been sent at once.
 
 A program may send several samples together, or after a pause all that it has kept meanwhile. The newest one that it had
 then is the one that was not kept; each of the others would have come so much earlier as it is older. What follows from

@@ -83,7 +83,7 @@ class SampleGrid:
         self._link_wait_ns = link_wait_ns
         self._silence_ns = 0
         self._shown_silence_ns = 0
-        """that of the source, as far as its producer has shown that it has sent nothing"""
+        """silence of the source, as far as its producer has shown that it has sent nothing"""
         self._tick_t_ns: int | None = None
         self._set_back_ns = 0  # by how much the host clock was set back, until it has caught up
         self._producer = ""
@@ -93,7 +93,7 @@ class SampleGrid:
         self._counts: Counter[str] = Counter()
 
     def step(self, item: Raw) -> list[Grid]:
-        """Add raw samples; returns the grid as far as it is determined."""
+        """Add raw samples; return the grid that they determine."""
         self._counts["samples_in"] += len(item.host_receive_t_ns)
         if is_of_replay(item.header.producer) or self._is_repeated(item):
             self._add(item, self._is_new(item))
@@ -135,7 +135,7 @@ class SampleGrid:
         return {**self._counts, **self._guard.counts, "clock_restarts": max(0, self._clock.segments - 1)}
 
     def problem(self) -> str:
-        """No samples, or a host clock that was set back."""
+        """Problem of the line: no samples, or a host clock that was set back."""
         if self._silence_ns >= self._watermark_ns:
             return (
                 f"no raw samples for more than {self._watermark_ns / NS_PER_S:g} s: see acquisition in `fantwin status`"
@@ -176,11 +176,11 @@ class SampleGrid:
         return values
 
     def _is_repeated(self, item: Raw) -> bool:
-        """Whether the bus has delivered a message of the present producer again."""
+        """Return whether the bus has delivered a message of the present producer again."""
         return item.header.producer == self._producer and item.header.sequence <= self._sequence
 
     def _is_new(self, item: Raw) -> bool:
-        """Whether a message is newer than all before: neither repeated nor one of an ended session."""
+        """Return whether a message is newer than all before: neither repeated nor one of an ended session."""
         return item.header.producer not in self._ended_producers and not self._is_repeated(item)
 
     def _times(self, item: Raw, is_new: bool) -> tuple[list[int], set[int]]:
@@ -198,7 +198,7 @@ class SampleGrid:
         return times, restarts
 
     def _follows(self, item: Raw) -> bool:
-        """Whether the device has not restarted since the newest sample, by its own numbers."""
+        """Return whether the device has not restarted since the newest sample, by its own numbers."""
         sequence = item.device_sequence
         if not len(sequence) or self._device_sequence is None:
             return False
@@ -220,7 +220,7 @@ class SampleGrid:
         self._device_sequence = int(sequence[-1]) if len(sequence) else None
 
     def _is_accepted(self, t_ns: int, is_new: bool, *, after_restart: bool) -> bool:
-        """Whether a sample is newer than all before; counts the reason if not."""
+        """Return whether a sample is newer than all before; counts the reason if not."""
         behind_ns = self._newest_t_ns - t_ns
         if after_restart and self._newest_t_ns != NEVER_NS:
             # Two segments of the device clock are not compared: a gap lies between, and nothing is interpolated.

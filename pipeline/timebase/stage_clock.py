@@ -1,4 +1,4 @@
-"""The time that a stage uses: the host's, or the replay's while a recording is replayed.
+"""Clock of a stage: the host's, or the replay's while a recording is replayed.
 
 Stages with an input use the time of their samples; only sources use the host clock. A replay may be slow, paused or
 faster than real time, and a tray must not look silent because of its pace. So ticks carry the time that the replay has
@@ -26,7 +26,7 @@ EXPIRES_S = 5.0
 
 
 def is_of_replay(producer: str) -> bool:
-    """Whether a message comes from a recording, not from a live fan."""
+    """Return whether a message comes from a recording, not from a live fan."""
     return producer.startswith(f"{REPLAY}-")
 
 
@@ -48,13 +48,13 @@ class StageClock:
         self._host_ns = host_ns
         self._monotonic_s = monotonic_s
         self.is_replay_alive = False
-        """whether a replay presents the site"""
+        """true while a replay presents the site"""
         self._owner = ""
         """the producer of the replay"""
         self._times: dict[str, _ReplayTime] = {}
-        """by tray: the last clock message of the replay"""
+        """last clock message of the replay, by tray"""
         self._replayed_until_ns: dict[str, int] = {}
-        """by tray: when the replay was there last, by the host's time: older samples may be its"""
+        """host time when the replay was there last, by tray: older samples may be its"""
 
     def set_replay_alive(self, alive: bool) -> None:
         """The replayer's liveliness token has appeared or gone."""
@@ -85,7 +85,7 @@ class StageClock:
         return last.clock.t_ns if last else self._host_ns()
 
     def is_of_replay(self, tray: str) -> bool:
-        """Whether the time of a tray is that of a replay."""
+        """Return whether the time of a tray is that of a replay."""
         return self._time_of(tray) is not None
 
     def now_ns(self, tray: str, t_ns: int) -> int | None:
