@@ -1,1 +1,1 @@
-"""Where samples come from: a folder for each kind of source, with its settings and what reads from it."""
+"""Sources of samples: a folder for each kind, with its settings and what reads from it."""

@@ -18,11 +18,11 @@ class FanValues:
     def __init__(self, fans: int) -> None:
         self._command = [math.nan] * fans
         self._speed: list[float | None] = [None] * fans
-        """of the reading that is not complete; None: no new one yet"""
+        """speeds of the reading that is not complete; None: no new one yet"""
 
     @property
     def lacks_commands(self) -> bool:
-        """Whether the command of a fan is not known yet: then there are no readings."""
+        """Return whether the command of a fan is not known yet: then there are no readings."""
         return any(map(math.isnan, self._command))
 
     def set_command(self, fan: int, command: float) -> Reading | None:

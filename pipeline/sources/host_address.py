@@ -6,7 +6,7 @@ import ipaddress
 
 
 def is_of_this_host_only(host: str) -> bool:
-    """Whether only this host can reach what listens there."""
+    """Return whether only this host can reach a server at that address."""
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:

@@ -17,9 +17,9 @@ from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS
 from fantwin.schemas.units import NS_PER_S
 
 LARGEST_BYTES = 1 << 20
-"""of one text"""
+"""size of one text"""
 MOST_SAMPLES = 4096
-"""in one text"""
+"""samples in one text"""
 _OTHERS = tuple(column.name for column in AUXILIARY)
 _OF_FAN = ("command", "speed", *_OTHERS)
 _OF_SAMPLE = ("t", "sequence", "fans", *_OF_FAN)
@@ -39,7 +39,7 @@ class TimedReading:
 
 
 def parse_samples(text: bytes) -> list[TimedReading | Rejected]:
-    """What a text says of each of its samples.
+    """Parse each of the samples in a text.
 
     Raises:
         JsonSamplesError: it is no JSON, too long, or neither a sample nor a list of samples.
@@ -79,7 +79,7 @@ def parse_samples(text: bytes) -> list[TimedReading | Rejected]:
 def batches_of(
     found: Sequence[TimedReading | Rejected], received_t_ns: int, receipts: ReceiptTimes, byte_count: int
 ) -> list[ReadingBatch]:
-    """What came together, as batches: a sample that is older than the newest one was kept by its sender."""
+    """Split samples that came together into batches: one that is older than the newest was kept by its sender."""
     times = [each.t_ns for each in found if isinstance(each, TimedReading) and each.t_ns is not None]
     newest_t_ns = times[-1] if times else 0
     ages_ns = [

@@ -34,15 +34,15 @@ from fantwin.pipeline.timebase.device_clock import UINT32
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 
 SLOWEST_S = 1.0
-"""between two samples that can be scored (resampler)"""
+"""longest time between two samples that can be scored (resampler)"""
 MOST_FAILURES = 3
-"""in a row; the device is then taken for lost"""
+"""failures in a row after which the device is taken for lost"""
 RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 0.5, 10.0
 """the first delay doubles with every attempt, up to the second"""
 STOP_LIMIT_S = 5.0
 """a request that takes longer does not delay the end"""
 WRITE_WAIT_S = 0.05
-"""for the outcome of a write; a device that is being asked takes it afterwards"""
+"""longest wait for the outcome of a write; a device that is being read takes it afterwards"""
 
 
 class PolledConfig(SourceConfig, frozen=True):
@@ -60,11 +60,11 @@ class DeviceError(Exception):
 
 
 class PolledDevice(Protocol):
-    """What is asked. All is called in one thread, but `name`, `settings_to_check` and `check`."""
+    """Device that is polled. All is called in one thread, but `name`, `settings_to_check` and `check`."""
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """Name of the device, for people."""
         ...
 
     @property
@@ -74,7 +74,7 @@ class PolledDevice(Protocol):
 
     @property
     def is_writable(self) -> bool:
-        """Whether it takes commands."""
+        """Return whether it takes commands."""
         ...
 
     def connect(self) -> None:
@@ -82,7 +82,7 @@ class PolledDevice(Protocol):
         ...
 
     def read(self) -> Reading | Rejected:
-        """One reading, NaN for a value that cannot be read; what is not to be taken for one, with the reason.
+        """Read once, NaN for a value that cannot be read; what cannot be used is `Rejected`, with the reason.
 
         Raises DeviceError where nothing can be read.
         """
@@ -97,7 +97,7 @@ class PolledDevice(Protocol):
         ...
 
     def check(self) -> list[str]:
-        """What would keep it from being read now, one line each."""
+        """Problems that would keep it from being read now, one line each."""
         ...
 
 
@@ -129,7 +129,7 @@ class PollingSource:
 
     @property
     def name(self) -> str:
-        """That of the device."""
+        """Name of the device."""
         return self.device.name
 
     @property
@@ -170,7 +170,7 @@ class PollingSource:
             return write.failure
 
     def check(self) -> list[str]:
-        """What would keep the device from being read."""
+        """Problems that would keep the device from being read."""
         return self.device.check()
 
     def _run(self) -> None:
@@ -239,7 +239,7 @@ class PollingSource:
                 self._deliver_reading(reading)
 
     def _next_due_s(self, due_s: float) -> float:
-        """When the poll after the one at due_s is to begin. Those that are over are left out, and counted."""
+        """Time of the poll after the one at due_s. Polls whose time is over are left out, and counted."""
         late_s = time.monotonic() - due_s
         skipped = max(0, math.ceil(late_s / self._period_s) - 1)
         self._sequence += skipped
@@ -287,6 +287,6 @@ class PollingSource:
 
 
 def _reason(error: Exception) -> str:
-    """One line."""
+    """Reason of an error in one line."""
     text = " ".join(str(error).split())
     return text if isinstance(error, DeviceError) else f"unexpected {type(error).__name__}: {text}; waiting for it"

@@ -1,4 +1,4 @@
-"""What a source of samples is: where the readings of one tray come from and its commands go to.
+"""Source of samples: where the readings of one tray come from and its commands go to.
 
 A source delivers readings as the device gives them, in the units of its tray. Everything else is shared by all sources
 and lives in stages/acquisition.py: range checks, unit conversion, message blocks, losses by sequence number.
@@ -19,17 +19,17 @@ from pydantic import BaseModel
 from fantwin.schemas.tacho import Tacho
 
 MOST_FANS = 1024
-"""of a tray: those whose samples come in one reading"""
+"""fans of a tray: those whose samples come in one reading"""
 
 
 class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """Base of every kind's settings, `source = { kind = "...", ... }` of a [[tray]]: frozen, unknown keys refused."""
 
     takes_pushed: ClassVar[bool] = False
-    """whether the samples of the tray are those that clients push over the bus"""
+    """true if the samples of the tray are those that clients push over the bus"""
 
     takes_port: ClassVar[bool] = False
-    """whether the source takes something that only one process can have, so that a check fails while it runs"""
+    """true if the source takes something that only one process can have, so that a check fails while it runs"""
 
     kind: str
 
@@ -44,8 +44,8 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         return ""
 
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
-        """What readings of this source are of the speed, one for all fans or one for each; None if the kind of source
-        does not determine it. `tacho` of the [[tray]] overrides it."""
+        """Tachos of this source, one for all fans or one for each; None if the kind of source does not determine them.
+        `tacho` of the [[tray]] overrides them."""
         del fans
         return None
 
@@ -65,14 +65,14 @@ def limits_of_float32(low: float, high: float) -> tuple[float, float]:
 
 
 def within(value: float, low: float, high: float) -> bool:
-    """Whether a float32 value lies in a range given in decimals."""
+    """Return whether a float32 value lies in a range given in decimals."""
     least, most = limits_of_float32(low, high)
     return least <= value <= most
 
 
 @dataclass(frozen=True, slots=True)
 class ReadingLimits:
-    """What a reading of a tray must be to be accepted; commands in the tray's unit, speeds in its speed unit."""
+    """Limits for accepted readings of a tray; commands in the tray's unit, speeds in its speed unit."""
 
     fans: int
     command_min: float
@@ -93,13 +93,13 @@ class ReadingLimits:
         return None
 
     def absurd_speeds(self, reading: Reading) -> int:
-        """How many speeds are beyond the largest one: acquisition takes them for missing."""
+        """Number of speeds beyond the largest one: acquisition takes them for missing."""
         return sum(abs(speed) > self.speed_max for speed in reading.speed)
 
 
 @dataclass(frozen=True, slots=True)
 class SourceContext:
-    """What a source has to know of its tray."""
+    """Context of a source: what it has to know of its tray."""
 
     fans: int
     speed_unit: str
@@ -109,23 +109,23 @@ class SourceContext:
     tray: str = ""
     """its name"""
     limits: ReadingLimits | None = None
-    """which readings acquisition accepts, for a source that says so to whoever sends them; None: not known"""
+    """limits of accepted readings, for a source that reports refused ones to their sender; None: not known"""
     run_folder: Path | None = None
-    """where it may keep files; None: nowhere"""
+    """folder where it may keep files; None: nowhere"""
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One sample of all fans of a tray, one value per fan.
+    """Sample of all fans of a tray, one value per fan.
 
     A source without a device clock gives no `clock_us`: the sample's time is then its time of receipt. Without a
     `sequence`, losses between device and host cannot be seen.
     """
 
     command: tuple[float, ...]
-    """in the tray's command unit"""
+    """commands in the tray's command unit"""
     speed: tuple[float, ...]
-    """in the tray's speed unit; NaN where there is no reading"""
+    """speeds in the tray's speed unit; NaN where there is no reading"""
     clock_us: int | None = None
     """device clock at the time of measurement, modulo 2^32"""
     sequence: int | None = None
@@ -134,7 +134,7 @@ class Reading:
     """this and the following: one value per fan, NaN where it is not known; empty if the source does not measure it"""
     current_a: tuple[float, ...] = ()
     temperature_c: tuple[float, ...] = ()
-    """of the air"""
+    """temperature of the air"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +153,7 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class ReadingBatch:
-    """What arrived at one time. It may be empty: a source also reports input that completes no reading."""
+    """Readings that arrived together. It may be empty: a source also reports input that completes no reading."""
 
     received_t_ns: int
     """host time, ns since the epoch"""
@@ -161,7 +161,7 @@ class ReadingBatch:
     byte_count: int = 0
     """bytes received, where the source counts them"""
     tachos: tuple[Tacho, ...] = ()
-    """what the device itself says that it measures, one for all fans or one for each; empty where it does not say"""
+    """tachos that the device itself states, one for all fans or one for each; empty where it states none"""
     device_counts: Mapping[str, int] = field(default_factory=dict)
     """the advance of the counters of the device itself, such as that of damaged frames, since the batch before"""
 
@@ -186,7 +186,7 @@ class SampleSource(Protocol):
 
     @property
     def name(self) -> str:
-        """What people call the connection, for example its port."""
+        """Name of the connection for people, for example its port."""
         ...
 
     @property
@@ -212,5 +212,5 @@ class SampleSource(Protocol):
         ...
 
     def check(self) -> list[str]:
-        """What would keep the source from connecting now, one line each."""
+        """Problems that would keep the source from connecting now, one line each."""
         ...

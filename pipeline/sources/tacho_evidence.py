@@ -1,4 +1,4 @@
-"""How a speed was measured, found from its readings: how finely they are graded, and how often they change.
+"""Evidence of how a speed was measured, from its readings: how finely they are graded, and how often they change.
 
 A counting tacho shows multiples of its resolution, one pulse more or less in its window, and repeats each reading until
 the next count is complete. Both show in any recording in which the fan changes its speed now and then. A resolution of
@@ -24,15 +24,15 @@ RAD_S_PER_RPM = RAD_S_PER_UNIT["rpm"]
 USUAL_PULSES = 2
 FEWEST_CHANGES = 20
 FEWEST_LEVELS, MOST_LEVELS = 10, 2000
-"""of readings: fewer may be multiples of something by chance, more are not graded"""
+"""levels of readings: fewer may be multiples of something by chance, more are not graded"""
 NEARLY_ALL = 0.95
 PRINTED_RAD_S = 0.51 * RAD_S_PER_RPM
-"""how far a multiple may be off where speeds are printed in whole rpm"""
+"""distance from a multiple that is allowed where speeds are printed in whole rpm"""
 GRADED_IN_PRINTED = 8.0
-"""resolutions below so many of these are those of the print"""
+"""resolution, in units of the print, below which the grading is that of the print"""
 HELD_IN_STEPS = 1.5
 LONGEST_STEP = 5.0
-"""in median steps; the time of a change is not known across a longer one"""
+"""longest step, in median steps; the time of a change is not known across a longer one"""
 SIMILAR = 0.1
 
 
@@ -88,7 +88,7 @@ def find_tacho(t_s: Array, speed_rad_s: Array) -> TachoEvidence | None:
 
 
 def tacho_hints(t_s: Array, speed_rad_s: Array, declared: Sequence[Tacho], fans: Sequence[int]) -> list[str]:
-    """One line for each kind of evidence that speaks against the declared tachos.
+    """Hints, one line for each kind of evidence that speaks against the declared tachos.
 
     t_s: (n,). speed_rad_s: (n, fans). declared: one for all fans, or one for each. fans: their numbers, for the text.
     """
@@ -117,7 +117,7 @@ _SEEN = ("resolution_rad_s", "held_s")
 
 
 def _resolution_rad_s(speed: Array, changed: NDArray[np.intp]) -> float | None:
-    """The coarsest grading of which nearly all readings are multiples; None where it is that of the print, or none."""
+    """Coarsest grading of which nearly all readings are multiples; None where it is that of the print, or none."""
     moves = np.abs(speed[changed] - speed[changed - 1])
     levels, samples = np.unique(speed, return_counts=True)
     if len(moves) < FEWEST_CHANGES or not FEWEST_LEVELS <= len(levels) <= MOST_LEVELS:
@@ -137,14 +137,14 @@ def _resolution_rad_s(speed: Array, changed: NDArray[np.intp]) -> float | None:
 
 
 def _could_count(speed: Array, changed: NDArray[np.intp], resolution: float, step_s: float) -> bool:
-    """Whether readings that may change with each sample move no further than the pulses between two samples."""
+    """Return whether readings that may change with each sample move no further than the pulses between two samples."""
     pulses = USUAL_PULSES / (2.0 * math.pi) * float(np.abs(speed).max()) * step_s
     moves = np.abs(speed[changed] - speed[changed - 1]) / resolution
     return bool(np.mean(moves <= pulses + 1.5) >= NEARLY_ALL)
 
 
 def _change_s(t_s: Array, changed: NDArray[np.intp], step_s: float) -> float | None:
-    """The time of which the times between changes are multiples; None where it is not longer than a sample."""
+    """Time of which the times between changes are multiples; None where it is not longer than a sample."""
     if len(changed) < FEWEST_CHANGES:
         return None
     longest_step = np.maximum.reduceat(np.diff(t_s)[: changed[-1]], changed[:-1])

@@ -30,12 +30,12 @@ class HttpConfig(SourceConfig, frozen=True):
 
     @property
     def is_local(self) -> bool:
-        """Whether only this host can reach it."""
+        """Return whether only this host can reach the server."""
         return is_of_this_host_only(self.host)
 
     @property
     def why_no_commands(self) -> str:
-        """No command is sent to the program that posts samples."""
+        """Reason why no command is sent to the program that posts samples."""
         return "the program that posts its samples moves the fans"
 
     @model_validator(mode="after")

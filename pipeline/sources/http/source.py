@@ -38,7 +38,7 @@ MOST_WAITING = 2 * MOST_SAMPLES
 """samples that wait for acquisition"""
 RETRY_AFTER_S = 1
 RETRY_S = 2.0
-"""between attempts to listen"""
+"""time between attempts to listen"""
 MOST_CONNECTIONS = 32
 STOP_LIMIT_S = 3.0
 MOST_REASONS = 20
@@ -49,7 +49,7 @@ class HttpSource:
     """A `SampleSource`."""
 
     def __init__(self, config: HttpConfig, context: SourceContext) -> None:
-        """Nothing listens yet.
+        """Prepare the server; it does not listen yet.
 
         Raises:
             UserError: the token cannot be read.
@@ -60,7 +60,7 @@ class HttpSource:
         self._receipts = ReceiptTimes()
         self._changed = threading.Condition()
         self._waiting: deque[SourceEvent] = deque()
-        """for acquisition"""
+        """events for acquisition"""
         self._waiting_samples = 0
         self._accepted = self._refused = self._turned_away = self._over_limit = 0
         self._stopping = False
@@ -69,7 +69,7 @@ class HttpSource:
 
     @property
     def name(self) -> str:
-        """Where it listens."""
+        """Address at which it listens."""
         scheme = "https" if self._config.certificate else "http"
         return f"{scheme}://{self._config.host}:{self._config.port}"
 
@@ -98,11 +98,11 @@ class HttpSource:
             thread.join(STOP_LIMIT_S)
 
     def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
-        """Nothing is sent."""
+        """Send nothing."""
         return self._config.why_no_commands
 
     def check(self) -> list[str]:
-        """Whether the port is free."""
+        """Problems before the start: the port is not free."""
         try:
             self._listen().close()
         except OSError as error:
@@ -110,7 +110,7 @@ class HttpSource:
         return []
 
     def app(self) -> Starlette:
-        """What answers the requests."""
+        """Application that answers the requests."""
         from starlette.applications import Starlette  # noqa: PLC0415  slow to import
         from starlette.routing import Route  # noqa: PLC0415
 
@@ -130,8 +130,8 @@ class HttpSource:
         if refusal is not None:
             return refusal
         body = bytearray()
-        async for piece in request.stream():
-            body += piece
+        async for part in request.stream():
+            body += part
             if len(body) > LARGEST_BYTES:
                 return _answer(413, {"error": f"at most {LARGEST_BYTES} bytes are accepted at once"})
         try:

@@ -1,4 +1,4 @@
-"""What is particular to the chips behind /sys/class/hwmon: one row each, with the kernel's document or source.
+"""Particularities of the chips behind /sys/class/hwmon: one row each, with the kernel's document or source.
 
 The rows say what `fanN_input` is of the speed, and what a program has to know to set `pwmN`. A chip that is not here is
 read all the same: what its readings are is then not known, and they count as instantaneous unless `tacho` says more.
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from fantwin.schemas.tacho import Tacho
 
 REVOLUTION_S = 0.05
-"""one revolution at 1,200 rpm: chips measure the time of one, and the speed is not known here"""
+"""time of a revolution at 1,200 rpm: chips measure the time of one, and the speed is not known here"""
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ class HwmonConfig(PolledConfig, frozen=True):
         return "" if self.writable else "its source does not have writable = true"
 
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
-        """What the driver of the chip gives, where it is known."""
+        """Tachos as the driver of the chip measures, where that is known."""
         del fans
         chip = chip_of(self.chip)
         return (chip.tacho,) if chip and chip.tacho else None

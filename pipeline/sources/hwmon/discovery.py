@@ -1,4 +1,4 @@
-"""What this computer could watch: hwmon chips with fans, and serial ports, each as a [[tray]] ready to paste."""
+"""Discovery of what this computer could watch: hwmon chips with fans, and serial ports, each as a [[tray]] to paste."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fantwin.pipeline.sources.hwmon.tree import ChipFolder, chip_folders, device
 
 HIGHEST_RPM = 20_000
 _UNKNOWN = "n/a"
-"""what pyserial returns for a port of which the system knows no device"""
+"""description by pyserial of a port of which the system knows no device"""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How the pwms of a chip were found, in a file that outlives the process that writes them."""
+"""Modes of the pwms of a chip before fantwin wrote them, in a file that outlives the process that writes them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class FoundPwm:
 
 @dataclass(frozen=True)
 class _Found:
-    """What the file holds. chip, device: whose pwms they are."""
+    """Content of the file. chip, device: whose pwms they are."""
 
     chip: str
     device: str
@@ -40,7 +40,7 @@ class FoundModes:
         self._path = path
 
     def kept(self, chip: ChipFolder) -> dict[int, FoundPwm]:
-        """What an earlier process has not given back, by the number of the pwm."""
+        """Modes that an earlier process has not given back, by the number of the pwm."""
         try:
             found = _FOUND.validate_json(self._path.read_bytes()) if self._path else None
         except (OSError, ValidationError):

@@ -24,7 +24,7 @@ from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
 MANUAL = 1
-"""in pwmN_enable"""
+"""value of pwmN_enable for commands by a program"""
 HIGHEST_PWM = 255
 HOTTEST_C = 127
 """a sensor that is not connected reads more (Documentation/hwmon/dell-smm-hwmon.rst)"""
@@ -57,7 +57,7 @@ class HwmonDevice:
         self._chip: ChipFolder | None = None
         self._modes = FoundModes(context.run_folder / f"hwmon-{context.tray}.json" if context.run_folder else None)
         self._before: dict[int, FoundPwm] = {}
-        """how each pwm that was written, also by a process that was killed, was found"""
+        """mode of each pwm before it was written, also by a process that was killed"""
         self._taken_over: set[int] = set()
         """the pwms that this connection has made manual"""
         self._written = False
@@ -69,12 +69,12 @@ class HwmonDevice:
 
     @property
     def settings_to_check(self) -> str:
-        """What may be wrong."""
+        """Settings that may be wrong."""
         return f"chip = {self._config.chip!r}"
 
     @property
     def is_writable(self) -> bool:
-        """As the configuration says."""
+        """Return whether the configuration lets fantwin command the fans."""
         return self._config.writable
 
     def connect(self) -> None:
@@ -146,7 +146,7 @@ class HwmonDevice:
             self._modes.forget()
 
     def check(self) -> list[str]:
-        """What is not there, or may not be read or written."""
+        """Problems before the start: what is not there, or may not be read or written."""
         try:
             chip = self._find()
         except DeviceError as error:
@@ -205,7 +205,7 @@ class HwmonDevice:
         return chip
 
     def _pwm(self, chip: ChipFolder, number: int) -> int:
-        """Without the command a reading is of no use."""
+        """Read a command, without which a reading is of no use."""
         try:
             return chip.number(f"pwm{number}")
         except FileNotFoundError as error:
@@ -241,7 +241,7 @@ class HwmonDevice:
         self._taken_over.add(number)
 
     def _mode(self, chip: ChipFolder, number: int) -> int | None:
-        """What pwmN_enable says; None if there is no such file, or it cannot be read."""
+        """Content of pwmN_enable; None if there is no such file, or it cannot be read."""
         try:
             return chip.number(f"pwm{number}_enable")
         except OSError:

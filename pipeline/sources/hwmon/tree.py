@@ -25,7 +25,7 @@ class ChipFolder:
     device: str
 
     def is_called(self, name: str, device: str) -> bool:
-        """Whether it is the chip of a configuration."""
+        """Return whether it is the chip of a configuration."""
         return self.name == name and (not device or f"/{self.device}".endswith(f"/{device.strip('/')}"))
 
     @cached_property

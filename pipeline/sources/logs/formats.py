@@ -13,7 +13,7 @@ _START_BYTES = 64
 
 
 class LogFormat(NamedTuple):
-    """How a format is recognised, and what reads it.
+    """Format of logs: how it is recognised, and what reads it.
 
     Attributes:
         title: what people call it.

@@ -1,4 +1,4 @@
-"""What a log of another system is to fantwin: fields with names, each with values at its own times.
+"""Log of another system, as fantwin sees it: fields with names, each with values at its own times.
 
 To add a format, write one file with a reader and add its row to pipeline/sources/logs/formats.py.
 """
@@ -40,7 +40,7 @@ class LogFile(Protocol):
 
     @property
     def notes(self) -> Sequence[str]:
-        """What is unusual about the log, one line each."""
+        """Notes on what is unusual about the log, one line each."""
         ...
 
     @property

@@ -16,7 +16,7 @@ from fantwin.pipeline.sources.logs.log_file import LogError, Series
 from fantwin.schemas.units import NS_PER_S
 
 MOST_ELEMENTS = 1024
-"""of an array; a longer one is an image or a cloud and no row of fans"""
+"""elements of an array; a longer one is an image or a cloud and no row of fans"""
 
 
 _NO_VALUES = ("header", "layout")

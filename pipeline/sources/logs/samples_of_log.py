@@ -1,4 +1,4 @@
-"""Fields of a log to samples of fans: which field is of which fan, and commands at the times of the speeds."""
+"""Samples of fans from the fields of a log: which field is of which fan, and commands at the times of the speeds."""
 
 from __future__ import annotations
 

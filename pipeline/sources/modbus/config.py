@@ -14,7 +14,7 @@ RegisterType = Literal["u16", "s16", "u32", "s32", "f32"]
 
 
 class Register(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
-    """One number in a device: its registers times `scale`, plus `offset`."""
+    """Number in a device: its registers times `scale`, plus `offset`."""
 
     address: int = Field(ge=0, le=65535, description="address in the request: from 0, without a leading 3 or 4")
     type: RegisterType = Field(default="u16", description="unsigned, signed or float; 32 bits are in two registers")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pymodbus.client.base import ModbusBaseSyncClient
 
 MOST_REGISTERS = 120
-"""of one request; the protocol allows 125"""
+"""registers of one request; the protocol allows 125"""
 _FORMATS = {"u16": ">H", "s16": ">h", "u32": ">I", "s32": ">i", "f32": ">f"}
 
 
@@ -40,7 +40,7 @@ class ModbusSource(PollingSource):
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a register is: the device, the table of it, and the address."""
+    """Place of a register: the device, its table, and the address."""
 
     unit: int
     table: str
@@ -78,14 +78,14 @@ class ModbusDevice:
 
     @property
     def settings_to_check(self) -> str:
-        """What may differ between the two ends."""
+        """Settings that may differ between the two ends."""
         config = self._config
         line = "" if config.host else f"baud = {config.baud}, parity = {config.parity!r}, "
         return f"{line}unit and registers"
 
     @property
     def is_writable(self) -> bool:
-        """Whether a fan has a register for commands."""
+        """Return whether a fan has a register for commands."""
         return any(fan.write for fan in self._config.fan)
 
     def connect(self) -> None:
@@ -132,7 +132,7 @@ class ModbusDevice:
             client.close()
 
     def check(self) -> list[str]:
-        """Whether the serial port is there; a host is not asked."""
+        """Problems before the start: the serial port is not there. A host is not asked."""
         if self._port and not os.access(self._port, os.R_OK | os.W_OK):
             return [f"{self._port}: no such port, or this user may not open it (group dialout); correct source.port"]
         return []

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 1, 10
 ANSWER_S = 5.0
-"""for a check"""
+"""longest wait for the answer to a check"""
 NOT_REACHED = "the broker cannot be reached; check host and port, and whether it runs"
 
 
@@ -72,7 +72,8 @@ def _of_tls(error: ssl.SSLError) -> str:
 
 
 def connection_problems(client: Client, settings: BrokerSettings, name: str) -> list[str]:
-    """Whether the broker answers and accepts a new client, which is not used afterwards; one line each.
+    """Problems of a new client that the broker does not answer or accept, one line each; the client is not used
+    afterwards.
 
     name: of the connection, with which each line begins.
     """

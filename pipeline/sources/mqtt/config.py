@@ -39,7 +39,7 @@ class MqttConfig(SourceConfig, BrokerSettings, frozen=True):
 
     @property
     def has_values(self) -> bool:
-        """Whether each topic has a number of one fan."""
+        """Return whether each topic has a number of one fan."""
         return bool(self.speed_topic)
 
     @property

@@ -1,4 +1,4 @@
-"""How an MQTT broker is reached, and who this client is: of the source `mqtt` and of the stage `mqtt`."""
+"""Settings of a connection to an MQTT broker, for the source `mqtt` and the stage `mqtt`."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class MqttSource:
     """A `SampleSource`."""
 
     def __init__(self, config: MqttConfig, context: SourceContext) -> None:
-        """Nothing is connected yet.
+        """Prepare the client; it does not connect yet.
 
         Raises:
             UserError: the extra is not installed, or a password or certificate cannot be read.
@@ -58,13 +58,13 @@ class MqttSource:
             for pattern in config.patterns
             for fan in range(context.fans if config.has_values else 1)
         }
-        """what is subscribed to; of numbers, which fan a topic is of, and whether it is its speed"""
+        """subscribed topics; of numbers, with the fan of the topic, and whether it is its speed"""
         self._foreign: deque[str] = deque(maxlen=MOST_RECENT)
         """topics that are not of this tray, and were unsubscribed"""
         self._recent: deque[tuple[str, bytes]] = deque(maxlen=MOST_RECENT)
         self._is_up = False
         self._is_refused = False
-        """by the broker, which ends the connection next"""
+        """true if the broker has refused the client; it ends the connection next"""
         self._stopping = False
         self._context = context
         self._client = self._new_client(config.client_id)
@@ -76,7 +76,7 @@ class MqttSource:
 
     @property
     def settings_to_check(self) -> str:
-        """What may differ from what is published."""
+        """Settings that may differ from what is published."""
         names = ("speed_topic", "command_topic") if self._config.has_values else ("topic",)
         return ", ".join(f"{name} = {getattr(self._config, name)!r}" for name in names)
 
@@ -115,7 +115,7 @@ class MqttSource:
         return "" if is_sent else f"{self.name} did not take it"
 
     def check(self) -> list[str]:
-        """Whether the broker answers and accepts this client."""
+        """Problems before the start: the broker does not answer, or does not accept this client."""
         # with an id of its own: the broker ends the connection of another client with the same one
         client = new_client(self._config, self._context.folder, "source mqtt", "acquisition")
         return connection_problems(client, self._config, self.name)
@@ -176,7 +176,7 @@ class MqttSource:
             self._deliver(batch)
 
     def _is_own(self, topic: str) -> bool:
-        """Whether this tray subscribes to a topic. With a client_id, the broker keeps earlier subscriptions."""
+        """Return whether this tray subscribes to a topic. With a client_id, the broker keeps earlier subscriptions."""
         from paho.mqtt.client import topic_matches_sub  # noqa: PLC0415  an extra
 
         return topic in self._topics or any(topic_matches_sub(_unshared(each), topic) for each in self._topics)
@@ -184,7 +184,7 @@ class MqttSource:
     def batches(
         self, topic: str, payload: bytes, received_t_ns: int, is_retained: bool = False, is_again: bool = False
     ) -> list[ReadingBatch]:
-        """What a message has. is_retained: the broker had kept it. is_again: the broker may have sent it before."""
+        """Samples of a message. is_retained: the broker had kept it. is_again: the broker may have sent it before."""
         if not self._is_own(topic):
             detail = f"{topic} is not a topic of this tray: the earlier subscription of client_id is ended"
             return [_refused(received_t_ns, payload, Rejected("foreign_topic", detail, harmless=True))]

@@ -16,5 +16,5 @@ class PushConfig(SourceConfig, frozen=True):
 
     @property
     def why_no_commands(self) -> str:
-        """No command is sent to the program that pushes samples."""
+        """Reason why no command is sent to the program that pushes samples."""
         return "the program that pushes its samples moves the fans"

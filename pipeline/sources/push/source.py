@@ -22,9 +22,9 @@ from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, PushedSam
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
 SILENT_NS = 10 * NS_PER_S
-"""a client that has sent nothing for so long gives its place to an earlier one"""
+"""silence after which a client gives its place to an earlier one"""
 SHOWN_NS = 60 * NS_PER_S
-"""how long a second client is reported"""
+"""time for which a second client is reported"""
 MOST_EARLIER = 64
 """clients that are remembered"""
 
@@ -40,7 +40,7 @@ class PushSource:
         self._rad_s_per_unit = RAD_S_PER_UNIT[context.speed_unit]
         self._client = ""
         self._heard_t_ns = 0
-        """when the present client was last heard"""
+        """time when the present client was last heard"""
         self._receipts = ReceiptTimes()
         self._earlier: dict[str, None] = {}
         """clients that another one has followed"""
@@ -52,18 +52,18 @@ class PushSource:
         deliver(LinkUp())
 
     def stop(self) -> None:
-        """Nothing is kept here."""
+        """Do nothing: no connection is kept here."""
 
     def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
-        """Nothing is sent: whoever pushes samples may hear commands on the bus."""
+        """Send nothing: a program that pushes samples may hear commands on the bus."""
         return self._config.why_no_commands
 
     def check(self) -> list[str]:
-        """Nothing: that nobody sends is seen while it runs."""
+        """Return no problem: a missing client is seen while it runs."""
         return []
 
     def problem(self, now_ns: int) -> str:
-        """That two clients push samples of one tray, for a minute; else empty."""
+        """Problem for a minute after two clients have pushed samples of one tray; else empty."""
         if now_ns > self._second_until_t_ns:
             return ""
         return f"two clients push samples: {self._second} is ignored, because {self._client} came later; stop one"

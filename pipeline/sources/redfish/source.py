@@ -55,7 +55,7 @@ class RedfishDevice:
 
     @property
     def settings_to_check(self) -> str:
-        """What may not fit the controller."""
+        """Settings that may not fit the controller."""
         return "source.fans, source.command"
 
     def connect(self) -> None:
@@ -118,7 +118,7 @@ class RedfishDevice:
             connector.close()
 
     def check(self) -> list[str]:
-        """Whether the credentials can be read; the controller is not asked."""
+        """Problems before the start: the credentials cannot be read. The controller is not asked."""
         try:
             self._credentials()
         except DeviceError as error:
@@ -143,7 +143,7 @@ class RedfishDevice:
         return lines[0].strip(), lines[1]
 
     def _asked(self, request: Any) -> Any:
-        """What a request gives. Raises DeviceError, whose text has no credentials."""
+        """Send a request and return the answer. Raises DeviceError, whose text has no credentials."""
         from sushy import exceptions  # noqa: PLC0415
 
         try:

@@ -9,7 +9,7 @@ from pydantic import Field
 from fantwin.pipeline.sources.source import MOST_FANS, SourceConfig
 
 MOST_FANS_ON_LINE = 64
-"""that a frame carries: `schemas.wire.MAX_FANS`, which is not imported for reading a configuration"""
+"""fans in a frame: `schemas.wire.MAX_FANS`, which is not imported for reading a configuration"""
 
 
 class SerialConfig(SourceConfig, frozen=True):

@@ -1,4 +1,4 @@
-"""How far the counters of a device, such as that of damaged frames, have advanced while the host read its line."""
+"""Counters of a device, such as that of damaged frames: how far they advanced while the host read its line."""
 
 from __future__ import annotations
 

@@ -139,7 +139,7 @@ class SerialPort:
 
 
 def _open_problem(error: Exception) -> str:
-    """What is wrong with the port and what to do, in one line."""
+    """Problem with the port and what to do, in one line."""
     number = error.errno if isinstance(error, OSError) else None
     return (
         _OPEN_PROBLEMS.get(number or 0) or f"cannot be opened ({error}); waiting for it; check [[tray]] port and baud"

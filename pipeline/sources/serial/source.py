@@ -40,7 +40,7 @@ class SerialSource:
     """A `SampleSource`. Frames are decoded in the thread that reads the port."""
 
     def __init__(self, config: SerialConfig, context: SourceContext, link: ByteLink | None = None) -> None:
-        """The port is not opened yet; a test may give another `link`.
+        """Prepare the line; the port is not opened yet. A test may give another `link`.
 
         Raises:
             UserError: no port is given, or a frame cannot carry so many fans.
@@ -63,7 +63,7 @@ class SerialSource:
 
     @property
     def settings_to_check(self) -> str:
-        """What may differ between the two ends of the line."""
+        """Settings that may differ between the two ends of the line."""
         return f"baud = {self._config.baud}, protocol = {self._config.protocol!r}"
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
@@ -75,7 +75,7 @@ class SerialSource:
         self._link.stop()
 
     def decode(self, item: LinkUp | LinkDown | ReceivedBytes) -> SourceEvent:
-        """The readings that these bytes complete. Pieces of the stream that are not frames are `Rejected`."""
+        """Decode the readings that these bytes complete. Bytes that are not a frame are `Rejected`."""
         if not isinstance(item, ReceivedBytes):
             self._decoder.reset()
             self._device_counters.connection_interrupted()
@@ -102,7 +102,7 @@ class SerialSource:
         return "" if is_written else f"{self.name} is not connected, or accepted no bytes"
 
     def check(self) -> list[str]:
-        """Whether the port exists and may be opened."""
+        """Problems before the start: the port does not exist or may not be opened."""
         if not self._path.exists():
             return [f"{self._path}: no such port; connect the device, or correct [[tray]] port"]
         if not os.access(self._path, os.R_OK | os.W_OK):

@@ -1,4 +1,4 @@
-"""A simulated device: a pseudo-terminal that speaks the wire protocol in real time.
+"""Simulated device: a pseudo-terminal that speaks the wire protocol in real time.
 
 `play` is its main loop. It never blocks and never waits for the reader: samples that nobody reads are counted and keep
 their sequence numbers, so that a reader sees the gap. The samples themselves come from a `Device`.
@@ -118,7 +118,7 @@ class PseudoTerminal:
                 raise
 
     def has_reader(self) -> bool:
-        """Whether a process holds the host end open."""
+        """Return whether a process holds the host end open."""
         return not any(events & select.POLLHUP for _, events in self._poll.poll(0))
 
     def write(self, data: bytes) -> bool:
@@ -206,13 +206,13 @@ class PlaybackCounts:
     samples_dropped: int = 0
     """simulated losses"""
     samples_unsent: int = 0
-    """no reader, or one that was too slow"""
+    """samples without a reader, or with one that was too slow"""
     samples_late: int = 0
     worst_lateness_s: float = 0.0
     commands_received: int = 0
     set_points_received: int = 0
     commands_refused: int = 0
-    """pieces of the stream from the host that are not a frame for this device"""
+    """parts of the stream from the host that are not a frame for this device"""
     bytes_unread: int = 0
     """sent, but unread when the line was closed"""
 

@@ -72,7 +72,7 @@ class _Channel:
 
 
 class HwmonTree:
-    """The files of a chip with so many fans; for a driver of single fans, a chip for each."""
+    """Files of a chip with its fans; for a driver of single fans, a chip for each."""
 
     def __init__(self, root: Path, chip: str, fans: int) -> None:
         """Write the tree. A tree that an earlier simulation left is replaced.

@@ -1,4 +1,4 @@
-"""The columns of a measured table, filled piece by piece: text becomes numbers at once, so that large tables fit."""
+"""Columns of a measured table, filled in parts: text becomes numbers at once, so that large tables fit."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class TimeColumn:
 
     @property
     def is_assumed(self) -> bool:
-        """Whether the unit is an assumption: numbers without one."""
+        """Return whether the unit is an assumption: numbers without one."""
         return not self._is_given and self._unit != DATE_UNIT
 
     def add(self, rows: Sequence[Sequence[str]]) -> None:

@@ -34,7 +34,7 @@ OUT_OF_ORDER_NS = NS_PER_S  # rows further back than this mean that the clock wa
 _DELIMITERS = ",;\t"
 LONGEST_LINE = 1 << 20
 """characters"""
-_ROWS_IN_PIECE = 4096
+_ROWS_IN_PART = 4096
 NO_COLUMNS: Mapping[str, Sequence[str]] = {}
 
 
@@ -74,7 +74,7 @@ class Table:
     assumed: str = ""
     """units that were assumed, and how to give them, in one line; empty if all were given"""
     auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
-    """what else was measured, (n, fans) each, NaN where not, by its name in schemas.auxiliary"""
+    """other measured columns, (n, fans) each, NaN where missing, by name in schemas.auxiliary"""
 
     @property
     def fans(self) -> int:
@@ -98,7 +98,7 @@ class Table:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """One line per kind of irregularity, for people."""
+        """Notes for people, one line per kind of irregularity."""
         found = self.repairs
         counts = (
             (found.without_time, "rows dropped: their time cannot be read"),
@@ -156,10 +156,10 @@ def read_table(
     speeds = [NumberColumn(path, name, index) for name, index, _ in found]
     others = {name: _auxiliary(path, name, given, names, len(speeds)) for name, given in auxiliary.items() if given}
     count = 0
-    for piece in _pieces(rows, len(names)):
+    for part in _parts(rows, len(names)):
         for column in (*filter(None, [times]), *commands, *speeds, *chain.from_iterable(others.values())):
-            column.add(piece)
-        count += len(piece)
+            column.add(part)
+        count += len(part)
     t_ns, has_time = times.values() if times else _counted_times(count, period or "")
     command_values = np.column_stack([column.values() for column in commands] * (len(speeds) // len(commands)))
     speed_rad_s = np.column_stack([column.values() for column in speeds])
@@ -178,11 +178,11 @@ def _auxiliary(path: Path, what: str, given: Sequence[str], names: list[str], fa
     return [NumberColumn(path, *_column(path, each, names, ())[:2]) for each in given]
 
 
-def _pieces(rows: Iterator[list[str]], width: int) -> Iterator[list[list[str]]]:
+def _parts(rows: Iterator[list[str]], width: int) -> Iterator[list[list[str]]]:
     """The rows that are not empty, some thousand at a time, each at least `width` cells wide."""
     filled = (row + [""] * (width - len(row)) for row in rows if any(row))
-    while piece := list(islice(filled, _ROWS_IN_PIECE)):
-        yield piece
+    while part := list(islice(filled, _ROWS_IN_PART)):
+        yield part
 
 
 def _rows(path: Path) -> Iterator[list[str]]:
@@ -238,7 +238,7 @@ def _column(path: Path, given: str, names: list[str], units: Iterable[str]) -> t
 
 
 def _assumed(time: str, speed: str) -> str:
-    """Which units were assumed, in one line. time, speed: name of the column without a unit, else empty."""
+    """Line on the units that were assumed. time, speed: name of the column without a unit, else empty."""
     found = [
         (what, f"{option} {shlex.quote(f'{name}:{other}')}")
         for name, what, option, other in (
@@ -314,7 +314,7 @@ def clean_samples(path: Path, t_ns: Array, has_time: Array, command: Array, spee
 
 
 def hold_last(command: Array) -> Array:
-    """(n, fans) with each NaN replaced by the last value before it; NaN remains where there is none."""
+    """Replace each NaN by the last value before it, (n, fans); NaN remains where there is none."""
     rows = np.arange(len(command))[:, np.newaxis]
     known = np.maximum.accumulate(np.where(np.isnan(command), 0, rows), axis=0)
     return np.take_along_axis(command, known, axis=0)

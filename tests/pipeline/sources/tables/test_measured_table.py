@@ -164,9 +164,9 @@ def test_times_read_in_too_large_a_unit_are_an_error_that_names_the_unit_to_try(
         "t,u,y\n,1,5\n2024-05-01 10:00:00,1,10\n2024-05-01 10:00:01,2,20\n",
     ],
 )
-def test_row_17_a_table_read_in_pieces_is_the_same(tmp_path, monkeypatch, text):
+def test_row_17_a_table_read_in_parts_is_the_same(tmp_path, monkeypatch, text):
     whole = table(tmp_path, text)
-    monkeypatch.setattr(measured_table, "_ROWS_IN_PIECE", 1)
+    monkeypatch.setattr(measured_table, "_ROWS_IN_PART", 1)
     pieces = table(tmp_path, text)
     for name in ("t_ns", "command", "speed_rad_s"):
         np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
