@@ -6,9 +6,9 @@ Timing: a version is made when the healthy history has doubled, at least once in
 four hours of healthy running since an operator has commissioned fans again. While a fan has an alarm, only a version
 that is offered may be made, for most fans have changed alike: that is checked beside alarms as well.
 
-It keeps the healthy history (pipeline.learning.healthy_history) and starts `fantwin learn` beside the stages, which
-makes the next version and decides whether it takes over (pipeline.cli.twins.next_version). An operator can change the
-version in force: see `fantwin twins`. The learner may drop messages: it must never delay a score.
+It keeps the healthy history (pipeline.learning.healthy_history) and starts `fantwin twins learn` beside the stages,
+which makes the next version and decides whether it takes over (pipeline.cli.twins.next_version). An operator can change
+the version in force: see `fantwin twins`. The learner may drop messages: it must never delay a score.
 """
 
 from __future__ import annotations

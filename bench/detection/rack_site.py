@@ -1,6 +1,6 @@
 """One rack under `fantwin up` without a twin: the cores of its stages, what it learns, and what its operators do.
 
-The learner makes its versions by the function of `fantwin learn`, while no sample comes. After each day everything is
+The learner makes its versions by the function of `fantwin twins learn`, while no sample comes. After each day all is
 kept, so that a month that was interrupted goes on from there: for the rack it is a restart of its site.
 """
 
@@ -79,7 +79,7 @@ _MONTH = TypeAdapter(RackMonth)
 
 
 class LearningAtOnce:
-    """`fantwin learn` in this process: a version is there as soon as it is due."""
+    """`fantwin twins learn` in this process: a version is there as soon as it is due."""
 
     def __init__(self, folder: Path, tray: str, per_day: float, took_s: list[float]) -> None:
         """took_s: what each version takes is added to it."""

@@ -140,7 +140,7 @@ def events(faults: list[Fault]) -> list[Event]:
 
 
 def swept_duty(t_s: float) -> Array:
-    """(RACK_FANS,) of a rack under `fantwin sweep`, from 0 to 1: its levels, held long and short in turn."""
+    """(RACK_FANS,) of a rack under `fantwin command --sweep`, from 0 to 1: its levels, held long and short in turn."""
     into_s = t_s % (len(LEVELS) * SETTLED_S + len(SHORT_LEVELS) * SHORT_S)
     held = int(into_s / SETTLED_S)
     levels, step = LEVELS, held

@@ -1,7 +1,7 @@
 """What many open pages cost the gateway: share of a core, memory, and how long an alarm takes to reach each page.
 
 A process publishes the scores of a made-up fleet on a real bus in real time, and raises an alarm now and then. The
-gateway is the process that `fantwin run gateway` starts. The pages are in a third process: each holds a stream of live
+gateway is that of `fantwin up --only gateway`. The pages are in a third process: each holds a stream of live
 events as a browser does, half of them looking at a fan, and notes when each alarm arrives. Prometheus' part is one
 scrape of /metrics every 15 s. Each row has a gateway of its own; Linux only, for what it says about processes.
 
@@ -112,7 +112,9 @@ def load_of(pages: int, fans: int, seconds: int, rate_hz: float, block_s: float,
     )
     scorers.start()
     assert is_made.wait(READY_S), "the fleet is not made in time"
-    gateway = subprocess.Popen([*FANTWIN, "run", "gateway", "-c", str(_configuration(fleet, endpoint, port, folder))])
+    gateway = subprocess.Popen(
+        [*FANTWIN, "up", "--only", "gateway", "-c", str(_configuration(fleet, endpoint, port, folder))]
+    )
     try:
         _wait_for(port)
         arrived, arrived_by = spawned.Pipe(duplex=False)

@@ -175,7 +175,7 @@ class Bench:
         config.write_text(CONFIGURATION.format(site=SITE, endpoint=endpoint, tray=TRAY, fans=FANS, port=port))
         url = f"opc.tcp://127.0.0.1:{port}/fantwin"
         self.hall = Hall(bus)
-        self._server = RunningCommand(["run", "opcua", "-c", config])
+        self._server = RunningCommand(["up", "--only", "opcua", "-c", config])
         eventually(lambda: _answers(port), "the server listens")
         self.listener, self._ended = Listener(), threading.Event()
         listening = listen(url, self.listener, self._ended, with_values=False)

@@ -1,7 +1,7 @@
-"""What learning costs a running site: latency of its scores beside `fantwin learn` and without it, memory and time.
+"""What learning costs a running site: latency of its scores beside `twins learn` and without it, memory and time.
 
 A simulated tray of eight fans at 100 Hz under `fantwin up`, which learns its first twin from a healthy history that is
-there already; then `fantwin learn` beside the running site, and as long without. The latency of a score is the time
+there already; then `twins learn` beside the running site, and as long without. The latency of a score is the time
 from a sample's receipt to the end of its scoring, which the scorer reports in its health for the last ten seconds.
 
     python -m bench.runtime.learning_cost
@@ -125,8 +125,8 @@ def measured(folder: Path) -> dict[str, float]:
             time.sleep(15.0)  # the twin takes over
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             began_s = time.monotonic()
-            progress("latency beside fantwin learn, and for as long without it")
-            learn = _started([*FANTWIN, "learn", "-c", str(config), "--until-stdin-closes"])
+            progress("latency beside fantwin twins learn, and for as long without it")
+            learn = _started([*FANTWIN, "twins", "learn", "-c", str(config), "--until-stdin-closes"])
             peak_mb = [0.0]
 
             def is_over() -> bool:

@@ -62,7 +62,7 @@ class Site:
         self.mail.start()
         secret(folder, "mail", self.mail.url)
         self._folder = folder
-        self._words = ["run", "notifier", "-c", config]
+        self._words = ["up", "--only", "notifier", "-c", config]
         key = tray_key("hall", "tray1", "alarm")
         self._publisher = bus.publisher(key, BY_NAME["alarm"], type_name(Alarm), "scorer-all-1")
         self.puts_s: list[float] = []

@@ -68,7 +68,7 @@ IMPORT_TIME = """
 import sys, time
 from importlib import import_module
 start = time.perf_counter()
-import_module("fantwin.pipeline.cli.watch.run")
+import_module("fantwin.pipeline.cli.watch.one_stage")
 from fantwin.pipeline.config.loading import load_config
 load_config(__import__("pathlib").Path(sys.argv[2]), (), (sys.argv[1],))
 import_module(f"fantwin.stages.{sys.argv[1]}")
@@ -117,7 +117,7 @@ def bare(stage: str, environment: dict[str, str]) -> tuple[float, float, float]:
 def at_rest(stage: str, folder: Path, environment: dict[str, str]) -> tuple[float, float]:
     """RSS and PSS in MB of a stage without input."""
     settings = [f"bus.endpoint='{free_endpoint()}'", f"run_folder='{folder / stage}'", "viewer.serve=false"]
-    command = [sys.executable, "-P", "-m", "fantwin", "run", stage, "-c", str(DEMO), "--until-stdin-closes"]
+    command = [sys.executable, "-P", "-m", "fantwin", "up", "--only", stage, "-c", str(DEMO), "--until-stdin-closes"]
     if stage == "acquisition":
         command += ["--tray", "tray1"]
     for setting in settings:

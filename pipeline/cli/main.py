@@ -28,7 +28,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Record healthy fans, train their twins, calibrate them, add them to the configuration, start `fantwin up`.",
     ),
     "up": ("watch.up", "Start all stages, restart those that die, stop all in order on Ctrl-C."),
-    "run": ("watch.run", "Run one stage alone, until Ctrl-C."),
     "status": ("watch.status", "Show stages, rates, latency, losses and alarms of a running site."),
     "alarms": (
         "watch.alarms",
@@ -40,19 +39,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Show how the speed of each fan has changed since commissioning, how fast, and when its limit will be reached\n"
         "(docs/explanation/wear.md).",
     ),
-    "command": ("watch.command", "Send a command to one fan, and wait until acquisition has sent it to the device."),
-    "sweep": (
-        "watch.sweep",
-        "Move the commands of all fans over their range while `fantwin up` records: levels up and down, long and "
-        "short.",
-    ),
-    "discover": (
-        "watch.discover",
-        "List the fans and serial ports of this computer, with a configuration to paste for each, and what is missing.",
+    "command": (
+        "watch.command",
+        "Send a command to one fan, or move the commands of all over their range while `fantwin up` records.",
     ),
     "doctor": (
         "watch.doctor",
-        "Check the installation, and a configuration: fantwin.toml in this folder unless another is given.",
+        "Check the installation and a configuration, find the fans of this computer, or send test messages.",
     ),
     "selftest": (
         "watch.selftest",
@@ -67,7 +60,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "watch.users",
         "List the users who may log in to the operators' page and over OPC UA; add or remove one.",
     ),
-    "notify": ("watch.notify", "Send a test message to the targets of the notifier, and say which ones accepted it."),
     "replay": (
         "recordings.replay",
         "Publish a recording on the bus in recorded time, for the viewer or the stages; or score recordings again "
@@ -120,13 +112,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "twins.report",
         "Compare the free run of a twin with recordings, and write the result as one self-contained HTML page.",
     ),
-    "learn": (
-        "twins.learn",
-        "Make the next version of a learned twin from the tray's healthy history, as `fantwin up` does by itself.",
-    ),
     "twins": (
         "twins.twins",
-        "List the versions of a learned twin, put one in force, or mark a time span as faulty (not used for learning).",
+        "List the versions of a learned twin, make the next one, put one in force, or mark a time span as faulty.",
     ),
     "simulate": (
         "simulation.simulate",

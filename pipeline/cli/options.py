@@ -18,6 +18,21 @@ SetOption: TypeAlias = Annotated[
 ]
 JsonOption: TypeAlias = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 
+LowOption: TypeAlias = Annotated[
+    float | None,
+    typer.Option(help="With --sweep: lowest command; default a fifth of the tray's range, where most fans turn."),
+]
+HighOption: TypeAlias = Annotated[
+    float | None, typer.Option(help="With --sweep: highest command; default command_max of the tray.")
+]
+SafeOption: TypeAlias = Annotated[
+    float | None,
+    typer.Option(help="With --sweep: the command at the end and after Ctrl-C; default what each fan had before."),
+]
+RoundsOption: TypeAlias = Annotated[
+    int, typer.Option(min=1, max=100, help="With --sweep: how often all levels are passed.")
+]
+
 SupplyVoltageOption: TypeAlias = Annotated[
     list[str] | None,
     typer.Option(metavar="COLUMN", help="Supply voltage, V: one column for all fans, or one per fan. Repeatable."),

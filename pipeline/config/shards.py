@@ -31,7 +31,7 @@ class Shard:
     Attributes:
         name: of the process, in keys, messages and file names: `all`, `2-of-8`, or made of the names of its trays.
         trays: in the order of the configuration.
-        words: the options of `fantwin run` that select them; none: all trays.
+        words: the options of `fantwin up --only` that select them; none: all trays.
         number: of a numbered shard, counted from 1.
     """
 
@@ -68,7 +68,7 @@ def chosen_trays(config: Config, trays: str | None, shard: str | None) -> list[s
 
 
 def chosen_shard(stage: str, config: Config, trays: str | None = None, shard: str | None = None) -> Shard:
-    """The shard of a stage that the options of `fantwin run` choose.
+    """The shard of a stage that the options of `fantwin up --only` choose.
 
     Raises:
         UsageError: see `chosen_trays`; or the shard has too many trays.

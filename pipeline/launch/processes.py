@@ -36,7 +36,18 @@ class Child:
         Raises:
             OSError: the system has no room for another process; nothing is left of it.
         """
-        command = [sys.executable, "-P", "-m", "fantwin", "run", row.stage, "-c", str(config_path), *row.shard.words]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "fantwin",
+            "up",
+            "--only",
+            row.stage,
+            "-c",
+            str(config_path),
+            *row.shard.words,
+        ]
         for override in overrides:
             command += ["--set", override]
         self.row = row

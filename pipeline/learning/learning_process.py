@@ -1,4 +1,4 @@
-"""`fantwin learn` as a child process that runs while nothing else does, one at a time in this process."""
+"""`fantwin twins learn` as a child process that runs while nothing else does, one at a time in this process."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ class LearningProcess:
     def __init__(self, config: Path, overrides: Sequence[str], tray: str, log: Path) -> None:
         """log: file for the standard error of the last run."""
         sets = [word for override in overrides for word in ("--set", override)]
-        self._command = [sys.executable, "-P", "-m", "fantwin", "learn", "-c", str(config), "--tray", tray, *sets]
+        self._fantwin = [sys.executable, "-P", "-m", "fantwin", "twins"]
+        self._options = ["-c", str(config), "--tray", tray, *sets, "--until-stdin-closes"]
         self._log = log
         self._child: subprocess.Popen[bytes] | None = None
         self._began_s = 0.0
@@ -59,14 +60,14 @@ class LearningProcess:
         return not _TURN.locked()
 
     def start(self, *, only_if_changed: bool) -> str:
-        """Begin, if it is free; returns what went wrong, or nothing. only_if_changed: see `fantwin learn --check`."""
+        """Begin, if it is free; returns what went wrong, or nothing. only_if_changed: see `fantwin twins check`."""
         if not _TURN.acquire(blocking=False):
             return "another tray is learning"
         try:
             self._log.parent.mkdir(parents=True, exist_ok=True)
             with self._log.open("wb") as log:
                 self._child = subprocess.Popen(
-                    [*self._command, "--until-stdin-closes", *(["--check"] if only_if_changed else [])],
+                    [*self._fantwin, "check" if only_if_changed else "learn", *self._options],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=log,
@@ -87,7 +88,7 @@ class LearningProcess:
         if not status:
             return ""
         lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1].removeprefix("fantwin: ") if lines else f"`fantwin learn` ended with status {status}"
+        return lines[-1].removeprefix("fantwin: ") if lines else f"`fantwin twins learn` ended with status {status}"
 
     @property
     def seconds(self) -> float | None:

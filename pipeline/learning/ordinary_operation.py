@@ -35,7 +35,9 @@ class OrdinaryOperation:
         self._last_t_ns: int | None = None
         takes_commands = not tray.source.why_no_commands
         self.how_to_move = (
-            "`fantwin sweep` moves the fans" if takes_commands else "the fans' own controller must vary their commands"
+            "`fantwin command --sweep` moves the fans"
+            if takes_commands
+            else "the fans' own controller must vary their commands"
         )
         """how the fans can be moved, for messages to people"""
 

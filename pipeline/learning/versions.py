@@ -243,7 +243,7 @@ class TwinVersions:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise UserError(f"{self.folder}: another `fantwin learn` works here: wait for its end") from error
+                raise UserError(f"{self.folder}: another `fantwin twins learn` works here: wait for its end") from error
             yield
 
     def add(self, version: Version, seen: VersionList | None = None, check: Check | None = None) -> None:

@@ -147,7 +147,7 @@ def _far_ahead(site: ScratchSite) -> str:
 
 
 def _second_owner(site: ScratchSite) -> str:
-    for words in (("up",), ("run", "acquisition")):
+    for words in (("up",), ("up", "--only", "acquisition")):
         what = f"fantwin {' '.join(words)}"
         try:
             done = site.command(*words, *site.configured(), limit_s=REPLACED_LIMIT_S)

@@ -40,7 +40,7 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
 
     @property
     def why_no_commands(self) -> str:
-        """Why no command of `fantwin command` or `sweep` can reach the fans, in a few words; empty if it can."""
+        """Why `fantwin command` cannot reach the fans, in a few words; empty if it can."""
         return ""
 
     def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:

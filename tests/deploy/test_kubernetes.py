@@ -122,7 +122,7 @@ def test_the_pods_of_a_stage_share_the_trays_and_keep_what_must_survive_them(sta
         assert ordinal["valueFrom"]["fieldRef"]["fieldPath"] == "metadata.labels['apps.kubernetes.io/pod-index']"
         for number in (1, 3):
             found = parsed([word.replace("$(SHARD)", str(number)) for word in pod["args"]])
-            assert (found["stage"], found["shard"]) == (stage, f"{number}/3")
+            assert (found["only"], found["shard"]) == (stage, f"{number}/3")
             assert {"bus.mode=client", "bus.endpoint=tls/plant-router:7447"} <= set(found["overrides"])
         assert ("--set=scorer.asks_for_snapshots=true" in pod["args"]) == (stage == "scorer")
         claims = [each["metadata"]["name"] for each in spec.get("volumeClaimTemplates", ())]

@@ -70,7 +70,7 @@ def test_a_unit_runs_the_shard_that_its_instance_names_and_the_router_listens():
     configuration = Path("/etc/fantwin/fantwin.toml")
     for stage in STAGES:
         found = parsed(command_of(f"fantwin-{stage}@.service", stage))
-        assert (found["stage"], found["shard"], found["config"]) == (stage, "2/8", configuration)
+        assert (found["only"], found["shard"], found["config"]) == (stage, "2/8", configuration)
     found = parsed(command_of("fantwin-router.service", ""))
     assert (found["listen"], found["config"]) == ("tls/0.0.0.0:7447", configuration)
 

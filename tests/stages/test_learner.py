@@ -206,7 +206,7 @@ def test_a_time_span_that_is_marked_up_to_a_later_time_starts_no_learning(tmp_pa
 def test_a_failure_is_over_although_the_version_was_made_before_the_failure_was_known(tmp_path: Path) -> None:
     learner = Learner(tmp_path)
     learner.run(2000)
-    learner.learning.fails_with = "another `fantwin learn` works here: wait for its end"
+    learner.learning.fails_with = "another `fantwin twins learn` works here: wait for its end"
     before = len(learner.learning.starts)
     while len(learner.learning.starts) == before:
         learner.run(10)

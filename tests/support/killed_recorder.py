@@ -122,7 +122,7 @@ class Kills:
     def _start(self) -> None:
         self._started_ns = time.time_ns()
         self._recorder = subprocess.Popen(
-            [*FANTWIN, "run", "recorder", "-c", str(self._config)],
+            [*FANTWIN, "up", "--only", "recorder", "-c", str(self._config)],
             stdin=subprocess.DEVNULL,
             stderr=(self._folder / "recorder.log").open("ab"),
             cwd=Path(__file__).parents[2],

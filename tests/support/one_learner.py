@@ -1,4 +1,4 @@
-"""A learner with a tray of one fan and a substitute for `fantwin learn`, and what it is fed."""
+"""A learner with a tray of one fan and a substitute for `fantwin twins learn`, and what it is fed."""
 
 from __future__ import annotations
 

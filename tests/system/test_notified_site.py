@@ -58,7 +58,7 @@ def test_a_notifier_that_is_killed_during_an_outage_sends_all_once_and_in_order(
     config = tmp_path / "fantwin.toml"
     config.write_text(CONFIGURATION.format(endpoint=endpoint))
     secret(tmp_path, "mail", mail.url)
-    words = ["run", "notifier", "-c", config]
+    words = ["up", "--only", "notifier", "-c", config]
     with Bus(BusConfig(endpoint=endpoint)) as bus:
         publisher = bus.publisher(
             tray_key("hall", "tray1", "alarm"), BY_NAME["alarm"], type_name(Alarm), "scorer-all-1"

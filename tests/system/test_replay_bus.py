@@ -66,7 +66,9 @@ class Site:
         self.heard[kind].put(decode(kind, data))
 
     def start(self, label: str) -> RunningCommand:
-        running = RunningCommand(["run", label.split("/", maxsplit=1)[0], *self.chain.words("run")[1:], "--json"])
+        running = RunningCommand(
+            ["up", "--only", label.split("/", maxsplit=1)[0], *self.chain.words("run")[1:], "--json"]
+        )
         self.running.append(running)
 
         def is_there() -> bool:
@@ -337,7 +339,7 @@ def test_row_07_beside_a_replay_neither_a_site_nor_an_acquisition_starts_and_the
     site.running.append(replay)
     site.next(Clock)
     up = fantwin(*site.chain.words("up"))
-    acquisition = fantwin("run", "acquisition", *site.chain.words("")[1:])
+    acquisition = fantwin("up", "--only", "acquisition", *site.chain.words("")[1:])
     assert (up.returncode, acquisition.returncode) == (1, 1)
     endpoint = site.chain.endpoint
     assert up.stderr == (

@@ -88,7 +88,7 @@ class Shards:
 
     def start(self, label: str, run_folder: str, *options: str) -> RunningCommand:
         """Start a process of a stage and wait until it is at work."""
-        running = self.run("run", label.partition("/")[0], *self.words(run_folder), *options)
+        running = self.run("up", "--only", label.partition("/")[0], *self.words(run_folder), *options)
 
         def is_at_work() -> bool:
             assert running.process.poll() is None, running.lines

@@ -38,7 +38,7 @@ SMALL_COMMAND_RANGE = 0.1
 SMALL_SPEED_RANGE_IN_NOISE = 5.0
 
 SHORTEST_TIME_CONSTANTS = 75
-"""one round of `fantwin sweep`: 13 levels until the speed has settled, and ten for one time constant each"""
+"""one round of `fantwin command --sweep`: 13 levels until the speed has settled, and ten for one time constant each"""
 RECOMMENDED_TIME_CONSTANTS, RECOMMENDED_S = 150, 300.0
 """two rounds, and the five minutes of docs/tutorial/own-fan.md; the longer of the two"""
 

@@ -1,4 +1,4 @@
-"""`fantwin command`: send a command to one fan."""
+"""`fantwin command`: send a command to one fan, or move all of them over their range."""
 
 from __future__ import annotations
 
@@ -9,7 +9,16 @@ from typing import Annotated
 import typer
 
 from fantwin.pipeline.bus.session import join_bus
-from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.options import (
+    DEFAULT_CONFIG,
+    ConfigOption,
+    HighOption,
+    JsonOption,
+    LowOption,
+    RoundsOption,
+    SafeOption,
+    SetOption,
+)
 from fantwin.pipeline.cli.watch.commanding import (
     CommandSender,
     chosen_tray,
@@ -19,11 +28,14 @@ from fantwin.pipeline.cli.watch.commanding import (
 )
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.roles import OPERATOR
+from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.runtime.signals import stop_on_signals
 
 
 def command(
-    fan: Annotated[tuple[int, float], typer.Option("--fan", metavar="N VALUE", help="The fan and its command.")],
+    fan: Annotated[
+        tuple[int, float] | None, typer.Option("--fan", metavar="N VALUE", help="The fan and its command.")
+    ] = None,
     config: ConfigOption = DEFAULT_CONFIG,
     tray: Annotated[str | None, typer.Option(help="The tray; required if there are several.")] = None,
     set_point: Annotated[
@@ -32,18 +44,39 @@ def command(
             "--set-point", help="VALUE is a speed in the tray's speed unit, for a device with its own controller."
         ),
     ] = False,
+    sweep: Annotated[
+        bool, typer.Option("--sweep", help="Move the fans over their range instead, for a recording to train on.")
+    ] = False,
+    fans: Annotated[str, typer.Option(metavar="all|N,N,...", help="With --sweep: the fans that are moved.")] = "all",
+    low: LowOption = None,
+    high: HighOption = None,
+    safe: SafeOption = None,
+    rounds: RoundsOption = 2,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Send a command to one fan, and wait until acquisition has sent it to the device.
+    """Send a command to one fan, or move the commands of all over their range while `fantwin up` records.
 
     A command is in the unit of the line, from command_min to command_max of the tray. The fan keeps it until something
     sets another.
 
+    --sweep moves the fans up and down, with long steps and short ones, as fast as the fans follow. Two steps show how
+    fast that is; nothing else may set the commands meanwhile. At the end, after Ctrl-C and after an error each fan gets
+    the command of --safe, or the one it had before.
+
     Example: fantwin command -c fantwin.toml --fan 0 0.6
+
+    Example: fantwin command --sweep --low 0.2
     """
+    if (fan is None) is not sweep:
+        raise UsageError("say what to send: --fan N VALUE, or --sweep")
     settings = load_config(config, overrides or (), stages=())
     chosen = chosen_tray(settings, tray)
+    if fan is None:
+        from fantwin.pipeline.cli.watch.sweep import sweep as move  # noqa: PLC0415  one command needs no excitation
+
+        move(settings, chosen, fans, low, high, safe, rounds, json_output=json_output)
+        return
     require_commandable(chosen, "")
     number, value = fan
     message = command_of(chosen, {number: value}, is_set_point=set_point)

@@ -14,7 +14,16 @@ from typing import Annotated, Any
 import typer
 
 from fantwin.pipeline.bus.endpoint import accepts_connections
-from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.options import (
+    DEFAULT_CONFIG,
+    ConfigOption,
+    HighOption,
+    JsonOption,
+    LowOption,
+    RoundsOption,
+    SafeOption,
+    SetOption,
+)
 from fantwin.pipeline.cli.progress import EXIT_INTERRUPTED
 from fantwin.pipeline.cli.twins.training_data import check_writable
 from fantwin.pipeline.cli.watch.child_commands import Commands, Stopped
@@ -43,19 +52,12 @@ def commission(
     ] = None,
     sweep: Annotated[
         bool,
-        typer.Option("--sweep", help="Move the commands, as `fantwin sweep` does; otherwise the plant must."),
+        typer.Option("--sweep", help="Move the commands, as `fantwin command --sweep` does; otherwise the plant must."),
     ] = False,
-    low: Annotated[float | None, typer.Option(help="With --sweep: lowest command, in the unit of the line.")] = None,
-    high: Annotated[float | None, typer.Option(help="With --sweep: highest command.")] = None,
-    safe: Annotated[float | None, typer.Option(help="With --sweep: the command at the end.")] = None,
-    rounds: Annotated[
-        int,
-        typer.Option(
-            min=1,
-            max=100,
-            help="With --sweep: times that the first sweep runs through all levels; the second does so once.",
-        ),
-    ] = 2,
+    low: LowOption = None,
+    high: HighOption = None,
+    safe: SafeOption = None,
+    rounds: RoundsOption = 2,
     minutes: Annotated[
         float, typer.Option(min=0.1, max=10_000, help="Length of each recording of ordinary operation.")
     ] = 10.0,
@@ -78,9 +80,9 @@ def commission(
 
     Each tray that names no twin gets one; the others stay as they are. The steps are commands of
     docs/tutorial/own-fan.md; each is shown before it runs, except the `up` that records. The fans must be healthy. With
-    --sweep, the trays are swept one after another. Without --sweep, no command is sent: the first recording lasts until
-    the plant has moved the command of every fan enough, and what is missing is shown. The calibration is from
-    little data: calibrate again after a few days.
+    --sweep, the trays are swept one after another, --rounds times; a second sweep passes all levels once. Without
+    --sweep, no command is sent: the first recording lasts until the plant has moved the command of every fan enough,
+    and what is missing is shown. The calibration is from little data: calibrate again after a few days.
 
     A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends `commission`
     without further twins. Recordings stay, in folders `commissioned-N` of their own, which the limits of `[recorder]`

@@ -136,7 +136,7 @@ class Commissioning:
             work.operation = operation
 
     def _swept(self, work: TrayWork, options: list[str], rounds: int) -> list[Path]:
-        words = ["sweep", *self._configured, *self._tray_words(work), *options, "--rounds", rounds]
+        words = ["command", "--sweep", *self._configured, *self._tray_words(work), *options, "--rounds", rounds]
         return self._recorded([work], lambda site: self._commands.run(*words, site=site))
 
     def _recorded(self, works: Sequence[TrayWork], during: Callable[[RecordingSite], None]) -> list[Path]:

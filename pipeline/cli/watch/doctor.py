@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Collection, Iterator, Sequence
+from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Annotated
@@ -25,7 +26,9 @@ from fantwin.pipeline.bus.opening import credentials_of
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.exposure import exposure_problem, is_exposed
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
+from fantwin.pipeline.cli.watch.found_fans import find_fans
 from fantwin.pipeline.cli.watch.line_check import check_line
+from fantwin.pipeline.cli.watch.trial_messages import send_test_messages
 from fantwin.pipeline.config.models import Config, ConfigError
 from fantwin.pipeline.config.registry import RECORDER, STAGES
 from fantwin.pipeline.config.roles import READERS, role_names
@@ -37,6 +40,7 @@ from fantwin.pipeline.recordings.disk_room import usage_of
 from fantwin.pipeline.runtime.second_owner import GOSSIP_S
 from fantwin.pipeline.runtime.sessions import Session
 from fantwin.pipeline.runtime.stage import Context, load_stage
+from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.schemas.topics import sessions_key
 
 _NOT_LISTED = {"all", "dev", "bench"}  # a sum of others, or for tests and benches only
@@ -46,7 +50,24 @@ _LOOKS = 4
 """for the sessions of a site, GOSSIP_S apart"""
 
 
+class Task(StrEnum):
+    """What the doctor can do."""
+
+    CHECK = "check"
+    FIND = "find"
+    NOTIFY = "notify"
+
+
 def doctor(
+    task: Annotated[
+        Task,
+        typer.Argument(
+            help="Check installation and configuration, find the fans of this computer, or notify by test messages."
+        ),
+    ] = Task.CHECK,
+    targets: Annotated[
+        list[str] | None, typer.Argument(metavar="[TARGET]...", help="notify: names of targets; all if omitted.")
+    ] = None,
     config: Annotated[
         Path | None,
         typer.Option(
@@ -56,21 +77,45 @@ def doctor(
     overrides: SetOption = None,
     json_output: JsonOption = False,
     listen_s: Annotated[
-        float, typer.Option(min=0.0, max=600.0, help="How long to listen to the line of each tray; 0: not at all.")
+        float,
+        typer.Option(min=0.0, max=600.0, help="check: how long to listen to the line of each tray; 0: not at all."),
     ] = 2.0,
     trays: Annotated[
         list[str] | None,
-        typer.Option("--tray", metavar="NAME", help="Check only the source and the line of this tray. Repeatable."),
+        typer.Option("--tray", metavar="NAME", help="check: only the source and line of this tray. Repeatable."),
     ] = None,
+    root: Annotated[Path, typer.Option(help="find: folder of the hwmon chips.")] = ROOT,
+    write: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="find: write a configuration of all hwmon chips with fans to this new file."),
+    ] = None,
+    writable: Annotated[
+        bool, typer.Option("--writable", help="find: let fantwin command the fans found, as `command` needs it.")
+    ] = False,
 ) -> None:
-    """Check the installation, and a configuration: fantwin.toml in this folder unless another is given.
+    """Check the installation and a configuration, find the fans of this computer, or send test messages.
 
-    It listens to the line of each tray and names what does not fit: rate, commands, speeds, fans, unit, tachos.
+    check listens to the line of each tray and names what does not fit: rate, commands, speeds, fans, unit, tachos.
+    find lists fans and serial ports, with a configuration to paste for each, and what is missing. notify sends a
+    message to the targets of the notifier, and says which ones accepted it.
 
-    Exit code 1 if there is a problem to fix.
+    Exit code 1 if there is a problem to fix, no fan to watch, or a message that was not accepted.
 
     Example: fantwin doctor -c fantwin.toml
+
+    Example: fantwin doctor find --write fantwin.toml
     """
+    if task is Task.FIND:
+        find_fans(root, write, writable=writable, json_output=json_output)
+    elif task is Task.NOTIFY:
+        send_test_messages(config or DEFAULT_CONFIG, overrides or (), targets or (), json_output=json_output)
+    else:
+        _check(config, overrides, listen_s, trays, json_output=json_output)
+
+
+def _check(
+    config: Path | None, overrides: list[str] | None, listen_s: float, trays: list[str] | None, *, json_output: bool
+) -> None:
     problems, good = [], []
     for ok, line in _findings(config, overrides, listen_s, trays or []):
         (good if ok else problems).append(line)

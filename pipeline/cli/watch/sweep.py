@@ -1,4 +1,4 @@
-"""`fantwin sweep`: move the commands of a tray's fans, so that a recording determines their twins."""
+"""`fantwin command --sweep`: move the commands of a tray's fans, so that a recording determines their twins."""
 
 from __future__ import annotations
 
@@ -8,24 +8,20 @@ import queue
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Annotated
 
 import numpy as np
 import typer
 
 from fantwin.pipeline.bus.session import Bus, join_bus
-from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.cli.watch.commanding import (
     CommandSender,
     NotReceivedError,
-    chosen_tray,
     command_of,
     require_commandable,
     require_within_limits,
 )
 from fantwin.pipeline.cli.watch.excitation import Excitation, Observed, StoppedError
-from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.config.roles import OPERATOR
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.runtime.signals import stop_on_signals
@@ -40,33 +36,26 @@ LEAST_SHARE = 0.2
 
 
 def sweep(
-    config: ConfigOption = DEFAULT_CONFIG,
-    tray: Annotated[str | None, typer.Option(help="The tray; required if there are several.")] = None,
-    fans: Annotated[str, typer.Option(metavar="all|N,N,...", help="The fans that are moved.")] = "all",
-    low: Annotated[
-        float | None,
-        typer.Option(help="Lowest command; without it a fifth of the tray's range, where 4-pin fans keep turning."),
-    ] = None,
-    high: Annotated[float | None, typer.Option(help="Highest command; without it command_max of the tray.")] = None,
-    safe: Annotated[
-        float | None,
-        typer.Option(help="The command at the end and after Ctrl-C; without it the one that each fan had before."),
-    ] = None,
-    rounds: Annotated[int, typer.Option(min=1, max=100, help="How often all levels are passed.")] = 2,
-    overrides: SetOption = None,
-    json_output: JsonOption = False,
+    settings: Config,
+    chosen: TrayConfig,
+    fans: str,
+    low: float | None,
+    high: float | None,
+    safe: float | None,
+    rounds: int,
+    *,
+    json_output: bool,
 ) -> None:
-    """Move the commands of all fans over their range while `fantwin up` records: levels up and down, long and short.
+    """Move the commands of fans over their range: levels up and down, long and short, while a site records.
 
     Two steps over the whole range show the time constants of the fans; each level then lasts five of the longest. Each
     fan runs through the levels in a different order, so that the load on the common supply does not follow any one fan.
-    At the end, after Ctrl-C and after an error each fan gets the command of --safe, or the one it had before. Nothing
-    else may set the commands meanwhile.
+    At the end, after Ctrl-C and after an error each fan gets the command `safe`, or the one it had before.
 
-    Example: fantwin sweep -c fantwin.toml --fans all --low 0.2
+    Raises:
+        UserError: the fans cannot be moved, or not be left as they shall be.
+        typer.Exit: the user stopped it.
     """
-    settings = load_config(config, overrides or (), stages=())
-    chosen = chosen_tray(settings, tray)
     require_commandable(chosen, "run `fantwin up` while the fans' own controller varies their commands; it is recorded")
     numbers = _fans(fans, chosen)
     lowest, highest = range_within(chosen, low, high, safe)

@@ -1,4 +1,4 @@
-"""`fantwin up`: all stages of one configuration, as processes."""
+"""`fantwin up`: all stages of one configuration, as processes, or one of them in this process."""
 
 from __future__ import annotations
 
@@ -7,29 +7,37 @@ import os
 import sys
 import threading
 from contextlib import suppress
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fantwin.pipeline.cli.exposure import InsecureOption, checked_exposure
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from fantwin.pipeline.config.shards import chosen_trays
-from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.launch.event_log import EventLog
-from fantwin.pipeline.launch.launcher import Launcher, Outcome
-from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.shards import chosen_shard, chosen_trays
+from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.runtime.signals import ignore_hangup, set_when_stdin_closes, stop_on_signals
-from fantwin.pipeline.site.refused_input import refused_lines
+
+if TYPE_CHECKING:
+    from fantwin.pipeline.launch.launcher import Outcome
 
 
 def up(
     config: ConfigOption = DEFAULT_CONFIG,
+    only: Annotated[
+        str | None, typer.Option(metavar="STAGE", help=f"Run this stage alone, in this process: {', '.join(STAGES)}.")
+    ] = None,
     trays: Annotated[
         str | None,
-        typer.Option(metavar="A,B", help="Only the processes whose first tray is one of these: a host of several."),
+        typer.Option(
+            metavar="A,B", help="Only the processes whose first tray is one of these; with --only, these trays."
+        ),
     ] = None,
     shard: Annotated[
-        str | None, typer.Option(metavar="K/N", help="The same for the trays of host K of N: see `fantwin run`.")
+        str | None,
+        typer.Option(metavar="K/N", help="Only the K-th tray of the configuration and every N-th after it; K from 1."),
     ] = None,
     insecure: InsecureOption = False,
     overrides: SetOption = None,
@@ -42,19 +50,51 @@ def up(
     It serves the operators' page on this host and prints its address.
     For a tray without `twin` in the configuration, a twin is learned in the background (docs/how-to/learned-twins.md).
 
+    With --only, one stage runs until Ctrl-C. It finds the others on the bus; the order of starting does not matter.
+    Several hosts or processes share the trays of a site: each has some of them.
+
     Exit codes: 0 stopped in order, nothing lost; 1 could not start, a stage failed or was killed at the end, or all
     that a device sent was refused; 3 data were lost.
 
     Example: fantwin up -c fantwin.toml
 
-    Example: fantwin up -c fantwin.toml --shard 1/2
+    Example: fantwin up --only scorer --shard 2/8
     """
     stop = threading.Event()
     stop_on_signals(stop)  # first: what follows takes a second or two
-    ignore_hangup()
-    if until_stdin_closes:
-        set_when_stdin_closes(stop)
-    loaded = load_for_this_host(config, overrides or ())
+    if only is None:
+        ignore_hangup()
+        if until_stdin_closes:
+            set_when_stdin_closes(stop)
+        _run_all(config, overrides or (), trays, shard, stop, insecure=insecure, json_output=json_output)
+        return
+    from fantwin.pipeline.cli.watch.one_stage import run_stage  # noqa: PLC0415  loads the runtime
+
+    if only not in STAGES:
+        raise UsageError(f"no stage called {only!r}; known: {', '.join(STAGES)}")
+    settings = load_config(config, overrides or (), stages=(only,))
+    chosen = chosen_shard(only, settings, trays, shard)
+    flags = {"insecure": insecure, "json_output": json_output, "until_stdin_closes": until_stdin_closes}
+    run_stage(only, settings, chosen, stop, **flags)
+
+
+def _run_all(
+    config: Path,
+    overrides: list[str] | tuple[str, ...],
+    trays: str | None,
+    shard: str | None,
+    stop: threading.Event,
+    *,
+    insecure: bool,
+    json_output: bool,
+) -> None:
+    # the process of a stage loads no launcher
+    from fantwin.pipeline.launch.event_log import EventLog  # noqa: PLC0415
+    from fantwin.pipeline.launch.launcher import Launcher  # noqa: PLC0415
+    from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port  # noqa: PLC0415
+    from fantwin.pipeline.site.refused_input import refused_lines  # noqa: PLC0415
+
+    loaded = load_for_this_host(config, overrides)
     of_host = chosen_trays(loaded.config, trays, shard)
     here = with_free_port(loaded, of_host)
     settings = here.config

@@ -21,7 +21,7 @@ class HwmonConfig(PolledConfig, frozen=True):
 
     kind: Literal["hwmon"] = "hwmon"
     chip: str = Field(
-        min_length=1, description="`name` of the chip, for example nct6798; `fantwin discover` lists them"
+        min_length=1, description="`name` of the chip, for example nct6798; `fantwin doctor find` lists them"
     )
     device: str = Field(
         default="",

@@ -186,7 +186,7 @@ class HwmonDevice:
             of_device = f" with device {config.device}" if config.device else ""
             raise DeviceError(
                 f"no chip is called {config.chip}{of_device} in {self._root}; there are: {there}; load its driver, or "
-                "see `fantwin discover`",
+                "see `fantwin doctor find`",
                 is_lost=True,
             )
         return found[0]

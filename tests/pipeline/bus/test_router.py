@@ -94,7 +94,7 @@ def test_clients_that_start_before_the_router_connect_once_it_runs(endpoint):
 
 @pytest.mark.parametrize(
     "words",
-    ["status --once", "alarms", "alarms ack tray1 0 --timeout 1", "wear", "command --fan 0 0.5", "sweep"],
+    ["status --once", "alarms", "alarms ack tray1 0 --timeout 1", "wear", "command --fan 0 0.5", "command --sweep"],
 )
 def test_a_question_to_a_site_whose_router_is_down_is_answered_soon(words, endpoint):
     settings = ("--set", "bus.mode='client'", "--set", f"bus.endpoint='{endpoint}'")
@@ -103,7 +103,7 @@ def test_a_question_to_a_site_whose_router_is_down_is_answered_soon(words, endpo
 
 def test_waiting_for_a_router_ends_on_stop(endpoint, started):
     """In another process, by a signal: it must not be deaf to it."""
-    words = ["run", "scorer", "-c", DEMO / "demo.toml", "--set", "bus.mode=client", "--set"]
+    words = ["up", "--only", "scorer", "-c", DEMO / "demo.toml", "--set", "bus.mode=client", "--set"]
     stage = RunningCommand([*words, f"bus.endpoint={endpoint}"])
     started.append(stage)
     eventually(lambda: catches_interrupts(stage.process.pid), "it handles Ctrl-C")

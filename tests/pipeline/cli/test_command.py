@@ -38,7 +38,7 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
 
 @pytest.fixture
 def acquisition(chain: Chain) -> Iterator[RunningCommand]:
-    running = RunningCommand(["run", "acquisition", *chain.words("run")[1:]])
+    running = RunningCommand(["up", "--only", "acquisition", *chain.words("run")[1:]])
     yield running
     running.kill()
 

@@ -159,7 +159,9 @@ def test_each_tray_gets_a_twin_of_its_own_samples_in_its_own_section(played: Pla
 def test_one_tray_after_the_other_is_swept_into_recordings_of_its_own(played: Played) -> None:
     result = played.commission("--sweep", "--low", 0.3)
     assert not result.exception, result.output
-    assert played.of("sweep") == [f" --tray {tray} --low 0.3 --rounds {rounds}" for tray in "ab" for rounds in (2, 1)]
+    assert played.of("command") == [
+        f" --sweep --tray {tray} --low 0.3 --rounds {rounds}" for tray in "ab" for rounds in (2, 1)
+    ]
     assert played.of("train") == [
         " runs/1.mcap --validate runs/2.mcap --tray a -o a.onnx",
         " runs/3.mcap --validate runs/4.mcap --tray b -o b.onnx",
@@ -187,7 +189,7 @@ def test_it_waits_for_the_fans_of_every_tray_and_says_which_have_not_moved(
     assert (played.folder / "a.onnx").exists()
 
 
-@pytest.mark.parametrize("command", ["train", "calibrate", "sweep"])
+@pytest.mark.parametrize("command", ["train", "calibrate", "command"])
 def test_a_tray_that_fails_leaves_the_others_their_twins(played: Played, command: str) -> None:
     before = played.configuration.read_text(encoding="utf-8")
     played.failing = (command, "a")
@@ -257,5 +259,5 @@ def test_a_wrong_tacho_of_a_tray_is_found_before_it_is_swept_again(
     result = played.commission("--sweep")
     failed = "tray a failed: fan 0: counts over 0.5 s: declare the tacho that was found, then start again"
     assert str(result.exception).startswith(failed)
-    assert [line.split()[1] for line in played.of("sweep")] == ["a", "b", "b"]
+    assert [line.split()[2] for line in played.of("command")] == ["a", "b", "b"]
     assert (played.folder / "b.onnx").exists()

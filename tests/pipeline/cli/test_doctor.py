@@ -43,7 +43,8 @@ def examine(capsys: pytest.CaptureFixture[str], config: Path | None = None, *set
     code = 0
     try:
         # the ports of the viewer may be taken on this computer
-        doctor(config, ["viewer.serve=false", *settings] if config else [], json_output=True, listen_s=0.0)
+        overrides = ["viewer.serve=false", *settings] if config else []
+        doctor(config=config, overrides=overrides, json_output=True, listen_s=0.0)
     except typer.Exit as end:
         code = end.exit_code
     return code, json.loads(capsys.readouterr().out)
@@ -198,7 +199,7 @@ def test_little_disk_is_a_problem(capsys, tmp_path, port, monkeypatch):
 
 def test_the_text_marks_problems_apart_from_passed_checks(capsys):
     with pytest.raises(typer.Exit):
-        doctor(DEMO / "demo.toml", ["tray.0.port='/dev/none'"])
+        doctor(config=DEMO / "demo.toml", overrides=["tray.0.port='/dev/none'"])
     out = capsys.readouterr().out
     assert "FIX  acquisition/tray1: /dev/none" in out
     assert "ok   scorer: can start" in out

@@ -81,10 +81,10 @@ def test_the_list_of_commands_imports_none_of_them(words: str) -> None:
 
 
 def test_the_process_of_a_stage_imports_no_rich_and_no_other_command() -> None:
-    modules = modules_after("main._register(['run'])")
+    modules = modules_after("main._register(['up']); import fantwin.pipeline.cli.watch.one_stage")
     assert {m for m in modules if m == "rich" or m.startswith(("rich.", "fantwin.pipeline.cli."))} == {
         *("fantwin.pipeline.cli.exposure", "fantwin.pipeline.cli.main", "fantwin.pipeline.cli.options"),
-        *("fantwin.pipeline.cli.watch", "fantwin.pipeline.cli.watch.run"),
+        *("fantwin.pipeline.cli.watch", "fantwin.pipeline.cli.watch.one_stage", "fantwin.pipeline.cli.watch.up"),
     }
 
 

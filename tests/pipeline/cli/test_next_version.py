@@ -149,15 +149,15 @@ def test_what_is_made_of_fans_as_they_change_and_how_it_is_listed_and_put_in_for
     (words,) = beside
     assert float(words[5]) > 2.0 * float(words[7]), "of the version in force, and of the one that is offered"
     assert "checked up to 2027-01-15" in listed
-    assert fantwin("twins", "-c", config, "--use", "tray1-3").exit_code == 0
+    assert fantwin("twins", "-c", config, "use", "tray1-3").exit_code == 0
     assert json.loads(fantwin("twins", "-c", config, "--json").stdout)["in_force"] == "tray1-3"
-    assert "no version 'tray1-9'; there are tray1-1, tray1-2" in error_of("twins", "-c", config, "--use", "tray1-9")
-    fantwin("twins", "-c", config, "--use", "tray1-2")
-    day = ("--faulty-from", "2027-01-14", "--faulty-to", "2027-01-17")
+    assert "no version 'tray1-9'; there are tray1-1, tray1-2" in error_of("twins", "-c", config, "use", "tray1-9")
+    fantwin("twins", "-c", config, "use", "tray1-2")
+    day = ("faulty", "2027-01-14", "2027-01-17")
     said = fantwin("twins", "-c", config, *day).stdout
     assert "tray1-2 was learned from that time span and stays in force: no version can replace it; the next" in said
     assert "marked as faulty: 2027-01-14" in said
-    assert "no healthy history to learn from yet" in error_of("learn", "-c", config)
+    assert "no healthy history to learn from yet" in error_of("twins", "learn", "-c", config)
 
 
 def test_a_tray_that_has_learned_nothing_yet_says_what_makes_its_first_twin(tmp_path: Path) -> None:

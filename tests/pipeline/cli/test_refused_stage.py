@@ -1,4 +1,4 @@
-"""`fantwin run` and `fantwin doctor` at a router that refuses: one line, and the exit code."""
+"""`fantwin up --only` and `fantwin doctor` at a router that refuses: one line, and the exit code."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ def test_a_stage_with_a_certificate_of_another_role_ends_with_1_and_one_line(sit
     other = site.certificates.folder / "viewer"
     words = [f"bus.security.{name}='{other}.{end}'" for name, end in (("certificate", "pem"), ("key", "key"))]
     with site.running():
-        done = fantwin("run", "resampler", "-c", site.config.path, *(w for word in words for w in ("--set", word)))
+        done = fantwin(
+            "up", "--only", "resampler", "-c", site.config.path, *(w for word in words for w in ("--set", word))
+        )
     assert done.returncode == 1
     assert done.stderr.startswith("fantwin: its certificate says 'viewer', which may not publish grid of a"), (
         done.stderr
@@ -57,7 +59,7 @@ def test_a_stage_that_the_router_lets_read_nothing_ends_with_1_and_one_line(site
     roles = dict(site.site.roles)
     deaf = SiteRoles(SITE, {**roles, "recorder": replace(roles["recorder"], reads=())})
     with open_router(site.endpoint, site.credentials("router"), deaf):
-        done = fantwin("run", "recorder", "-c", site.config.path)
+        done = fantwin("up", "--only", "recorder", "-c", site.config.path)
     assert done.returncode == 1
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("fantwin: ")]
     assert line.startswith("fantwin: the router does not let 'recorder' read raw of ")

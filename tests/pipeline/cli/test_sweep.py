@@ -1,4 +1,4 @@
-"""`fantwin sweep`: the excitation of simulated fans, in simulated time."""
+"""`fantwin command --sweep`: the excitation of simulated fans, in simulated time."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def configured(folder: Path, source: str) -> Path:
     ("source", "hint"),
     [
         ('kind = "push"', "the fans' own controller must vary their commands"),
-        ('kind = "mqtt", host = "broker", topic = "t", send_topic = "c"', "`fantwin sweep` moves the fans"),
+        ('kind = "mqtt", host = "broker", topic = "t", send_topic = "c"', "`fantwin command --sweep` moves the fans"),
     ],
 )
 def test_a_sweep_is_advised_only_where_it_can_be_done(tmp_path: Path, source: str, hint: str) -> None:
@@ -293,7 +293,7 @@ def swept_by_command(tray: SweptTray, monkeypatch: pytest.MonkeyPatch) -> str:
 
     monkeypatch.setattr(sweep_module, "join_bus", lambda *_, **__: NoBus())
     monkeypatch.setattr(sweep_module, "_BusLine", lambda *_: tray)
-    return error_of("sweep", "-c", DEMO / "demo.toml", "--fans", "0,1,2,3,4,5", "--rounds", "1")
+    return error_of("command", "--sweep", "-c", DEMO / "demo.toml", "--fans", "0,1,2,3,4,5", "--rounds", "1")
 
 
 def test_one_fan_that_refuses_its_command_keeps_no_other_from_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

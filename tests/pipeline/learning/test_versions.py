@@ -142,7 +142,7 @@ def test_what_operators_do_while_a_version_is_made_is_kept(versions: TwinVersion
 def test_one_version_is_made_at_a_time(versions: TwinVersions) -> None:
     with (
         versions.learning(),
-        pytest.raises(UserError, match="another `fantwin learn` works here"),
+        pytest.raises(UserError, match="another `fantwin twins learn` works here"),
         TwinVersions(versions.folder, "tray1").learning(),
     ):
         pass

@@ -1,4 +1,4 @@
-"""`fantwin discover`: what it finds on trees of files can be pasted as it is, and what is missing is said."""
+"""`fantwin doctor find`: what it finds on trees of files can be pasted as it is, and what is missing is said."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ def test_a_tree_without_fans_or_no_tree_says_what_is_missing(tmp_path: Path) -> 
 
 
 def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_path: Path) -> None:
-    command_line._register(["discover"] if not command_line.app.registered_commands else ["discover", "info"])
+    command_line._register(["doctor"] if not command_line.app.registered_commands else ["doctor", "info"])
     file = tmp_path / "fantwin.toml"
-    words = ["discover", "--root", str(root), "--json", "--write", str(file), "--writable"]
+    words = ["doctor", "find", "--root", str(root), "--json", "--write", str(file), "--writable"]
     result = CliRunner().invoke(command_line.app, words)
     assert result.exit_code == 0, result.output
     shown = json.loads(result.stdout)
@@ -89,10 +89,12 @@ def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_
 
 @pytest.mark.parametrize("content", [b"no configuration [", b"\xff\xfe"])
 def test_a_file_that_is_no_configuration_is_not_changed(root: Path, tmp_path: Path, content: bytes) -> None:
-    command_line._register(["discover"] if not command_line.app.registered_commands else ["discover", "info"])
+    command_line._register(["doctor"] if not command_line.app.registered_commands else ["doctor", "info"])
     file = tmp_path / "fantwin.toml"
     file.write_bytes(content)
-    error = CliRunner().invoke(command_line.app, ["discover", "--root", str(root), "--write", str(file)]).exception
+    error = (
+        CliRunner().invoke(command_line.app, ["doctor", "find", "--root", str(root), "--write", str(file)]).exception
+    )
     assert isinstance(error, UserError)
     assert str(error).startswith(f"{file}: exists, cannot be read as a configuration (")
     assert str(error).endswith("), and was not changed: name a new file")
@@ -109,8 +111,8 @@ def test_a_port_of_which_nothing_is_known_is_no_tray_and_what_is_not_written_is_
     known, unknown = discover_serial()
     assert known.tray["source"]["port"] == "/dev/ttyUSB0"
     assert not unknown.tray and unknown.title == "/dev/ttyS0" and "no device is known" in unknown.missing[0]
-    command_line._register(["discover"] if not command_line.app.registered_commands else ["discover", "info"])
-    words = ["discover", "--root", str(root), "--write", str(tmp_path / "fantwin.toml")]
+    command_line._register(["doctor"] if not command_line.app.registered_commands else ["doctor", "info"])
+    words = ["doctor", "find", "--root", str(root), "--write", str(tmp_path / "fantwin.toml")]
     lines = CliRunner().invoke(command_line.app, words).stdout.splitlines()
     assert [
         line

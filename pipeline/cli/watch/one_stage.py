@@ -1,4 +1,4 @@
-"""`fantwin run`: one stage in this process."""
+"""`fantwin up --only`: one stage in this process, which imports no launcher and no rich."""
 
 from __future__ import annotations
 
@@ -7,60 +7,42 @@ import os
 import sys
 import threading
 from contextlib import nullcontext, suppress
-from typing import Annotated
 
 import typer
 
 from fantwin.pipeline.bus.errors import NoAnswerError
-from fantwin.pipeline.cli.exposure import InsecureOption, checked_exposure
-from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.cli.exposure import checked_exposure
 from fantwin.pipeline.config.models import Config
-from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.config.shards import Shard, chosen_shard
-from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.launch.processes import EXIT_CANNOT_START
 from fantwin.pipeline.runtime.figures import without_figures
 from fantwin.pipeline.runtime.notifier import starting
 from fantwin.pipeline.runtime.runner import Runner
-from fantwin.pipeline.runtime.signals import set_when_stdin_closes, stop_on_signals
+from fantwin.pipeline.runtime.signals import set_when_stdin_closes
 from fantwin.pipeline.runtime.stage import load_stage
 from fantwin.schemas.health import Health
 from fantwin.schemas.streams import LOSS_PREFIX
 from fantwin.schemas.topics import stage_label
 
 
-def run(
-    stage: Annotated[str, typer.Argument(help=f"One of {', '.join(STAGES)}.")],
-    config: ConfigOption = DEFAULT_CONFIG,
-    trays: Annotated[
-        str | None, typer.Option("--trays", "--tray", metavar="A,B", help="Only these trays. Default: all.")
-    ] = None,
-    shard: Annotated[
-        str | None,
-        typer.Option(metavar="K/N", help="Only the K-th tray of the configuration and every N-th after it; K from 1."),
-    ] = None,
-    overrides: SetOption = None,
-    json_output: JsonOption = False,
-    until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
-    insecure: InsecureOption = False,
+def run_stage(
+    stage: str,
+    settings: Config,
+    chosen: Shard,
+    stop: threading.Event,
+    *,
+    insecure: bool,
+    json_output: bool,
+    until_stdin_closes: bool,
 ) -> None:
-    """Run one stage alone, until Ctrl-C.
+    """Run a stage in this process until `stop` is set.
 
-    It discovers the other stages on the bus; the order of starting does not matter. `fantwin up` starts all of them.
-    Several processes of a stage share the trays of a site: each has some of them, on this host or on others.
+    until_stdin_closes: a launcher started it, which hears its health and has checked what the bus is exposed to.
 
-    Example: fantwin run scorer -c fantwin.toml
-
-    Example: fantwin run scorer -c fantwin.toml --shard 2/8
+    Raises:
+        typer.Exit: the stage could not start, failed, or lost data.
     """
-    if stage not in STAGES:
-        raise UsageError(f"no stage called {stage!r}; known: {', '.join(STAGES)}")
-    settings = load_config(config, overrides or (), stages=(stage,))
-    chosen = chosen_shard(stage, settings, trays, shard)
-    stop = threading.Event()
-    stop_on_signals(stop)
-    # a launcher has checked it itself
     with checked_exposure(settings.bus, _say, insecure=insecure) if not until_stdin_closes else nullcontext():
         _run(stage, settings, chosen, stop, json_output=json_output, until_stdin_closes=until_stdin_closes)
 

@@ -1,14 +1,13 @@
-"""`fantwin notify`: a test message to the targets of the notifier."""
+"""`fantwin doctor notify`: a test message to the targets of the notifier."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
@@ -16,27 +15,19 @@ from fantwin.pipeline.outputs.notify.targets import send_test
 from fantwin.pipeline.outputs.notify.wording import Place
 
 
-def notify(
-    targets: Annotated[
-        list[str] | None, typer.Argument(metavar="[TARGET]...", help="Names of targets; all if omitted.")
-    ] = None,
-    config: ConfigOption = DEFAULT_CONFIG,
-    overrides: SetOption = None,
-    json_output: JsonOption = False,
-) -> None:
-    """Send a test message to the targets of the notifier, and say which ones accepted it.
+def send_test_messages(config: Path, overrides: Sequence[str], targets: Sequence[str], *, json_output: bool) -> None:
+    """Send a test message to the targets of the notifier, which need not be running. targets: names; empty for all.
 
-    The notifier need not be running.
-
-    Example: fantwin notify on_call
+    Raises:
+        UserError: there is no such target, or one did not accept its message.
     """
-    settings = load_config(config, overrides or (), stages=("notifier",))
+    settings = load_config(config, overrides, stages=("notifier",))
     section = settings.sections["notifier"]
     assert isinstance(section, NotifierConfig)
     known = {target.name: target for target in section.target}
     if not known:
         raise UserError(f"{config}: no targets: add a table [[notifier.target]] with a name and url_file")
-    if unknown := [name for name in targets or () if name not in known]:
+    if unknown := [name for name in targets if name not in known]:
         raise UsageError(f"{config}: no target {', '.join(unknown)}: there is {', '.join(known)}")
 
     def resolve(path: Path) -> Path:

@@ -1,4 +1,4 @@
-"""`fantwin discover`: the fans and serial ports of this computer, with a [[tray]] to paste for each."""
+"""`fantwin doctor find`: the fans and serial ports of this computer, with a [[tray]] to paste for each."""
 
 from __future__ import annotations
 
@@ -8,34 +8,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.console import Console
 
-from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.pipeline.sources.hwmon.discovery import Found, discover_hwmon, discover_serial
 
 
-def discover(
-    root: Annotated[Path, typer.Option(help="Folder of the hwmon chips.")] = ROOT,
-    write: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write a configuration of all hwmon chips with fans to this new file."),
-    ] = None,
-    writable: Annotated[
-        bool, typer.Option("--writable", help="Let fantwin command the fans found: `sweep` and `command` need that.")
-    ] = False,
-    json_output: JsonOption = False,
-) -> None:
-    """List the fans and serial ports of this computer, with a configuration to paste for each, and what is missing.
+def find_fans(root: Path, write: Path | None, *, writable: bool, json_output: bool) -> None:
+    """Print the fans and serial ports of this computer, with a configuration for each, and what is missing.
 
-    Nothing is written to a device. --write leaves out serial ports, because their devices are only guessed, and never
-    changes an existing file. Exit code 1 if nothing can be watched.
+    Nothing is written to a device. write: a new file for the configuration; serial ports are left out of it, because
+    their devices are only guessed. writable: the fans found take commands.
 
-    Example: fantwin discover --write fantwin.toml
+    Raises:
+        UserError: the file cannot be written.
+        typer.Exit: nothing can be watched.
     """
     shows_progress = not json_output and Console(stderr=True).is_terminal
     found: list[Found] = []

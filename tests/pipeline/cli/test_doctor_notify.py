@@ -1,4 +1,4 @@
-"""`fantwin notify` sends a test message; `fantwin doctor` finds what would keep messages from being sent."""
+"""`fantwin doctor notify` sends a test message; `fantwin doctor` finds what would keep messages from being sent."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def site(folder: Path, receiver: HttpReceiver, alertmanager_port: int) -> Path:
 
 def test_each_target_gets_a_test_message(tmp_path, receiver):
     config = site(tmp_path, receiver, receiver.port)
-    done = fantwin("notify", "-c", config)
+    done = fantwin("doctor", "notify", "-c", config)
     assert (done.exit_code, done.stdout) == (0, "hook: delivered\nother: delivered\n")
     message, (alert,) = receiver.received
     assert message["title"] == "Test (hall)"
@@ -60,13 +60,13 @@ def test_each_target_gets_a_test_message(tmp_path, receiver):
 
 def test_one_that_is_away_is_named_and_the_others_get_theirs(tmp_path, receiver):
     config = site(tmp_path, receiver, free_port())
-    done = fantwin("notify", "-c", config, "--json")
+    done = fantwin("doctor", "notify", "-c", config, "--json")
     hook, other = map(json.loads, done.stdout.splitlines())
     assert hook == {"target": "hook", "delivered": True, "reason": ""}
     assert not other["delivered"] and "refused" in other["reason"]
-    assert error_of("notify", "-c", config) == "no test message for other"
-    assert fantwin("notify", "hook", "-c", config).stdout == "hook: delivered\n"
-    assert "no target nobody: there is hook, other" in usage_error_of("notify", "nobody", "-c", config)
+    assert error_of("doctor", "notify", "-c", config) == "no test message for other"
+    assert fantwin("doctor", "notify", "hook", "-c", config).stdout == "hook: delivered\n"
+    assert "no target nobody: there is hook, other" in usage_error_of("doctor", "notify", "nobody", "-c", config)
 
 
 def test_doctor_reads_secrets_and_urls(tmp_path, receiver, capsys):
@@ -74,7 +74,7 @@ def test_doctor_reads_secrets_and_urls(tmp_path, receiver, capsys):
 
     def problems() -> list[str]:
         with pytest.raises(typer.Exit):
-            doctor(config, [], json_output=True, listen_s=0.0)
+            doctor(config=config, json_output=True, listen_s=0.0)
         found = json.loads(capsys.readouterr().out)
         return [line for line in found["problems"] if line.startswith("notifier")]
 
