@@ -389,7 +389,7 @@ def build(context: Context) -> BuiltStage:
         for path in parts.unrepaired:
             _LOG.warning(
                 "a recorder was killed; the disk refuses the repair of its recording, which stays %s: make room and "
-                "start again, or use `fantwin recover`",
+                "start again, or use `fantwin info --repair`",
                 path,
             )
         own = {tray_key(context.site, tray.name, topic) for tray in context.trays for topic in KEEPS}

@@ -1,7 +1,7 @@
 """The picture of docs/explanation/deciding.md: a filter that clogs, what is expected of its fan, score and causes.
 
 The demo's tray runs on a command that moves in small steps. From CLOGS_FROM_S on the drag of one fan grows. Its twin
-and its scorer run as on a site, without a bus. Colours are those of `fantwin plot`.
+and its scorer run as on a site, without a bus. Colours are those of `fantwin view`.
 
 Example: python -m bench.detection.pictures docs/explanation/deciding.png
 """

@@ -45,13 +45,13 @@ def main(
             recording, scored = Path(work) / f"{name}.mcap", Path(work) / f"{name}-judged.mcap"
             truth = Path(work) / f"{name}.json"
             options = [word for fault in faults for word in ("--fault", fault)]
-            settings = ("--fans", 8, "--profile", "manual", "--seed", seed, "--duration", 45, "--speed-unit", "rpm")
+            settings = ("--fans", 8, "--profile", "manual", "--seed", seed, "--duration", 45, "--set", "speed_unit=rpm")
             _fantwin("simulate", *settings, *options, "--recording", recording, "--truth", truth)
             reported = json.loads(
                 _fantwin("replay", recording, "--offline", "--twin", TWIN, "-o", scored, "--json", accept=(0, 3))
             )
             picture = folder / f"experiment-{name}.png"
-            _fantwin("plot", scored, "--fans", FAN, "--unit", "rpm", "--truth", truth, "-o", picture)
+            _fantwin("view", scored, "--fans", FAN, "--unit", "rpm", "--truth", truth, "-o", picture)
             start_ns = json.loads(truth.read_text(encoding="utf-8"))["start_ns"]
             rows += _rows(name, reported["alarms"], start_ns) or [NO_ALARM | {"run": name}]
     show({"alarms of the three runs, s since the first sample": rows}, [], as_json=json_output)

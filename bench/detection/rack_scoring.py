@@ -73,7 +73,7 @@ def calibrated(data: RackData, rack: int, learning: str, twin: Path, output: Pat
     """
     with _quietly(output.with_suffix(".calibrate.txt")):
         healthy = data.learning(learning, rack)
-        calibrate(twin, healthy, DECLARED_PER_DAY, extrapolate=learning != "three nights", output=output, jobs=1)
+        calibrate(twin, healthy, DECLARED_PER_DAY, extrapolate=learning != "three nights", output=output, jobs="1")
 
 
 def twin_of(data: RackData, rack: int, learning: str) -> Path:

@@ -51,7 +51,7 @@ def main(
         ]
         twin = folder / "twin.onnx"
         run(["train", paths[0], *MODEL, "-o", twin])
-        ways = {"1 job": ("-j", 1), "2 jobs": ("-j", 2), "2 workers": ("--scheduler", cluster.scheduler_address)}
+        ways = {"1 job": ("-j", 1), "2 jobs": ("-j", 2), "2 workers": ("-j", cluster.scheduler_address)}
         for command in ("train", "calibrate", "evaluate", "replay"):
             found: dict[str, tuple[float, str, bytes]] = {}
             for way, options in ways.items():

@@ -216,7 +216,7 @@ class _Site:
             for start_s in [20.0 + number * PERIOD_S]
             for word in ("--fault", f"rotor:fan={number % FANS},start={start_s},stop={start_s + FAULT_S},size=1.0")
         ]
-        words = ["simulate", "--fans", FANS, "--speed-unit", "rpm", "--link", folder / "tray", "--wait-for-reader"]
+        words = ["simulate", "--fans", FANS, "--set", "speed_unit=rpm", "--link", folder / "tray", "--wait-for-reader"]
         self._device = Process([*words, "--json", *faults], folder / "device")
         self._hosts = {
             stage: Host(stage.replace("_", "-")[:12], f"10.78.0.{number}") for number, stage in enumerate(STAGES, 11)

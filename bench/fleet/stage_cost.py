@@ -98,7 +98,7 @@ def calibrated_twin(folder: Path) -> Path:
         for raw in raws(rough_run(4, HEALTHY_S, 4, fan_variation=0.0).run, 1.0):
             writer.add_message(tray_key(SITE, TRAY, "raw"), raw, int(raw.host_receive_t_ns[-1]))
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        calibrate(path, [recording], 24.0, extrapolate=True, jobs=1)
+        calibrate(path, [recording], 24.0, extrapolate=True, jobs="1")
     return path
 
 

@@ -95,7 +95,18 @@ def recording(folder: Path, seconds: float) -> Path:
         for w in ("--fault", f"inlet:fan=2,start={start},stop={start + 10},size=1.8")
     ]
     done = fantwin(
-        *("simulate", "--fans", 8, "--speed-unit", "rpm", "--duration", seconds, "--epoch-ns", 10**18, *faults),
+        *(
+            "simulate",
+            "--fans",
+            8,
+            "--set",
+            "speed_unit=rpm",
+            "--duration",
+            seconds,
+            "--set",
+            f"epoch_ns={10**18}",
+            *faults,
+        ),
         *("--recording", recording),
         timeout_s=600,
     )

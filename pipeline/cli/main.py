@@ -69,10 +69,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "recordings.info",
         "Show what a recording contains: time, trays, twins, messages and losses of each topic, problems of stages.",
     ),
-    "recover": (
-        "recordings.recover",
-        "Repair a truncated or damaged recording, and list what it contains and what is missing.",
-    ),
     "import": (
         "recordings.import_table",
         "Turn a measured table or a log into a recording, the data format of training, evaluation and replay.",
@@ -81,21 +77,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "recordings.export",
         "Export a recording as tables: one per topic and tray, with a row per sample and fan.",
     ),
-    "view": ("recordings.view", "Turn a recording into a view file that shows what the stage `viewer` shows live."),
-    "plot": ("recordings.plot", "Plot measured speed, prediction, band, alarms and states of a recording."),
-    "picture": (
-        "recordings.picture",
-        "Draw a view file as a picture with a headless Rerun viewer (needs a Vulkan driver).",
-    ),
-    "identify": (
-        "twins.identify",
-        "Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.",
+    "view": (
+        "recordings.view",
+        "Turn a recording into a view file for Rerun, or plot its speeds, predictions, bands, alarms and states.",
     ),
     "train": ("twins.train", "Train a twin of healthy fans and write it, with its card, as an ONNX file."),
-    "place": (
-        "twins.place",
-        "Make a twin of more fans of a type, from a few minutes of each and the twin of other fans of the type.",
-    ),
     "calibrate": (
         "twins.calibrate",
         "Learn from healthy recordings how far a twin's fans may differ from it, and write that into its card.",
@@ -104,13 +90,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "twins.evaluate",
         "Compare the free run of a twin with the measured speeds of recordings, in the recordings' own units.",
     ),
-    "compare": (
-        "twins.compare",
-        "Train physical, NARX, neural ODE and both hybrids on the same recordings and print them side by side.",
-    ),
     "report": (
         "twins.report",
-        "Compare the free run of a twin with recordings, and write the result as one self-contained HTML page.",
+        "Compare the free run of a twin with recordings on an HTML page, or identify the fans of recordings.",
     ),
     "twins": (
         "twins.twins",
@@ -123,9 +105,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 """command -> its module in this folder, whose function of the same name is the command; the first line of its help"""
 VARIADIC: dict[str, tuple[str, ...]] = {
-    "train": ("--validate",),
-    "place": ("--validate",),
-    "compare": ("--validate", "--test"),
+    "train": ("--validate", "--test"),
     "calibrate": ("--verify", "--feedback"),
     "alarms": ("--recordings",),
 }

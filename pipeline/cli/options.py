@@ -9,7 +9,6 @@ from typing import Annotated, TypeAlias
 import typer
 
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.schemas.auxiliary import AUXILIARY
 
 ConfigOption: TypeAlias = Annotated[Path, typer.Option("-c", "--config", help="Configuration file (TOML).")]
 SetOption: TypeAlias = Annotated[
@@ -33,18 +32,6 @@ RoundsOption: TypeAlias = Annotated[
     int, typer.Option(min=1, max=100, help="With --sweep: how often all levels are passed.")
 ]
 
-SupplyVoltageOption: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option(metavar="COLUMN", help="Supply voltage, V: one column for all fans, or one per fan. Repeatable."),
-]
-CurrentOption: TypeAlias = Annotated[
-    list[str] | None, typer.Option(metavar="COLUMN", help="Current of a fan, A. Repeatable.")
-]
-TemperatureOption: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option(metavar="COLUMN", help="Temperature of the air, °C: one for all fans, or one per fan. Repeatable."),
-]
-
 DEFAULT_CONFIG = Path("fantwin.toml")
 
 
@@ -54,14 +41,6 @@ class ViewLayout(StrEnum):
     ALL = "all"
     ALARMS = "alarms"
     WEAR = "wear"
-
-
-def auxiliary_options(
-    supply_voltage: list[str] | None, current: list[str] | None, temperature: list[str] | None
-) -> dict[str, list[str]]:
-    """The columns of a table that options name, by what they are (schemas.auxiliary)."""
-    given = (supply_voltage, current, temperature)
-    return {column.name: names for column, names in zip(AUXILIARY, given, strict=True) if names}
 
 
 def fan_numbers(text: str | None) -> list[int] | None:

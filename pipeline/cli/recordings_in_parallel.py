@@ -32,12 +32,14 @@ if TYPE_CHECKING:
     from distributed import Client
 
 JobsOption: TypeAlias = Annotated[
-    int | None,
-    typer.Option("--jobs", "-j", min=1, help="Recordings to work on at a time. Default: one for each core."),
-]
-SchedulerOption: TypeAlias = Annotated[
     str | None,
-    typer.Option(metavar="tcp://HOST:PORT", help="Work on the cluster of this Dask scheduler (extra `remote`)."),
+    typer.Option(
+        "--jobs",
+        "-j",
+        metavar="N|tcp://HOST:PORT",
+        help="Recordings to work on at a time, default one for each core; or the Dask scheduler of a cluster (extra "
+        "`remote`).",
+    ),
 ]
 SkipBadOption: TypeAlias = Annotated[
     bool,
@@ -74,16 +76,18 @@ class _Bad:
 class RecordingsInParallel:
     """The processes of one command, and the recordings that it skipped. A context manager: its end is theirs."""
 
-    def __init__(self, jobs: int | None = None, scheduler: str | None = None, skip_bad: bool = False) -> None:
-        """jobs: None: one for each core. scheduler: of a cluster, whose workers take the place of jobs.
+    def __init__(self, jobs: int | str | None = None, skip_bad: bool = False) -> None:
+        """jobs: how many, None for one for each core; or the scheduler of a cluster, whose workers take their place.
 
         Raises:
-            UsageError: jobs and a scheduler.
+            UsageError: it is neither.
         """
-        if jobs and scheduler:
-            raise UsageError("--jobs and --scheduler: give one; a cluster has as many jobs as its workers have threads")
-        self._jobs = jobs or cpu_count()
-        self._scheduler = scheduler
+        self._scheduler = jobs if isinstance(jobs, str) and "://" in jobs else None
+        number = str(jobs or cpu_count()) if self._scheduler is None else "1"
+        if not number.isdecimal() or number == "0":
+            raise UsageError(f"--jobs {jobs}: give a number from 1, or the scheduler of a cluster: tcp://HOST:PORT")
+        self.jobs = int(number)
+        """at a time on this host"""
         self._skip_bad = skip_bad
         self._resources = ExitStack()
         self._client: Client | None = None
@@ -129,7 +133,7 @@ class RecordingsInParallel:
 
     def _here(self, attempt: Callable[[Recording], Any], recordings: Sequence[Recording]) -> Generator[Any]:
         """The outcomes in the order of the recordings. When it is closed early, the processes are ended."""
-        jobs = min(self._jobs, max(len(recordings), 1))
+        jobs = min(self.jobs, max(len(recordings), 1))
         self._has_processes |= jobs > 1
         return in_processes(attempt, recordings, jobs, RECORDINGS)
 
@@ -149,7 +153,7 @@ class RecordingsInParallel:
         except KilledWorker as error:
             raise UserError(f"{ENDED_FROM_OUTSIDE.format(what=RECORDINGS)}: see {self._scheduler}") from error
         except (CancelledError, CommClosedError, TimeoutError) as error:
-            raise UserError(f"--scheduler {self._scheduler}: the connection to it was lost") from error
+            raise UserError(f"--jobs {self._scheduler}: the connection to it was lost") from error
         finally:
             self._client.cancel(list(futures))
 
@@ -201,7 +205,7 @@ def _connected(scheduler: str) -> Iterator[Client]:
     Raises:
         UserError: there is none, or the extra is missing.
     """
-    require("--scheduler", "remote", "distributed")
+    require("--jobs on a cluster", "remote", "distributed")
     from distributed import Client  # noqa: PLC0415  an extra
 
     for name in ("asyncio", "distributed", "distributed.client"):
@@ -209,13 +213,13 @@ def _connected(scheduler: str) -> Iterator[Client]:
     try:
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise UserError(f"--scheduler {scheduler}: no Dask scheduler answers there") from error
+        raise UserError(f"--jobs {scheduler}: no Dask scheduler answers there") from error
     with client:
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
         except TimeoutError as error:
             raise UserError(
-                f"--scheduler {scheduler}: it has no workers; start some: dask worker {scheduler} --nthreads 1"
+                f"--jobs {scheduler}: it has no workers; start some: dask worker {scheduler} --nthreads 1"
             ) from error
         own = _versions()
         versions: Any = client.run(_versions, on_error="return")

@@ -99,7 +99,7 @@ def parse_config(
         except ValueError as error:  # an integer of more than 4,300 digits is one, too
             raise ConfigError(f"{path}: not valid TOML: {error}") from error
         for override in overrides:
-            _override(table, override)
+            set_key(table, override)
         return _checked(table, text, path, overrides, stages)
     except RecursionError as error:
         raise ConfigError(f"{path}: tables or lists are nested too deeply; two levels are enough") from error
@@ -114,10 +114,10 @@ def _checked(
     for key in own:
         if key not in _File.model_fields:
             raise ConfigError(f"{path}: unknown key {_shown(key)}{nearest(key, [*_File.model_fields, *STAGES])}")
-    file = _check(_File, own, path, "")
+    file = checked_section(_File, own, path, "")
     enabled = enabled_stages(file.launcher, table)
     sections = {
-        name: _check(STAGES[name].load().config, table.get(name, {}), path, name)
+        name: checked_section(STAGES[name].load().config, table.get(name, {}), path, name)
         for name in (enabled if stages is None else stages)
     }
     names = [tray.name for tray in file.tray]
@@ -165,8 +165,12 @@ def enabled_stages(launcher: LauncherConfig, table: Mapping[str, Any]) -> tuple[
     return tuple(name for name in STAGES if name in enabled and name not in launcher.without)
 
 
-def _override(table: dict[str, Any], override: str) -> None:
-    """Set one dotted key; `tray.0.port` is the port of the first tray."""
+def set_key(table: dict[str, Any], override: str) -> None:
+    """Set one dotted key; `tray.0.port` is the port of the first tray.
+
+    Raises:
+        ConfigUsageError: it is not KEY=VALUE, or cannot be set in this table.
+    """
     if len(override) > LONGEST_OVERRIDE:
         raise ConfigUsageError(f"--set {override[:LONGEST_SHOWN]}...: longer than {LONGEST_OVERRIDE:,} characters")
     dotted, equals, value_text = override.partition("=")
@@ -192,7 +196,12 @@ def _override(table: dict[str, Any], override: str) -> None:
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-def _check(model: type[_Model], values: Any, path: Path, section: str) -> _Model:
+def checked_section(model: type[_Model], values: Any, path: Path, section: str) -> _Model:
+    """A section of the file `path` as its model; an empty name is that of the whole file.
+
+    Raises:
+        ConfigError: a key or a value is wrong; one line names the nearest known key.
+    """
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: {section!r} must be a section, write [{section}]")
     try:

@@ -9,7 +9,7 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
 record() { # name, profile, seed, seconds
-    "$fantwin" simulate --fans 8 --profile "$2" --seed "$3" --duration "$4" --epoch-ns 0 --recording "$work/$1.mcap"
+    "$fantwin" simulate --fans 8 --profile "$2" --seed "$3" --duration "$4" --set epoch_ns=0 --recording "$work/$1.mcap"
 }
 record multisine multisine 101 80
 record manual manual 102 80

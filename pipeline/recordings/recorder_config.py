@@ -31,7 +31,7 @@ class RecorderConfig(StageConfig):
     topics: tuple[str, ...] = Field(
         default=(RAW,),
         description=f"which topics of samples to record, of {', '.join(SAMPLES)}; all others are always recorded. "
-        f"`fantwin view`, `plot` and `replay --offline` make the rest again from {RAW}",
+        f"`fantwin view` and `replay --offline` make the rest again from {RAW}",
     )
     file: Path = Field(
         default=Path("recording.mcap"),

@@ -91,7 +91,7 @@ class ScratchSite:
         self._log.close()
 
     def _start(self) -> None:
-        simulate = ("simulate", "--fans", FANS, "--speed-unit", "rpm", "--link", self.folder / "device")
+        simulate = ("simulate", "--fans", FANS, "--set", "speed_unit=rpm", "--link", self.folder / "device")
         self.tray = self.process(*simulate, "--wait-for-reader")
         self.line.start()
         self.up = self.process("up", *self.configured(), "--json", stdout=subprocess.PIPE)

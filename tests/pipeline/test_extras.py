@@ -130,13 +130,12 @@ def printed_by(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: py
     [
         ("export r.mcap --to parquet", "fantwin[logs]"),
         ("import log.ulg --list", "fantwin[logs]"),
-        ("picture view.rrd", "fantwin[view]"),
+        ("view view.rrd -o v.png", "fantwin[view]"),
         ("view r.mcap -o view.rrd", "fantwin[view]"),
-        ("plot r.mcap", "fantwin[report]"),
+        ("view r.mcap -o r.png", "fantwin[report]"),
         (f"report {DEMO / 'twin.onnx'} r.mcap", "fantwin[report]"),
-        ("identify s3://bucket/day.mcap", "fantwin[remote]"),
-        ("identify r.mcap r.mcap --scheduler tcp://127.0.0.1:1", "fantwin[remote]"),
-        ("train r.mcap -o t.onnx --trainer adam", "torch"),
+        ("report s3://bucket/day.mcap", "fantwin[remote]"),
+        ("report r.mcap r.mcap --jobs tcp://127.0.0.1:1", "fantwin[remote]"),
     ],
 )
 def test_a_command_without_its_extra_prints_one_line_with_what_to_type(

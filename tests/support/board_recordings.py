@@ -47,7 +47,7 @@ def run_board(
 def import_board(table: Path, recording: Path, *, with_supply: bool) -> Path:
     """Import what a board sent, with the column of its supply or without; returns the recording."""
     columns = [word for fan in range(FANS) for word in ("--command", f"duty{fan}", "--speed", f"rpm{fan}:rpm")]
-    supply = ("--supply-voltage", "supply") if with_supply else ()
+    supply = ("--channel", "supply_voltage_v=supply") if with_supply else ()
     succeed("import", table, "--time", "t:s", *columns, *supply, "--tacho", "period", "-o", recording)
     return recording
 

@@ -61,7 +61,7 @@ def make_golden(path: Path) -> None:
         folder = Path(name)
         healthy = folder / "healthy.mcap"
         run(
-            *("simulate", "--fans", FANS, "--rate", 50, "--profile", "multisine"),
+            *("simulate", "--fans", FANS, "--set", "rate_hz=50", "--profile", "multisine"),
             *("--duration", 120, "--recording", healthy),
         )
         run("train", healthy, "--model", "physical", "--name", "golden", "-o", folder / "twin.onnx")
@@ -96,7 +96,7 @@ def make_golden_restart(path: Path) -> None:
 def record(chain: Chain) -> None:
     """Some ten seconds with a fault and two killed stages."""
     tray = chain.start_tray(
-        "--fans", str(FANS), "--rate", "50", "--fault", f"inlet:fan={FAULTY},start=3,stop=9,size=2.0"
+        "--fans", str(FANS), "--set", "rate_hz=50", "--fault", f"inlet:fan={FAULTY},start=3,stop=9,size=2.0"
     )
     up = chain.start_up()
     with chain.watcher() as watcher:

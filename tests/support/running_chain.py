@@ -141,7 +141,7 @@ class Chain:
         truth = self.folder / "truth.json"
         self.tray = RunningCommand(
             [
-                *("simulate", "--fans", FANS, "--speed-unit", "rpm", "--link", self.port, "--truth", truth),
+                *("simulate", "--fans", FANS, "--set", "speed_unit=rpm", "--link", self.port, "--truth", truth),
                 *("--wait-for-reader", "--json", *words),
             ]
         )

@@ -36,7 +36,7 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
 @pytest.fixture
 def tray(tmp_path: Path) -> Iterator[RunningCommand]:
     """A simulated one, whose plant moves its fans."""
-    line = ("--rate", 20, "--speed-unit", "rpm", "--link", tmp_path / "line", "--json")
+    line = ("--set", "rate_hz=20", "--set", "speed_unit=rpm", "--link", tmp_path / "line", "--json")
     tray = RunningCommand(("simulate", "--fans", FANS, "--profile", "prbs", *line))
     try:
         tray.line_with(" on ")

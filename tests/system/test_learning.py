@@ -40,7 +40,7 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
 @pytest.fixture
 def tray(tmp_path: Path) -> Iterator[RunningCommand]:
     tray = RunningCommand(
-        ["simulate", "--fans", FANS, "--link", tmp_path / "line", "--profile", "prbs", "--rate", 20, "--json"]
+        ["simulate", "--fans", FANS, "--link", tmp_path / "line", "--profile", "prbs", "--set", "rate_hz=20", "--json"]
     )
     try:
         tray.line_with("fans on")

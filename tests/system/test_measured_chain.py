@@ -28,7 +28,9 @@ class Rig:
 
     tray: str
     file: str
-    columns: tuple[str, ...]
+    time: str
+    command: str
+    speed: str
     first_part_s: float
     played_s: tuple[float, float]
 
@@ -37,14 +39,18 @@ RIGS = (
     Rig(
         tray="esc_test",
         file="esc_test/f40_steps_5-2.csv",
-        columns=("--time", "Timestamp", "--command", "Duty", "--speed", "RPM:rpm"),
+        time="Timestamp",
+        command="Duty",
+        speed="RPM:rpm",
         first_part_s=80,
         played_s=(94, 115),
     ),
     Rig(
         tray="rosa",
         file="rosa/healthy_103.csv",
-        columns=("--time", "Time:ms", "--command", "Shaft Control Effort", "--speed", "Actual Speed:rpm"),
+        time="Time:ms",
+        command="Shaft Control Effort",
+        speed="Actual Speed:rpm",
         first_part_s=30,
         played_s=(30, 48),
     ),
@@ -75,7 +81,8 @@ twin = "{folder}/{tray}.onnx"
 
 def train_on_the_first_part(rig: Rig, measured_data: Path, folder: Path) -> None:
     recording, twin = folder / f"{rig.tray}-all.mcap", folder / f"{rig.tray}.onnx"
-    done = fantwin("import", measured_data / rig.file, *rig.columns, "-o", recording)
+    columns = ("--time", rig.time, "--command", rig.command, "--speed", rig.speed)
+    done = fantwin("import", measured_data / rig.file, *columns, "-o", recording)
     assert done.exit_code == 0, done.exception
     done = fantwin("train", recording, "--model", "physical", "--to", rig.first_part_s, "-o", twin)
     assert done.exit_code == 0, done.exception
@@ -84,10 +91,13 @@ def train_on_the_first_part(rig: Rig, measured_data: Path, folder: Path) -> None
 def play(rig: Rig, measured_data: Path, folder: Path) -> RunningCommand:
     """The rest of the file, as if the rig measured it live."""
     begin_s, end_s = rig.played_s
-    line = ("--link", folder / f"{rig.tray}.line", "--speed-unit", "rpm", "--wait-for-reader")
+    line = ("--link", folder / f"{rig.tray}.line", "--set", "speed_unit=rpm", "--wait-for-reader")
     truth = ("--truth", folder / f"{rig.tray}.json", "--json")
-    csv = ("--from-csv", measured_data / rig.file, *rig.columns, "--from", begin_s, "--to", end_s)
-    return RunningCommand(["simulate", *csv, *line, *truth])
+    columns = f'time = "{rig.time}"\ncommand = ["{rig.command}"]\nspeed = ["{rig.speed}"]\n'
+    scenario = folder / f"{rig.tray}.played.toml"
+    part = f'path = "{measured_data / rig.file}"\nfrom_s = {begin_s}\nto_s = {end_s}\n'
+    scenario.write_text(f"[file]\n{part}{columns}", encoding="utf-8")
+    return RunningCommand(["simulate", scenario, *line, *truth])
 
 
 def check(rig: Rig, folder: Path, messages: list[Message]) -> None:

@@ -183,7 +183,7 @@ def check_replay(chain: Chain) -> None:
 
 def test_operators_are_answered_and_killed_stages_come_back_without_losing_state(chain):
     fault = ("--fault", f"inlet:fan={FAULTY},start=8,stop=600,size=2.5")
-    chain.start_tray(*fault, "--measure", "supply_voltage_v")
+    chain.start_tray(*fault, "--set", "surroundings.measured=['supply_voltage_v']")
     up = chain.start_up()
     up.line_with("ALARM")
     before = operate(chain)

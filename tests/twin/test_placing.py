@@ -89,4 +89,6 @@ def test_what_cannot_be_placed_is_refused_in_one_line(type_twin: Path, others: t
     silent = Run("silent", own.t_s, own.command, np.where(np.arange(4) == 2, np.nan, own.speed_rad_s))
     with pytest.raises(TwinError, match="fan 2: fewer than 100 measured speeds"):
         place_twin(type_twin, [silent], [], name="x")
-    assert "no such file" in error_of("place", tmp_path / "none.onnx", tmp_path / "a.mcap", "-o", tmp_path / "b.onnx")
+    assert "no such file" in error_of(
+        "train", tmp_path / "a.mcap", "--type", tmp_path / "none.onnx", "-o", tmp_path / "b.onnx"
+    )

@@ -1,4 +1,4 @@
-"""The figures of a report, as SVG to stand inside HTML. Colours and marks are those of `fantwin plot`."""
+"""The figures of a report, as SVG to stand inside HTML. Colours and marks are those of `fantwin view`."""
 
 import io
 import re

@@ -8,19 +8,13 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 from pydantic import ValidationError
 
-from fantwin.pipeline.cli.options import (
-    CurrentOption,
-    JsonOption,
-    SupplyVoltageOption,
-    TemperatureOption,
-    auxiliary_options,
-)
+from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.config.models import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.reading import TACHO_KEY
@@ -29,6 +23,7 @@ from fantwin.pipeline.sources.logs.formats import LogFormat, log_format, open_lo
 from fantwin.pipeline.sources.logs.samples_of_log import read_samples
 from fantwin.pipeline.sources.tables.measured_table import Table, read_table
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
+from fantwin.schemas.auxiliary import AUXILIARY
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan, tachos_to_json
@@ -72,25 +67,23 @@ def import_table(
     period: Annotated[
         str | None, typer.Option(metavar="TIME", help="Time between rows of a table without a time column, e.g. 10ms.")
     ] = None,
-    supply_voltage: SupplyVoltageOption = None,
-    current: CurrentOption = None,
-    temperature: TemperatureOption = None,
-    tray: Annotated[str, typer.Option(help="Name of the tray in the recording.")] = "tray1",
-    tacho: Annotated[
-        Literal["instantaneous", "count", "average", "period"], typer.Option(help="How the speeds were measured.")
-    ] = "instantaneous",
-    pulses: Annotated[int, typer.Option(help="Pulses of a tacho per revolution.")] = 2,
-    window_s: Annotated[
-        list[float] | None,
+    channel: Annotated[
+        list[str] | None,
         typer.Option(
-            "--window",
-            metavar="S",
-            help="Seconds over which pulses are counted: one for all fans, or one per fan. Repeatable.",
+            metavar="NAME=COLUMN",
+            help=f"Column of {', '.join(column.name for column in AUXILIARY)}: one for all fans, or one per fan. "
+            "Repeatable.",
         ),
     ] = None,
-    update_s: Annotated[
-        float, typer.Option("--update", metavar="S", help="Seconds between new counts. Default: the window.")
-    ] = 0.0,
+    tray: Annotated[str, typer.Option(help="Name of the tray in the recording.")] = "tray1",
+    tacho: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND[:window_s=S,pulses=N,...]",
+            help="How the speeds were measured: instantaneous (default), count, average or period, with the keys of "
+            "`tacho` in [[tray]]: one for all fans, or one per fan. Repeatable.",
+        ),
+    ] = None,
     poles: Annotated[
         int | None, typer.Option(help="Magnetic poles of a motor, for speeds in erpm, if the log does not say it.")
     ] = None,
@@ -108,7 +101,7 @@ def import_table(
     Irregularities (repeated times, gaps, empty cells) are counted and reported; speeds are never filled in. Tachos of
     ordinary fans count pulses: say over which time, or see the hint.
 
-    Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm --tacho count --window 1 -o REC.mcap
+    Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm --tacho count:window_s=1 -o REC.mcap
 
     Example: fantwin import FLIGHT.bbl --command 'motor[*]' --speed 'eRPM[*]:erpm' --poles 14 -o REC.mcap
     """
@@ -123,9 +116,9 @@ def import_table(
         raise UsageError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
-    auxiliary = auxiliary_options(supply_voltage, current, temperature)
+    auxiliary = _channels(channel or ())
     if kind is None:
-        tachos = _tachos(tacho, pulses, window_s or [0.0], update_s, len(speed))
+        tachos = _tachos(tacho or (), len(speed))
         table = read_table(file, time, command, speed, period=period, auxiliary=auxiliary)
         notes = [table.assumed] if table.assumed else []
     else:
@@ -134,7 +127,7 @@ def import_table(
         log = open_log(file, kind, log_number)
         table, of_log = read_samples(file, log, command, speed, poles, auxiliary=auxiliary)
         notes = list(of_log)
-        tachos = _tachos(tacho, pulses, window_s or [0.0], update_s, table.fans)
+        tachos = _tachos(tacho or (), table.fans)
     write_table(table, output, tray, tachos)
     hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans))
     if json_output:
@@ -146,7 +139,7 @@ def import_table(
     for note in (*notes, *table.notes):
         typer.echo(f"  {note}")
     for hint in hints:
-        typer.echo(f"hint: {hint}; see --tacho and --window", err=True)
+        typer.echo(f"hint: {hint}; see --tacho", err=True)
 
 
 def _list_fields(file: Path, kind: LogFormat | None, number: int, *, json_output: bool) -> None:
@@ -178,22 +171,36 @@ def _range(values: Array) -> dict[str, float | None]:
     return {"lowest": float(known.min()), "highest": float(known.max())}
 
 
-def _tachos(
-    kind: Literal["instantaneous", "count", "average", "period"],
-    pulses: int,
-    windows_s: Sequence[float],
-    update_s: float,
-    fans: int,
-) -> tuple[Tacho, ...]:
+def _channels(given: Sequence[str]) -> dict[str, list[str]]:
+    """The columns of each channel beside command and speed."""
+    known = [column.name for column in AUXILIARY]
+    columns: dict[str, list[str]] = {}
+    for text in given:
+        name, equals, column = text.partition("=")
+        if name not in known or not equals:
+            raise UsageError(f"--channel {text}: give NAME=COLUMN; known are {', '.join(known)}")
+        columns.setdefault(name, []).append(column)
+    return columns
+
+
+def _tachos(given: Sequence[str], fans: int) -> tuple[Tacho, ...]:
+    """The tachos that options such as `count:window_s=1,pulses=2` describe."""
+    tachos: list[Tacho] = []
+    for text in given:
+        kind, _, settings = text.partition(":")
+        pairs = [setting.partition("=") for setting in settings.split(",") if setting]
+        try:
+            tachos.append(Tacho.model_validate({"kind": kind, **{key: value for key, _, value in pairs}}))
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = "".join(f"{part}: " for part in first["loc"])
+            raise UsageError(f"--tacho {text}: {where}{first['msg'].removeprefix('Value error, ')}") from error
+    found = tuple(tachos) or INSTANTANEOUS
     try:
-        tachos = [Tacho(kind=kind, pulses=pulses, window_s=window_s, update_s=update_s) for window_s in windows_s]
-        tacho_of_each_fan(tachos, fans)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise UsageError(f"--tacho {kind}: {first['msg'].removeprefix('Value error, ')}; see --window") from error
+        tacho_of_each_fan(found, fans)
     except ValueError as error:
-        raise UsageError(f"--window: {error}") from error
-    return tuple(tachos)
+        raise UsageError(f"--tacho: {error}") from error
+    return found
 
 
 def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...] = INSTANTANEOUS) -> None:

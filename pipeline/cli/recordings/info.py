@@ -17,6 +17,8 @@ from rich.table import Table
 
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.cli.recordings.repaired import repair
+from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.recordings.clips.clip import clip_lines
 from fantwin.pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
 from fantwin.pipeline.recordings.dates import format_clock, format_local
@@ -40,9 +42,18 @@ def info(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="A recording, the parts of one, or a run folder.")
     ],
+    repaired: Annotated[
+        bool, typer.Option("--repair", help="Repair a truncated or damaged recording, which is kept as FILE.original.")
+    ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="NEW.mcap", help="With --repair: write here, and leave FILE alone."),
+    ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Show what a recording contains: time, trays, twins, messages and losses of each topic, problems of stages.
+
+    With --repair, a truncated or damaged recording is made whole, and what was lost is listed.
 
     With several parts, it also checks that each continues the one before. A file without an index is read in full, as
     far as possible; one that is still being written, up to its last flush. Exit code 3 if messages are missing or a
@@ -51,7 +62,16 @@ def info(
     The recordings of the shards of a recorder are those of one run: name all, or the run folder.
 
     Example: fantwin info runs/recording.mcap
+
+    Example: fantwin info --repair runs/recording.mcap.active
     """
+    if repaired:
+        if len(files) > 1:
+            raise UsageError("--repair repairs one recording: name one")
+        repair(files[0], output, json_output=json_output)
+        return
+    if output:
+        raise UsageError("-o is for --repair: nothing else is written")
     with working(f"reading {', '.join(str(file) for file in files)}"):
         present = recorded_files(map(_present, files), with_unfinished=True)
         parts = sorted(map(contents_of, present), key=lambda part: part.first_ns or 0)
@@ -165,7 +185,7 @@ def _show(parts: Sequence[Contents], breaks: Iterable[str]) -> None:
         for line in part.recovered:
             console.print(f"[red]repaired earlier: {escape(line)}[/red]")
         for line in part.damage:
-            advice = "" if line == STILL_WRITTEN else "; repair it with `fantwin recover`"
+            advice = "" if line == STILL_WRITTEN else "; repair it with `fantwin info --repair`"
             console.print(f"[red]{escape(line)}{advice}[/red]")
     for line in breaks:
         console.print(f"[red]{escape(line)}[/red]")

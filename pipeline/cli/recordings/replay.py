@@ -18,7 +18,7 @@ from rich.live import Live
 from rich.text import Text
 
 from fantwin.pipeline.cli.options import JsonOption, SetOption
-from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.recordings.left_out import left_out_hint
@@ -114,7 +114,6 @@ def replay(
         ),
     ] = False,
     jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
     skip_bad: SkipBadOption = False,
 ) -> None:
     """Publish a recording on the bus in recorded time, for the viewer or the stages; or score recordings again offline.
@@ -131,7 +130,7 @@ def replay(
     """
     viewing = {"--rate": rate, "--pause": pause, "--loop": loop, "--topics": topics, "--from": from_topic}
     deciding = {"--twin": twin, "--output": output, "--verify": verify}
-    deciding |= {"--jobs": jobs, "--scheduler": scheduler, "--skip-bad": skip_bad}
+    deciding |= {"--jobs": jobs, "--skip-bad": skip_bad}
     for name in (name for name, value in (viewing if offline else deciding).items() if value):
         raise UsageError(f"{name} {'cannot be used' if offline else 'can only be used'} with --offline")
     if not 0.0 <= start < min(end, LONGEST_S) or (end > LONGEST_S and not math.isinf(end)):
@@ -141,7 +140,7 @@ def replay(
         from fantwin.pipeline.cli.recordings.score_again import Again  # noqa: PLC0415
 
         again = Again(config, tuple(overrides or ()), twin, verify, start, end)
-        run_offline(files, again, output, RecordingsInParallel(jobs, scheduler, skip_bad), json_output=json_output)
+        run_offline(files, again, output, RecordingsInParallel(jobs, skip_bad), json_output=json_output)
         return
     pace = Pace(_rate(rate or "1"), paused=pause)
     keys = Keys()

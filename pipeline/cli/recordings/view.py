@@ -1,61 +1,115 @@
-"""`fantwin view`: a recording as a view file for Rerun."""
+"""`fantwin view`: a recording as a view file for Rerun or as a plot; a view file as a picture."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
-from fantwin.pipeline.cli.options import JsonOption, ViewLayout
+from fantwin.pipeline.cli.options import JsonOption, ViewLayout, fan_numbers
+from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.recordings.with_scores import with_scores
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import require
 
+PLOTS = (".png", ".svg", ".pdf")
+
 
 def view(
-    recordings: Annotated[list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="The view file to write.")] = Path("view.rrd"),
+    files: Annotated[
+        list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts; or a view file (.rrd).")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="What to write: a view file .rrd for Rerun, or a plot .png, .svg or .pdf."),
+    ] = Path("view.rrd"),
     layout: Annotated[
         ViewLayout, typer.Option(help="all: every fan; alarms: fans that were in alarm; wear: change over days.")
     ] = ViewLayout.ALL,
     window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = 30.0,
-    fleet_above: Annotated[
-        int, typer.Option(min=0, help="With more fans than this, an overview and few plots are shown.")
-    ] = 64,
+    tray: Annotated[str | None, typer.Option(help="Pictures: which tray, if there are several.")] = None,
+    fans: Annotated[
+        str | None, typer.Option(help="Pictures: which fans, e.g. 2,5. Default: with alarms, and one without.")
+    ] = None,
+    unit: Annotated[
+        str | None, typer.Option(help="Plot: unit of speed, rpm or rad/s. Default: the recording's.")
+    ] = None,
+    truth: Annotated[Path | None, typer.Option(help="Plot: truth of a simulated tray, with its faults (JSON).")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing view file.")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Turn a recording into a view file that shows what the stage `viewer` shows live.
+    """Turn a recording into a view file for Rerun, or plot its speeds, predictions, bands, alarms and states.
 
-    Topics that the recorder left out (recorder.topics) are made again first.
+    Topics that the recorder left out (recorder.topics) are made again first. A view file becomes a picture .png with a
+    headless Rerun viewer, which needs a Vulkan driver.
 
     Exits with 3 if the recording could not be read in full, or if making the topics again shows that data were lost.
-    The view then shows the rest.
+    The rest is shown then.
 
     Example: fantwin view runs/demo/recording.mcap --layout alarms -o alarms.rrd
-    """
-    require("a view", "view")
-    from fantwin.pipeline.outputs.rerun.recorded_view import recorded_site, write_view  # noqa: PLC0415  an extra
-    from fantwin.pipeline.outputs.rerun.view_of_site import ViewOptions  # noqa: PLC0415
 
-    if output.suffix != ".rrd":
-        raise UsageError(f"{output}: name a file that ends in .rrd with -o")
-    if output.exists() and not force:
+    Example: fantwin view runs/demo/recording.mcap --truth runs/demo/truth.json -o bands.png
+    """
+    is_plot, chosen = output.suffix in PLOTS, fan_numbers(fans)
+    if unit not in ("rpm", "rad/s", None):
+        raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
+    if output.suffix not in (".rrd", *PLOTS):
+        raise UsageError(f"{output}: name a file that ends in .rrd, {', '.join(PLOTS)} with -o")
+    if files[0].suffix == ".rrd":
+        if output.suffix != ".png" or len(files) > 1:
+            raise UsageError(f"{files[0]}: a view file becomes a picture: name one, and -o NAME.png")
+        _draw(files[0], output, tray, chosen, window, layout, json_output=json_output)
+        return
+    require("a plot", "report", "matplotlib") if is_plot else require("a view", "view")
+    if output.exists() and not is_plot and not force:
         raise UserError(f"{output}: exists; name another file with -o, or use --force")
-    with Console(stderr=True).status(f"drawing {output}"), with_scores(recordings, output) as scored:
-        site = recorded_site(scored.files)
-        output.unlink(missing_ok=True)
-        options = ViewOptions(layout=layout.value, window_s=window, fleet_above=fleet_above)
-        damage = [*scored.damage, *write_view(site, output, options)]
-    fans = sum(tray.fans for tray in site.trays)
-    if json_output:
-        typer.echo(json.dumps({"view": str(output), "fans": fans, "damage": damage}))
-    else:
-        typer.echo(f"{output}: {fans} fans")
+    with working(f"drawing {output}"), with_scores(files, output) as scored:
+        if is_plot:
+            from fantwin.pipeline.outputs.rerun.band_plot import plot_recording  # noqa: PLC0415  an extra
+
+            drawn, unread = plot_recording(scored.files, output, tray=tray, fans=chosen, speed_unit=unit, truth=truth)
+            result: dict[str, Any] = {"plot": str(output), "fans": drawn}
+            shown = f"fans {', '.join(map(str, drawn))}"
+        else:
+            from fantwin.pipeline.outputs.rerun.recorded_view import recorded_site, write_view  # noqa: PLC0415  an extra
+            from fantwin.pipeline.outputs.rerun.view_of_site import ViewOptions  # noqa: PLC0415
+
+            site = recorded_site(scored.files)
+            output.unlink(missing_ok=True)
+            unread = write_view(site, output, ViewOptions(layout=layout.value, window_s=window))
+            result = {"view": str(output), "fans": sum(each.fans for each in site.trays)}
+            shown = f"{result['fans']} fans"
+    damage = [*scored.damage, *unread]
+    typer.echo(json.dumps(result | {"damage": damage}) if json_output else f"{output}: {shown}")
     for line in (*damage, *scored.remarks):
         typer.echo(line, err=True)
     if damage:
         raise typer.Exit(3)
+
+
+def _draw(
+    view_file: Path,
+    output: Path,
+    tray: str | None,
+    fans: list[int] | None,
+    window_s: float,
+    layout: ViewLayout,
+    *,
+    json_output: bool,
+) -> None:
+    """Draw a view file as a PNG, and say what the viewer reported."""
+    require("a picture of a view", "view")
+    from fantwin.pipeline.outputs.rerun.rerun_picture import draw_picture  # noqa: PLC0415  an extra
+
+    with working(f"drawing {view_file}"):
+        drawn = draw_picture(view_file, tray=tray, fans=fans, window_s=window_s, layout=layout.value)
+    output.write_bytes(drawn.png)
+    if json_output:
+        typer.echo(json.dumps({"picture": str(output), "views": drawn.reports}))
+        return
+    typer.echo(f"{output}: {', '.join(sorted(drawn.reports))}")
+    for name, reports in drawn.reports.items():
+        for report in reports:
+            typer.echo(f"{name}: {report}", err=True)

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from fantwin.pipeline.cli.options import JsonOption, SetOption
 from fantwin.pipeline.cli.progress import interruptible, show_part
-from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.twins.calibration_check import Check, check_declared_rate
 from fantwin.pipeline.cli.twins.drops_found import drop_lines, drops_found
 from fantwin.pipeline.cli.twins.marked_running import marked_running
@@ -112,7 +112,6 @@ def calibrate(
     ] = None,
     overrides: SetOption = None,
     jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
     skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
 ) -> None:
@@ -141,7 +140,7 @@ def calibrate(
         raise UserError(f"{output}: cannot write the twin: name a file in an existing folder")
     result: dict[str, Any] = {}
     check: Check | None = None
-    pool = RecordingsInParallel(jobs, scheduler, skip_bad)
+    pool = RecordingsInParallel(jobs, skip_bad)
     with interruptible("nothing was written"), pool:
         if healthy:
             if false_alarms_per_day is None:

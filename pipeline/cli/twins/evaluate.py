@@ -17,7 +17,7 @@ from rich.table import Table
 
 from fantwin.pipeline.cli.options import JsonOption, fan_numbers
 from fantwin.pipeline.cli.progress import interruptible
-from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
 from fantwin.pipeline.cli.twins.training_data import (
     FansOption,
@@ -62,7 +62,6 @@ def evaluate(
         typer.Option(metavar="HZ|irregular", help="Evaluate on this sample grid, too, e.g. 50. Repeatable."),
     ] = None,
     jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
     skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
 ) -> None:
@@ -76,7 +75,7 @@ def evaluate(
     """
     grids: list[Grid] = [_grid(text) for text in rate or []]
     part = Part(tray, fans, from_s, to_s)
-    pool = RecordingsInParallel(jobs, scheduler, skip_bad)
+    pool = RecordingsInParallel(jobs, skip_bad)
     with interruptible("nothing was evaluated"), twin_errors(), pool:
         # The command line loads twin only when it is needed.
         from fantwin.twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415

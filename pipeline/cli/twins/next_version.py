@@ -350,7 +350,7 @@ class _Work:
         with _quietly():
             left_out = self._alarms_since(of[0].span[0])
             paths = [each.path for each in of]
-            calibrate(named, paths, self._per_day, extrapolate=True, alarms_left_out=left_out, output=done, jobs=1)
+            calibrate(named, paths, self._per_day, extrapolate=True, alarms_left_out=left_out, output=done, jobs="1")
         calibration = calibration_in(done, load_tray_twin(done))
         assert calibration
         drops = (

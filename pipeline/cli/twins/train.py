@@ -1,32 +1,34 @@
-"""`fantwin train`: recordings of healthy fans become a twin."""
+"""`fantwin train`: recordings of healthy fans become a twin, or several side by side."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fantwin.pipeline.cli.networks_in_parallel import NetworksInParallel
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.progress import interruptible, training_progress
-from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
+from fantwin.pipeline.cli.twins.side_by_side import Data, train_side_by_side
 from fantwin.pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
     IgnoreOption,
     Part,
     RecordingsArgument,
+    TestOption,
     ToOption,
     TrainingData,
     TrayOption,
-    ValidateFromOption,
     ValidateOption,
-    ValidateToOption,
     WindowOption,
     check_writable,
     data_cards,
@@ -36,18 +38,14 @@ from fantwin.pipeline.cli.twins.training_data import (
     show_hints,
     twin_errors,
 )
-from fantwin.pipeline.extras import require_torch
+from fantwin.pipeline.errors import UsageError
 
 if TYPE_CHECKING:
     from fantwin.schemas.reference_conditions import ReferenceConditions
+    from fantwin.twin.comparison import Candidate
     from fantwin.twin.finishing import TrainedTwin
     from fantwin.twin.networks import ForEachNetwork
     from fantwin.twin.progress import Progress
-
-
-Trainer: TypeAlias = Literal["levenberg-marquardt", "adam"]
-Physics: TypeAlias = Literal["fixed", "refined"]
-NetworkInputs: TypeAlias = Literal["speed,command", "speed"]
 
 
 NETWORKS = 4
@@ -56,14 +54,12 @@ NETWORKS = 4
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a twin is trained; see the options of the command."""
+    """How a twin is trained; see the options of the command. network_inputs: None for those of the kind of model."""
 
     model: str = "hybrid"
     seed: int = 0
-    trainer: Trainer = "levenberg-marquardt"
     iterations: int | None = None
-    network_inputs: NetworkInputs = "speed,command"
-    physics: Physics = "refined"
+    network_inputs: tuple[str, ...] | None = None
     networks: int | None = None
     command_unit: str = ""
 
@@ -73,47 +69,44 @@ DEFAULT_SETTINGS = TrainingSettings()
 
 def train(
     recordings: RecordingsArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="TWIN.onnx", help="Twin to write.")],
-    model: Annotated[str, typer.Option(help="Kind of model: physical, narx, neural-ode or hybrid.")] = "hybrid",
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="TWIN.onnx", help="Twin to write; a folder for several models.")
+    ],
+    model: Annotated[
+        str,
+        typer.Option(
+            help="Kind of model: physical, narx, neural-ode, hybrid, or hybrid-w, whose network sees no command. "
+            "Several with commas, or all: they are trained side by side."
+        ),
+    ] = DEFAULT_SETTINGS.model,
+    type_twin: Annotated[
+        Path | None,
+        typer.Option(
+            "--type", metavar="TYPE.onnx", help="A hybrid twin of other fans of the type, whose network is kept."
+        ),
+    ] = None,
     validate: ValidateOption = None,
+    test: TestOption = None,
     from_s: FromOption = 0.0,
     to_s: ToOption = math.inf,
-    validate_from_s: ValidateFromOption = 0.0,
-    validate_to_s: ValidateToOption = math.inf,
     tray: TrayOption = None,
     fans: FansOption = None,
     window_s: WindowOption = None,
     ignore: IgnoreOption = None,
     name: Annotated[str | None, typer.Option(help="Name of the twin. Default: the name of the file.")] = None,
     seed: Annotated[int, typer.Option(help="The same seed and recordings give the same twin.")] = 0,
-    trainer: Annotated[Trainer, typer.Option(help="adam, the published one, needs PyTorch.")] = "levenberg-marquardt",
     iterations: Annotated[
-        int | None, typer.Option(min=1, help="Maximum iterations of each network. Default: depends on the trainer.")
+        int | None, typer.Option(min=1, help="Maximum iterations of each network. Default: depends on the model.")
     ] = None,
-    network_inputs: Annotated[
-        NetworkInputs, typer.Option(help="Inputs of the network (hybrid, neural ODE).")
-    ] = "speed,command",
-    physics: Annotated[
-        Physics, typer.Option(help="Hybrid: physics refined with the network, or fixed as identified.")
-    ] = "refined",
     networks: Annotated[
         int | None,
         typer.Option(
             help="Networks to train and average (hybrid, neural ODE). Default: "
-            f"{NETWORKS}, and 1 where they cannot be averaged."
+            f"{NETWORKS}, and 1 where they cannot be averaged or several models are compared."
         ),
     ] = None,
     command_unit: Annotated[str, typer.Option(help="Unit of the command, for the card, e.g. %.")] = "",
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            "--jobs",
-            "-j",
-            min=1,
-            help="Recordings to read, and networks to train, at a time. Default: one for each core.",
-        ),
-    ] = None,
-    scheduler: SchedulerOption = None,
+    jobs: JobsOption = None,
     skip_bad: SkipBadOption = False,
     json_output: JsonOption = False,
 ) -> None:
@@ -122,34 +115,53 @@ def train(
     The width of the band is the free-run error over --validate. Without --validate it is the error over the training
     data, which is too optimistic.
 
+    With several models, the best has the smallest free-run error over --test; without it, over --validate.
+
+    With --type, a twin of more fans of a type is made from a few minutes of each, in seconds: what the fans did not
+    show of their own physics is taken as typical of the type, and the band is as wide as that requires. A fan that is
+    not of the type, or has a fault, is named in a warning.
+
     Ctrl-C ends training without a twin, with exit code 130.
 
-    Example: fantwin train healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap --model hybrid -o TWIN.onnx
+    Example: fantwin train healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap -o TWIN.onnx
+
+    Example: fantwin train healthy.mcap --validate other.mcap --test third.mcap --model all -o twins
+
+    Example: fantwin train new-tray.mcap --type type.onnx -o new-tray.onnx
     """
-    if trainer == "adam":
-        require_torch("--trainer adam")
+    given = TrainingSettings(model, seed, iterations, None, networks, command_unit)
+    part = Part(tray, fans, from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
+    if type_twin and (given != DEFAULT_SETTINGS or window_s or ignore):
+        raise UsageError("--type keeps the network of the type: leave out the options of a model and of its training")
     not_written = "no twin was written; --iterations N ends after N iterations of each network and writes one"
-    pool = RecordingsInParallel(jobs, scheduler, skip_bad)
-    with interruptible(not_written), twin_errors():
+    pool = RecordingsInParallel(jobs, skip_bad)
+    with interruptible("no twin was written" if type_twin else not_written), twin_errors():
+        chosen = _chosen(model)
+        if len(chosen) > 1:
+            data = partial(_read, recordings, validate, test, part, pool)
+            train_side_by_side(chosen, data, given, output, pool, json_output=json_output)
+            return
+        if test:
+            raise UsageError("--test is for several models; `fantwin evaluate` judges one: fantwin evaluate TWIN.onnx")
+        if type_twin:
+            from fantwin.twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415  loads twin only when it is needed
+
+            OnnxTwin(type_twin)  # what is no twin is said before recordings are read
         check_writable(output, ".onnx")
-        part = Part(tray, fans, from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
-        validation_part = replace(part, from_s=validate_from_s, to_s=validate_to_s)
-        with pool:
-            training_data = read_training_data(recordings, part, pool)
-            held_out = read_held_out(training_data, validate, validation_part, pool) if validate else None
-        if not json_output:
+        training_data, held_out, _ = _read(recordings, validate, None, part, pool)
+        if not (json_output or type_twin):
             show_hints(training_data.hints)
-        with training_progress(training_data) as start, NetworksInParallel(jobs) as each_network:
-            trained = fit_twin(
-                training_data,
-                held_out,
-                name or output.stem,
-                TrainingSettings(model, seed, trainer, iterations, network_inputs, physics, networks, command_unit),
-                start(""),
-                each_network,
-            )
+        settings = replace(given, model=chosen[0].kind, network_inputs=chosen[0].network_inputs)
+        named = name or output.stem
+        with training_progress(training_data) as start, NetworksInParallel(pool.jobs) as each_network:
+            if type_twin:
+                trained = _place(type_twin, training_data, held_out, named, start(""))
+            else:
+                trained = fit_twin(training_data, held_out, named, settings, start(""), each_network)
         trained.save(output)
     result = as_json(trained, training_data, output)
+    if type_twin:
+        result |= {"of_type": trained.card.training.of_type}
     if json_output:
         typer.echo(json.dumps(result | pool.as_json()))
     else:
@@ -157,9 +169,52 @@ def train(
     pool.end()
 
 
+def _read(
+    recordings: Sequence[Path],
+    validate: Sequence[Path] | None,
+    test: Sequence[Path] | None,
+    part: Part,
+    pool: RecordingsInParallel,
+) -> Data:
+    """The data of training, of validation and of a test of several models."""
+    with pool:
+        training_data = read_training_data(recordings, part, pool)
+        others = [read_held_out(training_data, paths, part, pool) if paths else None for paths in (validate, test)]
+    return training_data, others[0], others[1]
+
+
+def _chosen(names: str) -> list[Candidate]:
+    from fantwin.twin.comparison import all_candidates  # noqa: PLC0415  loads twin only when it is needed
+
+    by_name = {candidate.name: candidate for candidate in all_candidates()}
+    wanted = list(by_name) if names == "all" else [name.strip() for name in names.split(",")]
+    for name in wanted:
+        if name not in by_name:
+            raise UsageError(f"--model {name}: no such model; known: {', '.join(by_name)}, all")
+    return [by_name[name] for name in dict.fromkeys(wanted)]
+
+
+def _place(
+    type_twin: Path, training_data: TrainingData, held_out: TrainingData | None, name: str, progress: Progress
+) -> TrainedTwin:
+    from fantwin.twin.placing import place_twin  # noqa: PLC0415  loads twin only when it is needed
+
+    return place_twin(
+        type_twin,
+        training_data.runs,
+        held_out.runs if held_out else [],
+        name=name,
+        fan_numbers=training_data.fans,
+        data=data_cards(training_data),
+        validation_data=data_cards(held_out) if held_out else (),
+        progress=progress,
+    )
+
+
 def _print(result: dict[str, Any], training_data: TrainingData, conditions: ReferenceConditions | None) -> None:
     networks = f"{result['network_parameters']} network parameters"
-    typer.echo(f"{result['twin']}: {result['model']} of {result['fans']} fan(s), {networks}")
+    of = f"the type of {result['of_type']}" if "of_type" in result else networks
+    typer.echo(f"{result['twin']}: {result['model']} of {result['fans']} fan(s), {of}")
     typer.echo(f"  {result['evaluated_on']} data, {sentence(result, training_data.speed_unit)}")
     typer.echo(f"  {balance_sentence(result)}")
     if conditions:
@@ -184,21 +239,19 @@ def fit_twin(
         TwinError: the data do not suffice.
     """
     from fantwin.twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
-    from fantwin.twin.kinds import find_kind  # noqa: PLC0415
+    from fantwin.twin.kinds import BOTH_INPUTS, find_kind  # noqa: PLC0415
     from fantwin.twin.networks import one_after_another  # noqa: PLC0415
     from fantwin.twin.progress import unreported  # noqa: PLC0415
 
-    can_average = find_kind(settings.model).averages_networks and settings.trainer == "levenberg-marquardt"
+    can_average = find_kind(settings.model).averages_networks
     return train_twin(
         training_data.runs,
         held_out.runs if held_out else [],
         settings.model,
         name=name,
         seed=settings.seed,
-        trainer=settings.trainer,
         max_iterations=settings.iterations,
-        network_inputs=tuple(settings.network_inputs.split(",")),
-        physics=settings.physics,
+        network_inputs=settings.network_inputs or BOTH_INPUTS,
         networks=settings.networks if settings.networks is not None else NETWORKS if can_average else 1,
         each_network=each_network or one_after_another,
         command_unit=settings.command_unit,

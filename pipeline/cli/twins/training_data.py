@@ -65,12 +65,20 @@ ValidateOption: TypeAlias = Annotated[
     typer.Option(
         parser=recording_path,
         callback=matching,
-        metavar="REC.mcap",
-        help="Held-out healthy recording: evaluated, not fitted. Repeatable.",
+        metavar="REC.mcap...",
+        help="Held-out healthy recordings: evaluated, not fitted. Of one that is also trained on, what --to, or else "
+        "--from, leaves out.",
     ),
 ]
-ValidateFromOption: TypeAlias = Annotated[float, typer.Option("--validate-from", help="Like --from, for --validate.")]
-ValidateToOption: TypeAlias = Annotated[float, typer.Option("--validate-to", help="Like --to, for --validate.")]
+TestOption: TypeAlias = Annotated[
+    list[Path] | None,
+    typer.Option(
+        parser=recording_path,
+        callback=matching,
+        metavar="REC.mcap...",
+        help="Several models: healthy recordings that decide which is the best, and take no part in training.",
+    ),
+]
 FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans, counted from 0, e.g. 0,2.")]
 
 TACHO_ADVICE = "see `tacho` in [[tray]], or --window for recordings that do not say"
@@ -312,12 +320,17 @@ def data_cards(data: TrainingData) -> list[DataCard]:
 def read_held_out(
     training_data: TrainingData, recordings: Sequence[Path], part: Part, pool: RecordingsInParallel
 ) -> TrainingData:
-    """Recordings for evaluation, which take no part in the fit.
+    """Recordings for evaluation, which take no part in the fit; of one that is fitted in part, the rest.
+
+    part: of the training data.
 
     Raises:
         UserError: they cannot be used, are in another unit, or overlap the training data.
     """
-    held_out = read_training_data(recordings, part, pool)
+    trained_on = frozenset(source.path for source in training_data.sources)
+    read = partial(_read_held_out, part=part, trained_on=trained_on)
+    held_out = joined(list(pool.map(read, recordings, "reading")))
+    report_damage(held_out)
     if held_out.speed_unit != training_data.speed_unit:
         raise UserError(
             f"{recordings[0]}: speeds in {held_out.speed_unit}, the training data are in {training_data.speed_unit}: "
@@ -327,9 +340,17 @@ def read_held_out(
         for other in training_data.sources:
             if own.path == other.path and own.first_s <= other.last_s and other.first_s <= own.last_s:
                 raise UserError(
-                    f"{own.path}: overlaps the training data; give another recording, or other seconds of it"
+                    f"{own.path}: overlaps the training data; give another recording, or train on a part with --to"
                 )
     return held_out
+
+
+def _read_held_out(path: Path, part: Part, trained_on: frozenset[Path]) -> TrainingData:
+    whole = replace(part, from_s=0.0, to_s=math.inf)
+    if path not in trained_on:
+        return read_recording_data(path, whole)
+    rest = replace(whole, from_s=part.to_s) if part.to_s < math.inf else replace(whole, to_s=part.from_s or math.inf)
+    return read_recording_data(path, rest)
 
 
 def check_writable(output: Path, suffix: str) -> None:

@@ -66,7 +66,7 @@ class Commands:
     def check(self, *words: object) -> None:
         """Run a command that prints what it finds; if it fails, that is the reason, and goes to standard error.
 
-        Raises as `up --only`.
+        Raises as `run`.
         """
         with TemporaryFile("w+", encoding="utf-8") as findings:
             failed = True

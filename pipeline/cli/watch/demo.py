@@ -36,6 +36,8 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.diagnosis.shown_causes import short_name
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
+SEED = 7
+"""of the commands and the noise of the tray"""
 DURATION_S = 36.0
 FAULTS = (
     ("inlet", "fan=2,start=8,stop=14,size=1.8"),
@@ -65,7 +67,6 @@ _STOP_TIMEOUT_S = 60.0
 
 def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the files it writes.")] = Path("runs/demo"),
-    seed: Annotated[int, typer.Option(help="Seed of the simulated tray's commands and noise.")] = 7,
     json_output: JsonOption = False,
 ) -> None:
     """Run a simulated tray of eight fans through the whole pipeline; cover one inlet, disturb one rotor.
@@ -89,7 +90,7 @@ def demo(
     for line in here.left_out:
         console.print(line, markup=False, soft_wrap=True)
     started_s = time.monotonic()
-    lost = _run(config, overrides, out, seed, console)
+    lost = _run(config, overrides, out, console)
     summary = summarise(out / "truth.json", sorted(out.glob("recording*.mcap")), lost)
     _draw(out, console)
     (out / "summary.json").write_text(summary.to_json() + "\n", encoding="utf-8")
@@ -113,7 +114,7 @@ def _clear(out: Path) -> None:
         ) from error
 
 
-def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Console) -> dict[str, int]:
+def _run(config: Config, overrides: list[str], out: Path, console: Console) -> dict[str, int]:
     """Run tray and pipeline to the end of the schedule; returns the losses that each stage reports, without zeros.
 
     Raises:
@@ -124,8 +125,8 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
     tray = config.trays[0]
     page = DemoPage(config, out, SHOWN_FAN)
     simulate = [
-        *("simulate", "--fans", str(tray.fans), "--profile", "manual", "--seed", str(seed)),
-        *("--duration", str(DURATION_S), "--speed-unit", tray.speed_unit, "--link", str(out / "tray")),
+        *("simulate", "--fans", str(tray.fans), "--profile", "manual", "--seed", str(SEED)),
+        *("--duration", str(DURATION_S), "--set", f"speed_unit={tray.speed_unit}", "--link", str(out / "tray")),
         *("--truth", str(out / "truth.json"), "--wait-for-reader"),
     ]
     for kind, settings in FAULTS:

@@ -40,7 +40,7 @@ class TableDevice:
         if not rows.any():
             raise UserError(
                 f"{table.path}: no row from {from_s:g} s to {to_s:g} s; the table is {table.duration_s:g} s long; "
-                "see --from and --to"
+                "see from_s and to_s"
             )
         t_ns = table.t_ns[rows]
         self._t_s = (t_ns - t_ns[0]) / NS_PER_S

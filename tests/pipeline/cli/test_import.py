@@ -59,7 +59,10 @@ def test_columns_beside_command_and_speed_go_into_the_recording_and_out_into_tab
     rows = [f"{k / 100},{0.5},{100 + k},{99 + k},{12 - k / 1000},{11.5},{'' if k % 2 else 21.5}" for k in range(40)]
     path.write_text("\n".join(["t,u,y1,y2,v1,v2,air", *rows, rows[-1]]) + "\n")
     recording = tmp_path / "r.mcap"
-    given = ("--supply-voltage", "v1", "--supply-voltage", "v2", "--temperature", "air")
+    given = (
+        *("--channel", "supply_voltage_v=v1", "--channel", "supply_voltage_v=v2"),
+        *("--channel", "temperature_c=air"),
+    )
     arguments = ("--time", "t", "--command", "u", "--speed", "y1", "--speed", "y2")
     summary = json.loads(fantwin("import", path, *arguments, *given, "-o", recording, "--json").stdout)
     assert summary["columns"] == ["supply_voltage_v", "temperature_c"]
@@ -77,7 +80,7 @@ def test_columns_beside_command_and_speed_go_into_the_recording_and_out_into_tab
     np.testing.assert_array_equal(np.isnan(table["temperature_c"]), np.repeat(k % 2 == 1, 2))
     assert np.isnan(table["current_a"]).all()
     assert "give one for all fans" in error_of(
-        "import", path, *arguments, *(("--current", "v1") * 3), "-o", tmp_path / "x.mcap"
+        "import", path, *arguments, *(("--channel", "current_a=v1") * 3), "-o", tmp_path / "x.mcap"
     )
 
 
@@ -128,7 +131,7 @@ def test_the_recording_has_unit_source_and_tray_in_its_metadata_and_is_the_same_
 def test_the_tachos_are_in_the_recording_and_in_the_configuration_made_for_it(tmp_path):
     path, _ = measured(tmp_path)
     recording = tmp_path / "r.mcap"
-    tachos = ("--tacho", "count", "--window", "1", "--window", "0.5", "--update", "0.25")
+    tachos = ("--tacho", "count:window_s=1,update_s=0.25", "--tacho", "count:window_s=0.5,update_s=0.25")
     assert fantwin("import", path, *ARGUMENTS, *tachos, "-o", recording).exit_code == 0
     expected = tuple(Tacho(kind="count", window_s=window_s, update_s=0.25) for window_s in (1.0, 0.5))
     assert read_runs(recording).tacho == expected
@@ -139,7 +142,7 @@ def test_the_tachos_are_in_the_recording_and_in_the_configuration_made_for_it(tm
     assert config.tray("tray1").tacho == expected
     for wrong, words in (
         (("--tacho", "count"), "needs window_s"),
-        (("--tacho", "count", *["--window", "1"] * 3), "3 tachos for 2 fans"),
+        ((*["--tacho", "count:window_s=1"] * 3,), "3 tachos for 2 fans"),
     ):
         assert words in error_of("import", path, *ARGUMENTS, *wrong, "-o", tmp_path / "wrong.mcap")
 
@@ -152,7 +155,7 @@ def test_speeds_that_look_counted_are_pointed_out_unless_they_are_declared_so(tm
     arguments = ("import", path, "--time", "t:s", "--command", "u", "--speed", "y:rpm", "-o", tmp_path / "r.mcap")
     result = fantwin(*arguments)
     assert "hint: fan 0: readings are multiples of 30 rpm and change every 1.00 s: a count over 1 s" in result.stderr
-    declared = fantwin(*arguments, "--tacho", "count", "--window", "1", "--force")
+    declared = fantwin(*arguments, "--tacho", "count:window_s=1", "--force")
     assert "hint" not in declared.stderr
 
 

@@ -78,7 +78,7 @@ def test_ulog_with_commands_held_at_the_times_of_the_readings(tmp_path: Path) ->
     expected = np.interp(np.minimum(held_us, 3_997_000) / 1e6, T_S, COMMANDS[:, 0])
     np.testing.assert_allclose(command, np.column_stack([expected] * 2), rtol=1e-6)
     assert read_runs(recording).speed_unit == "rpm"
-    volts = ("--supply-voltage", "esc_status.esc[*].esc_voltage", "--force")
+    volts = ("--channel", "supply_voltage_v=esc_status.esc[*].esc_voltage", "--force")
     assert fantwin("import", tmp_path / "flight.ulg", *words, *volts, "-o", recording).exit_code == 0
     (first, *_) = [entry.message for entry in read_recording(recording)]
     assert isinstance(first, Raw)
@@ -91,7 +91,7 @@ def test_blackbox_with_electrical_speeds_and_the_tacho_that_is_declared(tmp_path
     words = ("--command", "motor[*]", "--speed", "eRPM[*]:erpm", "-o", recording)
     assert "give the magnetic poles of the motor, for example --poles 14" in error_of("import", path, *words)
     assert "poles come in pairs" in usage_error_of("import", path, *words, "--poles", "13")
-    result = fantwin("import", path, *words, "--poles", 14, "--tacho", "count", "--window", "0.02")
+    result = fantwin("import", path, *words, "--poles", 14, "--tacho", "count:window_s=0.02")
     assert "log 1 of 2 in the file; --log chooses another" in result.stdout
     _, command, speed = samples(recording)
     np.testing.assert_array_equal(command, np.floor(1000 + 1000 * COMMANDS))

@@ -161,7 +161,7 @@ def test_a_truncated_file_is_reported_and_one_that_lacks_only_its_index_has_lost
     path.write_bytes(content[:40_000])
     (found,) = shown(path, exit_code=3)["files"]
     assert found["damage"][0] == "it is truncated, as after a crash"
-    assert "it is truncated, as after a crash; repair it with `fantwin recover`" in fantwin("info", path).stdout
+    assert "it is truncated, as after a crash; repair it with `fantwin info --repair`" in fantwin("info", path).stdout
 
 
 def test_a_file_that_is_still_being_written_is_shown_up_to_what_is_on_disk(tmp_path):

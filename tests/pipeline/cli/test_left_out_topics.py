@@ -78,7 +78,7 @@ def test_a_difference_is_exit_code_1(lean, tmp_path):
 def test_a_plot_makes_the_scores_again_and_shows_the_same(lean, whole, tmp_path):
     pictures = [tmp_path / name for name in ("lean.svg", "whole.svg")]
     for path, picture in zip((lean, whole), pictures, strict=True):
-        assert fantwin("plot", path, "--fans", "0,1,2", "-o", picture).exit_code == 0
+        assert fantwin("view", path, "--fans", "0,1,2", "-o", picture).exit_code == 0
     paths = [re.findall(r'<path d="[^"]{200,}"', picture.read_text()) for picture in pictures]
     assert len(paths[0]) > 3 and paths[0] == paths[1], "the curves"
 
@@ -100,7 +100,7 @@ def test_what_a_view_and_a_plot_lack_is_told_as_by_a_replay(lean, tmp_path, monk
     replayed = fantwin("replay", "--offline", "--json", damaged)
     found = json.loads(replayed.stdout)
     assert replayed.exit_code == 3 and found["lost"] and found["damage"]
-    for command, output in (("view", tmp_path / "v.rrd"), ("plot", tmp_path / "p.svg")):
+    for command, output in (("view", tmp_path / "v.rrd"), ("view", tmp_path / "p.svg")):
         done = fantwin(command, damaged, "-o", output, "--json")
         damage = json.loads(done.stdout)["damage"]
         assert damage == [*found["damage"], f"{damaged}: {found['lost']} samples and messages lost"]
@@ -111,7 +111,7 @@ def test_what_a_view_and_a_plot_lack_is_told_as_by_a_replay(lean, tmp_path, monk
 def test_a_plot_tells_of_damage_where_scores_were_recorded(whole, tmp_path):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole.read_bytes()[:-40_000])
-    done = fantwin("plot", cut, "-o", tmp_path / "p.svg")
+    done = fantwin("view", cut, "-o", tmp_path / "p.svg")
     assert (done.exit_code, str(cut) in done.stderr) == (3, True), done.output
 
 
@@ -131,7 +131,7 @@ def test_topics_that_are_not_there_cannot_be_replayed(lean):
 
 
 def test_without_raw_samples_there_is_nothing_to_make_the_rest_of(without_raw, whole):
-    for words in (("replay", "--offline"), ("identify",), ("evaluate", whole.with_name("twin.onnx"))):
+    for words in (("replay", "--offline"), ("report",), ("evaluate", whole.with_name("twin.onnx"))):
         assert error_of(*words, without_raw) == (
             f"{without_raw}: no raw samples in this recording: its recorder left out raw (recorder.topics), and "
             "without raw nothing can be made again"

@@ -103,8 +103,8 @@ def test_a_command_imports_nothing_that_only_watching_and_judging_need() -> None
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        ("plot none.mcap", 1, "fantwin: none.mcap: cannot read the recording: No such file or directory"),
-        ("plott", 2, "No such command 'plott'"),
+        ("view none.mcap", 1, "fantwin: none.mcap: cannot read the recording: No such file or directory"),
+        ("vieww", 2, "No such command 'vieww'"),
     ],
 )
 def test_a_mistake_in_a_process_of_its_own_is_an_exit_code_and_no_traceback(words: str, code: int, said: str) -> None:

@@ -51,7 +51,7 @@ def words_of(command: str, folder: Path, recordings: Sequence[Path | str], outpu
     """The words of a command, which writes into the folder `output` if it writes anything."""
     twin, rate = folder / "twin.onnx", ("--false-alarms-per-day", 1500, "--extrapolate")
     words: dict[str, Sequence[object]] = {
-        "identify": recordings,
+        "report": recordings,
         "train": (*recordings, "--model", "physical", "-o", output / "trained.onnx"),
         "calibrate": (twin, *recordings, *rate, "-o", output / "calibrated.onnx"),
         "replay": ("--offline", *recordings, "--twin", twin, "-o", output),
@@ -141,8 +141,8 @@ def test_a_bad_recording_stops_all_before_anything_is_written_or_is_skipped_and_
 def test_the_error_of_another_process_is_that_of_one_and_of_several_the_first_argument_s(folder: Path) -> None:
     bad = [folder / "none.mcap", folder / BAD]
     expected = f"{folder / 'none.mcap'}: cannot read the recording: No such file or directory"
-    assert error_of("identify", folder / "a.mcap", *bad, "--jobs", 2) == expected
-    assert error_of("identify", *bad, "--jobs", 1, "--skip-bad") == expected, "where none is left, that is an error"
+    assert error_of("report", folder / "a.mcap", *bad, "--jobs", 2) == expected
+    assert error_of("report", *bad, "--jobs", 1, "--skip-bad") == expected, "where none is left, that is an error"
 
 
 def test_a_recording_of_which_nothing_can_be_scored_is_bad_and_leaves_no_output(folder: Path, tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_ctrl_c_ends_all_processes_with_one_line(tmp_path: Path) -> None:
     for pipe in pipes:
         os.mkfifo(pipe)
     command = subprocess.Popen(
-        [sys.executable, "-m", "fantwin", "identify", *map(str, pipes), "--jobs", "2"],
+        [sys.executable, "-m", "fantwin", "report", *map(str, pipes), "--jobs", "2"],
         stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     ends = [os.open(pipe, os.O_WRONLY) for pipe in pipes]  # returns when a worker has opened it
@@ -236,7 +236,7 @@ def test_a_command_that_is_ended_while_it_fetches_a_recording_leaves_no_copy(tmp
         threading.Thread(target=server.serve_forever, daemon=True).start()
         urls = [f"http://127.0.0.1:{server.server_port}/{name}" for name in RECORDINGS[:2]]
         command = subprocess.Popen(
-            [sys.executable, "-m", "fantwin", "identify", *urls, "--jobs", "2"],
+            [sys.executable, "-m", "fantwin", "report", *urls, "--jobs", "2"],
             stderr=subprocess.PIPE, text=True, env=os.environ | {"TMPDIR": str(temporary)},
         )  # fmt: skip
         assert begun.acquire(timeout=DEADLINE_S) and begun.acquire(timeout=DEADLINE_S)

@@ -29,15 +29,15 @@ def cluster_of(workers: int) -> Any:
 
 def test_two_workers_give_what_one_process_gives(folder: Path, tmp_path: Path) -> None:
     with cluster_of(2) as cluster:
-        scheduler = "--scheduler", cluster.scheduler_address
+        scheduler = "--jobs", cluster.scheduler_address
         alone, there = tmp_path / "alone", tmp_path / "there"
         expected = outcome_of(run_all("replay", folder, RECORDINGS, alone, "--jobs", 1), alone)
         result = run_all("replay", folder, RECORDINGS, there, *scheduler)
         assert result.exit_code == 0, result.output
         assert outcome_of(result, there) == expected
         bad = folder / "bad.mcap"
-        assert error_of("identify", bad, folder / "a.mcap", *scheduler) == error_of("identify", bad, "--jobs", 1)
-        result = run_all("identify", folder, ("a.mcap", "bad.mcap"), tmp_path / "skipped", *scheduler, "--skip-bad")
+        assert error_of("report", bad, folder / "a.mcap", *scheduler) == error_of("report", bad, "--jobs", 1)
+        result = run_all("report", folder, ("a.mcap", "bad.mcap"), tmp_path / "skipped", *scheduler, "--skip-bad")
         (skipped,) = json.loads(result.stdout)["skipped"]
         assert (result.exit_code, skipped["recording"]) == (4, str(bad))
 
@@ -52,7 +52,7 @@ def test_a_worker_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),
         cluster_of(1) as cluster,
-        RecordingsInParallel(scheduler=cluster.scheduler_address) as pool,
+        RecordingsInParallel(jobs=cluster.scheduler_address) as pool,
         pytest.raises(UserError, match=f"ended from outside, .*: see {cluster.scheduler_address}"),
     ):
         list(pool.map(end_itself, paths, "reading"))
@@ -60,5 +60,5 @@ def test_a_worker_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
 
 def test_no_scheduler_there_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fantwin.pipeline.cli.recordings_in_parallel.CONNECT_S", 0.2)
-    error = error_of("identify", folder / "a.mcap", "--scheduler", "tcp://127.0.0.1:1")
-    assert error == "--scheduler tcp://127.0.0.1:1: no Dask scheduler answers there"
+    error = error_of("report", folder / "a.mcap", "--jobs", "tcp://127.0.0.1:1")
+    assert error == "--jobs tcp://127.0.0.1:1: no Dask scheduler answers there"

@@ -98,7 +98,9 @@ def test_a_reader_gets_every_sample_of_the_tray_that_a_recording_holds_and_the_t
     tmp_path: Path,
 ) -> None:
     recording = tmp_path / "same.mcap"
-    simulate(recording=recording, duration=2.0, seed=9, epoch_ns=0, fault=["inlet:fan=1,start=0.5,stop=1"])
+    simulate(
+        recording=recording, duration=2.0, seed=9, overrides=["epoch_ns=0"], fault=["inlet:fan=1,start=0.5,stop=1"]
+    )
     options = ("--duration", "2", "--seed", "9", "--wait-for-reader", "--fault", "inlet:fan=1,start=0.5,stop=1")
     with simulated(tmp_path, *options) as process:
         opened_ns = time.time_ns()
@@ -126,7 +128,7 @@ def test_a_reader_gets_every_sample_of_the_tray_that_a_recording_holds_and_the_t
 
 
 def test_simulated_losses_are_gaps_in_the_sequence(tmp_path: Path) -> None:
-    options = ("--duration", "1", "--lost", "0.2", "--protocol", "text", "--wait-for-reader")
+    options = ("--duration", "1", "--set", "lost=0.2", "--set", "protocol=text", "--wait-for-reader")
     with simulated(tmp_path, *options) as process:
         reader = Reader(tmp_path / "tray", "text")
         reader.read_all()
@@ -186,7 +188,8 @@ def test_unread_samples_are_counted_and_a_later_reader_sees_the_gap(tmp_path: Pa
 
 
 def test_commands_and_set_points_show_in_the_samples(tmp_path: Path) -> None:
-    with simulated(tmp_path, "--fans", "2", "--wait-for-reader", "--speed-unit", "rpm", "--noise", "0") as process:
+    silent = ("--set", "speed_unit=rpm", "--set", "noise_rad_s=0")
+    with simulated(tmp_path, "--fans", "2", "--wait-for-reader", *silent) as process:
         reader = Reader(tmp_path / "tray", fans=2)
         reader.read_until(1)
         reader.send(wire.CommandFrame((0.25, KEEP)))
@@ -351,8 +354,9 @@ def raw_of(path: Path) -> list[Raw]:
 def test_a_recording_holds_the_tray_and_the_same_seed_and_epoch_give_the_same_bytes(tmp_path: Path) -> None:
     one, two, other = (tmp_path / name for name in ("one.mcap", "two.mcap", "other.mcap"))
     for path, seed in ((one, 3), (two, 3), (other, 4)):
-        options = {"duration": 3.05, "lost": 0.1, "fans": 2, "fault": ["inlet:fan=1,start=1,stop=2"]}
-        simulate(recording=path, seed=seed, epoch_ns=10**18, truth=tmp_path / "truth.json", **options)
+        options = {"duration": 3.05, "fans": 2, "fault": ["inlet:fan=1,start=1,stop=2"]}
+        overrides = ["lost=0.1", f"epoch_ns={10**18}"]
+        simulate(recording=path, seed=seed, overrides=overrides, truth=tmp_path / "truth.json", **options)
     with pytest.raises(UserError, match="exists; name another file"):
         simulate(recording=one, duration=1.0)
     assert one.read_bytes() == two.read_bytes()
@@ -370,10 +374,12 @@ def test_a_recording_holds_the_tray_and_the_same_seed_and_epoch_give_the_same_by
 
 def test_a_rack_of_4_pin_fans_is_recorded_with_counts_of_its_window(tmp_path: Path) -> None:
     recording, truth = tmp_path / "rack.mcap", tmp_path / "truth.json"
-    rack = {"fan": "4-pin", "fans": 4, "tacho": "count", "rate": 10.0, "profile": "thermostat"}
     windows = [1.0, 1.0, 0.5, 0.5]
-    faults = ["blocked:fan=1,start=30"]
-    simulate(recording=recording, truth=truth, duration=60.0, window=windows, missing=0.05, fault=faults, **rack)
+    tachos = "".join(f'[[tacho]]\nkind = "count"\nwindow_s = {window_s}\n' for window_s in windows)
+    scenario = tmp_path / "rack.toml"
+    rack = 'fan = "4-pin"\nfans = 4\nrate_hz = 10\nprofile = "thermostat"\nmissing_readings = 0.05\n'
+    scenario.write_text(rack + tachos, encoding="utf-8")
+    simulate(scenario, recording=recording, truth=truth, duration=60.0, fault=["blocked:fan=1,start=30"])
     messages = raw_of(recording)
     speed = np.concatenate([raw.speed_rad_s for raw in messages])
     counts = speed * 2 * np.array(windows) / (2 * np.pi)
@@ -400,9 +406,10 @@ TABLE = """t ms,duty,rpm,rpm2
 
 def test_a_measured_file_is_played_with_its_recorded_times_and_units(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text(TABLE)
-    columns = ("--time", "t ms:ms", "--command", "duty", "--speed", "rpm:rpm", "--speed", "rpm2:rpm")
-    options = ("--from-csv", str(tmp_path / "run.csv"), *columns, "--to", "1", "--speed-unit", "rpm")
-    with simulated(tmp_path, *options, "--wait-for-reader") as process:
+    scenario = tmp_path / "played.toml"
+    columns = 'time = "t ms:ms"\ncommand = ["duty"]\nspeed = ["rpm:rpm", "rpm2:rpm"]\n'
+    scenario.write_text(f'speed_unit = "rpm"\n[file]\npath = "run.csv"\nto_s = 1\n{columns}', encoding="utf-8")
+    with simulated(tmp_path, str(scenario), "--wait-for-reader") as process:
         reader = Reader(tmp_path / "tray", fans=2)
         reader.read_all()
         assert process.wait(10.0) == 0

@@ -61,7 +61,7 @@ def test_wildcards_stand_for_what_is_there_in_order(at_url: str, tmp_path: Path)
     "url", ["ftp://me:pass@host/a.mcap", "https://pass@host/a.mcap", "https://host/a.mcap?signature=pass"]
 )
 def test_a_url_with_a_secret_is_refused_without_showing_it(url: str) -> None:
-    error = error_of("identify", url)
+    error = error_of("report", url)
     assert "may hold no password" in error and "pass@" not in error and "signature" not in error
 
 
@@ -91,8 +91,8 @@ def test_a_command_works_on_recordings_in_s3_as_on_files(store: str, tmp_path: P
     for seed, name in enumerate(names, start=1):
         write_run(tmp_path / name, published_run(seed, 10.0))
         pipes.put(str(tmp_path / name), f"fleet/{name}")
-    of_files = fantwin("identify", *(tmp_path / name for name in names), "--json", "--jobs", 1)
-    in_store = fantwin("identify", f"{store}/*.mcap", "--json", "--jobs", 2)
+    of_files = fantwin("report", *(tmp_path / name for name in names), "--json", "--jobs", 1)
+    in_store = fantwin("report", f"{store}/*.mcap", "--json", "--jobs", 2)
     assert (in_store.exit_code, in_store.stdout) == (0, of_files.stdout), in_store.output
-    error = error_of("identify", f"{store}/a.mcap", f"{store}/c.mcap", "--jobs", 1)
+    error = error_of("report", f"{store}/a.mcap", f"{store}/c.mcap", "--jobs", 1)
     assert error == f"{store}/c.mcap: cannot read the recording: there is no such file"

@@ -13,7 +13,7 @@ from matplotlib.colors import to_rgb
 from typer.testing import CliRunner
 
 from fantwin.pipeline.cli.main import app
-from fantwin.pipeline.cli.recordings.plot import plot
+from fantwin.pipeline.cli.recordings.view import view
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun import band_plot
 from fantwin.pipeline.outputs.rerun.band_plot import Fault, plot_bands, plot_recording, read_trace
@@ -115,10 +115,10 @@ def test_the_command_plots_a_recording_with_its_true_faults(tmp_path: Path) -> N
     recording = record(tmp_path / "rec.mcap", scores, alarms)
     truth = tmp_path / "truth.json"
     truth.write_text(json.dumps({"faults": [vars(FAULT)]}))
-    app.command("plot")(plot)
+    app.command("view")(view)
     app.command("other")(lambda: None)
     output = tmp_path / "bands.png"
-    arguments = ["plot", str(recording), "-o", str(output), "--truth", str(truth), "--json"]
+    arguments = ["view", str(recording), "-o", str(output), "--truth", str(truth), "--json"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     drawn = {"plot": str(output), "fans": [0, 2], "damage": []}

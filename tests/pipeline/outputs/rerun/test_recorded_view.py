@@ -13,6 +13,7 @@ import pytest
 from fantwin.pipeline.cli.options import ViewLayout
 from fantwin.pipeline.cli.recordings.view import view
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.outputs.rerun.view_of_site import ViewOptions
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.messages import Alarm, Message, Score
 from fantwin.schemas.topics import health_key, tray_key
@@ -23,6 +24,7 @@ from tests.support.score_data import START_NS, made_up_tray
 from tests.support.wear_data import worn_snapshot
 
 pytest.importorskip("rerun")
+recorded = pytest.importorskip("fantwin.pipeline.outputs.rerun.recorded_view")
 TOPICS = {"Score": "score", "Alarm": "alarm", "ModelCard": "twin", "Health": "health", "ScorerSnapshot": "snapshot"}
 HOLE_S = (4.0, 6.0)
 
@@ -115,17 +117,15 @@ def test_an_existing_view_is_kept_and_a_recording_without_scores_is_one_line(tmp
     assert not (tmp_path / "new.rrd").exists()
 
 
-def test_a_recording_of_a_fleet_shows_its_overview_and_has_a_plot_for_the_fan_in_alarm(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_of_a_fleet_shows_its_overview_and_has_a_plot_for_the_fan_in_alarm(tmp_path: Path) -> None:
     trays = {f"fans.{tray}": "3" for tray in TRAYS}
     with RecordingWriter(tmp_path / "fleet.mcap", {"trays": ",".join(TRAYS), **trays}, {}) as writer:
         for number, message in enumerate(messages_of()):
             header = replace(message.header, sequence=number)
             key = tray_key("site", message.header.tray, TOPICS[type(message).__name__])
             writer.add_message(key, replace(message, header=header), last_t_ns(message))
-    view([writer.path], tmp_path / "fleet.rrd", fleet_above=3, json_output=True)
-    assert json.loads(capsys.readouterr().out)["fans"] == 9
+    fleet = recorded.recorded_site([writer.path])
+    assert recorded.write_view(fleet, tmp_path / "fleet.rrd", ViewOptions(fleet_above=3)) == []
     rows = rows_of(tmp_path / "fleet.rrd")
     in_alarm = [(t_ns - START_NS) / 1e9 for t_ns, row in rows["/fleet/counts/in_alarm"] if row["Scalars:scalars"][0]]
     assert 8.5 <= in_alarm[0] <= 9.1 and 14.0 <= in_alarm[-1] <= 15.1

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fantwin.pipeline.cli.recordings.picture import picture
+from fantwin.pipeline.cli.recordings.view import view
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun.viewer_core import PAGE_PERIOD_NS
 from fantwin.stages.viewer import build
@@ -59,7 +59,7 @@ def test_the_command_writes_the_picture_and_lists_every_view_without_warnings(
     view_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "view.png"
-    picture(view_file, output, fans="0,1,2", json_output=True)
+    view([view_file], output, fans="0,1,2", json_output=True)
     document = json.loads(capsys.readouterr().out)
     assert document["picture"] == str(output)
     plots = [f"tray1 / fan {fan} {kind}" for fan in range(3) for kind in ("speed (rpm)", "torque balance", "score")]

@@ -1,4 +1,4 @@
-"""`fantwin compare`: every model is trained, judged by data it has not seen, and kept as it was judged."""
+"""`fantwin train` of several models: each is trained, judged by data it has not seen, and kept as it was judged."""
 
 import json
 from pathlib import Path
@@ -24,7 +24,9 @@ def folder(made_once: MadeOnce) -> Path:
         for seed, name in ((1, "healthy"), (2, "held-out"), (3, "untouched")):
             record(path / f"{name}.mcap", rough_run(seed, 12.0), unit="rpm")
         parts = ("--validate", path / "held-out.mcap", "--test", path / "untouched.mcap")
-        result = fantwin("compare", path / "healthy.mcap", *parts, "--iterations", 3, "-o", path / "twins", "--json")
+        result = fantwin(
+            "train", path / "healthy.mcap", *parts, "--model", "all", "--iterations", 3, "-o", path / "twins", "--json"
+        )
         assert result.exit_code == 0, result.output
         (path / "compared.json").write_text(result.stdout)
 
@@ -64,28 +66,27 @@ def test_a_saved_twin_gives_on_each_recording_the_figures_that_were_printed(fold
     assert trained_on["rmse"] == pytest.approx(models[-1]["training_rmse"], rel=1e-4)
 
 
-def test_the_untouched_recordings_take_no_part_in_training(folder, compared):
-    arguments = ("--validate", folder / "held-out.mcap", "--iterations", 3, "--model", "hybrid", "--json")
-    without = json.loads(fantwin("compare", folder / "healthy.mcap", *arguments).stdout)
-    assert (without["evaluated_on"], without["best"]) == ("held-out", "hybrid")
-    (alone,), (among,) = without["models"], [its for its in compared["models"] if its["model"] == "hybrid"]
+def test_the_untouched_recordings_take_no_part_in_training(folder, compared, tmp_path):
+    arguments = ("--validate", folder / "held-out.mcap", "--iterations", 3, "--model", "physical,hybrid", "--json")
+    without = json.loads(fantwin("train", folder / "healthy.mcap", *arguments, "-o", tmp_path).stdout)
+    assert without["evaluated_on"] == "held-out"
+    (alone,), (among,) = ([its for its in of["models"] if its["model"] == "hybrid"] for of in (without, compared))
     assert alone["figures"] == {"held-out": among["figures"]["held-out"]}
-    assert alone["twin"] is None
 
 
-def test_without_other_recordings_it_says_that_the_figures_are_too_optimistic(folder):
-    arguments = (folder / "healthy.mcap", "--model", "physical")
-    result = json.loads(fantwin("compare", *arguments, "--json").stdout)
-    (its,) = result["models"]
+def test_without_other_recordings_it_says_that_the_figures_are_too_optimistic(folder, tmp_path):
+    arguments = (folder / "healthy.mcap", "--model", "physical,hybrid-w", "--iterations", 1, "-o", tmp_path)
+    result = json.loads(fantwin("train", *arguments, "--json").stdout)
+    its, _ = result["models"]
     assert (result["evaluated_on"], list(its["figures"])) == ("training", ["training"])
     assert its["training_rmse"] == pytest.approx(its["figures"]["training"]["rmse"])
-    assert "the training recordings, which is too optimistic" in fantwin("compare", *arguments).stdout
+    assert "the training recordings, which is too optimistic" in fantwin("train", *arguments).stdout
 
 
-def test_the_table_fits_a_terminal_and_marks_the_best(folder):
+def test_the_table_fits_a_terminal_and_marks_the_best(folder, tmp_path):
     validate = ("--validate", folder / "held-out.mcap", "--test", folder / "untouched.mcap")
-    chosen = ("--model", "hybrid-w,physical,hybrid", "--iterations", 1)
-    lines = fantwin("compare", folder / "healthy.mcap", *validate, *chosen).stdout.splitlines()
+    chosen = ("--model", "hybrid-w,physical,hybrid", "--iterations", 1, "-o", tmp_path)
+    lines = fantwin("train", folder / "healthy.mcap", *validate, *chosen).stdout.splitlines()
     rows = [line for line in lines if line.strip().startswith(("hybrid", "physical"))]
     assert [row.split("  ")[0].strip(" *") for row in rows][1] == "physical"
     assert rows[0].strip().startswith("hybrid [w]")
@@ -95,14 +96,14 @@ def test_the_table_fits_a_terminal_and_marks_the_best(folder):
     assert "* best: smallest free-run rmse over the test recordings" in " ".join(lines)
 
 
-def test_a_model_that_cannot_be_trained_is_a_row_and_not_the_end(folder, monkeypatch):
+def test_a_model_that_cannot_be_trained_is_a_row_and_not_the_end(folder, tmp_path, monkeypatch):
     def train_or_diverge(runs, validation_runs, kind, **options):
         if kind == "narx":
             raise TwinError("the narx model diverges")
         return train_twin(runs, validation_runs, kind, **options)
 
     monkeypatch.setattr("fantwin.twin.comparison.train_twin", train_or_diverge)
-    arguments = ("compare", folder / "healthy.mcap", "--model", "narx,physical")
+    arguments = ("train", folder / "healthy.mcap", "--model", "narx,physical", "-o", tmp_path)
     result = json.loads(fantwin(*arguments, "--json").stdout)
     assert result["best"] == "physical"
     assert result["models"][0] == {"model": "narx", "title": "NARX", "invalid_reason": "the narx model diverges"}

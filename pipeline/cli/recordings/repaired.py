@@ -1,14 +1,13 @@
-"""`fantwin recover`: repairs a truncated or damaged recording."""
+"""`fantwin info --repair`: repairs a truncated or damaged recording."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.recordings.contents import losses, messages_as_text
 from fantwin.pipeline.recordings.dates import format_local
@@ -18,20 +17,14 @@ from fantwin.pipeline.recordings.scan import Scan
 from fantwin.pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 
 
-def recover(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording that is truncated or damaged.")],
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="FILE", help="The repaired recording; without it, the same name."),
-    ] = None,
-    json_output: JsonOption = False,
-) -> None:
-    """Repair a truncated or damaged recording, and list what it contains and what is missing.
+def repair(file: Path, output: Path | None, *, json_output: bool) -> None:
+    """Repair a truncated or damaged recording, and print what it contains and what is missing.
 
-    Without -o the repaired recording takes the name of FILE, which is kept as FILE.original. Exit code 0: nothing was
-    lost; 3: data were lost, or may have been; 1: nothing could be recovered.
+    output: without it the repaired recording takes the name of `file`, which is kept as `file`.original.
 
-    Example: fantwin recover runs/recording.mcap.active
+    Raises:
+        UserError: nothing can be recovered, or it cannot be written.
+        typer.Exit: data were lost, or may have been.
     """
     with working(f"reading {file}"):
         recovery = recover_file(file, output)

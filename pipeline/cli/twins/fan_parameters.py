@@ -1,9 +1,11 @@
-"""`fantwin identify`: the physical parameters of the fans in recordings."""
+"""`fantwin report` without a twin: the physical parameters of the fans in recordings."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -11,20 +13,11 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.progress import interruptible, training_progress
-from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.twins.training_data import (
-    FansOption,
-    FromOption,
-    IgnoreOption,
     Part,
-    RecordingsArgument,
-    ToOption,
     TrainingData,
-    TrayOption,
-    WindowOption,
-    ignored_columns,
     read_training_data,
     show_hints,
     twin_errors,
@@ -43,33 +36,20 @@ UNITS = {
 }
 
 
-def identify(
-    recordings: RecordingsArgument,
-    from_s: FromOption = 0.0,
-    to_s: ToOption = math.inf,
-    tray: TrayOption = None,
-    fans: FansOption = None,
-    window_s: WindowOption = None,
-    ignore: IgnoreOption = None,
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
-    skip_bad: SkipBadOption = False,
-    json_output: JsonOption = False,
-) -> None:
-    """Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.
+def show_fans(recordings: Sequence[Path], part: Part, pool: RecordingsInParallel, *, json_output: bool) -> None:
+    """Print J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.
 
     Each has a 95 % interval. w is in rad/s and the command in its own unit, and so are the parameters: only their
     ratios are mechanical quantities. Where supply voltage or temperature are recorded and the fans follow them, the
-    parameters hold at reference values of these. A warning on stderr names what the recordings do not determine, and
-    why.
+    parameters hold at reference values of these. A warning names what the recordings do not determine, and why.
 
-    Example: fantwin identify REC.mcap --json
+    Raises:
+        UserError: the recordings cannot be used.
+        typer.Exit: Ctrl-C, or recordings were skipped.
     """
-    pool = RecordingsInParallel(jobs, scheduler, skip_bad)
     with interruptible("nothing was identified"), twin_errors():
         from fantwin.twin.fitting.reference_choice import identify_at_reference  # noqa: PLC0415  loads twin only when it is needed
 
-        part = Part(tray, fans, from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
         with pool:
             training_data = read_training_data(recordings, part, pool)
         if not json_output:

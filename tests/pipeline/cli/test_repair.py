@@ -1,4 +1,4 @@
-"""`fantwin recover`: a damaged recording is repaired, and the exit code says whether anything was lost."""
+"""`fantwin info --repair`: a damaged recording is repaired, and the exit code says whether anything was lost."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def truncated(tmp_path, whole) -> Path:
 
 
 def test_a_truncated_file_is_repaired_under_its_name_and_the_loss_reported(tmp_path, truncated):
-    done = fantwin("recover", truncated)
+    done = fantwin("info", "--repair", truncated)
     assert done.exit_code == 3
     assert f"{truncated}: 20 messages recovered in {tmp_path / 'r.mcap'}; the original is kept as" in done.stdout
     assert f"{RAW_KEY}: 20 messages, the last at 0.000 s" in done.stdout
@@ -43,7 +43,7 @@ def test_a_truncated_file_is_repaired_under_its_name_and_the_loss_reported(tmp_p
 
 
 def test_the_json_says_the_same(tmp_path, truncated):
-    done = fantwin("recover", truncated, "-o", tmp_path / "out.mcap", "--json")
+    done = fantwin("info", "--repair", truncated, "-o", tmp_path / "out.mcap", "--json")
     shown = json.loads(done.stdout)
     assert done.exit_code == 3
     assert shown["output"] == str(tmp_path / "out.mcap")
@@ -62,12 +62,12 @@ def test_the_json_says_the_same(tmp_path, truncated):
 
 def test_an_intact_file_is_not_changed_and_one_that_lacks_only_its_index_has_lost_nothing(whole):
     before = whole.read_bytes()
-    done = fantwin("recover", whole)
+    done = fantwin("info", "--repair", whole)
     assert done.exit_code == 0
     assert "intact, with 41 messages; nothing to recover" in done.stdout and "nothing was lost" in done.stdout
     assert whole.read_bytes() == before
     whole.write_bytes(before[:-100])
-    done = fantwin("recover", whole)
+    done = fantwin("info", "--repair", whole)
     assert done.exit_code == 0 and "nothing was lost" in done.stdout
     assert len(read_by_others(whole)) == 41
 
@@ -76,7 +76,7 @@ def test_a_damaged_chunk_is_reported(whole):
     content = bytearray(whole.read_bytes())
     content[chunk_ends(whole)[3][0] - 5] ^= 0xFF
     whole.write_bytes(content)
-    done = fantwin("recover", whole)
+    done = fantwin("info", "--repair", whole)
     assert done.exit_code == 3
     assert "damaged chunks: 1" in done.stdout
     assert f"{RAW_KEY}: 5 messages of acquisition-1 missing in between" in done.stdout
@@ -96,7 +96,7 @@ def test_info_reports_the_losses_of_a_repaired_file(tmp_path, number):
     content = bytearray(path.read_bytes())
     content[(chunks[number].offset + chunks[number].end) // 2] ^= 0xFF
     path.write_bytes(content)
-    assert fantwin("recover", path, "-o", tmp_path / "out.mcap").exit_code == 3
+    assert fantwin("info", "--repair", path, "-o", tmp_path / "out.mcap").exit_code == 3
     done = fantwin("info", tmp_path / "out.mcap", "--json")
     assert done.exit_code == 3
     shown = json.loads(done.stdout)
@@ -106,11 +106,11 @@ def test_info_reports_the_losses_of_a_repaired_file(tmp_path, number):
     assert (file["recovered"][1:], file["damage"]) == (["damaged chunks: 1"], [])
     assert contents_of(tmp_path / "out.mcap").next[RAW_KEY, "acquisition-1"] == 15
     assert "repaired earlier: damaged chunks: 1" in fantwin("info", tmp_path / "out.mcap").stdout
-    assert fantwin("recover", tmp_path / "out.mcap").exit_code == 3, "it still is what it is"
+    assert fantwin("info", "--repair", tmp_path / "out.mcap").exit_code == 3, "it still is what it is"
 
 
 def test_info_reports_the_possible_losses_of_a_truncated_file_after_its_repair(tmp_path, truncated):
-    assert fantwin("recover", truncated, "-o", tmp_path / "out.mcap").exit_code == 3
+    assert fantwin("info", "--repair", truncated, "-o", tmp_path / "out.mcap").exit_code == 3
     repaired = repair_in_place(truncated)
     assert repaired is not None
     for path in (tmp_path / "out.mcap", repaired.path):
@@ -128,7 +128,7 @@ def test_messages_that_health_reports_as_published_and_that_are_not_there_are_re
     writer.add_message(health_key("plant", "acquisition", "tray1"), health, 2)
     writer.flush()
     writer._file.close()
-    done = fantwin("recover", tmp_path / "r.mcap.active")
+    done = fantwin("info", "--repair", tmp_path / "r.mcap.active")
     assert done.exit_code == 3
     assert "messages received in the last 0.5 s may be missing" in done.stdout
     assert (

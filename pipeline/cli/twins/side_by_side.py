@@ -1,0 +1,174 @@
+"""`fantwin train` of several models on the same recordings, side by side."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from fantwin.pipeline.cli.options import make_folder
+from fantwin.pipeline.cli.progress import training_progress
+from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.cli.twins.figures import figures_in, shown
+from fantwin.pipeline.cli.twins.training_data import TrainingData, data_cards
+from fantwin.pipeline.errors import UsageError, UserError
+
+if TYPE_CHECKING:
+    from fantwin.pipeline.cli.twins.train import TrainingSettings
+    from fantwin.twin.comparison import Candidate, Contender, Source
+
+Data: TypeAlias = tuple[TrainingData, TrainingData | None, TrainingData | None]
+"""of training, of validation and of the test"""
+SOURCE_HEADER = {"held-out": "held\nout", "test": "test\nrmse"}
+SOURCE_MEANING = {
+    "test": "the test recordings, which took no part in training",
+    "held-out": "the held-out recordings, which stopped training; --test takes unused ones",
+    "training": "the training recordings, which is too optimistic; use --validate and --test",
+}
+
+
+def train_side_by_side(
+    chosen: Sequence[Candidate],
+    read: Callable[[], Data],
+    settings: TrainingSettings,
+    folder: Path,
+    pool: RecordingsInParallel,
+    *,
+    json_output: bool,
+) -> None:
+    """Train several models on the same recordings, print them side by side, and write the twins and comparison.json.
+
+    Raises:
+        UserError: the recordings cannot be used, or the folder cannot be written.
+        typer.Exit: recordings were skipped.
+    """
+    from fantwin.twin.comparison import best, contend, source_of  # noqa: PLC0415  loads twin only when it is needed
+
+    if folder.suffix == ".onnx":
+        raise UsageError(f"{folder}: several models are several twins: name a folder with -o")
+    if settings.networks is not None:
+        raise UsageError("--networks is for one model: models are compared with one network each")
+    training_data, *others = read()
+    make_folder(folder)
+    validation_runs, test_runs = (part.runs if part else [] for part in others)
+    data, validation_data = data_cards(training_data), data_cards(others[0]) if others[0] else ()
+    contenders = []
+    with training_progress(training_data) as start:
+        for candidate in chosen:
+            contender = contend(
+                candidate,
+                training_data.runs,
+                validation_runs,
+                test_runs,
+                seed=settings.seed,
+                max_iterations=settings.iterations,
+                command_unit=settings.command_unit,
+                fan_numbers=training_data.fans,
+                data=data,
+                validation_data=validation_data,
+                progress=start(candidate.title),
+            )
+            if contender.twin:
+                contender.twin.save(_file(folder, candidate))
+            contenders.append(contender)
+    winner = best(contenders)
+    source = source_of(validation_runs, test_runs)
+    result = {
+        "speed_unit": training_data.speed_unit,
+        "evaluated_on": source,
+        "best": winner.candidate.name,
+        "models": [as_json(contender, training_data, folder) for contender in contenders],
+        "warnings": training_data.with_fan_numbers(winner.twin.identification.warnings if winner.twin else []),
+    }
+    _write(folder / "comparison.json", json.dumps(result, indent=2) + "\n")
+    if json_output:
+        typer.echo(json.dumps(result | pool.as_json()))
+    else:
+        _print(result, folder)
+    pool.end()
+
+
+def _print(result: dict[str, Any], folder: Path) -> None:
+    source: Source = result["evaluated_on"]
+    Console().print(table(result))
+    typer.echo(f"* best: smallest free-run rmse over {SOURCE_MEANING[source]}.")
+    if floor := next(
+        its["figures"][source]["tacho_floor"] for its in result["models"] if its["model"] == result["best"]
+    ):
+        typer.echo(f"The tacho alone would leave a perfect model an rmse of {shown(floor)} {result['speed_unit']}.")
+    typer.echo(f"{folder}: the twins and comparison.json")
+    for its in result["models"]:
+        if its["invalid_reason"]:
+            typer.echo(f"{its['title']}: not trained: {its['invalid_reason']}", err=True)
+    for warning in result["warnings"]:
+        typer.echo(warning, err=True)
+
+
+def as_json(contender: Contender, training_data: TrainingData, folder: Path) -> dict[str, Any]:
+    """The result as JSON fields; figures in the recordings' own units, null where there are none."""
+    candidate, twin, each = contender.candidate, contender.twin, training_data.rad_s_per_unit
+    result: dict[str, Any] = {
+        "model": candidate.name,
+        "title": candidate.title,
+        "invalid_reason": contender.invalid_reason or None,
+    }
+    if twin is None:
+        return result
+    parts = {"training": contender.training, "held-out": contender.held_out, "test": contender.test}
+    return result | {
+        "physical_parameters": contender.physical_parameters,
+        "network_parameters": twin.card.network.parameter_count,
+        "training_s": twin.card.training.duration_s,
+        "iterations": twin.card.training.iterations,
+        "sigma": [sigma / each for sigma in twin.card.sigma_rad_s],
+        "training_rmse": contender.training_rmse_rad_s / each,
+        "figures": {name: figures_in(part.pooled, each) for name, part in parts.items() if part},
+        "twin": str(_file(folder, candidate)),
+    }
+
+
+def table(result: dict[str, Any]) -> Table:
+    """The models side by side: all figures over the data that decide the comparison, the rmse over all data."""
+    source, unit = result["evaluated_on"], result["speed_unit"]
+    sources = [name for name in ("held-out", "test") if any(name in m.get("figures", {}) for m in result["models"])]
+    rows = Table(box=box.SIMPLE_HEAD, padding=0, caption=f"rmse and error in {unit}", caption_justify="left")
+    rows.add_column("model", no_wrap=True)
+    rmse = (SOURCE_HEADER[name] for name in sources)
+    for header in ("para-\nmeters", "train\nrmse", *rmse, "max\nerror", "R2", "in\n±2σ", "1-step\nrmse", "train\ns"):
+        rows.add_column(header, justify="right", no_wrap=True)
+    for its in result["models"]:
+        if its["invalid_reason"]:
+            rows.add_row(escape(its["title"]), *("-" for _ in rows.columns[1:]))
+            continue
+        figures, is_best = its["figures"][source], its["model"] == result["best"]
+        rows.add_row(
+            escape(its["title"] + (" *" if is_best else "")),
+            " + ".join(str(its[part]) for part in ("physical_parameters", "network_parameters") if its[part]),
+            shown(its["training_rmse"]),
+            *(shown(its["figures"][name]["rmse"]) for name in sources),
+            shown(figures["max_error"]),
+            shown(figures["r2"], ".4f"),
+            shown(figures["coverage_2_sigma"], ".1%"),
+            shown(figures["one_step_rmse"]),
+            f"{its['training_s']:.1f}",
+            style="bold" if is_best else "",
+        )
+    return rows
+
+
+def _file(folder: Path, candidate: Candidate) -> Path:
+    return folder / f"{candidate.name}.onnx"
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}; name another folder with -o") from error
