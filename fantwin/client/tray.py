@@ -68,7 +68,7 @@ class Tray:
         """whether it was said that acquisition has gone"""
         self._reported = Losses(0, 0, 0, 0)
         """the losses of the last check"""
-        self._producer = f"client-{name}-{secrets.token_hex(4)}"
+        self._producer = f"client-{name}-{secrets.token_hex(2)}-{bus.id}"
         self._key = tray_key(site, name, READING)
         self._acquisition = TrayAcquisition(bus, site, name, self._on_change)
         try:

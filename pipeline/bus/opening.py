@@ -91,6 +91,7 @@ def open_session(
     stop: threading.Event | None,
     listens: bool,
     site: SiteRoles | None,
+    session_id: str,
 ) -> zenoh.Session:
     """A session: of a peer at once; of a client as soon as its router answers.
 
@@ -98,7 +99,7 @@ def open_session(
         BusError: the endpoint cannot be used, or no router answers, and `stop` is set or None.
     """
     try:
-        conf = zenoh_config(config, credentials, site, listens=listens)
+        conf = zenoh_config(config, credentials, site, listens=listens, session_id=session_id)
         if config.mode == "peer":
             return zenoh.open(conf)
     except zenoh.ZError as error:
@@ -127,10 +128,17 @@ def open_session(
 
 
 def zenoh_config(
-    config: BusConfig, credentials: Credentials | None = None, site: SiteRoles | None = None, *, listens: bool
+    config: BusConfig,
+    credentials: Credentials | None = None,
+    site: SiteRoles | None = None,
+    *,
+    listens: bool,
+    session_id: str = "",
 ) -> zenoh.Config:
-    """What Zenoh is configured with for a session that stays."""
+    """What Zenoh is configured with for a session that stays. Without `session_id` Zenoh chooses one."""
     settings = Settings()
+    if session_id:
+        settings.set("id", session_id)
     settings.set("mode", config.mode)
     settings.set("connect/endpoints", list(config.endpoints))
     settings.set("connect/timeout_ms", -1 if config.mode == "peer" else _ROUTER_TIMEOUT_MS)

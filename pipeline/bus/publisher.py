@@ -49,6 +49,7 @@ class Publisher:
             congestion_control=zenoh.CongestionControl.BLOCK,
             express=True,
         )
+        self._sender = zenoh.SourceInfo(self._publisher.id, 0)
         self._recovery_key = recovery_key(key, producer)
         self._queryable = session.declare_queryable(self._recovery_key, self._answer, complete=True)
 
@@ -60,7 +61,7 @@ class Publisher:
             self.published += 1
             while self._keeps_too_much():
                 self._add(-len(self._kept.popleft()[1]))
-        self._publisher.put(payload)
+        self._publisher.put(payload, source_info=self._sender)
 
     def forget(self, before: int) -> None:
         """Keep no message with a sequence number below `before`: its consumer has it."""

@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 import zenoh
 
+from fantwin.pipeline.bus.identity import Forgeries, answerer_of, names_another
 from fantwin.schemas.topics import CATCH_UP_MESSAGES, largest_bytes
 
 MOST_RECOVERED_MESSAGES = 16_384
@@ -59,6 +60,7 @@ class RecoveryRequest:
     def __init__(
         self,
         session: zenoh.Session,
+        forgeries: Forgeries,
         key: str,
         producer: str,
         first: int,
@@ -70,6 +72,8 @@ class RecoveryRequest:
         """newest: the last so many messages of each producer, without the number of published ones; None: as many as a
         consumer that begins may ask for, if all producers are asked, and otherwise all."""
         self._is_of_one = producer != ALL_PRODUCERS
+        self._producer = producer
+        self._forgeries = forgeries
         self._on_answer = on_answer
         self._messages: list[tuple[str, bytes]] = []
         self._messages_left = min(MOST_RECOVERED_MESSAGES, last - first + 1)
@@ -103,8 +107,9 @@ class RecoveryRequest:
         if sample is None:  # the only error of these queries: not all have answered in time
             self._timed_out = True
             return
+        answerer = answerer_of(reply)
         if sample.attachment is not None:
-            if self._is_of_one:
+            if self._is_of_one and not names_another(self._producer, answerer):
                 self._end(number_in(sample.attachment.to_bytes().decode(errors="replace")))
             return
         size = len(sample.payload)
@@ -113,9 +118,12 @@ class RecoveryRequest:
             return
         if size > self._largest_bytes:
             return
+        key, payload = published_key(str(sample.key_expr)), sample.payload.to_bytes()
+        if self._forgeries.is_one(key, payload, answerer):
+            return
         self._messages_left -= 1
         self._bytes_left -= size
-        self._messages.append((published_key(str(sample.key_expr)), sample.payload.to_bytes()))
+        self._messages.append((key, payload))
 
     def _end(self, published: int | None) -> None:
         with self._lock:

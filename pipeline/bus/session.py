@@ -18,6 +18,7 @@ import zenoh
 from fantwin.pipeline.bus.access_rules import SiteRoles
 from fantwin.pipeline.bus.endpoint import endpoint_problem, somebody_listens
 from fantwin.pipeline.bus.errors import BusError, NoAnswerError
+from fantwin.pipeline.bus.identity import Forgeries, new_session_id, sender_of
 from fantwin.pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept, kept_key
 from fantwin.pipeline.bus.meeting import Meeting
 from fantwin.pipeline.bus.opening import (
@@ -53,6 +54,7 @@ class Bus:
         listens: bool = True,
         roles: Sequence[str] = READERS,
         site: SiteRoles | None = None,
+        session_id: str = "",
     ) -> None:
         """Open a session. Peers need no other process. A client needs its router; with `stop` it waits for the router
         until `stop` is set.
@@ -60,6 +62,7 @@ class Bus:
         listens: whether to listen on the endpoint if no process does; not for a command that connects only briefly.
         roles: with `bus.security`, the certificate of the first of these that has one here is shown.
         site: with `bus.security`, what peers accept of one another, and what this session may do; None: not known.
+        session_id: its id, with which the names of its producers end; empty: a new one.
 
         Raises:
             BusError: the endpoint or a certificate cannot be used, or a client's router is not there.
@@ -73,13 +76,15 @@ class Bus:
         self.came_second = somebody_listens(config.endpoint)
         """Whether another process listened before: discovering the others takes a moment."""
         self._has_answered = config.mode == "client" or (self.came_second and answers(config, self.credentials, stop))
-        self._session = open_session(config, self.credentials, stop, listens, site)
+        self.id = session_id or new_session_id()
+        self._session = open_session(config, self.credentials, stop, listens, site, self.id)
         self._site = site
         self._claims: list[tuple[str, str]] = []
         """what has been declared: kinds of messages of Zenoh, each with its key or key expression"""
         self._meeting = Meeting()
         self._stop = stop or threading.Event()
         self.refused_too_large = 0
+        self.forgeries = Forgeries()
         self._kept_bytes = KeptBytes()
         self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken] = []
 
@@ -102,7 +107,8 @@ class Bus:
         that.
 
         While it blocks, publishers wait. Messages of one session arrive in the order of publishing, over all keys. A
-        message that is larger than any of its topic is refused, and counted in `refused_too_large`.
+        message that is larger than any of its topic is refused, and counted in `refused_too_large`; one in the name of
+        another session in `forgeries`.
         """
         limit = largest_bytes(key_expression)
 
@@ -110,7 +116,9 @@ class Bus:
             if len(sample.payload) > limit:
                 self.refused_too_large += 1
                 return
-            on_message(str(sample.key_expr), sample.payload.to_bytes())
+            key, payload = str(sample.key_expr), sample.payload.to_bytes()
+            if not self.forgeries.is_one(key, payload, sender_of(sample)):
+                on_message(key, payload)
 
         # not indirect: with a thread and a queue for each subscriber, keys lose their order and publishers never wait
         handler = zenoh.handlers.Callback(receive, indirect=False)
@@ -205,7 +213,7 @@ class Bus:
 
         `on_answer` is called once, from a thread of the bus: it must not block. `newest`: see `RecoveryRequest`.
         """
-        return RecoveryRequest(self._session, key, producer, first, last, timeout_s, on_answer, newest)
+        return RecoveryRequest(self._session, self.forgeries, key, producer, first, last, timeout_s, on_answer, newest)
 
     def recover(self, key: str, producer: str = ALL_PRODUCERS) -> list[tuple[str, bytes]]:
         """All messages on `key` that `producer` still keeps, as (key, payload). Waits for the answer: not for a stage,
@@ -282,6 +290,7 @@ def join_bus(
     *,
     listens: bool = True,
     roles: Sequence[str] = READERS,
+    session_id: str = "",
     say: Callable[[str], None] = lambda _line: None,
 ) -> Bus:
     """A session on the bus of a site, with the roles of the site where its bus has any. say: is given a line if a
@@ -292,6 +301,6 @@ def join_bus(
     if config.bus.mode == "client":
         waiting.start()
     try:
-        return Bus(config.bus, stop, listens=listens, roles=roles, site=site)
+        return Bus(config.bus, stop, listens=listens, roles=roles, site=site, session_id=session_id)
     finally:
         waiting.cancel()

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from fantwin.pipeline.config.roles import Role
 from fantwin.schemas.health import Health
+from fantwin.schemas.streams import MOST_PUBLISHED
 from fantwin.schemas.topics import topic_of, tray_of
 
 
@@ -19,7 +20,11 @@ class BelievedOutputs:
 
     def of(self, health: Health) -> Health:
         """The health with only those outputs that its process may write; the same object if these are all."""
-        believed = tuple(output for output in health.outputs if self._may_write(health, output.key))
+        believed = tuple(
+            output
+            for output in health.outputs
+            if output.published <= MOST_PUBLISHED and self._may_write(health, output.key)
+        )
         return health if len(believed) == len(health.outputs) else replace(health, outputs=believed)
 
     def _may_write(self, health: Health, key: str) -> bool:

@@ -21,12 +21,13 @@ def build_and_join(
     config: Config,
     shard: Shard,
     session: Session,
+    session_id: str,
     stop: threading.Event,
     is_replayed: Callable[[], bool],
 ) -> tuple[Bus, dict[str, BuiltStage]]:
     """Build a process of a stage and join the bus: afterwards, so that what cannot be built says so even where the bus
-    cannot be joined; earlier if a core continues from what others keep. If it fails, nothing is left. is_replayed: see
-    Context.
+    cannot be joined; earlier if a core continues from what others keep. If it fails, nothing is left. session_id: of
+    the session on the bus. is_replayed: see Context.
 
     Raises:
         StageError: it cannot be built, or another process has one of its trays.
@@ -36,7 +37,7 @@ def build_and_join(
 
     def bus() -> Bus:
         if not joined:
-            joined.append(join_bus(config, stop, roles=role_names(stage.name, shard)))
+            joined.append(join_bus(config, stop, roles=role_names(stage.name, shard), session_id=session_id))
         return joined[0]
 
     def refuse_others() -> None:

@@ -32,6 +32,7 @@ from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Clock
+from fantwin.schemas.streams import MOST_PUBLISHED
 from fantwin.schemas.topics import (
     ALL_TRAYS,
     alive_key,
@@ -231,8 +232,6 @@ class Receiver:
         said, health = health, self._believed_outputs.of(health)
         if health is not said:
             self.counts["refused_outputs"] += 1
-        if not self.tracker.believes(health):
-            return
         self.peers.add_health(alive_key(self._site, health.stage, health.instance), health)
         if health.stage == REPLAY:
             self._clock.add_replay_health(health.header.producer, has_ended=health.is_last)
@@ -264,7 +263,9 @@ class Receiver:
     def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
         try:
             envelope = Envelope(key, topic_of(key).name, payload, received_t_ns)
-            _ = envelope.header if self.is_undecoded(envelope) else envelope.message
+            header = envelope.header if self.is_undecoded(envelope) else envelope.message.header
+            if header.sequence >= MOST_PUBLISHED:
+                raise CodecError(f"no producer has ever published {header.sequence} messages")
         except (KeyError, CodecError):
             self.counts["undecodable"] += 1
             if key in self._unreadable or len(self._unreadable) < MOST_UNREADABLE_KEYS:

@@ -8,7 +8,6 @@ viewer) discards its oldest items instead, and counts them.
 from __future__ import annotations
 
 import functools
-import secrets
 import threading
 import time
 from collections import Counter
@@ -16,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import replace
 from itertools import chain
 
+from fantwin.pipeline.bus.identity import new_session_id
 from fantwin.pipeline.bus.kept_messages import KeptQuery
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import STAGES
@@ -85,7 +85,8 @@ class Runner:
         """Set when the process that started this stage has gone: it ends as soon as its producers have ended."""
         self._site = config.site
         self._shard = shard
-        self.producer = f"{stage.name}-{self._shard.name}-{secrets.token_hex(4)}"
+        session_id = new_session_id()
+        self.producer = f"{stage.name}-{self._shard.name}-{session_id}"
         self._inbox = Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
         started_t_ns = HOST_CLOCK.now_ns()
@@ -94,7 +95,7 @@ class Runner:
         self._sessions = Sessions()
         self._session = Session.of_this_process(stage.name, shard, started_t_ns, self.producer)
         self._bus, self._parts = build_and_join(
-            stage, config, shard, self._session, stop, lambda: self._clock.is_replay_alive
+            stage, config, shard, self._session, session_id, stop, lambda: self._clock.is_replay_alive
         )
         before = {key: payload for parts in self._parts.values() for key, payload in parts.kept.items()}
         self._kept = KeptForOthers(
@@ -235,12 +236,14 @@ class Runner:
         next_tick = next_health = next_loss = time.monotonic()
         reported_lost = 0
         while not until():
-            if self._due:
+            if self._due.is_pressing:
                 self._step_once()
-            elif (item := self._inbox.get(max(0.0, next_tick - time.monotonic()))) is not None:
+            elif (item := self._inbox.get(0.0 if self._due else max(0.0, next_tick - time.monotonic()))) is not None:
                 self._handle(item)
                 if self._due.joins:
                     self._handle_what_waits()
+            elif self._due:
+                self._step_once()
             now = time.monotonic()
             if now >= next_tick or (now >= next_tick - EARLY_S and not self._due and not self._inbox.waiting()):
                 next_tick = now + TICK_S
@@ -350,7 +353,10 @@ class Runner:
 
     def _step_once(self) -> None:
         """Process the next message, or as many as can be at once."""
-        self._steps.step(self._due.pop_of_each() if self.stage.joint and self._due.joins else [self._due.pop()])
+        if self._due.is_pressing:
+            self._steps.step(self._due.pop_of_each() if self.stage.joint and self._due.joins else [self._due.pop()])
+        if request := self._due.pop_request():
+            self._steps.step([request])
 
     def _has_caught_up(self) -> bool:
         return not (self._receiver.is_catching_up or self._due) or self._ending.left_s(CAUGHT_UP) < 0
@@ -363,8 +369,12 @@ class Runner:
             + Counter(self._tracker.counters())
             + Counter(lost_at_stop=self._sources.lost)
         )
+        if self._due.refused_requests:
+            counters["refused_requests"] = self._due.refused_requests
         if self._bus.refused_too_large:
             counters["refused_too_large"] = self._bus.refused_too_large
+        if self._bus.forgeries.count:
+            counters["refused_forged"] = self._bus.forgeries.count
         for parts in self._parts.values():
             counters.update(parts.core.counters())
         if self._inbox.dropped:
@@ -391,6 +401,7 @@ class Runner:
                 self._ending.problem,
                 self._bus.certificate_warning(),
                 self._sessions.problem(),
+                self._bus.forgeries.problem(),
                 self._tracker.problem(),
                 *(core.problem() for core in cores),
             ],

@@ -1,5 +1,4 @@
-"""Puts arriving messages in sequence: requests missing messages, drops duplicates, counts messages that remain missing,
-and refuses impossible sequence numbers.
+"""Puts arriving messages in sequence: requests missing messages, drops duplicates, and counts what remains missing.
 
 Nothing here waits. While the missing messages of a stream are on their way, its later messages are held; all other
 streams go on. What is held and remembered is bounded: docs/reference/bounds.md.
@@ -17,15 +16,13 @@ from fantwin.pipeline.runtime.sessions import Sessions
 from fantwin.pipeline.runtime.tracked_streams import Request, Stream, TrackedStreams, Waiting
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health, Input
-from fantwin.schemas.streams import MOST_PUBLISHED, StreamId, output_streams
+from fantwin.schemas.streams import StreamId, output_streams
 from fantwin.schemas.topics import CATCH_UP_MESSAGES
 
 MOST_HELD_MESSAGES = 4096
 """of one stream"""
 MOST_HELD_BYTES = 64 << 20
 """of one stream. Beyond either limit it goes on without the messages that were requested."""
-MOST_PER_S = 100_000
-"""no producer publishes more messages a second on one key"""
 PATIENCE_S, PATIENCE_WITH_REPLACED_S = 120.0, 5.0
 """how long requests to a stage without an answer are repeated: its link may be slow, lose packets, or work in one
 direction only. The second is for a stage whose place another process has taken: only its last answer may still
@@ -63,10 +60,6 @@ class SequenceTracker:
     for; those it no longer keeps are history, not a loss. A stage that does not answer, or not completely, is asked
     again for a while; then what it may have kept counts as missing. From then on every gap is either recovered or
     counted.
-
-    A number beyond the next is believed if the producer confirms that it has published so many messages. If it does not
-    answer, the number is believed if it can have published so many since it was last heard. Otherwise the message is
-    refused, and the stream goes on as if it had not arrived.
     """
 
     def __init__(self, ask: Ask, now_s: Callable[[], float] = time.monotonic, sessions: Sessions | None = None) -> None:
@@ -140,15 +133,6 @@ class SequenceTracker:
                 due += self._go_on(stream, stream.waiting, Found())
         return due
 
-    def believes(self, health: Health) -> bool:
-        """Whether its producer can have published what a health says. If not, the health is counted as refused."""
-        for (key, producer), published in output_streams(health).items():
-            stream = self._streams.get(key, producer)
-            if published > MOST_PUBLISHED or (stream is not None and not self._is_possible(stream, published)):
-                self._refuse_number(key, producer, published, stream.next_sequence if stream else None)
-                return False
-        return True
-
     def forget(self, key: str) -> None:
         """This consumer reads a key no more. What it has not read if it begins again is history, not a loss."""
         self._streams.forget(key)
@@ -184,12 +168,8 @@ class SequenceTracker:
 
     def _take(self, stream: Stream, envelope: Envelope) -> list[Envelope]:
         sequence, expected = envelope.header.sequence, stream.next_sequence
-        if sequence != expected and not stream.is_duplicate(sequence):
-            if sequence >= MOST_PUBLISHED:
-                self._refuse_number(stream.key, stream.producer, sequence + 1, expected)
-                return []
-            if expected is not None or sequence > 0:
-                return self._request(stream, sequence, envelope)
+        if sequence != expected and not stream.is_duplicate(sequence) and (expected is not None or sequence > 0):
+            return self._request(stream, sequence, envelope)
         stream.heard_s = self._now_s()
         return [envelope] if stream.accept(sequence) else []
 
@@ -198,8 +178,7 @@ class SequenceTracker:
         if stream and stream.next_sequence is None:
             if stream.waiting:  # its first message came live before these: they answer what it made this consumer ask
                 return self._go_on(stream, stream.waiting, Found(kept))
-            if first < MOST_PUBLISHED:
-                stream.skip_to(first)
+            stream.skip_to(first)
         return [due for envelope in kept for due in self.accept(envelope)]
 
     def _request(self, stream: Stream, until: int, shown_by: Envelope | None) -> list[Envelope]:
@@ -242,15 +221,11 @@ class SequenceTracker:
         is_patient = bool(due) or self._now_s() - waiting.since_s < self._patience_s(stream)
         if may_ask_again and is_incomplete and is_patient:
             return due + self._ask_again(stream, waiting, is_at_once=bool(due))
-        if self._is_believed(stream, waiting, found.published):
-            if stream.next_sequence is None and self._owes_answer(stream, found):
-                stream.next_sequence = waiting.request.first
-            stream.skip_to(waiting.until)
-            stream.heard_s = self._now_s()
-            arrived = [waiting.shown_by] if waiting.shown_by else []
-        else:
-            self._refuse_number(stream.key, stream.producer, waiting.published, found.published or stream.next_sequence)
-            arrived = []
+        if stream.next_sequence is None and self._owes_answer(stream, found):
+            stream.next_sequence = waiting.request.first
+        stream.skip_to(waiting.until)
+        stream.heard_s = self._now_s()
+        arrived = [waiting.shown_by] if waiting.shown_by else []
         for envelope in (*arrived, *waiting.held):
             if stream.waiting is None:
                 due += self._take(stream, envelope)
@@ -258,24 +233,8 @@ class SequenceTracker:
                 stream.waiting.hold(envelope)
         return due
 
-    def _is_believed(self, stream: Stream, waiting: Waiting, published: int | None) -> bool:
-        if published is not None:
-            return waiting.published <= published
-        return self._is_possible(stream, waiting.published)
-
     def _owes_answer(self, stream: Stream, found: Found) -> bool:
         return found.was_asked and found.published is None and self._sessions.is_alive(stream.producer)
-
-    def _is_possible(self, stream: Stream, published: int) -> bool:
-        """Whether a producer that does not answer can have published so many messages since it was last heard."""
-        if stream.next_sequence is None:
-            return True
-        silent_s = self._now_s() - stream.heard_s
-        return published - stream.next_sequence <= CATCH_UP_MESSAGES + MOST_PER_S * silent_s
-
-    def _refuse_number(self, key: str, producer: str, claimed: int, known: int | None) -> None:
-        line = f"{key}: {producer} cannot have published {claimed} messages after {known or 0}: refused"
-        self._refuse("refused_numbers", line)
 
     def _refuse(self, counter: str, line: str) -> None:
         self._refused[counter] += 1

@@ -57,11 +57,6 @@ class Waiting:
         self.held.append(envelope)
         self.held_bytes += len(envelope.payload)
 
-    @property
-    def published(self) -> int:
-        """How many messages have been published at least, if what showed the gap is true."""
-        return self.until if self.shown_by is None else self.until + 1
-
 
 @dataclass(slots=True)
 class Stream(StreamState):

@@ -155,6 +155,9 @@ class JudgedFans:
         found: list[Unjudged] = []
         with self._lock:
             for tray in self._trays:
+                if late := _why_late(tray.name, states):
+                    found.append(Unjudged(tray.name, (), late))
+                    continue
                 fans = np.flatnonzero(self._judged_s[tray.name] < oldest_s)
                 if len(fans) and self._seen_s.get(tray.name, -np.inf) < oldest_s:
                     found.append(Unjudged(tray.name, (), _why_no_scores(tray.name, states)))
@@ -212,12 +215,21 @@ def _meaning(unjudged: Sequence[Unjudged]) -> list[tuple[tuple[int, ...], str]]:
     return [(each.fans, without_figures(each.why)) for each in unjudged]
 
 
+def _why_late(tray: str, states: Sequence[StageState]) -> str:
+    """The first stage on the way from the device to the scores that is late: scores come, of earlier samples."""
+    late = (state for state in _on_the_way(tray, states) if state.word == Word.LATE)
+    return next((f"{state.label}: {state.detail}" for state in late), "")
+
+
+def _on_the_way(tray: str, states: Sequence[StageState]) -> list[StageState]:
+    stages = list(STAGES)[: list(STAGES).index(_LAST_JUDGE) + 1]
+    return [state for state in states if state.is_expected and state.stage in stages and state.has(tray)]
+
+
 def _why_no_scores(tray: str, states: Sequence[StageState]) -> str:
     """The first stage on the way from the device to the scores that does not work."""
-    on_the_way = list(STAGES)[: list(STAGES).index(_LAST_JUDGE) + 1]
-    for state in states:
-        if state.is_expected and state.stage in on_the_way and state.has(tray):
-            problem = state.view.health.problem if state.view and state.word == Word.DEGRADED else ""
-            if state.is_fault or state.word == Word.WAITING or problem:
-                return f"{state.label}: {problem or state.detail}"
+    for state in _on_the_way(tray, states):
+        problem = state.view.health.problem if state.view and state.word == Word.DEGRADED else ""
+        if state.is_fault or state.word == Word.WAITING or problem:
+            return f"{state.label}: {problem or state.detail}"
     return "no score arrives"

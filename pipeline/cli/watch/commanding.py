@@ -103,7 +103,7 @@ class CommandSender:
         self._acquisition = TrayAcquisition(bus, site, tray)
         self._tray = tray
         self.stop = stop
-        self._producer = f"command-{tray}-{secrets.token_hex(4)}"
+        self._producer = f"command-{tray}-{secrets.token_hex(2)}-{bus.id}"
         key = tray_key(site, tray, "command")
         self._publisher = bus.publisher(key, BY_NAME["command"], type_name(Command), self._producer)
         self._before: Health | None = None

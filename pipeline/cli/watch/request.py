@@ -37,7 +37,7 @@ def ask(
     Raises:
         UserError: an answer is missing after `timeout_s`, or there is no right to ask.
     """
-    producer = f"alarms-{tray}-{secrets.token_hex(4)}"
+    producer = f"alarms-{tray}-{secrets.token_hex(2)}-{bus.id}"
     publisher = bus.publisher(tray_key(site, tray, "request"), BY_NAME["request"], type_name(Request), producer)
     name = f"{producer}/{publisher.published}"
     received: queue.Queue[bytes] = queue.Queue()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import time
 from collections import Counter
 from collections.abc import Collection, Mapping
@@ -27,7 +26,7 @@ class Sender:
 
     def __init__(self, bus: Bus, site: str, trays: Collection[str]) -> None:
         """Join the bus; `trays` are the trays of the site."""
-        self.producer = f"{REPLAY}-all-{secrets.token_hex(4)}"
+        self.producer = f"{REPLAY}-all-{bus.id}"
         self.sent: Counter[str] = Counter()
         """messages sent, by topic"""
         self._bus = bus

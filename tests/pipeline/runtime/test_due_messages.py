@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fantwin.pipeline.runtime.due_messages import MOST_JOINED_VALUES, DueMessages
+from fantwin.pipeline.runtime.due_messages import MOST_JOINED_VALUES, MOST_REQUESTS, DueMessages
 from fantwin.schemas.blocks import can_join
 from fantwin.schemas.enums import Action
 from fantwin.schemas.envelope import Envelope
@@ -43,8 +43,12 @@ def envelope(topic: str, message: Message) -> Envelope:
 def popped(due: DueMessages) -> list[list[Envelope]]:
     found = []
     while due:
-        found.append(due.pop())
+        found.append(taken(due))
     return found
+
+
+def taken(due: DueMessages) -> list[Envelope]:
+    return due.pop() if due.is_pressing else due.pop_request()
 
 
 def begun() -> DueMessages:
@@ -66,14 +70,15 @@ def test_messages_of_a_tray_come_together_after_the_first_and_trays_take_turns()
     due.add([a[0], b[0], a[1], between, a[2], b[1]])
     assert len(due) == 6
     assert due.bytes == sum(len(each.payload) for each in (*a, *b, between))
-    assert popped(due) == [a[:2], b, [between], [a[2]]]
+    assert popped(due) == [a, b, [between]], "the request waits behind samples"
     assert due.bytes == 0
     mixed = [raw("a", 0), raw("a", 0, producer="acquisition-2"), raw("a", 1, fans=3)]
     due.add(mixed)
     assert popped(due) == [[each] for each in mixed], "another producer or number of fans is not joined"
     due.add([*a, between, *b])
     assert due.pop_of_each() == [a, b]
-    assert [len(group) for group in due.pop_of_each()] == [1], "the request comes after what was sent before it"
+    assert not due.is_pressing
+    assert due.pop_request() == [between]
     of_all = DueMessages([""], joins=True)
     of_all.add([*a, *b, request("", 0)])
     assert popped(of_all) == [[each] for each in (*a, *b, request("", 0))], "one core for all trays gets each alone"
@@ -100,23 +105,42 @@ STEPS = st.lists(st.one_of(st.none(), st.tuples(st.sampled_from(["a", "b", "c"])
 def test_nothing_is_lost_or_overtaken_within_a_tray(
     steps: Sequence[tuple[str, bool] | None], joins: bool, of_each: bool
 ) -> None:
-    due, added, taken = DueMessages(TRAYS, joins=joins), [], []
+    due, added, found = DueMessages(TRAYS, joins=joins), [], []
     for step in steps:
         if step is not None:
             added.append(request(step[0], len(added)) if step[1] else raw(step[0], len(added)))
             due.add(added[-1:])
-        elif due and of_each:
+        elif due.is_pressing and of_each:
             at_once = due.pop_of_each()
             assert len({group[0].header.tray for group in at_once if group[0].header.tray in TRAYS}) == len(
                 [group for group in at_once if group[0].header.tray in TRAYS]
             )
-            taken += at_once
+            found += at_once
         elif due:
-            taken.append(due.pop())
-    taken += popped(due)
-    for group in taken:
+            found.append(taken(due))
+    found += popped(due)
+    for group in found:
         assert all(can_join(group[0].message, other.message) for other in group[1:])
         assert joins or len(group) == 1
     for tray in ("a", "b", "c"):
-        of_tray = [each for group in taken for each in group if each.message.header.tray == tray]
-        assert of_tray == [each for each in added if each.message.header.tray == tray]
+        for kind in (Raw, Request):
+            of_tray = [each for group in found for each in group if is_of(each, tray, kind)]
+            assert of_tray == [each for each in added if is_of(each, tray, kind)]
+
+
+def is_of(envelope: Envelope, tray: str, kind: type[Message]) -> bool:
+    return envelope.header.tray == tray and isinstance(envelope.message, kind)
+
+
+def test_row_11_requests_of_people_wait_behind_samples_and_no_more_than_some_of_a_tray():
+    due = begun()
+    flood = [request("a", number) for number in range(MOST_REQUESTS + 5)]
+    of_another_tray, samples = request("b", 0), raw("a", 1)
+    due.add([*flood, of_another_tray, samples])
+    assert due.refused_requests == 5
+    assert due.has("b")
+    assert due.pop() == [samples]
+    assert popped(due) == [*([each] for each in flood[:MOST_REQUESTS]), [of_another_tray]]
+    assert not due.has("b")
+    due.add([request("a", 100)])
+    assert len(due) == 1, "there is room again"
