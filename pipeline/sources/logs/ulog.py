@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fantwin.pipeline.sources.logs.log_file import LogError, Series
 
 NS_PER_US = 1000
+MOST_FIELDS = 10_000
+"""of one topic, arrays and nested formats counted out; PX4's largest has some hundreds"""
 
 
 class ULogFile:
@@ -22,6 +25,7 @@ class ULogFile:
         from pyulog import ULog  # noqa: PLC0415  an extra
 
         try:
+            _refuse_endless(ULog(str(path), parse_header_only=True).message_formats)
             log = ULog(str(path))
         except Exception as error:
             raise LogError(f"{path}: no ULog that can be read: {error}") from error
@@ -50,6 +54,24 @@ class ULogFile:
             t_ns = columns["timestamp"].astype(np.int64) * NS_PER_US
             found[name] = Series(t_ns, columns[field].astype(np.float64))
         return found
+
+
+def _refuse_endless(formats: Mapping[str, Any]) -> None:
+    """Raise ValueError where nested formats stand for more fields than a log has: a few bytes can name millions."""
+    sizes: dict[str, int] = {}
+
+    def size_of(name: str, nested_in: tuple[str, ...] = ()) -> int:
+        if name in nested_in:
+            raise ValueError(f"the format {name} contains itself")
+        if name not in sizes:
+            fields = formats[name].fields if name in formats else ()
+            sizes[name] = sum(max(1, number) * size_of(kind, (*nested_in, name)) for kind, number, _ in fields) or 1
+            if sizes[name] > MOST_FIELDS:
+                raise ValueError(f"the format {name} has more than {MOST_FIELDS:,} fields")
+        return sizes[name]
+
+    for name in formats:
+        size_of(name)
 
 
 def open_ulog(path: Path, number: int) -> ULogFile:

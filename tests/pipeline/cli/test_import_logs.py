@@ -153,6 +153,12 @@ def test_a_mistake_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
         assert error in error_of("import", path, *words, *out)
     path.write_bytes(path.read_bytes()[:20])
     assert "this ULog has no fields with numbers; is it damaged?" in error_of("import", path, "--list")
+    nested = {f"f{depth}": (f"f{depth + 1}[10] a;", ()) for depth in range(12)}
+    write_ulog(path, {**nested, "f12": ("float a;", ())})
+    assert path.stat().st_size < 500, "a few bytes that name a million million fields"
+    assert "no ULog that can be read: the format" in error_of("import", path, "--list")
+    write_ulog(path, {"a": ("b[2] x;", ()), "b": ("a y;", ())})
+    assert "contains itself" in error_of("import", path, "--list")
     bad = tmp_path / "bad.bbl"
     bad.write_bytes(b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n")
     assert "no blackbox log that can be read" in error_of("import", bad, "--list")
