@@ -135,9 +135,10 @@ class _Tables:
                 self._begin(path, block)
             table = self.begun[path]
             if not table.belongs_to(block):
+                one, other = (_printable(each.tray or each.site) for each in (table, block))
                 raise UserError(
-                    f"{path}: would hold both {table.topic} of {table.tray or table.site} and {block.topic} of "
-                    f"{block.tray or block.site}: name a folder with -o, or choose with --topic and --tray"
+                    f"{path}: would hold both {table.topic} of {one} and {block.topic} of {other}: name a folder with "
+                    "-o, or choose with --topic and --tray"
                 )
             table.file.add(block)
         except OSError as error:
@@ -164,7 +165,7 @@ class _Tables:
     def _path(self, block: Block) -> Path:
         if self._is_file:
             return self._output
-        name = ".".join(part for part in (self._stem, block.tray, block.topic, self._form) if part)
+        name = ".".join(part for part in (self._stem, _printable(block.tray), block.topic, self._form) if part)
         return self._output / name
 
     def _begin(self, path: Path, block: Block) -> None:
@@ -179,6 +180,11 @@ class _Tables:
         }
         file = open_table(self._form, _unfinished(path), block.topic, about)
         self.begun[path] = _Table(block.site, block.tray, block.topic, path, file)
+
+
+def _printable(name: str) -> str:
+    """A tray's name as part of a file's: a recording from elsewhere may name it anything."""
+    return "".join(each if each.isprintable() else "_" for each in name)
 
 
 def _cannot_write(path: Path, error: OSError) -> UserError:

@@ -221,6 +221,14 @@ def test_one_file_holds_one_table_of_one_tray_of_one_site(tmp_path):
     assert "would hold both" in error_of("export", tmp_path / "sites.mcap", "--to", "csv", "-o", tmp_path / "out")
 
 
+def test_a_tray_of_any_name_has_a_file_of_a_plain_name(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
+        writer.add_message("fantwin/here/a\0b\n\x1b[31m/raw", raw(0), 1)
+    result = fantwin("export", tmp_path / "r.mcap", "--to", "csv", "-o", tmp_path / "out")
+    assert (result.exit_code, names(tmp_path / "out")) == (0, ["r.a_b__[31m.raw.csv"])
+    assert result.stdout == f"{tmp_path}/out/r.a_b__[31m.raw.csv: 20 rows\n"
+
+
 def test_without_pyarrow_csv_works(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
