@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Iterable, Sequence
 from importlib import import_module
@@ -179,6 +180,8 @@ def main() -> None:
         _register([named])  # a stage's process imports its own command only
     else:
         _list_commands()
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # commands clean up when they are interrupted
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         app(words)
     except UserError as error:

@@ -2,7 +2,8 @@
 
 The reader of the output may go away or stop reading, and its disk may be full. So a separate thread writes the lines;
 it counts those that it cannot write, and reports the count when it can write again. A line that keeps repeating is
-folded: it is written again after 10 s, then after twice as long each time, with the number of repetitions.
+folded: it is written again after 10 s, then after twice as long each time, with the number of repetitions. Control
+characters in a line become spaces: a terminal would obey them.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+
+from fantwin.pipeline.site.one_line import one_line
 
 FOLD_S = 10.0
 FOLD_MAX_S = 600.0
@@ -116,7 +119,7 @@ class EventLog:
         with self._lock:
             unwritten, self._unwritten = self._unwritten, 0
         note = f"({unwritten} lines could not be written)\n" if unwritten else ""
-        data = f"{note}{line}\n".encode(errors="replace")
+        data = f"{note}{one_line(line)}\n".encode(errors="replace")
         try:
             while data:
                 data = data[os.write(self._descriptor, data) :]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from fantwin.pipeline.site.one_line import one_line
 from fantwin.schemas.enums import Action
 from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
 
@@ -27,15 +27,6 @@ OperatorAction = Literal[
     "true_alarm",
     "false_alarm",
 ]
-_NOT_SHOWN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
-"""characters that end a line, move the cursor of a terminal, or turn the direction of what follows"""
-
-
-def one_line(text: str) -> str:
-    """A text in which each character is one that is seen, or a space: it is shown on pages, terminals and in mails."""
-    return _NOT_SHOWN.sub(" ", text)
-
-
 OneLine = Annotated[str, AfterValidator(one_line)]
 
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from fantwin.pipeline.runtime.stage import Core
+from fantwin.pipeline.site.one_line import readable_alarm, readable_health
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.envelope import Envelope
@@ -24,7 +25,7 @@ class SiteCore(Core):
     def step(self, item: Message | Envelope) -> Sequence[Message]:
         """Keep what has arrived, if it is about a fan of the site or about a stage."""
         if isinstance(item, Health):
-            self._model.add_health(item)
+            self._model.add_health(readable_health(item))
             return ()
         tray = self._model.tray(item.header.tray)
         if tray is None:
@@ -37,7 +38,7 @@ class SiteCore(Core):
             self._model.add_snapshot(item)
         elif isinstance(item, Alarm):
             if item.fan < tray.fans:
-                self.add_alarm(item)
+                self.add_alarm(readable_alarm(item))
             else:
                 self._counts["unknown_fan"] += 1
         return ()

@@ -81,6 +81,11 @@ class StageState:
         return not self.trays or tray in self.trays
 
     @property
+    def problem(self) -> str:
+        """What the stage itself says is wrong, while it is alive; empty if nothing is."""
+        return self.view.health.problem if self.view and self.view.alive else ""
+
+    @property
     def is_fault(self) -> bool:
         """Whether the site lacks a stage that the configuration asks for, or its work."""
         return self.is_expected and self.word not in AT_WORK

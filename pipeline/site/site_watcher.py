@@ -17,6 +17,7 @@ from fantwin.pipeline.runtime.lost_sessions import LostSessions
 from fantwin.pipeline.runtime.sessions import Session, this_host
 from fantwin.pipeline.site.known_sessions import KnownSessions
 from fantwin.pipeline.site.loss_accounting import Launched, label, losses
+from fantwin.pipeline.site.one_line import readable_alarm, readable_health
 from fantwin.pipeline.site.refused_input import refused, unusable_lines
 from fantwin.pipeline.site.watched_alarms import WatchedAlarms
 from fantwin.schemas.codec import CodecError, decode
@@ -200,7 +201,7 @@ class SiteWatcher:
     def _on_health(self, key: str, payload: bytes) -> None:
         health = _decoded(Health, payload)
         if isinstance(health, Health) and key == health_key(self._site, health.stage, health.instance):
-            health = self._believed_outputs.of(health)
+            health = self._believed_outputs.of(readable_health(health))
             with self._lock:
                 self._sessions.add_health(health)
                 before = self._healths.get(health.header.producer) or self._unknown.get(health.header.producer)
@@ -226,7 +227,7 @@ class SiteWatcher:
         if isinstance(alarm, Alarm) and alarm.header.producer and key == _alarm_key(self._site, alarm.header.tray):
             with self._lock:
                 if self._sessions.counts(key, alarm.header.producer):
-                    self._alarms.add(alarm, len(payload))
+                    self._alarms.add(readable_alarm(alarm), len(payload))
 
 
 def _alarm_key(site: str, tray: str) -> str:

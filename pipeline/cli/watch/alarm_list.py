@@ -20,6 +20,7 @@ from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.shards import process_list
 from fantwin.pipeline.site.judged_fans import JudgedChanges, JudgedFans, Unjudged, as_judged
+from fantwin.pipeline.site.one_line import readable_alarm
 from fantwin.pipeline.site.site_state import site_states
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.site.stage_notes import note_lines
@@ -153,7 +154,7 @@ def _decoded(site: str, key: str, payload: bytes, then: Callable[[Alarm], None])
         return
     assert isinstance(alarm, Alarm)
     if key == tray_key(site, alarm.header.tray, "alarm"):
-        then(alarm)
+        then(readable_alarm(alarm))
 
 
 def _counts(watcher: SiteWatcher, site: str, alarm: Alarm) -> bool:

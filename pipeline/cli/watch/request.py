@@ -10,6 +10,7 @@ from dataclasses import replace
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.site.one_line import readable_alarm
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import CodecError, decode, encode, type_name
 from fantwin.schemas.header import Header
@@ -59,5 +60,5 @@ def ask(
         except (queue.Empty, CodecError):
             continue
         if isinstance(alarm, Alarm) and alarm.request == name and watcher.counts(key, alarm.header.producer):
-            answers[alarm.fan] = alarm
+            answers[alarm.fan] = readable_alarm(alarm)
     return [answers[fan] for fan in sorted(fans)]

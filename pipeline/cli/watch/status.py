@@ -65,8 +65,8 @@ def status(
 
     Below the table are the counters of what was lost and refused; --json has all counters.
 
-    Exit code 1 if a stage is missing, gone, silent, starved or late, or if a fan is not judged though the configuration
-    has a scorer; 3 if a stage has lost data.
+    Exit code 1 if a stage is missing, gone, silent, starved or late or has a problem, such as a recorder that cannot
+    write, or if a fan is not judged though the configuration has a scorer; 3 if a stage has lost data.
 
     With --stage: 0 if that process is heard and has caught up, 1 if not, whatever the others do.
 
@@ -101,7 +101,7 @@ def status(
                     live.update(stage_table(watcher, settings, judged, of_bus))
             _require_a_stage(watcher, settings)
         states = site_states(watcher, process_list(settings))
-        if any(state.is_fault for state in states) or unjudged(states, judged):
+        if any(state.is_fault or state.problem for state in states) or unjudged(states, judged):
             raise typer.Exit(1)
         if any(watcher.losses().values()):
             raise typer.Exit(3)
@@ -182,8 +182,8 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans, of_bus
         table.add_row(state.label, Text(state.word, style=style), *_figures(state.view, lost.get(state.label, 0)))
         if state.detail and (state.is_fault or state.word == Word.WAITING):
             problems.append(Text(f"{state.label}: {state.detail}", style=style))
-        if state.view and state.view.health.problem and state.view.alive:
-            problems.append(Text(f"{state.label}: {state.view.health.problem}", style="red"))
+        if state.problem:
+            problems.append(Text(f"{state.label}: {state.problem}", style="red"))
     notes = [Text(line) for line in note_lines(state.view.health for state in states if state.view)]
     problems += [Text(line, style="yellow") for line in (*loss_lines(states), *refused_lines(watcher.refused()))]
     now, lacking = judged.words_now(), unjudged(states, judged)

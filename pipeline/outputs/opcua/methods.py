@@ -32,8 +32,9 @@ from fantwin.pipeline.outputs.opcua.sessions import CURRENT_SESSION
 from fantwin.pipeline.outputs.opcua.site_nodes import SiteNodes
 from fantwin.pipeline.outputs.opcua.templates import method_nodes
 from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.one_line import one_line
 from fantwin.pipeline.site.request_desk import RequestDesk
-from fantwin.pipeline.site.request_form import LONGEST_COMMENT, LONGEST_SHELVING_S, one_line
+from fantwin.pipeline.site.request_form import LONGEST_COMMENT, LONGEST_SHELVING_S
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Action
 from fantwin.schemas.messages import Request

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import tomllib
@@ -98,6 +99,26 @@ def test_a_command_imports_nothing_that_only_watching_and_judging_need() -> None
     rooms = ("scoring", "stages", "twin", "pipeline.launch", "pipeline.runtime.stage")
     unneeded = (*(f"fantwin.{room}" for room in rooms), "rich", "scipy", "onnxr")
     assert [name for name in modules_after("main._register(['command'])") if name.startswith(unneeded)] == []
+
+
+INTERRUPTED_WHEN_IT_IMPORTS = """
+import os, signal, sys
+from fantwin.__main__ import main
+class Interrupt:
+    def find_spec(self, name, *_rest):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+sys.argv = ["fantwin", "up"]
+main()
+"""
+
+
+@pytest.mark.parametrize("module", ["typer", "fantwin.pipeline.cli.main", "fantwin.pipeline.cli.watch.up"])
+def test_ctrl_c_while_a_command_is_still_imported_ends_it_without_a_word(module: str) -> None:
+    code = INTERRUPTED_WHEN_IT_IMPORTS.format(module=module)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
 
 
 @pytest.mark.parametrize(

@@ -355,6 +355,31 @@ def test_into_a_pipe_a_running_site_is_shown_once_and_a_loss_is_exit_code_3(site
         beating.join()
 
 
+def test_a_problem_of_a_stage_is_exit_code_1_and_a_text_of_an_alarm_moves_no_cursor(site, monkeypatch):
+    monkeypatch.setattr(status_command, "_LISTEN_S", 0.5)
+    monkeypatch.setattr(status_command, "_LISTEN_MAX_S", 60.0)
+    stop = threading.Event()
+    broken = replace(HEALTH, lost=0, inputs=(), status=StageStatus.DEGRADED, problem="NOTHING IS RECORDED: \x1b[2Jfull")
+
+    def beat() -> None:
+        for number in itertools.count():
+            site.health.put(encode(replace(broken, t_ns=HEALTH.t_ns + number)))
+            site.score.put(encode(one_sample(FANS)))
+            site.alarm.put(encode(replace(ALARM, header=Header("scorer-all-1", number, TRAY), message="\x1b[31mslow")))
+            if stop.wait(0.1):
+                return
+
+    beating = threading.Thread(target=beat)
+    beating.start()
+    try:
+        done = fantwin_here(*map(str, status_words(site)))
+    finally:
+        stop.set()
+        beating.join()
+    assert done.exit_code == 1, done
+    assert "NOTHING IS RECORDED" in done.stdout and "[31mslow" in done.stdout and "\x1b" not in done.stdout
+
+
 def test_a_probe_asks_for_one_process_only_and_is_answered_as_soon_as_that_is_known(site, monkeypatch):
     name, *words = status_words(site)
     site.health.put(encode(replace(HEALTH, problem="the disk is full", status=StageStatus.DEGRADED)))

@@ -32,6 +32,13 @@ def test_lines_arrive_in_order_and_repetitions_at_the_end(pipe):
     assert os.read(pipe[0], 1000).decode() == "a\nb\nc\na ... repeated 2 times\n"
 
 
+def test_control_characters_of_a_stage_or_an_alarm_do_not_reach_the_terminal(pipe):
+    log = EventLog(pipe[1])
+    log.say("ALARM  tray1  fan 2: \x1b[2J\x1b]0;owned\x07slow\x9b31m\r\nok \u202e°")
+    log.close()
+    assert os.read(pipe[0], 1000).decode() == "ALARM  tray1  fan 2:  [2J ]0;owned slow 31m  ok  °\n"
+
+
 def test_row_08_a_reader_that_has_gone_ends_nothing(pipe):
     os.close(pipe[0])
     log = EventLog(pipe[1])

@@ -1,0 +1,38 @@
+"""Texts of devices, stages and operators as one visible line, for terminals, pages and mails."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm
+
+_NOT_SHOWN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+"""characters that end a line, move the cursor of a terminal, or turn the direction of what follows"""
+
+
+def one_line(text: str) -> str:
+    """The text with a space for each character that would not be seen as itself."""
+    return _NOT_SHOWN.sub(" ", text)
+
+
+def readable_alarm(alarm: Alarm) -> Alarm:
+    """The alarm with texts that are safe to show: whoever may publish on the bus chooses them."""
+    return replace(
+        alarm,
+        message=one_line(alarm.message),
+        operator_name=one_line(alarm.operator_name),
+        comment=one_line(alarm.comment),
+        feedback_by=one_line(alarm.feedback_by),
+        feedback_reason=one_line(alarm.feedback_reason),
+        causes=tuple(
+            replace(each, cause=one_line(each.cause), evidence=one_line(each.evidence)) for each in alarm.causes
+        ),
+    )
+
+
+def readable_health(health: Health) -> Health:
+    """The health with a problem and notes that are safe to show."""
+    notes = tuple(replace(note, text=one_line(note.text)) for note in health.notes)
+    return replace(health, problem=one_line(health.problem), notes=notes)
