@@ -1,4 +1,4 @@
-"""From residuals to statistics, limits, alarm states and causes, without bus, clock or files.
+"""Scoring: from residuals to statistics, limits, alarm states and causes, without bus, clock or files.
 
 docs/explanation/deciding.md explains the method.
 """

@@ -1,4 +1,4 @@
-"""What a tacho may show of a predicted speed, and the command that belongs to its readings.
+"""Expected reading: what a tacho may show of a predicted speed, and the command that belongs to its readings.
 
 A counting tacho shows the mean speed over its window, and keeps showing it until the next count is complete. When its
 windows begin is not known. At any time it may therefore show any of the means whose windows ended within the last
@@ -77,7 +77,7 @@ class AveragedCommand(ColumnState):
         for columns, over_window, over_age in self._means:
             self._memory_rows[columns] = over_window.depth + over_age.depth
         self._known_rows = np.zeros(len(tachos), np.int64)
-        """(fans,) for how many samples in a row the command has been known"""
+        """(fans,) number of samples in a row for which the command has been known"""
 
     @property
     def states(self) -> list[ColumnState]:
@@ -111,9 +111,10 @@ class _WindowMean(ColumnState):
     def __init__(self, columns: int, window_s: float, delay_s: float, period_s: float) -> None:
         self._end, self._begin = delay_s / period_s, (delay_s + window_s) / period_s  # in samples before the present
         self.depth = math.ceil(self._begin)
-        """how many samples back it reaches"""
+        """number of past samples that it needs"""
         self._integral = np.zeros((self.depth + 1, columns))
-        """at the last samples, in units times samples; it grows as long as the stage runs, a double is fine enough"""
+        """integral at the last samples, in units times samples; it grows as long as the stage runs, a double is fine
+        enough"""
         self._last = np.zeros(columns)
 
     def columns(self) -> dict[str, Array]:
@@ -159,7 +160,7 @@ class _Range(ColumnState):
 
 
 def _ago(past_and_new: Array, count: int, samples: float) -> Array:
-    """(count, columns) the values so many samples before each of the last `count` rows, interpolated."""
+    """Interpolate the values `samples` before each of the last `count` rows, (count, columns)."""
     whole = math.floor(samples)
     share, end = samples - whole, len(past_and_new) - whole
     near = past_and_new[end - count : end]

@@ -1,4 +1,4 @@
-"""Which samples of a prediction say what."""
+"""Samples of a prediction by what they say."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ NOT_ARRIVED = tuple(map(int, (InvalidReason.GAP, InvalidReason.STALE)))
 
 
 def arrived(invalid_reason: Array) -> Array:
-    """Where samples arrived on the line."""
+    """Return where samples arrived on the line."""
     return ~among(invalid_reason, *NOT_ARRIVED)
 
 
 def among(values: Array, first: int, *others: int) -> Array:
-    """Where values are one of these; of small blocks faster than np.isin by several times."""
+    """Return where values are one of these; for small blocks faster than np.isin by several times."""
     found: Array = values == first
     for other in others:
         found |= values == other
@@ -27,12 +27,12 @@ def among(values: Array, first: int, *others: int) -> Array:
 
 
 def reading_missing_of(prediction: Prediction) -> Array:
-    """(n, fans) of bool: where the newest raw sample has no reading; nowhere if the message does not tell."""
+    """Return where the newest raw sample has no reading, (n, fans); nowhere if the message does not tell."""
     return _or_nowhere(prediction.reading_missing, prediction)
 
 
 def reading_repeated_of(prediction: Prediction) -> Array:
-    """(n, fans) of bool: where a reading is that of the sample before, because no raw sample has come in between."""
+    """Return where a reading is that of the sample before, (n, fans), because no raw sample has come in between."""
     return _or_nowhere(prediction.reading_repeated, prediction)
 
 

@@ -21,12 +21,12 @@ IDLE_STATES = (
     (np.uint8(InvalidReason.STOPPED), np.uint8(FanState.STOPPED)),
     (np.uint8(InvalidReason.STARTING), np.uint8(FanState.STARTING)),
 )
-"""of a fan that is not scored because its command stops it, or has just started it"""
+"""reasons of a fan that is not scored because its command stops it, or has just started it"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScoreColumns:
-    """What was decided on fans: (fans,) each, or (n, fans) for the rows of a block."""
+    """Decisions on fans: (fans,) each, or (n, fans) for the rows of a block."""
 
     SUSPECT_FROM: ClassVar[float] = 0.5
     """score from which a fan is suspect"""
@@ -39,7 +39,7 @@ class ScoreColumns:
 
     @classmethod
     def empty(cls, *shape: int) -> Self:
-        """Columns of fans of which nothing is known."""
+        """Make columns of fans of which nothing is known."""
         return cls(
             score=np.zeros(shape),
             statistic=np.full(shape, int(Statistic.DEVIATION), np.uint8),

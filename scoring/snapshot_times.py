@@ -1,4 +1,4 @@
-"""The times in a scorer's snapshot, moved together: as after the host clock was set back while the site was stopped."""
+"""Times in a scorer's snapshot, moved together: as after the host clock was set back while the site was stopped."""
 
 from __future__ import annotations
 

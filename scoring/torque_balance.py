@@ -29,11 +29,11 @@ class BalanceModel:
     lag_s: Array
     filter_rate_per_s: float
     lowest_speed_rad_s: Array
-    """below it friction is undefined, and there is no balance"""
+    """speed below which friction is undefined, and there is no balance"""
     highest_speed_rad_s: float
-    """above it the command of a healthy fan is not known"""
+    """speed above which the command of a healthy fan is not known"""
     off_below: Array | None = None
-    """(fans,) with a smaller command the drive is off; None: where friction is not overcome"""
+    """(fans,) command below which the drive is off; None: where friction is not overcome"""
 
 
 class TorqueBalance(ColumnState):
@@ -110,7 +110,7 @@ class TorqueBalance(ColumnState):
             return filtered, weight
         for fan in np.flatnonzero(linked.any(axis=0)).tolist():
             state = np.array([[self._filtered[fan], self._weight[fan]]])
-            for rows in stretches(linked[:, fan]):
+            for rows in unbroken_rows(linked[:, fan]):
                 if rows.start > 0:
                     state = np.zeros((1, 2))
                 pair = np.column_stack((excess[rows, fan], np.ones(rows.stop - rows.start)))
@@ -130,7 +130,7 @@ class TorqueBalance(ColumnState):
         for fan in np.flatnonzero(lag_s).tolist():
             keep, share = float(keeps[fan]), float(shares[fan])
             lagged = self._lagged[fan : fan + 1]
-            for rows in stretches(np.isfinite(given[:, fan])):
+            for rows in unbroken_rows(np.isfinite(given[:, fan])):
                 held = given[rows, fan]
                 # a lag that has long settled, where nothing is known from before
                 start = held[:1] if np.isnan(lagged[0]) or rows.start > 0 else lagged
@@ -142,7 +142,7 @@ class TorqueBalance(ColumnState):
         return acting
 
     def _acting_once(self, period_s: float, given: Array) -> Array:
-        """The same for one sample, (fans,): all fans at once."""
+        """Filter one sample, (fans,): all fans at once."""
         keep, share = self._lagging(period_s)
         start = np.where(np.isnan(self._lagged), given, self._lagged)
         after = (1.0 - keep) * given + keep * start
@@ -164,7 +164,7 @@ SETTLED = 0.6
 
 
 def by_rows(rows: int, fans: int) -> bool:
-    """Whether to filter row by row, all fans at once, where each fan needs a call of its own otherwise."""
+    """Return whether to filter row by row, all fans at once, where each fan needs a call of its own otherwise."""
     return rows <= max(FEW_ROWS, ROWS_OF_FAN * fans)
 
 
@@ -186,7 +186,7 @@ def load_lfilter() -> Any:
     return lfilter
 
 
-def stretches(flags: Array) -> Sequence[slice]:
-    """Where flags (n,) are set without interruption."""
+def unbroken_rows(flags: Array) -> Sequence[slice]:
+    """Rows where flags (n,) are set without interruption."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(np.int8), [0]))))
     return [slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]

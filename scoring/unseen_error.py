@@ -1,4 +1,4 @@
-"""How far a twin may be wrong where it was not trained."""
+"""Error that a twin may have where it was not trained."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class UnseenError:
     drag: Array
 
     def of_fans(self, rows: Sequence[int]) -> UnseenError:
-        """That of the fans in these rows."""
+        """Error of the fans in these rows."""
         return replace(
             self,
             table=self.table.of_fans(rows),
@@ -58,5 +58,5 @@ class UnseenError:
         return of_speed, np.nan_to_num(slope * np.hypot(of_speed, of_needed))
 
     def _needed_by_speed(self, speed_rad_s: Array) -> Array:
-        """How the command that a fan needs rises with its speed."""
+        """Slope of the command that a fan needs, over its speed."""
         return self.viscous + 2.0 * self.drag * np.abs(speed_rad_s)

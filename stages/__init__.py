@@ -1,1 +1,1 @@
-"""One independent stage a module; none imports another."""
+"""Stages, one independent stage a module; none imports another."""

@@ -62,7 +62,7 @@ class AcquisitionConfig(StageConfig):
 
 
 def limits_of(tray: TrayConfig) -> ReadingLimits:
-    """Which readings of a tray are accepted."""
+    """Limits for the accepted readings of a tray."""
     return ReadingLimits(tray.fans, tray.command_min, tray.command_max, tray.speed_max)
 
 
@@ -70,7 +70,8 @@ Item: TypeAlias = BlockEvent | Command | PushedSamples
 
 
 class AcquisitionCore(Core):
-    """One tray. Everything that arrives is either published or counted by kind; no input raises an exception."""
+    """Acquisition of one tray. Everything that arrives is either published or counted by kind; no input raises an
+    exception."""
 
     def __init__(
         self,
@@ -93,10 +94,10 @@ class AcquisitionCore(Core):
         """the last event of the blocks"""
         self._sequence = DeviceSequence()
         self._most_samples = most_samples(tray.fans)
-        """in a message, however fast a line is"""
+        """samples in a message, however fast a line is"""
         self._stated_tachos = tuple(map(StatedTacho.of, tray.stated_tachos))
         self._tachos: tuple[Tacho, ...] = ()
-        """as the device itself says"""
+        """tachos that the device itself states"""
         self._commands = DeviceCommands(tray, source)
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
@@ -160,7 +161,7 @@ class AcquisitionCore(Core):
         }
 
     def notes(self) -> list[str]:
-        """What the source measures beside command and speed, and which input and commands were refused or lost."""
+        """Notes on what the source measures beside command and speed, and on refused or lost input and commands."""
         also = ", ".join(column.title for column in AUXILIARY if column in self._plausibility.auxiliary)
         found = [f"the source also measures {also}"] if also else []
         found += [
@@ -175,7 +176,7 @@ class AcquisitionCore(Core):
         return sum(isinstance(each, Reading) for batch in batches for each in batch.items)
 
     def problem(self) -> str:
-        """What is wrong with the connection now, and for a minute that the host clock was set."""
+        """Problem of the connection now, and for a minute that the host clock was set."""
         of_clients = self._source.problem(self._now_ns) if isinstance(self._source, PushSource) else ""
         return "; ".join(filter(None, (of_clients, self._problem_of_line(), self._problem_of_host_clock())))
 
@@ -239,7 +240,7 @@ class AcquisitionCore(Core):
         return [raw_message(samples, self._tray, self._stated_tachos)] if samples else []
 
     def _follow_device(self, tachos: tuple[Tacho, ...]) -> None:
-        """What the device itself says goes into the messages, whatever the configuration says."""
+        """Put what the device itself states into the messages, whatever the configuration says."""
         self._tachos = tachos
         stated = tachos[:1] if len(set(tachos)) == 1 else tachos
         self._stated_tachos = tuple(map(StatedTacho.of, stated or self._tray.stated_tachos))
@@ -295,7 +296,7 @@ def build(context: Context) -> BuiltStage:
 
 
 def check(context: Context) -> list[str]:
-    """What would keep the source from connecting."""
+    """Problems that would keep the source from connecting."""
     try:
         source = build_tray_source(context)
         return [] if context.is_running and context.tray.source.takes_port else source.check()

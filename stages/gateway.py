@@ -35,7 +35,7 @@ from fantwin.schemas.units import NS_PER_S
 FLEET_PERIOD_NS = NS_PER_S
 STAGES_PERIOD_NS = 2 * NS_PER_S
 ALL_FOLLOWED = 64
-"""with no more fans than this, all samples of all trays arrive"""
+"""number of fans up to which all samples of all trays arrive"""
 MOST_FOLLOWED = 32
 """trays that somebody looks at; of more, the samples come once a second"""
 
@@ -111,18 +111,18 @@ class GatewayCore(SiteCore):
         return set(sorted({tray for tray, _ in self._feed.looked_at()})[:MOST_FOLLOWED])
 
     def problem(self) -> str:
-        """Of the server, the users and the history."""
+        """Problem of the server, the users and the history."""
         return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
 
 
 class Server:
-    """What the core needs of the web server."""
+    """Web server, as far as the core needs it."""
 
     def stop(self) -> None:
         """End it."""
 
     def problem(self) -> str:
-        """What is wrong; empty if nothing is."""
+        """Problem of the server; empty for none."""
         return ""
 
 

@@ -34,9 +34,9 @@ from fantwin.schemas.messages import Message, NewTwin, Raw, Request, Score
 from fantwin.schemas.units import NS_PER_S
 
 LOOK_NS = NS_PER_S
-"""how often the learner looks for what has changed"""
+"""time between two looks for what has changed"""
 FLUSH_NS = 10 * NS_PER_S
-"""how often the history is flushed to the disk: a crash loses as much"""
+"""time between two flushes of the history to the disk: a crash loses as much"""
 AHEAD_NS = 60 * NS_PER_S
 """the history may be so much ahead of the samples"""
 
@@ -81,14 +81,14 @@ class LearnerCore(Core):
         self._looked_ns = self._flushed_ns = 0
         self._seen_change: int | None = None
         self._is_list_read = False
-        """whether the list of versions could be read; if not, nothing is learned: a new version could not be listed"""
+        """true if the list of versions could be read; if not, nothing is learned: a new version could not be listed"""
         self._listed = VersionList()
         """the versions when they were last read"""
         self._in_force: Version | None = None
         """the one that was published"""
         self._schedule = LearningSchedule(history, operation, config.first_minutes)
         self._problems: dict[str, str] = {}
-        """of the versions: what was done with them, and what went wrong"""
+        """problems with the versions, by what was done with them"""
 
     def step(self, item: Raw | Score | Request) -> Sequence[Message]:
         """Add samples to the healthy history, or see whether a fan has an alarm or is commissioned again."""
@@ -174,7 +174,8 @@ class LearnerCore(Core):
 
     @property
     def _is_watched(self) -> bool:
-        """Whether samples wait until they are judged: there is a version, or it is not known whether there is one."""
+        """Return whether samples wait until they are judged: there is a version, or it is not known whether there is
+        one."""
         return not self._is_list_read or (self._last is not None and not self._is_tainted)
 
     @property
@@ -185,7 +186,7 @@ class LearnerCore(Core):
 
     @property
     def _is_tainted(self) -> bool:
-        """Whether the twin that the stages have was learned from a time that was marked as faulty."""
+        """Return whether the twin that the stages have was learned from a time that was marked as faulty."""
         return self._in_force is not None and overlap(self._in_force.learned_spans, self._listed.faulty)
 
     def _see(self, score: Score) -> None:
@@ -263,7 +264,7 @@ class LearnerCore(Core):
             self._schedule.failed(problem)
 
     def _take_outcome(self) -> None:
-        """What became of the version or check that was started last."""
+        """Take the result of the version or check that was started last."""
         ended = self._learning.poll()
         if ended:
             self._schedule.failed(ended)
@@ -271,7 +272,7 @@ class LearnerCore(Core):
             self._schedule.succeeded()
 
     def _ahead(self) -> str:
-        """That the history or the newest version is of later times than the samples."""
+        """Note that the history or the newest version is of later times than the samples."""
         end_t_ns = max(self._history.end_t_ns, self._last.made_t_ns if self._last else 0)
         if not self._history.newest_t_ns or end_t_ns - self._history.newest_t_ns <= AHEAD_NS:
             return ""
@@ -288,7 +289,7 @@ class LearnerCore(Core):
         return f"no twin yet, nothing is judged; {minutes:.0f} min recorded ({needed}){lacks}"
 
     def _next_version(self) -> str:
-        """When it is due, as the end of a sentence; empty where something else decides."""
+        """Time when it is due, as the end of a sentence; empty where something else decides."""
         wait_s = self._schedule.version_wait_s(self._listed)
         if wait_s is None or self._learning.seconds is not None:
             return ""
@@ -302,7 +303,7 @@ def _duration(seconds: float) -> str:
 
 
 def _finds(version: Version) -> str:
-    """What the limits of a version find at its middle speed, and their false-alarm rate."""
+    """Drops that the limits of a version find at its middle speed, and their false-alarm rate."""
     known = [drop for drop in version.drops if drop.within_a_minute is not None]
     if not known:
         return version.rate_text
@@ -312,10 +313,10 @@ def _finds(version: Version) -> str:
 
 
 class _NamesItsTwin(Core):
-    """Of a tray that names its twin: it learns none."""
+    """Learner of a tray that names its twin: it learns none."""
 
     def step(self, item: Raw | Score | Request) -> Sequence[Message]:
-        """Nothing."""
+        """Do nothing."""
         return []
 
 
@@ -353,7 +354,7 @@ def build(context: Context) -> BuiltStage:
 
 
 def check(context: Context) -> list[str]:
-    """What would keep it from learning."""
+    """Problems that would keep it from learning."""
     with suppress(UserError):
         TwinVersions(learning_folder(context.run_folder, context.tray.name), context.tray.name).all()
         return []

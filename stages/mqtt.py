@@ -40,11 +40,11 @@ from fantwin.schemas.units import NS_PER_S
 
 HISTORY = "mqtt-alarms.sqlite"
 SETTLED_AFTER_NS = 2 * NS_PER_S
-"""after the start: alarms of before are being heard again, and nothing is published yet"""
+"""time after the start in which alarms of before are heard again, and nothing is published"""
 KNOWN_AFTER_NS = 10 * NS_PER_S
-"""after the start: a fan of which no alarm was heard has none, a tray without a score is silent"""
+"""time after the start until a fan of which no alarm was heard has none, and a tray without a score is silent"""
 FOUND_WITHIN_NS = 10 * NS_PER_S
-"""after connecting: what the broker had retained has come"""
+"""time after connecting in which the broker sends what it had retained"""
 CHANGES_PERIOD_NS = NS_PER_S // 2
 SITE_PERIOD_NS = 5 * NS_PER_S
 
@@ -88,7 +88,7 @@ class MqttCore(SiteCore):
         self._changed_alarms.add(Fan(alarm.header.tray, alarm.fan))
 
     def tick(self, now_ns: int) -> Sequence[Message]:
-        """Publish what has changed, as far as the broker has room, and pass on requests."""
+        """Publish changes while the broker has room, and pass on requests."""
         if self._began_ns is None or now_ns < self._began_ns:
             self._began_ns = now_ns
         if self._link.sessions != self._session:
@@ -114,7 +114,7 @@ class MqttCore(SiteCore):
         self._model.close()
 
     def counters(self) -> Mapping[str, int]:
-        """What was published, what waits, and what became of requests."""
+        """Counters of what was published, what waits, and what became of requests."""
         return {
             "connections": self._link.sessions,
             "waiting_transitions": self._queue.waiting,
@@ -138,7 +138,7 @@ class MqttCore(SiteCore):
         return (f"Home Assistant: {left_out} fans have no entities; home_assistant_trays chooses those that have",)
 
     def problem(self) -> str:
-        """Of the broker, and of the history."""
+        """Problem of the broker or the history."""
         broker = self._link.problem()
         if broker and self._queue.lost:
             broker += f"; more than {self._config.most_waiting} transitions of alarms wait, the oldest are lost"
@@ -158,7 +158,7 @@ class MqttCore(SiteCore):
             self._link.forget(patterns_of_retained(self._config, self._topics, self._home_assistant))
 
     def _is_left_over(self, topic: str) -> bool:
-        """Whether a retained topic is of a device or fan that is not configured any more."""
+        """Return whether a retained topic is of a device or fan that is not configured any more."""
         if self._home_assistant.is_own(topic):
             return topic not in self._devices
         parts = self._topics.parts(topic)
@@ -220,7 +220,7 @@ class MqttCore(SiteCore):
 
 
 def patterns_of_retained(config: MqttConfig, topics: Topics, home_assistant: HomeAssistant) -> tuple[str, ...]:
-    """What is looked at after connecting, for topics of fans that are not configured any more."""
+    """Patterns of the topics that are read after connecting, for topics of fans that are not configured any more."""
     devices = () if config.home_assistant == "off" else (home_assistant.pattern,)
     return (*topics.of_fans(), *devices)
 

@@ -27,7 +27,7 @@ from fantwin.schemas.units import NS_PER_S
 
 OUTBOX = Path("notifier.sqlite")
 EXPIRY_PERIOD_NS = 60 * NS_PER_S
-"""so often, messages that have waited too long are looked for"""
+"""time between two searches for messages that have waited too long"""
 ALERTS_PERIOD_NS = NS_PER_S
 SAVED_AGAIN_AFTER_NS = NS_PER_S
 """a full disk is tried again"""
@@ -115,21 +115,21 @@ class NotifierCore(Core):
         }
 
     def problem(self) -> str:
-        """Of the targets and the outbox."""
+        """Problem of the targets or the outbox."""
         lost = [
             f"target {name}: messages were lost: too old, too many, or refused" for name in sorted(self._outbox.lost)
         ]
         return "; ".join(filter(None, (self._saving, *(s.problem() for s in self._senders.values()), *lost)))
 
     def notes(self) -> Sequence[str]:
-        """How many fans wait for the end of quiet hours, or for others that go into the same message."""
+        """Number of fans that wait for the end of quiet hours, or for others that go into the same message."""
         return [
             f"target {target}: {count} {'fan' if count == 1 else 'fans'} wait for the next message ({basket})"
             for (target, basket), count in self._notifications.waiting().items()
         ]
 
     def _save(self, now_ns: int) -> None:
-        """What cannot be saved stays, and is tried again."""
+        """Save the decisions; what cannot be saved is tried again."""
         changes = self._notifications.changes
         try:
             self._outbox.save(

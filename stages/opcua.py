@@ -33,7 +33,7 @@ CERTIFICATE, KEY = Path("opcua-certificate.der"), Path("opcua-key.pem")
 
 
 class Server:
-    """What the core needs of the OPC UA server."""
+    """OPC UA server, as far as the core needs it."""
 
     def publish(self, condition: Condition) -> None:
         """Send the event of a transition; never waits."""
@@ -42,11 +42,11 @@ class Server:
         """End it."""
 
     def problem(self) -> str:
-        """What is wrong; empty if nothing is."""
+        """Problem of the server; empty for none."""
         return ""
 
     def counters(self) -> Mapping[str, int]:
-        """What it counts."""
+        """Counters of the server."""
         return {}
 
 
@@ -97,11 +97,11 @@ class OpcuaCore(SiteCore):
         return {"refused_scores": self._model.refused_scores, **self._counts, **self._server.counters()}
 
     def followed(self) -> Set[str] | None:
-        """No tray in full: the newest score of each, once a second, is enough."""
+        """Return that no tray is followed in full: the newest score of each, once a second, is enough."""
         return set()
 
     def problem(self) -> str:
-        """Of the server, the users and the history."""
+        """Problem of the server, the users and the history."""
         return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
 
 

@@ -52,13 +52,13 @@ HELD_BYTES = 16 << 20
 TICK_NS = 50_000_000
 """about the time between ticks"""
 DISK_CHECK_NS = NS_PER_S
-"""how often the free space is checked"""
+"""time between two checks of the free space"""
 LIMITS_CHECK_NS = 10 * NS_PER_S
-"""how often the limits on age and size are checked; they are also checked before each part"""
+"""time between two checks of the limits on age and size; they are also checked before each part"""
 URGENT = ("alarm", "request", "twin")
 """topics whose messages are on the disk within FLUSH_S"""
 CLIP_SETTLED_S = 2.0
-"""after the end of a clip, for what comes late; it then waits until all of that is on the disk"""
+"""time after the end of a clip for what comes late; it then waits until all of that is on the disk"""
 ROOM_TO_RESUME = 1 << 20
 """bytes that must be free beyond the minimum to resume, so that recording does not pause again at once"""
 KEEPS = STAGES[RECORDER].keeps
@@ -115,7 +115,7 @@ class Recorder(Core):
         """time of receipt of the oldest message that may not be on the disk yet"""
         self._unflushed_bytes = 0
         self._is_urgent = False
-        """whether a message must be on the disk soon"""
+        """true if a message must be on the disk soon"""
         try:
             self._keep_limits()
             shortage = self._room.shortage(0)
@@ -255,7 +255,8 @@ class Recorder(Core):
             self._part.add(card.received_at(self._began_ns))
 
     def _is_flush_due(self) -> bool:
-        """Whether a message would be unflushed for too long at the next tick; not at every tick behind a backlog."""
+        """Return whether a message would be unflushed for too long at the next tick; not at every tick behind a
+        backlog."""
         is_clip_running = self._clips is not None and self._clips.is_running
         is_soon = self._is_urgent or is_clip_running or self._unflushed_bytes >= FLUSH_BYTES
         flush_ns = self._soon_ns if is_soon else self._flush_ns

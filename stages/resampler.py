@@ -1,4 +1,4 @@
-"""Resampler: irregular raw samples to a uniform time grid.
+"""Resampler: puts irregular raw samples on a uniform time grid.
 
 Reads: topic `raw` (device clock us, host time of receipt ns, command, speed rad/s).
 Writes: topic `grid`: samples at absolute multiples of the period (t_ns % period_ns == 0), speed interpolated linearly,
@@ -110,14 +110,14 @@ class ResamplerCore(Core):
         self._fans = fans
         self._tachos = tacho_of_each_fan(tachos, fans)
         self._stated: tuple[StatedTacho, ...] = ()
-        """by the newest message"""
+        """tachos stated by the newest message"""
         self._other_tachos = ""
         self._config = config
         self._line = LineRate()
         self._line_hz: float | None = None
-        """as found; None: not yet, or not asked for"""
+        """rate of the line as found; None: not yet, or not asked for"""
         self._waiting: list[Raw] = []
-        """until the rate of the line is known"""
+        """samples that wait until the rate of the line is known"""
         self._newest = SampleTimes(ENOUGH_SAMPLES)
         self._wrong_fans = 0
         self._input_is_complete = True
@@ -128,7 +128,7 @@ class ResamplerCore(Core):
             self._start(config.rate_hz)
 
     def step(self, item: Raw) -> list[Grid]:
-        """Add raw samples; returns the grid as far as it is determined."""
+        """Add raw samples; return the grid that they determine."""
         if item.fans != self._fans:
             self._wrong_fans = item.fans
             self._counts["lost_wrong_fan_count"] += len(item.host_receive_t_ns)
@@ -151,7 +151,7 @@ class ResamplerCore(Core):
         return self._grid.tick(now_ns, is_complete=self._input_is_complete) if self._grid else []
 
     def confirm_input(self, *, is_complete: bool) -> None:
-        """Whether acquisition has shown since the last tick that all of its samples have arrived."""
+        """Note whether acquisition has shown since the last tick that all of its samples have arrived."""
         self._input_is_complete = is_complete
 
     def publish_until(self, t_ns: int) -> list[Grid]:
@@ -182,14 +182,14 @@ class ResamplerCore(Core):
         return [f"grid of {self._timing.rate_hz:g} Hz{line}; {gaps}, {share:.1f} % of the grid"]
 
     def problem(self) -> str:
-        """No samples, those of another number of fans or other tachos, a line that does not fit the grid, or a host
-        clock set back."""
+        """Problem: no samples, those of another number of fans or other tachos, a line that does not fit the grid, or a
+        host clock that was set back."""
         if self._wrong_fans:
             return f"raw samples of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
         return "; ".join(filter(None, (self._other_tachos, self._problem_of_times())))
 
     def _difference(self, stated: tuple[StatedTacho, ...]) -> str:
-        """What a message states to measure, where the configuration says otherwise."""
+        """Words on the tachos that a message states, where the configuration says otherwise."""
         try:
             tachos = tacho_of_each_fan([each.tacho for each in stated], self._fans) if stated else self._tachos
         except ValueError:

@@ -95,7 +95,7 @@ class ScorerCore(Core):
         self._not_restored = ""
         """why the snapshot was not used as a whole, for people"""
         self._set_back, self._set_back_until_t_ns = "", 0
-        """that the snapshot was set back, for people"""
+        """note for people that the snapshot was moved back in time, and until when it is shown"""
         self._rest_ns = fans * REST_NS_PER_FAN if fans > MOST_FANS_AT_ONCE else 0
         self._owes_snapshot = False
         """alarms have changed since the last one"""
@@ -113,11 +113,11 @@ class ScorerCore(Core):
         self.tray = TrayScorer(self._fans, self._text, self._config, self._twin)
         self._last_t_ns = self._snapshot_t_ns = np.iinfo(np.int64).min
         self._shown_until_t_ns = np.iinfo(np.int64).max
-        """until when health says that a snapshot was not used; not known before the first sample"""
+        """end of the time in which health says that a snapshot was not used; not known before the first sample"""
         self._input_producer = ""
-        """who made the last prediction"""
+        """producer of the last prediction"""
         self._is_restored = False
-        """from a snapshot that was not yet compared with the first prediction"""
+        """true while a restored snapshot was not yet compared with the first prediction"""
 
     def restore(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
         """Continue from a snapshot. Returns the messages that report it.
@@ -232,14 +232,14 @@ class ScorerCore(Core):
         return {**self._counts, **of_alarms}
 
     def notes(self) -> list[str]:
-        """Where it continued from, if not from its file; which share of the samples was judged, and why the others were
-        not; fans that change slowly."""
+        """Notes on where it continued from, if not from its file; on the share of the samples that was judged, and why
+        the others were not; on fans that change slowly."""
         of_twin = [] if self._twin.is_calibrated else [NOT_CALIBRATED]
         of_store = [self._snapshot_store.note] if self._snapshot_store and self._snapshot_store.note else []
         return [*of_twin, *of_store, *self._judged_share.notes, *self.tray.wear.notices()]
 
     def problem(self) -> str:
-        """What people should look at: input, snapshot, fans without a score, wear."""
+        """Problem for people to look at: input, snapshot, fans without a score, wear."""
         if self._wrong_fans:
             return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
         is_new = self._last_t_ns < self._shown_until_t_ns
@@ -293,7 +293,8 @@ class ScorerCore(Core):
         )
 
     def _discard_if_replayed(self, item: Prediction) -> list[Alarm]:
-        """Discard a restored snapshot if a replay plays samples from before it; the messages on discarded alarms.
+        """Discard a restored snapshot if a replay plays samples from before it; return the messages on discarded
+        alarms.
 
         On a live site a snapshot stays valid with older samples: a restarted producer repeats all that was kept.
         """
@@ -321,7 +322,7 @@ class ScorerCore(Core):
         return [*self._take_snapshot(), *alarms]  # whoever has the answer can rely on it
 
     def _is_snapshot_due(self, period_ns: int) -> bool:
-        """Whether alarms have changed since the last snapshot, or it is old; period_ns: between samples."""
+        """Return whether alarms have changed since the last snapshot, or it is old; period_ns: between samples."""
         rest_ns = self._rest_ns if self._owes_snapshot else max(SNAPSHOT_PERIOD_NS, SNAPSHOT_PERIOD_SAMPLES * period_ns)
         return self._last_t_ns - self._snapshot_t_ns >= rest_ns
 
@@ -352,7 +353,7 @@ def _json(state: Mapping[str, Any]) -> str:
 
 
 def _kept_by_others(context: Context) -> Elsewhere | None:
-    """What others keep of the state of a tray; None: they are not asked."""
+    """Access to the snapshots that others keep of a tray; None: they are not asked."""
     kept, tray, config = context.kept, context.tray.name, context.config
     asks = config.asks_for_snapshots if config.asks_for_snapshots is not None else context.instance != ALL_TRAYS
     return (lambda is_patient: kept.of(tray, is_patient=is_patient)) if kept and asks else None

@@ -126,7 +126,7 @@ class TwinIntegratorCore(Core):
         return {**self._counts, **self.tray.counters()}
 
     def notes(self) -> list[str]:
-        """Which columns the twin needs."""
+        """Note on the columns that the twin needs."""
         conditions = self._twin.card.conditions
         return [f"twin {self._twin.card.name} allows for {conditions.in_words}"] if conditions else []
 
@@ -152,7 +152,7 @@ class TwinIntegratorCore(Core):
         return select(grid, new)
 
     def _is_of_another_session(self, grid: Grid) -> bool:
-        """Whether another session of the resampler continues the grid.
+        """Return whether another session of the resampler continues the grid.
 
         Each derives times from the clock of the device again. By tens of milliseconds they may differ, as if the speed
         had jumped.
@@ -167,7 +167,7 @@ class JointIntegrators:
         self._joint = JointTrayIntegrator()
 
     def process(self, cores: Sequence[TwinIntegratorCore], blocks: Sequence[Grid]) -> Sequence[Prediction]:
-        """What `finish` of each is given."""
+        """Predict blocks; return what `finish` of each is given."""
         return self._joint.predict([core.tray for core in cores], blocks)
 
 
@@ -187,7 +187,7 @@ def build(context: Context) -> BuiltStage:
 
 
 def check(context: Context) -> list[str]:
-    """What would keep the twin from being loaded."""
+    """Problems that would keep the twin from being loaded."""
     if context.tray.twin is None:
         return []
     try:

@@ -152,7 +152,7 @@ def check(context: Context) -> list[str]:
 
 
 def topics_read(config: ViewerConfig, trays: Sequence[TrayConfig]) -> tuple[str, ...]:
-    """Of a fleet, the wear is not drawn: the snapshots of its scorers are many megabytes a minute."""
+    """Topics of trays. Of a fleet, the wear is not drawn: the snapshots of its scorers are many megabytes a minute."""
     is_fleet = sum(tray.fans for tray in trays) > config.fleet_above
     return tuple(topic for topic in READS if not (is_fleet and topic == "snapshot"))
 

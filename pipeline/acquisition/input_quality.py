@@ -46,7 +46,7 @@ class InputQuality:
         self._input_t_ns, self._valid_t_ns = max(self._input_t_ns, t_ns), max(self._valid_t_ns, t_ns)
 
     def add_input(self, t_ns: int) -> None:
-        """Something has arrived."""
+        """Note that input has arrived."""
         self._input_t_ns = t_ns
 
     def add_valid(self) -> None:

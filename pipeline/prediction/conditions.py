@@ -71,7 +71,7 @@ class ConditionTracker(ColumnState):
         return f"{subject} not scored: {cause} the command out of the twin's range"
 
     def update(self, grid: Grid) -> Ratios:
-        """Those of the next block."""
+        """Ratios of the next block."""
         return Ratios(*self._ratios.update(grid.t_ns / NS_PER_S, grid.supply_voltage_v, grid.temperature_c))
 
     def missing(self, grid: Grid) -> str:

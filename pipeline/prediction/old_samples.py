@@ -1,7 +1,7 @@
 """Detection of input whose times have gone back for good: it is dropped as repeated, and nothing is judged.
 
 A stage that restarts repeats what its producers have kept, and catches up at once. If the host clock was set back and
-the stages before this one were restarted, its input is older than what it has had and stays so.
+the stages before this one were restarted, its input remains older than what it has had.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class OldSamples:
         self._behind_ns = last_t_ns - int(t_ns[-1])
 
     def clear(self) -> None:
-        """There was a new sample."""
+        """Note a new sample."""
         self._dropped_ns = self._behind_ns = 0
 
     def problem(self, input_name: str, stages: str) -> str:

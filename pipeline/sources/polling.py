@@ -134,7 +134,7 @@ class PollingSource:
 
     @property
     def settings_to_check(self) -> str:
-        """Those of the device."""
+        """Settings of the device that may be wrong."""
         return self.device.settings_to_check
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:

@@ -24,7 +24,7 @@ class Samples(NamedTuple):
     auxiliary: Array
 
     def extended(self, later: Samples) -> Samples:
-        """These samples and later ones."""
+        """Return these samples followed by later ones."""
         before = self.auxiliary
         if before.shape[1] < later.auxiliary.shape[1]:
             before = np.full((len(self.t_ns), *later.auxiliary.shape[1:]), np.nan)

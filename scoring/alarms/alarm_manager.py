@@ -40,10 +40,10 @@ class Measured:
 
 
 class FanFacts(Protocol):
-    """What is known of the fans of a tray at the end of a bin."""
+    """Facts about the fans of a tray at the end of a bin."""
 
     def measured(self, fan: int) -> Measured:
-        """What is measured of a fan with an alarm."""
+        """Measurements of a fan with an alarm."""
         ...
 
     def causes(self, fan: int, known: tuple[Diagnosis, ...] = ()) -> tuple[Diagnosis, ...]:
@@ -52,7 +52,7 @@ class FanFacts(Protocol):
 
     @property
     def stands_against_command(self) -> Array:
-        """(fans,) whether each stands or turns against its command."""
+        """Return which fans stand or turn against their command, (fans,)."""
         ...
 
 
@@ -66,16 +66,16 @@ class AlarmManager:
         self._last_emitted: dict[int, Alarm] = {}
         """the last message about each fan"""
         self._stood = np.zeros(fans, np.bool_)
-        """(fans,) whether each stood or turned against its command when last looked at"""
+        """(fans,) true where a fan stood or turned against its command at the last look"""
         self._due_t_ns: dict[int, list[int]] = {}
-        """when the causes of each alarm are looked at again"""
+        """times at which the causes of each alarm are looked at again"""
         self._answered: dict[str, int] = {}
-        """for each producer of requests, the sequence of the first one that is not answered"""
+        """sequence of the first request that is not answered, for each producer of requests"""
         self.raised = self.cleared = 0
 
     @property
     def active(self) -> Array:
-        """(fans,) whether each fan's alarm is active."""
+        """Return which fans have an active alarm, (fans,)."""
         return self._conditions.active
 
     def update(self, now: Decided, facts: FanFacts) -> list[Alarm]:
@@ -120,7 +120,7 @@ class AlarmManager:
         return alarms
 
     def answer(self, request: Request, last_t_ns: int) -> list[Alarm]:
-        """One answer for each fan that a request concerns; none if it was answered before.
+        """Answer for each fan that a request concerns; return nothing if it was answered before.
 
         last_t_ns: time of the last sample, 0 for none.
         """
@@ -153,7 +153,7 @@ class AlarmManager:
         return alarms
 
     def republish(self) -> list[Alarm]:
-        """After a restart: one message for each listed alarm, with the name of who acknowledged it."""
+        """Messages after a restart: one for each listed alarm, with the name of who acknowledged it."""
         return [self._republished(fan) for fan in self._listed()]
 
     def discard_all(self, t_ns: int, *, keep_silenced: bool) -> list[Alarm]:
@@ -210,7 +210,7 @@ class AlarmManager:
         self._answered = {str(producer): int(sequence) for producer, sequence in stored["answered"].items()}
 
     def _is_new(self, header: Header) -> bool:
-        """Whether a request is not yet answered. A restarted scorer receives again what producers still hold."""
+        """Return whether a request is not yet answered. A restarted scorer receives again what producers still hold."""
         if header.sequence < self._answered.get(header.producer, 0):
             return False
         self._answered.pop(header.producer, None)  # re-inserted at the end: the latest requesters are kept
@@ -256,7 +256,7 @@ class AlarmManager:
 
 
 def _is_news(causes: tuple[Diagnosis, ...], than: tuple[Diagnosis, ...]) -> bool:
-    """Whether causes are worth a message. What a fan does after it stood says less of why it came to rest."""
+    """Return whether causes are worth a message. What a fan does after it stood says less of why it came to rest."""
     stood = bool(than) and is_of_standstill(than[0])
     return bool(causes) and not (stood and not is_of_standstill(causes[0])) and says_more(causes, than)
 

@@ -89,7 +89,7 @@ class AlarmText:
 
 
 def _after_restart(alarm: Alarm) -> str:
-    """Of an alarm that is over: what keeps it on the list, if anything does."""
+    """Words on an alarm that is over: what keeps it on the list, if anything does."""
     if alarm.active:
         return CONTINUES
     kept = {

@@ -1,4 +1,4 @@
-"""What the fault of an alarm takes, in the units of a tray."""
+"""Units of a tray for alarms: what the fault of an alarm takes, in numbers for people."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class AlarmUnits:
         return f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
 
     def deviation(self, alarm: Alarm) -> str:
-        """How far a fan is from what it would do when healthy, by its speed or by its torque balance."""
+        """Deviation of a fan from its healthy state, by its speed or by its torque balance."""
         if alarm.residual_rad_s or not alarm.torque_balance_command:
             side = "slower" if alarm.residual_rad_s < 0 else "faster"
             size = self.shown_speed(abs(alarm.residual_rad_s))

@@ -127,8 +127,8 @@ def in_sequence(messages: Iterable[Alarm]) -> list[Alarm]:
 
 
 def needed(messages: Sequence[Alarm]) -> list[Alarm]:
-    """Of the messages about a fan, in sequence, the few from which its current alarm follows; the others never matter
-    again, whatever is published next."""
+    """Select, of the messages about a fan in sequence, the few from which its current alarm follows; the others never
+    matter again, whatever is published next."""
     parts = _parts(messages)
     return [alarm for alarm in messages if alarm in parts]
 

@@ -21,7 +21,7 @@ from fantwin.schemas.units import NS_PER_S
 UNTIL_IT_CLEARS_T_NS = 2**63 - 1
 """`shelved_until_t_ns` of a one-shot shelving: until the alarm clears or is unshelved."""
 ONSET_TOLERANCE_NS = NS_PER_S
-"""of the onset by which an operator names an alarm: people read it in seconds, and a browser rounds it"""
+"""tolerance of the onset by which an operator names an alarm: people read it in seconds, and a browser rounds it"""
 GIVES_FEEDBACK = {
     Action.TRUE_ALARM: (Transition.MARKED_TRUE, Feedback.TRUE_ALARM),
     Action.FALSE_ALARM: (Transition.MARKED_FALSE, Feedback.FALSE_ALARM),
@@ -34,10 +34,10 @@ EARLIER_ALARMS = 32
 
 @dataclass(frozen=True)
 class ConditionSettings:
-    """What operators must do with an alarm, and for how long it is confirmed by data."""
+    """Settings of an alarm: what operators must do with it, and for how long data confirm it."""
 
     latching: bool = False
-    """a cleared alarm stays until it is reset"""
+    """true: a cleared alarm remains until it is reset"""
     confirming: bool = False
     """an acknowledged alarm must also be confirmed"""
     data_lost_after_ns: int = DATA_LOST_AFTER_NS
@@ -54,7 +54,7 @@ class AlarmState:
     severity: Severity = Severity.NONE
     """highest since the alarm was raised; NONE if it never was"""
     onset_t_ns: int = 0
-    """when the fault of the alarm probably began; identifies the occurrence"""
+    """probable start of the alarm's fault; identifies the occurrence"""
     acknowledged: bool = True
     confirmed: bool = True
     """False between an acknowledgement and its confirmation, where confirming is required"""
@@ -67,7 +67,7 @@ class AlarmState:
     """the state is that of before a gap: no sample has confirmed it since"""
     acknowledged_by: str = ""
     comment: str = ""
-    """of the last granted request that had one, feedback apart"""
+    """comment of the last granted request that had one, feedback apart"""
     feedback: Feedback = Feedback.NONE
     """the last one on this occurrence"""
     feedback_by: str = ""
@@ -75,13 +75,13 @@ class AlarmState:
 
 
 class FanCondition:
-    """One fan's alarm."""
+    """Alarm of one fan, as a condition of OPC UA Part 9."""
 
     def __init__(self, settings: ConditionSettings) -> None:
         self._settings = settings
         self.alarm_state = AlarmState()
         self._earlier_onsets_t_ns: tuple[int, ...] = ()
-        """of the alarms before this one, oldest first"""
+        """onsets of the alarms before this one, oldest first"""
 
     def update(self, *, active: bool, severity: Severity, onset_t_ns: int) -> Sequence[tuple[Transition, AlarmState]]:
         """Process what was decided, on data; returns the transitions, in order.
@@ -127,7 +127,7 @@ class FanCondition:
         return cleared, self.unshelve()
 
     def lose_data(self) -> Sequence[tuple[Transition, AlarmState]]:
-        """Nothing has been judged for too long: an active alarm becomes stale."""
+        """Make an active alarm stale: nothing has been judged for too long."""
         if not self.alarm_state.active or self.alarm_state.stale:
             return ()
         self.alarm_state = replace(self.alarm_state, stale=True)

@@ -30,28 +30,28 @@ class AlarmEvent:
 
 @dataclass(frozen=True, eq=False)
 class Decided:
-    """What was decided at a time, (fans,) each."""
+    """Decisions at a time, (fans,) each."""
 
     t_ns: int
     judged: Array
-    """whether something was: else the rest says nothing"""
+    """true where there was a decision; elsewhere the rest means nothing"""
     active: Array
     severity: Array
     """value of schemas.enums.Severity, where an alarm is active"""
     onset_t_ns: Array
-    """when the fault of an active alarm began"""
+    """start of the fault of an active alarm"""
     every_ns: int
     """time between two decisions"""
 
 
 class TrayConditions:
-    """One condition for each fan of a tray."""
+    """Conditions of a tray, one for each fan."""
 
     def __init__(self, fans: int, settings: ConditionSettings) -> None:
         self._settings = settings
         self._conditions = [FanCondition(settings) for _ in range(fans)]
         self._judged_t_ns = np.full(fans, NEVER_NS, np.int64)
-        """(fans,) when each was judged last"""
+        """(fans,) time when each was judged last"""
         self._refresh_all()
 
     def update(self, now: Decided) -> list[AlarmEvent]:
@@ -107,7 +107,7 @@ class TrayConditions:
 
     @property
     def active(self) -> Array:
-        """(fans,) whether each fan's alarm is active."""
+        """Return which fans have an active alarm, (fans,)."""
         return self._active.copy()
 
     def alarm_state(self, fan: int) -> AlarmState:

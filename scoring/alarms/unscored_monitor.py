@@ -35,7 +35,7 @@ enough: the end of a long time without a score gives one"""
 
 
 class UnscoredMonitor:
-    """How long each fan has not been scored, in the time of its samples, and why.
+    """Time for which each fan has not been scored, in the time of its samples, and the reason.
 
     A fan that is scored only now and then can hardly raise an alarm either. Its scored time is counted in windows of
     `limit_ns`.
@@ -48,10 +48,10 @@ class UnscoredMonitor:
         self._was_scored = np.zeros(fans, np.bool_)
         self._window = _Window(fans)
         self._rare_windows = np.zeros(fans, np.int64)
-        """by fan: windows in which it was scored rarely, since the last one in which it was scored for half of the
+        """number of windows in which a fan was scored rarely, since the last one in which it was scored for half of the
         time"""
         self._latest_reason = np.zeros(fans, np.uint8)
-        """by fan: the reason of the last sample that was not scored"""
+        """reason of the last sample that was not scored, by fan"""
 
     def update(self, period_ns: int, valid: Array, invalid_reason: Array) -> None:
         """Process a block; valid, invalid_reason: (n, fans)."""
@@ -80,7 +80,7 @@ class UnscoredMonitor:
                 self._window = _Window(len(self._rare_windows))
 
     def problem(self) -> str:
-        """Which fans are not scored, in one line; empty for none. Times double, so that the line rarely changes."""
+        """Line on the fans that are not scored; empty for none. Times double, so that the line rarely changes."""
         first_warm_up = ~self._was_scored & (self._invalid_reason == int(InvalidReason.WARMING_UP))
         limit_ns = np.where(first_warm_up, max(self._limit_ns, FIRST_WARM_UP_NS), self._limit_ns)
         late = self._unscored_ns >= limit_ns
@@ -98,7 +98,7 @@ class UnscoredMonitor:
 
 
 class _Window:
-    """How long each fan was scored since the window began, in ns."""
+    """Time for which each fan was scored since the window began, in ns."""
 
     def __init__(self, fans: int) -> None:
         self.length_ns = 0

@@ -1,10 +1,10 @@
-"""What a fan with an alarm does now, in words: its alarm may go on although its newest samples have no deviation."""
+"""Words for what a fan with an alarm does now: the alarm may go on although its newest samples have no deviation."""
 
 from __future__ import annotations
 
 from fantwin.schemas.enums import FanState, InvalidReason
 
-RETURNING = "like a healthy fan again (the alarm clears once it stays so for ten seconds)"
+RETURNING = "like a healthy fan again (the alarm clears after ten seconds of it)"
 STOPPED, STARTING = "stopped by its command", "starting"
 
 

@@ -16,6 +16,6 @@ def poisson_interval(count: float) -> tuple[float, float]:
 
 
 def daily_interval(count: float, fan_hours: float) -> tuple[float, float]:
-    """95 % interval of the rate per fan and day, given the count in so many hours."""
+    """Compute the 95 % interval of the rate per fan and day from the count in `fan_hours`."""
     low, high = poisson_interval(count)
     return low / fan_hours * HOURS_PER_DAY, high / fan_hours * HOURS_PER_DAY

@@ -1,4 +1,4 @@
-"""What healthy recordings say of a twin's alarms: the entry `calibration` of its card, and how a limit is checked.
+"""Calibration of a twin's alarms by healthy recordings: the entry `calibration` of its card, and the check of a limit.
 
 The limit of the statistic follows from the declared rate alone (scoring.model.onsets). Healthy recordings check it.
 Where they have more false alarms than chance explains, they show more than the model knows, and the log of the limit
@@ -30,7 +30,7 @@ BEYOND = 1.0 + 1e-9
 
 
 class Calibration(BaseModel):
-    """The entry of a card.
+    """Entry `calibration` of a card.
 
     false_alarms_per_day: declared, of each fan. limit_factor: on the log of the limit that follows from it. fan_hours:
     of healthy running that was compared with the twin, in so many runs. found: false alarms in it by this calibration.
@@ -52,22 +52,22 @@ class Calibration(BaseModel):
 
     @field_serializer("priors")
     def _changed_priors(self, priors: Priors) -> dict[str, float]:
-        """Only those that differ from a population's."""
+        """Priors that differ from a population's."""
         return changed_priors(priors)
 
     @property
     def is_target(self) -> bool:
-        """Whether the recordings do not show the rate: they are too few, or have more false alarms."""
+        """Return whether the recordings do not show the rate: they are too few, or have more false alarms."""
         return not supports(self.fan_hours, self.false_alarms_per_day) or self.is_exceeded
 
     @property
     def is_exceeded(self) -> bool:
-        """Whether the recordings have more false alarms than chance explains by the rate."""
+        """Return whether the recordings have more false alarms than chance explains by the rate."""
         return is_exceeded(self.found, self.fan_hours, self.false_alarms_per_day)
 
 
 def changed_priors(priors: Priors) -> dict[str, float]:
-    """Those that differ from a population's."""
+    """Priors that differ from a population's."""
     of_population = asdict(Priors())
     return {name: value for name, value in asdict(priors).items() if value != of_population[name]}
 
@@ -83,7 +83,7 @@ def needed_fan_hours(per_day: float) -> float:
 
 
 def supports(fan_hours: float, per_day: float) -> bool:
-    """Whether so much healthy running can show a rate."""
+    """Return whether `fan_hours` of healthy running can show a rate."""
     return expected_alarms(fan_hours, per_day) >= SHOWN_BY
 
 
@@ -97,7 +97,7 @@ def least_per_day(fan_hours: float) -> float:
 
 
 def is_exceeded(found: int, fan_hours: float, per_day: float) -> bool:
-    """Whether there were more false alarms than chance explains by a rate: its whole 95 % interval is above."""
+    """Return whether there were more false alarms than chance explains by a rate: its whole 95 % interval is above."""
     return daily_interval(found, fan_hours)[0] > per_day
 
 
@@ -120,11 +120,11 @@ class Excursions:
 
     @property
     def peaks(self) -> list[float]:
-        """All so far."""
+        """Peaks so far."""
         return [*self._ended, *self._peak[self._peak > 0.0].tolist()]
 
 
 def raised_limit(peaks: Sequence[float], allowed: int) -> float:
-    """The lowest factor of the limit, at least 1, that at most so many of all peaks above 1 exceed."""
+    """Find the lowest factor of the limit, at least 1, that at most `allowed` of all peaks above 1 exceed."""
     falling = sorted(peaks, reverse=True)
     return max(1.0, falling[allowed] * BEYOND) if allowed < len(falling) else 1.0

@@ -1,4 +1,4 @@
-"""The rate of false alarms that really was, beside the declared one.
+"""Observed rate of false alarms, beside the declared one.
 
 Operators say which alarms were false. An alarm on which nobody has said anything may be either, so it is counted apart.
 """
@@ -33,7 +33,7 @@ class ObservedRate:
     declared_per_day: float | None
 
     def per_day(self, alarms: int) -> float:
-        """So many alarms as a rate, per fan and day."""
+        """Convert a number of alarms to a rate per fan and day."""
         return alarms / self.fan_hours * HOURS_PER_DAY
 
     def interval_95(self, alarms: int) -> tuple[float, float]:
@@ -57,7 +57,7 @@ class ObservedRate:
         return f"{found}; {declared}"
 
     def as_json(self) -> dict[str, Any]:
-        """For machines; rates are null where no fan was judged."""
+        """Convert for machines; rates are null where no fan was judged."""
         known = bool(self.fan_hours)
         possible = self.false_alarms + self.unmarked
         return {
@@ -80,7 +80,7 @@ class ObservedRate:
 
 
 def _number(value: float) -> str:
-    """For people: two digits are enough, and large numbers have no exponent."""
+    """Format for people: two digits are enough, and large numbers have no exponent."""
     return f"{value:,.0f}" if value >= 10.0 else f"{value:.2g}"
 
 

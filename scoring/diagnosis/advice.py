@@ -1,4 +1,4 @@
-"""What would tell the cause of an alarm, where what was seen since its onset does not.
+"""Advice on what would tell the cause of an alarm, if what was seen since its onset does not.
 
 Causes differ in how they change with the speed (docs/explanation/diagnosis.md), so what is missing is motion: a change
 of the speed by a third, beyond the speeds that were seen. The command for it follows from the healthy torque balance.
@@ -24,7 +24,7 @@ KNOWN_SOON = "more is known in a few seconds"
 
 @dataclass(frozen=True)
 class SeenSinceOnset:
-    """What a fan did since the onset of its alarm."""
+    """Summary of what a fan did since the onset of its alarm."""
 
     age_s: float
     lowest_rad_s: float
@@ -56,7 +56,8 @@ class Advice:
         return f"{unclear}: move the command to {self._of(command)} for ten seconds, and back"
 
     def _other_command(self, seen: SeenSinceOnset, fan: SteadyFan) -> float:
-        """One that gives a lower speed or, where that turns no fan, a higher one; NaN where there is neither."""
+        """Find a command that gives a lower speed or, where that turns no fan, a higher one; NaN where there is
+        neither."""
         low, high = seen.lowest_rad_s, seen.highest_rad_s
         if not 0.0 < low <= high < math.inf:
             return math.nan

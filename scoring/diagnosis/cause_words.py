@@ -37,12 +37,12 @@ relative to the healthy value"""
 STEADY_SHARE = 0.05
 """a speed that varies by less than this share tells drag, friction and gain little apart"""
 NARROW = 2.0
-"""per cent: narrower intervals have a decimal"""
+"""width in per cent below which an interval has a decimal"""
 
 
 @dataclass(frozen=True)
 class PossibleCause:
-    """One cause of an alarm, with its share of the posterior.
+    """Cause of an alarm, with its share of the posterior.
 
     change: share of the top speed that the fault takes (negative) or gives by now; of a tacho, share of the reading, or
     of the readings that are missing; of an unsteady speed, its standard deviation as a multiple of a healthy fan's.
@@ -76,7 +76,8 @@ class CauseWords:
         return (unclear, *listed)
 
     def _ranked(self, causes: Sequence[PossibleCause]) -> list[PossibleCause]:
-        """Most probable first. A measured supply leaves less drive the share of its prior that is the driver's."""
+        """Rank causes, most probable first. A measured supply leaves less drive the share of its prior that is the
+        driver's."""
         weights = [
             each.probability * (DRIVER_SHARE if self._has_supply and each.cause == GAIN_DOWN else 1.0)
             for each in causes
@@ -108,7 +109,7 @@ class CauseWords:
 
 
 def says_more(causes: Sequence[Diagnosis], than: Sequence[Diagnosis]) -> bool:
-    """Whether causes are worth a message after others: in another order, or with other probabilities.
+    """Return whether causes are worth a message after others: in another order, or with other probabilities.
 
     A fan that did not turn and turns again has recovered: causes found from then on are of the fault's end.
     """

@@ -13,7 +13,7 @@ from typing import Protocol, TypeVar
 from fantwin.schemas.messages import Diagnosis
 
 MIN_PROBABILITY = 0.15
-"""less probable causes are not listed, except the first"""
+"""probability below which causes are not listed, except the first"""
 CLOSE = 0.1
 """causes whose probability is at most this much below that of the first are as likely as the first"""
 CANNOT_TELL = "cannot_tell"
@@ -24,7 +24,7 @@ STILL_DRIVEN, WINDMILLING = "still_driven", "windmilling"
 
 
 class Size(StrEnum):
-    """How large a fault is said to be: `parameter` of a diagnosis."""
+    """Size of a fault: `parameter` of a diagnosis."""
 
     SPEED = "speed"
     DRAG = "drag"
@@ -39,7 +39,7 @@ class Size(StrEnum):
 
 @dataclass(frozen=True)
 class CauseRow:
-    """One cause in words. name: for people, with what the fault may be in brackets."""
+    """Cause in words. name: for people, with what the fault may be in brackets."""
 
     cause: str
     name: str
@@ -80,17 +80,17 @@ ROWS = (
 CAUSES = {row.cause: row.name for row in ROWS}
 """names for people, with what the fault may be"""
 WHAT_TO_DO = {row.cause: row.to_do for row in ROWS if row.to_do}
-"""by cause; what is to be done where the cause is unclear is part of the evidence"""
+"""advice by cause; where the cause is unclear, the evidence has it"""
 STANDSTILL_CAUSES = {cause: CAUSES[cause] for cause in (BLOCKED, NO_POWER, NO_TACHO, STILL_DRIVEN, WINDMILLING)}
 """causes of a fan that does not turn or stop as commanded"""
 
 
 class RatedCause(Protocol):
-    """What is known about a cause."""
+    """Cause with its probability, as alarms and messages have it."""
 
     @property
     def cause(self) -> str:
-        """One of `CAUSES`."""
+        """Name of the cause, one of `CAUSES`."""
         ...
 
     @property
@@ -100,7 +100,7 @@ class RatedCause(Protocol):
 
     @property
     def evidence(self) -> str:
-        """In words; may be empty."""
+        """Evidence in words; may be empty."""
         ...
 
 
@@ -147,7 +147,7 @@ def likely_evidence(causes: Sequence[RatedCause]) -> str:
 
 
 def advice(causes: Sequence[RatedCause]) -> str:
-    """What to do about the likely causes; empty: nothing is known."""
+    """Advice on the likely causes; empty: nothing is known."""
     return "; or ".join(dict.fromkeys(WHAT_TO_DO[each.cause] for each in likely(causes) if each.cause in WHAT_TO_DO))
 
 
@@ -168,5 +168,5 @@ def most_probable(causes: Sequence[Diagnosis]) -> list[str]:
 
 
 def is_of_standstill(cause: Diagnosis) -> bool:
-    """Whether it is of a fan that does not turn or stop as commanded."""
+    """Return whether the cause is of a fan that does not turn or stop as commanded."""
     return cause.cause in STANDSTILL_CAUSES

@@ -31,7 +31,7 @@ from fantwin.scoring.diagnosis.shown_causes import (
 
 
 class Standing(Enum):
-    """What a fan does against its command."""
+    """Behaviour of a fan against its command."""
 
     CAME_TO_REST = "does not turn"
     NOT_STARTED = "has not started"
@@ -63,12 +63,12 @@ PHASES, HALVINGS = 20, 20
 """number of phases of a reading at which a fall may begin, and steps of a bisection"""
 LEAST_HELD_S = 0.02
 LEAST_DENSITY = 1e-3
-"""per coast: of a fall that lasts longer than any cause explains"""
+"""density per coast of a fall that lasts longer than any cause explains"""
 
 
 @dataclass(frozen=True)
 class Fall:
-    """How a fan came to rest, by its readings below BEGUN and above rest.
+    """Fall of a fan to rest, by its readings below BEGUN and above rest.
 
     lasted_s: integral of the share of the expected speed that they show, s; rest_s: that of all but the first one;
     coasts_s: that of a whole healthy coast without power; held_s: how long a reading is held, at least the time between

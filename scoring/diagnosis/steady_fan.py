@@ -21,21 +21,21 @@ LEAST_DRAG = 0.1
 
 @dataclass(frozen=True)
 class SteadyFan:
-    """One fan of the twin's card. Torque is in the unit of the command."""
+    """Fan of the twin's card at steady speed. Torque is in the unit of the command."""
 
     viscous: float
     drag: float
     friction: float
     top_rad_s: float
     has_own_drive: bool = False
-    """whether it controls its speed by itself: its torque is then not known, and a fault is a share of the speed"""
+    """true if it controls its speed by itself: its torque is then not known, and a fault is a share of the speed"""
 
     def needed(self, speed_rad_s: float) -> float:
         """Command that holds a speed."""
         return max(self.friction + (self.viscous + self.drag * speed_rad_s) * speed_rad_s, 1e-9)
 
     def tells(self, size: Size) -> bool:
-        """Whether the balance gives this size."""
+        """Return whether the balance gives this size."""
         if size == Size.DRAG and self.drag * self.top_rad_s**2 < LEAST_DRAG * self.needed(self.top_rad_s):
             return False
         return not self.has_own_drive

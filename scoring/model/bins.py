@@ -1,6 +1,6 @@
-"""Predictions of one tray, sample by sample, to bins: all that the model sees of them.
+"""Bins of the predictions of one tray: all that the model sees of them.
 
-A bin is a fixed stretch of time since the epoch, so how samples are cut into messages changes nothing. Within a bin of
+A bin is a fixed interval of time since the epoch, so how samples are cut into messages changes nothing. Within a bin of
 several samples, one that lies far from their median is a wrong reading of the tacho and does not count.
 """
 
@@ -42,20 +42,20 @@ COLUMNS = (
     "after_missing",
     "pair",
 )
-"""what is collected of samples, (n, fans) each"""
+"""columns that are collected of samples, (n, fans) each"""
 READS = (int(InvalidReason.NONE), int(InvalidReason.WARMING_UP), NO_SPEED)
 """states in which a tacho should give readings"""
 
 
 @dataclass(frozen=True, eq=False)
 class Bin:
-    """What is known of the fans of a tray within one bin. All (fans,) but where it says so. t_ns: of its end."""
+    """Bin of the fans of a tray. All (fans,) but where it says so. t_ns: of its end."""
 
     t_ns: int
     row: int
     """row of the sample with which it ended, in its block"""
     judged: Array
-    """whether a reading or a torque balance is compared with the twin"""
+    """true where a reading or a torque balance is compared with the twin"""
     deviations_rad_s: Array
     """(n, fans) distance of each reading from the free run; NaN where it cannot be compared"""
     balances_command: Array
@@ -74,7 +74,7 @@ class Bin:
     newest_rad_s: Array
     """the newest reading; NaN without one"""
     another: Array
-    """(n, fans) whether a reading is another than the one before"""
+    """(n, fans) true where a reading is another than the one before"""
     balances: Array
     """number of samples with a torque balance"""
     balance_command: Array
@@ -99,9 +99,9 @@ class Bins:
         self._parts: list[dict[str, Array]] = []
         self._number = 0
         self.unseen_rad_s: Array | float = 0.0
-        """(n, fans) of the samples of the last block"""
+        """(n, fans) error of the twin where it was not trained, in the samples of the last block"""
         self._before = np.zeros((2, len(top_rad_s)), np.bool_)
-        """(2, fans) of the newest sample: the reading was missing, and there should have been one"""
+        """(2, fans) state of the newest sample: the reading was missing, and there should have been one"""
         self._newest_rad_s = np.full(len(top_rad_s), np.nan)
         """(fans,) newest reading; NaN: there was none"""
 
@@ -171,7 +171,7 @@ class Bins:
         }
 
     def _another(self, measured: Array) -> Array:
-        """(n, fans) whether each reading, NaN where there is none, is another than the one before."""
+        """Return where each reading, NaN where there is none, is another than the one before, (n, fans)."""
         known, readings = np.isfinite(measured), np.concatenate((self._newest_rad_s[np.newaxis], measured))
         rows = np.where(known, np.arange(1, len(readings))[:, np.newaxis], 0)
         newest = np.take_along_axis(readings, np.maximum.accumulate(rows, axis=0), axis=0)
@@ -231,7 +231,7 @@ def mean(values: Array, counts: Array) -> Array:
 
 
 def differ(before_rad_s: Array, newest_rad_s: Array) -> Array:
-    """Whether a tacho has not repeated its reading; not where one of them is missing (NaN)."""
+    """Return where a tacho has not repeated its reading; not where one of them is missing (NaN)."""
     found: Array = np.abs(newest_rad_s - before_rad_s) > HAIR * np.maximum(np.abs(newest_rad_s), np.abs(before_rad_s))
     return found
 

@@ -11,9 +11,9 @@ from fantwin.scoring.model.operation import Fans, Inputs
 
 DRAG, DRAG_GROWS, FRICTION, FRICTION_GROWS, DRIVE, SCALE, STUCK, RISES, FALLS = range(9)
 OF_TACHO = slice(SCALE, STUCK + 1)
-"""what changes the reading and not the rotor"""
+"""faults that change the reading and not the rotor"""
 BEFORE_GROWTH = {DRAG_GROWS: DRAG, FRICTION_GROWS: FRICTION}
-"""what each that grows is multiplied by its age of"""
+"""column that each growing fault multiplies by its age"""
 COLUMNS = 9
 GROWS_S = 60.0
 """unit of time of what grows"""
@@ -35,7 +35,7 @@ class Fault:
     weight: float
     """prior probability, of a fan whose command is a torque: there the course over the speed tells one from another"""
     of_own_drive: float
-    """and of one that controls its speed by itself: there the course over the time tells"""
+    """prior of a fan that controls its speed by itself: there the course over the time tells"""
 
 
 FAULTS = (
@@ -58,7 +58,7 @@ a course"""
 
 
 def forces(fans: Fans, now: Inputs, age_s: Array, then_rad_s: Array, columns: int = COLUMNS) -> Array:
-    """(fans, onsets, columns) what each column of size 1 adds to what a fan tends to, rad/s, or to its reading.
+    """Effect (fans, onsets, columns) of each column of size 1 on what a fan tends to, rad/s, or on its reading.
 
     A torque moves the steady speed by itself over the slope of the torque that the fan needs; a weak drive takes a
     share of that and of what turns the rotor faster. Of a fan that controls its speed by itself drag takes a share of

@@ -1,4 +1,4 @@
-"""The model of a healthy fan: what may make its speed differ from the prediction of its twin.
+"""Model of a healthy fan: what may make its speed differ from the prediction of its twin.
 
 With w the speed, w' its rate, both as the twin predicts them, a healthy fan in bin k deviates from its twin by
 
@@ -12,7 +12,7 @@ With w the speed, w' its rate, both as the twin predicts them, a healthy fan in 
     sag         share                what the load of the other fans of the tray does to the supply
     a           share                age: how the fan changes within days and months, a random walk
     c           share                what the air does: an Ornstein-Uhlenbeck process over an hour
-    v           share                what theta does not resolve: it stays while speed and command stay
+    v           share                what theta does not resolve: constant at one speed and command
     u           share                the wandering of the speed: an Ornstein-Uhlenbeck process over seconds
     f           share                what a fault takes: 0, and a random walk while there is an alarm
     e           rad/s                part of a pulse that a count misses; the next count has it, if it adjoins
@@ -47,19 +47,19 @@ K = len(KNOTS)
 RISE, FALL, LATE, SAG, AGE, AIR, LOCAL, WANDER, FAULT, COUNT, ROTOR, BALANCE, SHOWN = range(K, K + 13)
 STATES = K + 13
 SLOW = slice(WANDER)
-"""the states that stay what they are during a fault"""
+"""states that keep their value during a fault"""
 FADING = slice(AIR, WANDER + 1)
-"""the states of which a bin keeps a share"""
+"""states of which a bin keeps a share"""
 FOLLOWING = slice(ROTOR, SHOWN + 1)
 """the states that follow what a fan tends to"""
 HALF = np.tril_indices(STATES)
 CARRIED = SHOWN
 """number of the states that the next bin follows from: all but the last, what a tacho shows but for e_k and white"""
 BOTH_BUT_NOT = np.array([[1.0], [-1.0]])
-"""what a reading tells of two states, but not between two of which nothing is learned"""
+"""directions in which a reading tells of two states, but not between two of which nothing is learned"""
 UNSEEN_S = 100.0
-"""how long an error of the twin where it was not trained stays what it is: how heat and supply move it there is not
-known either"""
+"""time for which an error of the twin where it was not trained keeps its value: how heat and supply move it there is
+not known either"""
 SLOWEST_RAD_S = 10.0
 """errors in rad/s are no larger share of a lower speed"""
 
@@ -72,7 +72,7 @@ def hats(share: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """What the readings of a bin tell: how far each is from what was expected, (fans,), and how sure that was."""
+    """Innovation of the readings of a bin: how far each is from what was expected, (fans,), and how sure that was."""
 
     distance_rad_s: Array
     variance: Array
@@ -99,11 +99,11 @@ class HealthyFans(Saved):
         self.tends = np.zeros((count, 3, STATES))
         """rows of FOLLOWING: these are the rows times the states before"""
         self.follows = np.ones((count, 3))
-        """how far they go to what a fan tends to in a bin"""
+        """share by which they approach in a bin what a fan tends to"""
         self._has_begun = np.zeros(count, np.bool_)
-        """(fans,) whether there was a reading: at the first one a rotor is where it tends to"""
+        """(fans,) true after the first reading, at which a rotor is where it tends to"""
         self._holds = np.ones(count)
-        """(fans,) 1 where no reading ends, so that what the last count missed stays"""
+        """(fans,) 1 where no reading ends, so that the error of the last count is kept"""
         self._filters = 1.0 - math.exp(-bin_s * fans.balance_filter_per_s)
         self.kept[:, WANDER - AIR], self.kept[:, 0] = np.exp(-bin_s / priors.wander_s), np.exp(-bin_s / priors.air_s)
         self.noise = np.zeros((count, STATES))
@@ -113,12 +113,12 @@ class HealthyFans(Saved):
         self.noise[:, AIR] = priors.air**2 * (1.0 - self.kept[:, 0] ** 2)
         self._missed = np.square(priors.count * fans.pulse_rad_s) / 12.0
         self._adjoins = fans.adjoins & (fans.held_s > 0.75 * bin_s)
-        """(fans,) whether each count begins where the one before ended, and no bin contains two"""
+        """(fans,) true where each count begins where the one before ended, and no bin contains two"""
         self._of_balance = np.zeros(count)
         """(fans,) variance of the noise of the torque balance, as speed"""
         self.tends[:, SHOWN - ROTOR, COUNT] = -1.0
         self.steady = np.zeros((count, COUNT))
-        """(fans, COUNT) what a fan tends to is this times the states"""
+        """(fans, COUNT) factors of the states in what a fan tends to"""
 
     def of(self, fan: int) -> HealthyFans:
         """A copy for one fan."""
@@ -159,13 +159,12 @@ class HealthyFans(Saved):
 
     @property
     def expected_rad_s(self) -> Array:
-        """(fans,) how far a healthy fan tends to deviate from its twin at the present speed."""
+        """Expected deviation of a healthy fan from its twin at the present speed, (fans,)."""
         return np.asarray(np.einsum("ni,ni->n", self.steady[:, :FAULT], self.mean[:, :FAULT]))
 
     @property
     def age(self) -> tuple[Array, Array]:
-        """(fans,) how much faster (+) or slower each fan has become, and its standard deviation: shares of the
-        speed."""
+        """Change (fans,) of each fan since its beginning, + faster, and its standard deviation: shares of the speed."""
         return self.mean[:, AGE].copy(), np.sqrt(self.covariance[:, AGE, AGE])
 
     def predict(self, now: Inputs) -> None:
@@ -178,13 +177,13 @@ class HealthyFans(Saved):
         # what is unseen is not renewed by the speed: a fault must not widen what is not known of a fan
         path = now.command_moved + (1.0 - is_unseen) * moved + is_of_lowest * now.command_path
         per_s = (1.0 - is_unseen) / p.local_s + is_unseen / UNSEEN_S
-        stays = np.exp(-path / p.local_length - self._bin_s * per_s)
-        self.kept[:, LOCAL - AIR] = stays
-        self.noise[:, LOCAL] = local / np.square(np.maximum(now.speed_rad_s, SLOWEST_RAD_S)) * (1.0 - stays**2)
+        remains = np.exp(-path / p.local_length - self._bin_s * per_s)
+        self.kept[:, LOCAL - AIR] = remains
+        self.noise[:, LOCAL] = local / np.square(np.maximum(now.speed_rad_s, SLOWEST_RAD_S)) * (1.0 - remains**2)
         faded = covariance[:, FADING] * self.kept[:, :, np.newaxis]
         faded[:, :, FADING] *= self.kept[:, np.newaxis, :]
         covariance[:, FADING], covariance[:, :, FADING] = faded, faded.swapaxes(1, 2)
-        variance = covariance.reshape(len(stays), -1)[:, :: STATES + 1]  # a view
+        variance = covariance.reshape(len(remains), -1)[:, :: STATES + 1]  # a view
         variance += self.noise
         lags = variance[:, RISE : FALL + 1]
         walked = np.minimum(lags + (p.lag_s**2 * moved)[:, np.newaxis], (2.0 * p.lag_s) ** 2)
@@ -236,7 +235,7 @@ class HealthyFans(Saved):
         tends[:, 2, LATE] = -moves
 
     def innovation(self, now: Inputs) -> Innovation:
-        """What the readings of the bin tell."""
+        """Innovation of the readings of the bin."""
         p, fans = self._priors, self._fans
         shown = np.where(now.is_balance, BALANCE, SHOWN)
         with_states = self.covariance[self._rows, shown]
@@ -252,8 +251,8 @@ class HealthyFans(Saved):
         return Innovation(distance, variance, with_states, shown)
 
     def update(self, found: Innovation, gain: Array, distance_rad_s: Array) -> None:
-        """Take the readings up. gain: (fans, STATES), with_states over variance, or 0 where nothing is learned;
-        distance: as far as it counts."""
+        """Update the states by the readings. gain: (fans, STATES), with_states over variance, or 0 where nothing is
+        learned; distance: as far as it counts."""
         self.mean += gain * distance_rad_s[:, np.newaxis]
         halves = np.empty((len(gain), STATES, 2))
         np.divide(found.with_states, np.sqrt(found.variance)[:, np.newaxis], out=halves[:, :, 0])

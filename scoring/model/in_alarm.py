@@ -1,4 +1,4 @@
-"""What speaks for each cause of an alarm, from its onset on, for as long as it lasts.
+"""Evidence for each cause of an alarm, from its onset on, for as long as it lasts.
 
 The model of a healthy fan goes on as though nothing were wrong, and the sums of each onset that was possible when the
 alarm was raised go on with it, so what a fan does long afterwards still counts. What grows may end to grow: each onset
@@ -36,7 +36,7 @@ HOPELESS, MOST = 12.0, 24
 
 
 class FanInAlarm:
-    """One fan with an alarm."""
+    """Fan with an alarm."""
 
     def __init__(self, fan: int, fans: Fans, model: HealthyFans, evidence: Evidence, hypotheses: Hypotheses) -> None:
         """Begin with the bin that raised the alarm; model: which has not heard of the alarm."""
@@ -86,7 +86,7 @@ class FanInAlarm:
 
     @property
     def probabilities(self) -> Array:
-        """(onsets, faults) of the posterior, of faults with a course."""
+        """Probabilities (onsets, faults) of the posterior, of faults with a course."""
         weights = np.exp(self._terms - self._terms.max())
         return np.asarray(weights / weights.sum())
 
@@ -103,7 +103,7 @@ class FanInAlarm:
 
     @property
     def varies(self) -> bool:
-        """Whether the fault probably has no course, and the fan is not steady again."""
+        """Return whether the fault probably has no course, and the fan is not steady again."""
         squares, number = self._varies[1]
         return squares > STEADY * number and self.unsteady > 0.5
 
@@ -160,7 +160,7 @@ class FanInAlarm:
         return np.minimum(self._ages_s, self._ends_s)
 
     def _log_terms(self) -> Array:
-        """(onsets, faults) as in `Hypotheses`, with the weight of the onset."""
+        """Log terms (onsets, faults) as in `Hypotheses`, with the weight of the onset."""
         hypotheses = self._hypotheses
         terms = hypotheses.log_bayes_factors(self._sums, self._has_changed)[:, 0] + hypotheses.log_weights()
         return np.asarray((terms + self._log_weight).T)

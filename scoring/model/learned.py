@@ -1,13 +1,13 @@
-"""Priors that healthy recordings have narrowed or widened.
+"""Learned priors: those that healthy recordings have narrowed or widened.
 
 Three of them differ most between makes of fan and places, and show in any healthy run: the wandering of the speed over
 seconds, what the air does over minutes, and how far fans and runs differ in the mean. The first two follow from how
-much more two stretches of steady running differ the farther apart they are, in which the noise of the tacho cancels.
+much more two segments of steady running differ the farther apart they are, in which the noise of the tacho cancels.
 A tacho that counts pulses hides both: of such fans only the means are learned from.
 
 What was measured on a few fan-hours is not what the next month brings. So the logarithm of a variance is a weighted
 mean of what was measured and of the prior: the prior counts as one fan's measurement on one day would, but where more
-than the prior was measured, only the number of stretches counts against it.
+than the prior was measured, only the number of segments counts against it.
 
 Each run is added up on its own, in bounded memory. The sums of many runs give the same priors in any order.
 """
@@ -26,15 +26,15 @@ from fantwin.scoring.model.bins import Bin
 from fantwin.scoring.model.operation import Fans, Inputs, Operation
 from fantwin.scoring.model.priors import Priors
 
-STRETCH_S = 2.0
+SEGMENT_S = 2.0
 NEAR, FAR, FARTHEST = 2, 5, 15
-"""distances of the stretches that are compared, in stretches"""
+"""distances of the segments that are compared, in segments"""
 STEADY, SLOWEST = 0.02, 0.1
 """shares of the top speed: largest movement within what is compared, as of the load, and least speed"""
 COMPARED_AT_ONCE = 500
-"""stretches that are kept until they are compared"""
+"""segments that are kept until they are compared"""
 FEWEST = 30
-"""pairs of stretches; from fewer nothing is learned"""
+"""pairs of segments; from fewer nothing is learned"""
 POPULATION = 2.0
 """variance of the logarithm of a variance, between makes of fan"""
 DAY = 1.0
@@ -46,21 +46,21 @@ SECONDS_PER_DAY = 86400.0
 
 @dataclass(frozen=True, eq=False)
 class RunSums:
-    """What one run of the fans of a tray tells of the priors."""
+    """Sums of one run of the fans of a tray, from which priors are learned."""
 
     judged_s: Array
     """(fans,) time in which a fan was compared with its twin"""
     mean_share: Array
     """(fans,) mean deviation from the twin, share of the speed; NaN of a fan that did not turn"""
     pairs: Array
-    """(3,) number of pairs of stretches that lie NEAR, FAR and FARTHEST apart"""
+    """(3,) number of pairs of segments that lie NEAR, FAR and FARTHEST apart"""
     squares: Array
     """(3,) sum of the squares of their differences"""
 
 
 @dataclass(frozen=True, eq=False)
-class _Stretches:
-    """Stretches of running that follow one another. All (stretches, fans)."""
+class _Segments:
+    """Segments of running that follow one another. All (segments, fans)."""
 
     mean: Array
     """deviation, share of the speed; NaN where the fan moved or was not compared"""
@@ -69,28 +69,28 @@ class _Stretches:
     moved: Array
 
     @staticmethod
-    def joined(parts: Sequence[_Stretches]) -> _Stretches:
-        """Those of several parts, one after another."""
-        return _Stretches(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+    def joined(parts: Sequence[_Segments]) -> _Segments:
+        """Join several parts, one after another."""
+        return _Segments(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
-    def last(self, count: int) -> _Stretches:
+    def last(self, count: int) -> _Segments:
         """The last ones."""
-        return _Stretches(*(values[-count:] for values in vars(self).values()))
+        return _Segments(*(values[-count:] for values in vars(self).values()))
 
 
 class HealthyRun:
-    """One run of healthy fans, which is added up bin by bin."""
+    """Run of healthy fans, added up bin by bin."""
 
     def __init__(self, fans: Fans, bin_ns: int) -> None:
         """Begin without a bin."""
         count = len(fans.top_rad_s)
         self._fans, self._bin_s = fans, bin_ns / NS_PER_S
         self._operation = Operation(fans, bin_ns)
-        self._per_stretch = max(1, round(STRETCH_S / self._bin_s))
+        self._per_segment = max(1, round(SEGMENT_S / self._bin_s))
         self._inputs: list[Inputs] = []
-        self._new: list[_Stretches] = []
+        self._new: list[_Segments] = []
         nothing = np.zeros((0, count))
-        self._compared = _Stretches(nothing, nothing, nothing, nothing.astype(np.bool_))
+        self._compared = _Segments(nothing, nothing, nothing, nothing.astype(np.bool_))
         """the last ones that have been compared with those before them"""
         self._judged_s, self._readings, self._shares = np.zeros((3, count))
         self._pairs, self._squares = np.zeros((2, 3))
@@ -101,22 +101,22 @@ class HealthyRun:
         now = self._operation.inputs(one)
         counts = np.isfinite(self._operation.samples_rad_s(one, now)) & ~one.wrong
         self._inputs.append(self._operation.read(one, now, counts))
-        if len(self._inputs) == self._per_stretch:
-            self._new.append(self._stretch())
+        if len(self._inputs) == self._per_segment:
+            self._new.append(self._segment())
             if len(self._new) == COMPARED_AT_ONCE:
                 self._compare()
 
     @property
     def sums(self) -> RunSums:
-        """What the bins so far tell."""
+        """Sums of the bins so far."""
         if self._inputs:
-            self._stretch()  # too short to be compared, and part of the mean
+            self._segment()  # too short to be compared, and part of the mean
         if self._new:
             self._compare()
         mean = np.where(self._readings > 0, self._shares / np.maximum(self._readings, 1), np.nan)
         return RunSums(self._judged_s.copy(), mean, self._pairs.copy(), self._squares.copy())
 
-    def _stretch(self) -> _Stretches:
+    def _segment(self) -> _Segments:
         """The inputs since the last one, taken together."""
         inputs, self._inputs = self._inputs, []
         speed, load = np.array([now.speed_rad_s for now in inputs]), np.array([now.load for now in inputs])
@@ -127,24 +127,24 @@ class HealthyRun:
         self._shares += total
         moved = (np.ptp(speed, axis=0) > STEADY * self._fans.top_rad_s) | (np.ptp(load, axis=0) > STEADY)
         mean = np.where((count > 0) & ~moved, total / np.maximum(count, 1), np.nan)
-        return _Stretches(*(row[np.newaxis] for row in (mean, speed.mean(axis=0), load.mean(axis=0), moved)))
+        return _Segments(*(row[np.newaxis] for row in (mean, speed.mean(axis=0), load.mean(axis=0), moved)))
 
     def _compare(self) -> None:
-        """Compare each new stretch with those before it."""
+        """Compare each new segment with those before it."""
         old = len(self._compared.mean)
-        stretches = _Stretches.joined([self._compared, *self._new])
+        segments = _Segments.joined([self._compared, *self._new])
         self._new = []
-        turns = np.cumsum(stretches.moved, axis=0)
+        turns = np.cumsum(segments.moved, axis=0)
         for which, apart in enumerate((NEAR, FAR, FARTHEST)):
             first, second = slice(max(old - apart, 0), -apart), slice(max(old, apart), None)
-            speed, load = stretches.speed_rad_s, stretches.load
-            stays = (turns[second] == turns[first]) & (self._fans.pulse_rad_s == 0.0)
-            stays &= np.abs(speed[second] - speed[first]) < STEADY * self._fans.top_rad_s
-            stays &= np.abs(load[second] - load[first]) < STEADY
-            differences = (stretches.mean[second] - stretches.mean[first])[stays]
+            speed, load = segments.speed_rad_s, segments.load
+            is_steady = (turns[second] == turns[first]) & (self._fans.pulse_rad_s == 0.0)
+            is_steady &= np.abs(speed[second] - speed[first]) < STEADY * self._fans.top_rad_s
+            is_steady &= np.abs(load[second] - load[first]) < STEADY
+            differences = (segments.mean[second] - segments.mean[first])[is_steady]
             self._pairs[which] += np.isfinite(differences).sum()
             self._squares[which] += np.nansum(np.square(differences))
-        self._compared = stretches.last(FARTHEST)
+        self._compared = segments.last(FARTHEST)
 
 
 def learned_priors(runs: Sequence[RunSums]) -> Priors:
@@ -159,7 +159,7 @@ def learned_priors(runs: Sequence[RunSums]) -> Priors:
     def between(prior: float, variance: float, number: float) -> float:
         return _between(prior, variance, number, fan_days)
 
-    step_s, wander_s, air_s = STRETCH_S, priors.wander_s, priors.air_s
+    step_s, wander_s, air_s = SEGMENT_S, priors.wander_s, priors.air_s
     within = _same(NEAR * step_s, wander_s, step_s) - _same(FAR * step_s, wander_s, step_s)
     drifts = math.exp(-FAR * step_s / air_s) - math.exp(-FARTHEST * step_s / air_s)
     return replace(
@@ -171,8 +171,8 @@ def learned_priors(runs: Sequence[RunSums]) -> Priors:
 
 
 def _grown(pairs: list[float], squares: list[float], apart: tuple[int, int], share: float) -> tuple[float, float]:
-    """The variance of which a share makes stretches that are farther apart differ more, at the upper end of its
-    standard error; and the number of independent pairs. pairs, squares, apart: of the nearer and the farther ones."""
+    """Variance of which a share makes segments that are farther apart differ more, at the upper end of its standard
+    error; and the number of independent pairs. pairs, squares, apart: of the nearer and the farther ones."""
     numbers = [number / distance for number, distance in zip(pairs, apart, strict=True)]
     if min(numbers) < 1.0:
         return 0.0, 0.0
@@ -191,7 +191,7 @@ def _between(prior: float, variance: float, number: float, fan_days: float) -> f
     return math.exp(0.5 * (weight * measured + (1.0 - weight) * 2.0 * math.log(prior)))
 
 
-def _same(apart_s: float, time_s: float, stretch_s: float) -> float:
-    """Covariance of the means of two stretches of an Ornstein-Uhlenbeck process of variance 1."""
-    long = stretch_s / time_s
-    return math.exp(-(apart_s - stretch_s) / time_s) * (-math.expm1(-long) / long) ** 2
+def _same(apart_s: float, time_s: float, segment_s: float) -> float:
+    """Covariance of the means of two segments of an Ornstein-Uhlenbeck process of variance 1."""
+    long = segment_s / time_s
+    return math.exp(-(apart_s - segment_s) / time_s) * (-math.expm1(-long) / long) ** 2

@@ -16,11 +16,11 @@ PRIOR = np.array([300.0, 0.5, 4.0, 1.0])
 NOTHING, LARGEST = -30.0, 60.0
 """limits of the log of the statistic"""
 LEAST_RATIO, LARGEST_SHARE = 2.0, 0.9
-"""a loose wire loses at least so many times what a healthy line loses"""
+"""least ratio of the losses of a loose wire to those of a healthy line, and the largest share that it loses"""
 LONGEST_BURST = 5
 """missing readings in a row from which on nothing is learned of a healthy line: the tacho may be dead"""
 OVER_S = 10.0
-"""how long a healthy line must be likelier before an alarm is over"""
+"""time for which a healthy line must be likelier before an alarm is over"""
 
 
 class MissingReadings(Saved):
@@ -40,7 +40,7 @@ class MissingReadings(Saved):
         self._returned = np.zeros(fans)
         """(fans,) log of how much likelier a healthy line is by the newest readings"""
         self._returns_s = np.zeros(fans)
-        """(fans,) for how long it has been likelier"""
+        """(fans,) time for which it has been likelier"""
         self._run = np.zeros(fans)
         """(fans,) readings that are missing one after the other"""
         self.is_active = np.zeros(fans, np.bool_)
@@ -77,13 +77,13 @@ class MissingReadings(Saved):
 
     @property
     def explains_silence(self) -> Array:
-        """(fans,) whether a loose wire makes the present silence more often than a false alarm comes."""
+        """Return where a loose wire makes the present silence more often than a false alarm comes, (fans,)."""
         share = self.share
         found: Array = self.is_active & (share < LARGEST_SHARE) & (-np.log(share) * self._run < self._log_limit)
         return found
 
     def _is_over(self, gain: Array, known: Array) -> Array:
-        """(fans,) whether a line is healthy again. known: (fans,) whether there should have been a reading."""
+        """Return where a line is healthy again, (fans,). known: (fans,) whether there should have been a reading."""
         back = self._returned - (_log_sum(self._log_terms + gain) - _log_sum(self._log_terms))
         self._returned = np.where(self.is_active, np.maximum(back, 0.0), 0.0)
         self._returns_s = np.where(self._returned > 0.0, self._returns_s + known * self._bin_s, 0.0)
@@ -101,8 +101,8 @@ class MissingReadings(Saved):
         readings, lost, missing, lost_again = self._counts.tolist()
         healthy = np.array([[lost / readings], [lost_again / missing]])
         shares = self._shares()
-        loses, stays = np.log(shares / healthy), np.log((1.0 - shares) / (1.0 - healthy))
-        return np.stack((stays[0], loses[0] - stays[0], stays[1], loses[1] - stays[1]))
+        loses, arrives = np.log(shares / healthy), np.log((1.0 - shares) / (1.0 - healthy))
+        return np.stack((arrives[0], loses[0] - arrives[0], arrives[1], loses[1] - arrives[1]))
 
 
 def _log_sum(logs: Array) -> Array:

@@ -43,7 +43,7 @@ LARGEST_LOG = 80.0
 
 
 class Sums:
-    """What speaks for each onset, of all fans side by side: A and B of the module, and what they follow from.
+    """Sums of the evidence for each onset, of all fans side by side: A and B of the module, and what they follow from.
 
     What each column has made of the states, less what the filter took up, is `_factors` times `_parts`. The parts are
     what it had made of the states at the last gathering, and for each bin since what it did to the rotor and its rho.
@@ -63,7 +63,7 @@ class Sums:
         self.squares = np.zeros((fans, onsets, columns), np.float32)
         """(fans, onsets, columns) the diagonals of A"""
         self.crossed = {pair: np.zeros((fans, onsets), np.float32) for pair in pairs}
-        """(fans, onsets) and what else is used of it"""
+        """(fans, onsets) products of A that are used besides"""
         self.products = np.zeros((fans, onsets, columns), np.float32)
 
     def of(self, fan: int, onsets: Array, columns: int) -> Sums:
@@ -117,8 +117,8 @@ class Sums:
             each[:, onset] = 0.0
 
     def add(self, forces: Array, model: HealthyFans, found: Innovation, gain: Array, distance_rad_s: Array) -> None:
-        """The readings of a bin. forces: (fans, onsets, columns); gain: of the model, 0 where a reading does not count;
-        distance_rad_s: (fans,) as far as it counts."""
+        """Add the readings of a bin. forces: (fans, onsets, columns); gain: of the model, 0 where a reading does not
+        count; distance_rad_s: (fans,) as far as it counts."""
         if self._used == self._parts.shape[1]:
             self._gather()
         done, read, self._used = self._used, self._used + 1, self._used + 2
@@ -171,7 +171,7 @@ class Hypotheses:
         self.faults = [fault for fault, _ in may_be]
         """those that one of the fans may have; those of a known sign come first"""
         self._weights = np.array([weight for _, weight in may_be])
-        """(faults, 2) of a fan whose command is a torque, and of one with a drive of its own"""
+        """(faults, 2) weights for a fan whose command is a torque, and for one with a drive of its own"""
         self._has_own_drive = has_own_drive
         self.columns = 1 + max(max(fault.columns) for fault in self.faults)
         self.pairs = sorted({pair for fault in self.faults for pair in combinations(fault.columns, 2)})
@@ -185,7 +185,7 @@ class Hypotheses:
         self._means = [(row, fault.mean) for row, fault in enumerate(self.faults) if fault.mean]
 
     def of(self, fan: int) -> Hypotheses:
-        """Those of one fan."""
+        """Hypotheses of one fan."""
         return Hypotheses(self.faults, self._has_own_drive[[fan]])
 
     def log_weights(self) -> Array:
@@ -200,7 +200,8 @@ class Hypotheses:
         return np.where(self._has_own_drive[:, np.newaxis], of_own, of_torque)
 
     def log_bayes_factors(self, sums: Sums, has_changed: Array) -> Array:
-        """(faults, fans, onsets), by elimination of one size after the other; the first comes last, for its sign.
+        """Log Bayes factors (faults, fans, onsets), by elimination of one size after the other; the first comes last,
+        for its sign.
 
         has_changed: (fans, onsets) whether the reading has since: then its tacho is not stuck.
         """
@@ -238,7 +239,7 @@ class Hypotheses:
 
 
 def _squares(fault: Fault, sums: Sums) -> Array:
-    """(columns, columns, fans, onsets) of A that a fault uses."""
+    """Products (columns, columns, fans, onsets) of A that a fault uses."""
     columns = fault.columns
     found = np.empty((len(columns), len(columns), *sums.squares.shape[:2]), np.float32)
     for one, column in enumerate(columns):
@@ -249,7 +250,7 @@ def _squares(fault: Fault, sums: Sums) -> Array:
 
 
 def _without_others(fault: Fault, sums: Sums) -> tuple[Array, Array, Array]:
-    """(fans, onsets) what all sizes of a fault but the first tell, and what they leave of its pivot and product."""
+    """Evidence (fans, onsets) of all sizes of a fault but the first, and what they leave of its pivot and product."""
     std = np.array(fault.std, np.float32)[:, np.newaxis, np.newaxis]
     squares, products = _squares(fault, sums), np.stack([sums.products[:, :, column] for column in fault.columns])
     found = fault.mean * (products[0] - 0.5 * fault.mean * squares[0, 0])
@@ -282,15 +283,15 @@ class Evidence:
         self.then_rad_s = np.zeros((fans, ONSETS))
         """(fans, ONSETS) speed at which they began"""
         self.has_changed = np.zeros((fans, ONSETS), np.bool_)
-        """(fans, ONSETS) whether the reading has changed since the bin of the onset"""
+        """(fans, ONSETS) true where the reading has changed since the bin of the onset"""
         self.since = np.full(fans, NEVER)
-        """(fans,) only onsets after this bin count"""
+        """(fans,) bin after which onsets count"""
         self._log_bayes_factors = np.zeros((len(hypotheses.faults), fans, ONSETS), np.float32)
         self.number = 0
 
     @property
     def age_s(self) -> Array:
-        """(ONSETS,) at the end of the present bin."""
+        """Age of each onset at the end of the present bin, (ONSETS,)."""
         return (self.number - self.began + 1) * self._bin_s
 
     def begin(self, speed_rad_s: Array) -> None:
@@ -302,7 +303,7 @@ class Evidence:
         self.sums.begin(slot)
 
     def show(self, changes: Array) -> None:
-        """Where the tacho has shown another reading within the bin, (fans,)."""
+        """Note where the tacho has shown another reading within the bin, (fans,)."""
         self.has_changed |= changes[:, np.newaxis] & (self.began < self.number)
 
     def _place(self) -> int:
@@ -323,7 +324,7 @@ class Evidence:
 
     @property
     def _counts(self) -> Array:
-        """(fans, ONSETS) whether an onset counts."""
+        """Return which onsets count, (fans, ONSETS)."""
         return self.began > self.since[:, np.newaxis]
 
     def log_terms(self, fan: int) -> Array:

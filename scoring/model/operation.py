@@ -1,4 +1,4 @@
-"""What drives the model within a bin: speed, movement and load of each fan, and what its tacho has shown."""
+"""Operation of the fans within a bin: speed, movement and load of each fan, and what its tacho has shown."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ speed, and not what its speed loop does around it"""
 
 @dataclass(frozen=True, eq=False)
 class Fans:
-    """What the twin's card tells about the fans of a tray, (fans,) each. Torque is in the unit of the command."""
+    """Fans of a tray as the twin's card has them, (fans,) each. Torque is in the unit of the command."""
 
     top_rad_s: Array
     inertia: Array
@@ -34,15 +34,15 @@ class Fans:
     noise_rad_s: Array
     """standard deviation of one reading"""
     pulse_rad_s: Array
-    """what a pulse more in a count is worth; 0: the tacho does not count"""
+    """speed of one pulse more in a count; 0: the tacho does not count"""
     held_s: Array
-    """how long a tacho holds a reading"""
+    """time for which a tacho holds a reading"""
     adjoins: Array
-    """whether each count begins where the one before ended"""
+    """true if each count begins where the one before ended"""
     timing_s: Array
     """standard deviation of the time of a reading"""
     coasts_s: Array
-    """how long a fan without power turns on: the integral of its speed over that before"""
+    """time for which a fan without power turns on: the integral of its speed over that before"""
     balance_noise: Array
     """standard deviation of the healthy torque balance"""
     balance_filter_per_s: float
@@ -51,24 +51,24 @@ class Fans:
     commands: float
     """range of the commands that the twin was trained on"""
     has_own_drive: Array
-    """whether it controls its speed by itself, so that the torque of the card is no torque of its motor"""
+    """true if it controls its speed by itself, so that the torque of the card is no torque of its motor"""
     may_have_plateau: Array
-    """whether its speed may stay the same below some command, of which the twin knows nothing"""
+    """true if its speed may be constant below some command, of which the twin knows nothing"""
     prefers_balance: Array
-    """whether the torque balance tells more than the speed, where both are known"""
+    """true if the torque balance tells more than the speed, where both are known"""
 
     def of(self, fan: int) -> Fans:
-        """One of them."""
+        """Select one fan."""
         return replace(self, **{name: each[[fan]] for name, each in vars(self).items() if isinstance(each, np.ndarray)})
 
     def slope(self, speed_rad_s: Array) -> Array:
-        """How the torque that a fan needs rises with its speed."""
+        """Slope of the torque that a fan needs, over its speed."""
         return np.maximum(self.viscous + 2.0 * self.drag * speed_rad_s, 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What drives the model within a bin, (fans,) each."""
+    """Inputs of the model within a bin, (fans,) each."""
 
     speed_rad_s: Array
     """speed of the twin; where the torque balance is used, the measured one"""
@@ -77,13 +77,13 @@ class Inputs:
     """the newest reading; NaN without one"""
     rate_rad_s2: Array
     moved_to_rad_s: Array
-    """the speed as far as it has moved by more than what a speed loop makes of the noise of its tacho"""
+    """speed, as far as it has moved by more than what a speed loop makes of the noise of its tacho"""
     moves_rad_s2: Array
-    """and its rate"""
+    """rate of that speed"""
     load: Array
     """mean of the squares of the shares of the top speed of the other fans of the tray"""
     command_path: Array
-    """how far the command has moved, share of the largest command so far"""
+    """movement of the command so far, share of the largest command so far"""
     command_moved: Array
     """share that it has moved by more than BACKLASH"""
     unseen_rad_s: Array
@@ -94,17 +94,17 @@ class Inputs:
     readings: Array
     """0: nothing new is known"""
     is_new: Array
-    """whether a reading ends that its tacho holds"""
+    """true where a reading ends that its tacho holds"""
     ends: Array
-    """whether one ends, seen or not"""
+    """true where a reading ends, seen or not"""
     changes: Array
-    """whether the tacho has shown another reading within the bin"""
+    """true where the tacho has shown another reading within the bin"""
     deviation_rad_s: Array
     """distance from the free run; or what it would be at a steady speed by the torque balance"""
     is_balance: Array
 
     def of(self, fan: int) -> Inputs:
-        """Those of one fan."""
+        """Inputs of one fan."""
         return Inputs(**{name: each[[fan]] for name, each in vars(self).items()})
 
 
@@ -118,7 +118,7 @@ class Operation(Saved):
         count = len(fans.top_rad_s)
         self._fans, self._bin_ns, self._bin_s = fans, bin_ns, bin_ns / NS_PER_S
         self.bins_held = np.maximum(np.round(fans.held_s / self._bin_s), 1).astype(np.int64)
-        """(fans,) a reading is held for so many bins"""
+        """(fans,) number of bins for which a reading is held"""
         self._held = np.zeros((3, count))
         """(3, fans) readings that have not counted yet: number, sum of deviations, sum of half ranges"""
         self.t_ns = 0
@@ -130,7 +130,7 @@ class Operation(Saved):
         self._has_lowest = np.isfinite(fans.lowest_command).any()
 
     def inputs(self, one: Bin) -> Inputs:
-        """Those of a bin; bins come in order of time."""
+        """Inputs of a bin; bins come in order of time."""
         fans = self._fans
         predicted = np.minimum(np.abs(one.predicted_rad_s), FASTEST * fans.top_rad_s)
         measured = np.where(np.isfinite(one.measured_rad_s), np.abs(one.measured_rad_s), predicted)

@@ -42,4 +42,5 @@ class Priors:
     balance: Positive = 0.3
     """white error, of the noise of the torque balance; the rest passes its filter"""
     balance_time_s: Positive = 0.04
-    """how early or late a movement may show in the torque balance: its filter is no mean over the same time"""
+    """time by which a movement may show earlier or later in the torque balance: its filter is no mean over the same
+    time"""

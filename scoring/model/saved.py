@@ -64,5 +64,5 @@ def within(name: str, arrays: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def part(name: str, stored: Mapping[str, Array]) -> dict[str, Array]:
-    """Those that `within` has put under a name."""
+    """Select the columns that `within` has put under a name."""
     return {each.removeprefix(f"{name}."): array for each, array in stored.items() if each.startswith(f"{name}.")}

@@ -1,1 +1,1 @@
-"""Whether fans stand and turn as commanded: no prediction is needed for it."""
+"""Checks that fans stand and turn as commanded: no prediction is needed for them."""

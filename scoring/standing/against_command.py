@@ -27,12 +27,12 @@ KINDS = (None, *Standing)
 
 
 class AgainstCommand(Saved):
-    """What each fan of a tray does against its command. A fan that could not show that it obeys changes nothing."""
+    """Check of each fan of a tray against its command. A fan that could not show that it obeys changes nothing."""
 
     KEPT = ("_arrived_t_ns", "_obeyed_ns", "_is_against")
 
     def __init__(self, healthy: Standstill, tachos: Sequence[Tacho]) -> None:
-        """Begin with fans of which nothing is known. tachos: of each fan."""
+        """Begin without knowledge of the fans. tachos: of each fan."""
         self._stands, self._runs = StandsStill(healthy, tachos), RunsOn(healthy, tachos)
         count = len(tachos)
         self._arrived_t_ns = np.full(count, NEVER_NS, np.int64)
@@ -40,11 +40,11 @@ class AgainstCommand(Saved):
         """(2, fans) time for which each has obeyed a command to turn, and one to stop, since it did not"""
         self._is_against = np.zeros((2, count), np.bool_)
         self.active = np.zeros((0, count), np.bool_)
-        """(n, fans) of the samples of the last block"""
+        """(n, fans) true where a fan acts against its command, in the samples of the last block"""
         self.score = np.zeros((0, count))
-        """(n, fans) of them: the longest time against a command, in multiples of what is healthy; CERTAIN above 1"""
+        """(n, fans) longest time against a command, in multiples of what is healthy; CERTAIN above 1"""
         self.kind = np.zeros((0, count), np.int64)
-        """(n, fans) of them: the number in KINDS, 0 where a fan does as commanded"""
+        """(n, fans) number in KINDS, 0 where a fan does as commanded"""
 
     def take(self, block: Prediction) -> None:
         """Judge a block of samples."""
@@ -105,7 +105,7 @@ class AgainstCommand(Saved):
             self.score[rows] = np.maximum(self.score[rows], np.where(against, CERTAIN, ratio))
 
     def _missed_ns(self, t_ns: Array, period_ns: int, is_here: Array) -> Array:
-        """(n, fans) how long nothing had arrived before a sample that did; 0 where nothing was missed."""
+        """Time (n, fans) without samples before a sample that arrived; 0 where nothing was missed."""
         seen = np.where(is_here, t_ns[:, np.newaxis], NEVER_NS)
         latest = np.maximum.accumulate(np.vstack((self._arrived_t_ns, seen)), axis=0)
         self._arrived_t_ns = latest[-1]

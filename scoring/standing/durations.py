@@ -1,4 +1,4 @@
-"""For how long conditions have held."""
+"""Durations for which conditions have held."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from fantwin.schemas.messages import Array
 
 
 class Durations:
-    """Of a block of samples, each of which lasts one period. Samples that are not valid change nothing."""
+    """Durations over blocks of samples, each of which lasts one period. Samples that are not valid change nothing."""
 
     def __init__(self, valid: Array, period_ns: int) -> None:
         self.valid = valid

@@ -1,4 +1,4 @@
-"""How fans lose their speed: what tells a rotor that is held from one that has no power."""
+"""Falls of speed: what distinguishes a rotor that is held from one that has no power."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fantwin.scoring.model.saved import Saved
 
 STANDS, FALLS = 0.08, 0.85
 """shares of the expected speed: below, a fan stands; above, it has not begun to fall"""
-STAYS = 0.02
+CONSTANT = 0.02
 """share of a reading: two above FALLING that differ by less are of a fan that turns slowly and does not fall"""
 FALLING = 0.6
 """share of the expected speed: a fan below it may come to rest"""
@@ -28,15 +28,15 @@ class Falls(Saved):
         self._share = np.zeros(count)
         """(fans,) newest reading, share of the expected speed"""
         self._passed_s = np.zeros(count)
-        """(fans,) since the newest reading"""
+        """(fans,) time since the newest reading"""
         self._lasted_s = np.zeros(count)
         """(fans,) integral of the speed as a share of the expected one, since it fell"""
         self._rest_s = np.zeros(count)
         """(fans,) the same integral without the first reading of the fall"""
         self._is_first = np.zeros(count, np.bool_)
-        """(fans,) whether the tacho still shows the first reading of the fall"""
+        """(fans,) true while the tacho still shows the first reading of the fall"""
         self._has_stood = np.zeros(count, np.bool_)
-        """(fans,) whether a fan has stood since it fell: what it turns at rest is no part of the fall"""
+        """(fans,) true after a fan has stood since it fell: what it turns at rest is no part of the fall"""
         self.stands = np.zeros(count, np.bool_)
         self.is_falling = np.zeros(count, np.bool_)
 
@@ -48,8 +48,8 @@ class Falls(Saved):
         share = np.abs(now.newest_rad_s) / np.maximum(expected, 1.0)
         turned_s = np.where(known & ~self._has_stood, share * self._passed_s, 0.0)
         self._is_first = (self._is_first & ~now.changes) | (known & (self._lasted_s == 0.0))
-        stays = (share > FALLING) & (np.abs(share - self._share) < STAYS * share)
-        falls = ~known | ((share <= FALLS) & ~stays)
+        is_constant = (share > FALLING) & (np.abs(share - self._share) < CONSTANT * share)
+        falls = ~known | ((share <= FALLS) & ~is_constant)
         self._share = np.where(known, share, self._share)
         self._rest_s = np.where(falls, self._rest_s + np.where(self._is_first, 0.0, turned_s), 0.0)
         self._lasted_s = np.where(falls, self._lasted_s + turned_s, 0.0)

@@ -1,4 +1,4 @@
-"""How long starts, coasts and lapses of a healthy fan may take, in s: limits from the twin's card."""
+"""Limits in s on starts, coasts and lapses of a healthy fan, from the twin's card."""
 
 from __future__ import annotations
 

@@ -32,12 +32,12 @@ KINDS = (Standing.TURNED_AGAIN, Standing.KEEPS_SPEED, Standing.COASTS_TOO_LONG)
 
 
 class RunsOn(Saved):
-    """How long each fan has turned although it is stopped."""
+    """Time for which each fan has turned although it is stopped."""
 
     KEPT = ("_lasted_ns", "_peak_rad_s")
 
     def __init__(self, healthy: Standstill, tachos: Sequence[Tacho]) -> None:
-        """Begin with fans of which nothing is known. tachos: of each fan."""
+        """Begin without knowledge of the fans. tachos: of each fan."""
         self._healthy = healthy
         reach_s = np.array([tacho.reach_s for tacho in tachos])
         self._lag_s = lag_s(reach_s)
@@ -51,7 +51,7 @@ class RunsOn(Saved):
 
     @property
     def memory_s(self) -> float:
-        """No gap: in one the fan may have been started and stopped again."""
+        """Memory of gaps, none: in one the fan may have been started and stopped again."""
         return 0.0
 
     def update(self, command: Array, speed_rad_s: Array, counts: Durations) -> tuple[Array, Array, Array]:

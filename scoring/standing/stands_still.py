@@ -27,12 +27,12 @@ KINDS = (Standing.NO_READING, Standing.CAME_TO_REST, Standing.NOT_STARTED)
 
 
 class StandsStill(Saved):
-    """How long each fan has stood or given no reading against its command."""
+    """Time for which each fan has stood or given no reading against its command."""
 
     KEPT = ("_lasted_ns",)
 
     def __init__(self, healthy: Standstill, tachos: Sequence[Tacho]) -> None:
-        """Begin with fans of which nothing is known. tachos: of each fan."""
+        """Begin without knowledge of the fans. tachos: of each fan."""
         self._healthy = healthy
         reach_s = np.array([tacho.reach_s for tacho in tachos])
         started_s = UNKNOWN_STARTED_S + reach_s if healthy.start_s is None else healthy.start_s + 0.0 * reach_s

@@ -36,7 +36,7 @@ class SlowChange:
 
 
 def is_of_slow_change(note: str) -> bool:
-    """Whether a note of a scorer is about fans that change slowly, one of them or most of a tray."""
+    """Return whether a note of a scorer is about fans that change slowly, one of them or most of a tray."""
     return note.endswith(WEAR_HINT) or note.startswith(MOST_FANS)
 
 

@@ -38,7 +38,7 @@ MAX_ERROR_RATIO = 3.0
 MIN_EFFECTIVE_POINTS = 5.0
 BATCHES = 24
 MAX_HORIZON_RATIO = 10.0
-"""no forecast of a limit farther ahead than this many times the observed time"""
+"""horizon of the forecast of a limit, in multiples of the observed time"""
 REACHED = "the limit is already reached"
 THEIL_SEN_EFFICIENCY = 3.0 / np.pi
 SCATTER_PER_MEDIAN = 1.4826
@@ -64,13 +64,13 @@ class Trend:
 
     @property
     def significant(self) -> bool:
-        """Whether the slope differs from zero at 95 % confidence."""
+        """Return whether the slope differs from zero at 95 % confidence."""
         return self.low > 0.0 or self.high < 0.0
 
 
 @dataclass(frozen=True)
 class LimitForecast:
-    """When a limit will be reached (95 %: earliest to latest), or why that is unknown."""
+    """Forecast of when a limit will be reached (95 %: earliest to latest), or why that is unknown."""
 
     earliest_ns: int | None = None
     likely_ns: int | None = None
@@ -79,7 +79,7 @@ class LimitForecast:
 
 
 class Point(NamedTuple):
-    """One value of a series, or the mean of several."""
+    """Value of a series, or the mean of several."""
 
     t_ns: int
     value: float
@@ -183,7 +183,8 @@ class WearSeries:
 
 
 def forecast_limit(trend: Trend, limit: float, now_ns: int) -> LimitForecast:
-    """When the value will reach `limit`, which lies ahead in the direction of the trend, if the trend continues."""
+    """Forecast when the value will reach `limit`, which lies ahead in the direction of the trend, if the trend
+    continues."""
     now = (now_ns - trend.origin_ns) / NS_PER_DAY
     distance = limit - (trend.level + trend.slope_per_day * now)
     if not trend.significant:
@@ -217,7 +218,7 @@ def _crossings(trend: Trend, limit: float) -> tuple[float, float]:
 
 
 def _inflation(residual: Array) -> float:
-    """How many correlated points count as one."""
+    """Number of correlated points that count as one."""
     bounded = np.clip(residual, *np.quantile(residual, (0.02, 0.98)))
     size = max(1, len(residual) // BATCHES)
     n = len(residual) // size

@@ -25,13 +25,13 @@ SETTLING_INTERVALS = 6
 REFERENCE_DAYS = 1.0
 """a change is the difference from the mean of this time after commissioning, which levels day and night"""
 MIN_FORECAST_DAYS = 1.0
-"""no forecast before: weather and warming bearings change more within a day than wear does"""
+"""time before the first forecast: weather and warming bearings change more within a day than wear does"""
 HALF_INTERVAL = 1.96
 """half of a 95 % interval, in standard errors"""
 MIN_CHANGE = 0.03
 """share of the speed; any healthy fan shows smaller changes"""
 NOTICED_INTERVALS = 2.0
-"""a change is noticed from so many half intervals on: every fan is tested again with every point"""
+"""change that is noticed, in half intervals: every fan is tested again with every point"""
 TOGETHER_NS = 1800 * NS_PER_S
 """fans whose first points are no farther apart were commissioned together"""
 REPORT_WITHIN_DAYS = 7.0
@@ -100,7 +100,7 @@ class WearMonitor:
         self._trends.pop(fan, None)
 
     def _reference(self, fan: int) -> Point:
-        """What the change of a fan refers to, with the error of the takeovers since."""
+        """Reference of the change of a fan, with the error of the takeovers since."""
         reference = self._series[fan].mean_from(int(self.first_t_ns[fan]), REFERENCE_DAYS)
         return reference._replace(std_error=math.hypot(reference.std_error, math.sqrt(self.joined_variance[fan])))
 
@@ -154,7 +154,7 @@ class WearMonitor:
             self._series[fan] = WearSeries()
 
     def problem(self, now_ns: int) -> str:
-        """One line while a fan will likely reach its limit within days by a change of its own, or may have reached it;
+        """Line while a fan will likely reach its limit within days by a change of its own, or may have reached it;
         empty otherwise, and once that is sure."""
         soon = []
         for fan in self._changed_fans():

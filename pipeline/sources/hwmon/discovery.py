@@ -21,7 +21,7 @@ _UNKNOWN = "n/a"
 
 @dataclass(frozen=True)
 class Found:
-    """Something that could be a tray.
+    """Possible tray: a chip with fans, or a serial port.
 
     Attributes:
         kind: of its source.

@@ -54,6 +54,6 @@ class FoundModes:
         replace_file(self._path, json.dumps(_FOUND.dump_python(_Found(chip.name, chip.device, dict(pwms)))).encode())
 
     def forget(self) -> None:
-        """All was given back. Raises OSError."""
+        """Note that all was given back. Raises OSError."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)

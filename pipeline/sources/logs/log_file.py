@@ -54,5 +54,5 @@ class LogFile(Protocol):
         ...
 
     def read(self, names: Sequence[str]) -> Mapping[str, Series]:
-        """Some fields by name. Raises LogError."""
+        """Read some fields by name. Raises LogError."""
         ...

@@ -81,7 +81,7 @@ class ModbusConfig(PolledConfig, frozen=True):
 
     @property
     def most_fans(self) -> int:
-        """Those whose registers are named."""
+        """Columns whose registers are named."""
         return len(self.fan)
 
     @property

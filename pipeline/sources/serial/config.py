@@ -22,5 +22,5 @@ class SerialConfig(SourceConfig, frozen=True):
 
     @property
     def most_fans(self) -> int:
-        """Those of a frame. Without a port there is no line: the samples come from elsewhere, such as a replay."""
+        """Columns of a frame. Without a port there is no line: the samples come from elsewhere, such as a replay."""
         return MOST_FANS_ON_LINE if self.port else MOST_FANS
