@@ -39,7 +39,7 @@ class ScoreColumns:
 
     @classmethod
     def empty(cls, *shape: int) -> Self:
-        """Make columns of fans of which nothing is known."""
+        """Make columns without knowledge of the fans."""
         return cls(
             score=np.zeros(shape),
             statistic=np.full(shape, int(Statistic.DEVIATION), np.uint8),

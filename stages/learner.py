@@ -38,7 +38,7 @@ LOOK_NS = NS_PER_S
 FLUSH_NS = 10 * NS_PER_S
 """time between two flushes of the history to the disk: a crash loses as much"""
 AHEAD_NS = 60 * NS_PER_S
-"""the history may be so much ahead of the samples"""
+"""largest lead of the history over the samples"""
 
 
 class LearnerConfig(StageConfig):

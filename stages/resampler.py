@@ -50,7 +50,7 @@ from fantwin.schemas.messages import Grid, Raw, StatedTacho
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from fantwin.schemas.units import NS_PER_S
 
-FASTER = 2.0  # a line that sends so many times the samples of its grid has changed
+FASTER = 2.0  # a line that sends this many times the samples of its grid has changed
 
 
 class ResamplerConfig(StageConfig):

@@ -27,7 +27,7 @@ from fantwin.schemas.units import NS_PER_S
 
 APART_NS = NS_PER_S
 ESTABLISHED_NS = 3 * NS_PER_S // 2  # by which one side must have gone on: longer than a message of acquisition spans
-ESTABLISHED_STEPS = 3  # and by so many steps of the line, if these are longer
+ESTABLISHED_STEPS = 3  # and by this many steps of the line, if these are longer
 LONGEST_STEP_NS = 5 * NS_PER_S
 MAX_HELD = 10_000  # samples; of more, the oldest are lost
 SHOWN_NS = 60 * NS_PER_S  # how long health shows what happened

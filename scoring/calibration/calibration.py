@@ -33,7 +33,7 @@ class Calibration(BaseModel):
     """Entry `calibration` of a card.
 
     false_alarms_per_day: declared, of each fan. limit_factor: on the log of the limit that follows from it. fan_hours:
-    of healthy running that was compared with the twin, in so many runs. found: false alarms in it by this calibration.
+    of healthy running that was compared with the twin, in `runs` runs. found: false alarms in it by this calibration.
     interval_95: of the rate of false alarms per fan and day that they show. data: the recordings: name and SHA-256,
     from_s, to_s of a part, tray of several.
     """
@@ -88,7 +88,7 @@ def supports(fan_hours: float, per_day: float) -> bool:
 
 
 def least_per_day(fan_hours: float) -> float:
-    """The lowest rate, of two digits, that so much healthy running can show."""
+    """Lowest rate, of two digits, that `fan_hours` of healthy running can show."""
     rate = needed_fan_hours(fan_hours)  # hours and rate are interchangeable
     digits = 1 - math.floor(math.log10(rate))
     while not supports(fan_hours, rounded := float(f"{math.ceil(rate * 10.0**digits) / 10.0**digits:.2g}")):

@@ -43,7 +43,7 @@ class SerialSource:
         """Prepare the line; the port is not opened yet. A test may give another `link`.
 
         Raises:
-            UserError: no port is given, or a frame cannot carry so many fans.
+            UserError: no port is given, or a frame cannot carry all fans.
         """
         if context.fans > wire.MAX_FANS:
             raise UserError(too_many_fans(config.kind, context.fans, wire.MAX_FANS))
