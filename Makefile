@@ -5,8 +5,7 @@
 # make compose-test  compose.yaml brought up, killed and cut off, in namespaces of this machine (root)
 # make bench  measurements, as ratios
 # make schema regenerate the code of schemas/fan.proto
-# make configuration  write docs/reference/configuration.md again
-# make tables  write the tables of docs/reference that come from the code again
+# make reference  write the pages and tables of docs/reference that come from the code again
 # make twin   train the demo's twin again
 # make lock   pin the dependencies again
 # make rerun-bump VERSION=0.42  pin Rerun to this release, and run all tests that draw with it
@@ -25,7 +24,7 @@ BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_t
 unexport PYTHONDONTWRITEBYTECODE
 SOURCES := fantwin schemas scoring pipeline simulation stages twin tests bench
 
-.PHONY: demo test check selftest compose-test bench schema configuration tables twin lock rerun-bump clean
+.PHONY: demo test check selftest compose-test bench schema reference twin lock rerun-bump clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.runtime
@@ -55,10 +54,9 @@ bench: $(VENV)/.benches
 schema: $(VENV)/.development
 	$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. schemas/fan.proto
 
-configuration: $(VENV)/.development
+reference: $(VENV)/.development
 	$(BIN)/python -m fantwin.pipeline.config.reference_page > docs/reference/configuration.md
-
-tables: $(VENV)/.development
+	$(BIN)/python -m fantwin.pipeline.cli.reference_page > docs/reference/commands.md
 	$(BIN)/python -m fantwin.pipeline.config.reference_tables
 
 twin: $(VENV)/.development

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import signal
 import subprocess
@@ -28,6 +29,7 @@ from bench.training.published_fan import RATE_HZ, ROUGH_RANGE, published_fan, ra
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
+from fantwin.pipeline.learning.learning_process import VARIABLE
 from fantwin.pipeline.learning.versions import TwinVersions, learning_folder
 from fantwin.pipeline.selftest.scratch_site import FANTWIN
 from fantwin.pipeline.site.site_watcher import SiteWatcher
@@ -91,9 +93,14 @@ def main() -> None:
         print(f"{key}: {value:.3g}")
 
 
-def _started(words: list[str]) -> subprocess.Popen[bytes]:
+def _started(words: list[str], **variables: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        words,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+        env={**os.environ, **variables},
     )
 
 
@@ -126,7 +133,7 @@ def measured(folder: Path) -> dict[str, float]:
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             began_s = time.monotonic()
             progress("latency beside fantwin twins learn, and for as long without it")
-            learn = _started([*FANTWIN, "twins", "learn", "-c", str(config), "--until-stdin-closes"])
+            learn = _started([*FANTWIN, "twins", "learn", "-c", str(config)], **{VARIABLE: "1"})
             peak_mb = [0.0]
 
             def is_over() -> bool:

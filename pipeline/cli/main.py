@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -140,11 +140,16 @@ def _group(
     """Digital twins of fans: run a healthy twin beside each fan, raise an alarm when the two diverge."""
 
 
+def function_of(name: str) -> Callable[..., Any]:
+    """The function that is a command."""
+    path = COMMANDS[name][0]
+    return getattr(import_module(f"fantwin.pipeline.cli.{path}"), path.rpartition(".")[2])
+
+
 def _register(names: Iterable[str]) -> None:
     for name in names:
-        folder, module = COMMANDS[name][0].split(".")
-        function = getattr(import_module(f"fantwin.pipeline.cli.{folder}.{module}"), module)
-        app.command(name, rich_help_panel=PANELS[folder])(function)
+        folder, _, _ = COMMANDS[name][0].partition(".")
+        app.command(name, rich_help_panel=PANELS[folder])(function_of(name))
 
 
 def _list_commands() -> None:

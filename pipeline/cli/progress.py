@@ -1,4 +1,4 @@
-"""Progress of commands: bars on a terminal, a plain line every few seconds elsewhere."""
+"""Progress of commands: one display for all long work, a bar on a terminal and lines elsewhere."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
     from fantwin.pipeline.cli.twins.training_data import TrainingData
@@ -40,50 +41,78 @@ def interruptible(outcome: str) -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+class Reporter:
+    """Shows on standard error what is being done: a bar on a terminal, which disappears at the end.
+
+    Elsewhere a line comes when something else is done than before, and every LINE_PERIOD_S. A context manager.
+    """
+
+    def __init__(self, quietly: str = "", *, has_lines: bool = True) -> None:
+        """quietly: what begins without a line. has_lines: whether there are lines where there is no terminal."""
+        self.console = console = Console(stderr=True, highlight=False)
+        """what is printed with it stands above the bar"""
+        self._has_lines = has_lines and not console.is_terminal
+        columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[count]}"))
+        is_disabled = not console.is_terminal
+        self._bars = Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=is_disabled)
+        self._bar: TaskID | None = None
+        self._doing = quietly
+        self.restart()
+
+    def restart(self) -> None:
+        """Count the time from now on."""
+        self._started_s = self._shown_s = time.monotonic()
+
+    def show(self, doing: str, done: int = 0, at_most: int = 0, note: str = "") -> None:
+        """Say what is being done, how much of it is done, and more about it."""
+        count = f"{done}/{at_most}" if at_most else ""
+        is_new, now_s = doing != self._doing, time.monotonic()
+        self._doing = doing
+        if self._has_lines and (is_new or now_s - self._shown_s >= LINE_PERIOD_S):
+            self._shown_s, took_s = now_s, now_s - self._started_s
+            took = f", {took_s:.0f} s" if at_most or took_s >= 1.0 else ""
+            typer.echo(f"{doing}{f' {count}' if count else ''}{f', {note}' if note else ''}{took}", err=True)
+        text = ", ".join(filter(None, (doing, note)))
+        if is_new and self._bar is not None:  # each has a bar of its own
+            self._bars.remove_task(self._bar)
+            self._bar = None
+        if self._bar is None:
+            self._bar = self._bars.add_task(text, total=at_most or None, count=count)
+        self._bars.update(self._bar, completed=done, description=text, count=count)
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._bars.stop()
+
+
 @contextmanager
 def working(title: str) -> Iterator[Callable[[str], None]]:
     """Around work of unknown length; yields a function that shows which part is being done."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        typer.echo(title, err=True)
-        yield lambda part: typer.echo(part, err=True)
-        return
-    with console.status(title) as status:
-        yield status.update
+    with Reporter() as reporter:
+        reporter.show(title)
+        yield reporter.show
 
 
 @contextmanager
 def recordings_progress(doing: str, count: int) -> Iterator[Callable[[], None]]:
-    """Around work on so many recordings: one bar. Yields a function that says that one more is done.
+    """Around work on so many recordings. Yields a function that says that one more is done.
 
-    Without a terminal, lines appear every LINE_PERIOD_S. Inside, `show_part` shows what is being done.
+    Inside, `show_part` shows what is being done.
     """
-    console = Console(stderr=True)
     done = 0
-    shown_s = time.monotonic()
 
-    def line(part: str = "") -> None:
-        nonlocal shown_s
-        if time.monotonic() - shown_s >= LINE_PERIOD_S:
-            shown_s = time.monotonic()
-            typer.echo(f"{doing}: {done}/{count}{f', {part}' if part else ''}", err=True)
+    def show(part: str = "") -> None:
+        reporter.show(doing, done, count, part)
 
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
-        bar = bars.add_task(doing, total=count)
+    def advance() -> None:
+        nonlocal done
+        done += 1
+        show()
 
-        def show(part: str) -> None:
-            bars.update(bar, description=f"{doing}: {part}")
-            if not console.is_terminal:
-                line(part)
-
-        def advance() -> None:
-            nonlocal done
-            done += 1
-            bars.update(bar, completed=done, description=doing)
-            if not console.is_terminal:
-                line()
-
+    with Reporter(quietly=doing) as reporter:
         token = _SHOW_PART.set(show)
         try:
             yield advance
@@ -100,52 +129,18 @@ def show_part(part: str) -> None:
 @contextmanager
 def training_progress(training_data: TrainingData) -> Iterator[Callable[[str], ProgressCallback]]:
     """Around identification and training; yields a function that starts the display of one by its name and returns its
-    progress callback.
+    progress callback."""
+    with Reporter() as reporter:
 
-    Bars disappear at the end. Lines appear when a part of the work begins and every LINE_PERIOD_S.
-    """
-    console = Console(stderr=True)
-
-    def error(rmse_rad_s: float) -> str:
-        if math.isnan(rmse_rad_s):
-            return ""
-        return f", free-run rmse {rmse_rad_s / training_data.rad_s_per_unit:.4g} {training_data.speed_unit}"
-
-    def start_lines(name: str) -> ProgressCallback:
-        prefix = f"{name}: " if name else ""
-        started_s, shown_s, shown_part = time.monotonic(), -math.inf, ""
-
-        def show(part: str, done: int, at_most: int, rmse_rad_s: float) -> None:
-            nonlocal shown_s, shown_part
-            now_s = time.monotonic()
-            if part != shown_part or now_s - shown_s >= LINE_PERIOD_S:
-                shown_s, shown_part = now_s, part
-                count = f" {done}/{at_most}" if at_most else ""
-                typer.echo(f"{prefix}{part}{count}{error(rmse_rad_s)}, {now_s - started_s:.0f} s", err=True)
-
-        return show
-
-    if not console.is_terminal:
-        yield start_lines
-        return
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[count]}"))
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bars:
-
-        def start_bar(name: str) -> ProgressCallback:
+        def start(name: str) -> ProgressCallback:
+            reporter.restart()
             prefix = f"{name}: " if name else ""
-            shown_part = ""
 
             def show(part: str, done: int, at_most: int, rmse_rad_s: float) -> None:
-                nonlocal shown_part
-                count = f"{done}/{at_most}" if at_most else ""
-                description = f"{prefix}{part}{error(rmse_rad_s)}"
-                if part != shown_part:  # each has a bar of its own
-                    shown_part = part
-                    for task in bars.task_ids:
-                        bars.remove_task(task)
-                    bars.add_task(description, total=at_most or None, count=count)
-                bars.update(bars.task_ids[0], completed=done, description=description, count=count)
+                in_unit = rmse_rad_s / training_data.rad_s_per_unit
+                error = "" if math.isnan(in_unit) else f"free-run rmse {in_unit:.4g} {training_data.speed_unit}"
+                reporter.show(f"{prefix}{part}", done, at_most, error)
 
             return show
 
-        yield start_bar
+        yield start

@@ -1,6 +1,6 @@
 """docs/reference/configuration.md: every key of the configuration, from the models that check it.
 
-`python -m fantwin.pipeline.config.reference_page` writes the page to standard output, `make configuration` the file.
+`python -m fantwin.pipeline.config.reference_page` writes the page to standard output, `make reference` the file.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ paths start at the folder of the file. `--set` changes a key for one command: `-
 Where the default is empty, the description says what holds; times of the `[scorer]` are then those that the twin was
 calibrated with.
 
-This page is made from the models in the code: `make configuration`.
+This page is made from the models in the code: `make reference`.
 """
 _TYPE_WORDS = {str: "text", int: "integer", float: "number", bool: "`true` or `false`", Path: "path"}
 _ELSEWHERE = "see below"
@@ -49,25 +49,25 @@ def page() -> str:
     parts = [
         _INTRODUCTION,
         "## The file\n",
-        _table(top_level(), but=tables),
+        table(top_level(), but=tables),
         "## `[[tray]]`\n",
         "One for each tray. `port`, `baud` and `protocol` may be written in it directly, for a serial source.\n",
-        _table(TrayConfig, but=()),
+        table(TrayConfig),
         *_sources(),
         "### `tacho = { kind = ..., ... }`\n",
         "What a reading is of the speed ([tachos](../explanation/tachos.md)).\n",
-        _table(Tacho, but=()),
+        table(Tacho),
         "## `[bus]`\n",
-        _table(BusConfig, but=("security", "zenoh")),
+        table(BusConfig, but=("security", "zenoh")),
         "## `[bus.security]`\n",
         "Certificates and roles ([security](../how-to/security.md)). Without this section there are none.\n",
-        _table(SecurityConfig, but=()),
+        table(SecurityConfig),
         "## `[bus.zenoh]`\n",
         "Settings of Zenoh itself, passed to every session and to the router: path = value, with the paths of Zenoh's "
         'own configuration, for example `"transport/unicast/max_sessions" = 5000`. What Zenoh does not know, or '
         "fantwin sets itself, is refused.\n",
         "## `[launcher]`\n",
-        _table(LauncherConfig, but=()),
+        table(LauncherConfig),
     ]
     for name, row in STAGES.items():
         stage = row.load()
@@ -81,8 +81,8 @@ def page() -> str:
         parts += [
             f"## `[{name}]`\n",
             f"{stage.about[0].upper()}{stage.about[1:]}.{start}\n",
-            _table(stage.config, but=()),
-            *_tables_within(stage.config),
+            table(stage.config),
+            *tables_within(stage.config),
         ]
     return re.sub(r"\n{3,}", "\n\n", "\n".join(parts))
 
@@ -93,11 +93,11 @@ def _sources() -> Iterator[str]:
         model: type[BaseModel] = getattr(import_module(module), name)
         has_keys = set(model.model_fields) > {"kind"}
         yield f'### `source = {{ kind = "{kind}"{", ..." if has_keys else ""} }}`\n'
-        yield _table(model, but=("kind",)) if has_keys else "It has no other keys.\n"
-        yield from _tables_within(model)
+        yield table(model, but=("kind",)) if has_keys else "It has no other keys.\n"
+        yield from tables_within(model)
 
 
-def _tables_within(model: type[BaseModel]) -> Iterator[str]:
+def tables_within(model: type[BaseModel]) -> Iterator[str]:
     """The keys of the tables that are values of keys of a source or a stage, each kind of table once."""
     waiting, shown = [model], set[type[BaseModel]]()
     while waiting:
@@ -107,7 +107,7 @@ def _tables_within(model: type[BaseModel]) -> Iterator[str]:
                 shown.add(inner)
                 waiting.append(inner)
                 yield f"A table such as `{key}`: {(inner.__doc__ or '').splitlines()[0]}\n"
-                yield _table(inner, but=())
+                yield table(inner)
 
 
 def _plain_types(annotation: Any) -> Iterator[Any]:
@@ -123,7 +123,7 @@ def _is_model(annotation: Any) -> bool:
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
-def _table(model: type[BaseModel], but: Iterable[str]) -> str:
+def table(model: type[BaseModel], but: Iterable[str] = ()) -> str:
     """The keys of a section, one a row."""
     rows = [
         f"| `{key}` | {_values(field)} | {_default(field)} | {field.description or ''} |"
@@ -168,7 +168,7 @@ def _type_words(annotation: Any) -> str:
 def _default(field: FieldInfo) -> str:
     if field.is_required():
         return "required"
-    if field.default is None:
+    if field.default is None or field.default == {} or _is_of_models(field.default):
         return ""
     if isinstance(field.default, dict):
         return "`{ " + ", ".join(f"{key} = {json.dumps(value)}" for key, value in field.default.items()) + " }`"
@@ -176,6 +176,11 @@ def _default(field: FieldInfo) -> str:
     return (
         _number(value) if isinstance(value, int | float) and not isinstance(value, bool) else f"`{json.dumps(value)}`"
     )
+
+
+def _is_of_models(value: Any) -> bool:
+    """Whether it is a table, or a list of tables, whose keys say their own defaults."""
+    return isinstance(value, BaseModel) or (isinstance(value, tuple) and any(map(_is_of_models, value)))
 
 
 def _number(value: float) -> str:

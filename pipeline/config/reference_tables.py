@@ -1,6 +1,6 @@
 """The tables of docs/reference that are made of the code: the topics of messages.md, and the values of bounds.md.
 
-`make tables` writes both pages again. The words of bounds.md are its own; each row names a constant, whose value is
+`make reference` writes both pages again. The words of bounds.md are its own; each row names a constant, whose value is
 filled in here.
 """
 

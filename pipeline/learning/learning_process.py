@@ -14,6 +14,9 @@ from typing import Protocol
 _TURN = threading.Lock()
 """one tray learns at a time, to limit memory and processor use"""
 STOP_S = 2.0
+VARIABLE = "FANTWIN_LEARNS_FOR_A_STAGE"
+"""environment variable of the child: it gives way to all else, and ends with its parent, which holds its standard
+input open"""
 
 
 class Learning(Protocol):
@@ -49,7 +52,7 @@ class LearningProcess:
         """log: file for the standard error of the last run."""
         sets = [word for override in overrides for word in ("--set", override)]
         self._fantwin = [sys.executable, "-P", "-m", "fantwin", "twins"]
-        self._options = ["-c", str(config), "--tray", tray, *sets, "--until-stdin-closes"]
+        self._options = ["-c", str(config), "--tray", tray, *sets]
         self._log = log
         self._child: subprocess.Popen[bytes] | None = None
         self._began_s = 0.0
@@ -71,7 +74,7 @@ class LearningProcess:
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=log,
-                    env={**os.environ, "OMP_NUM_THREADS": "1"},
+                    env={**os.environ, "OMP_NUM_THREADS": "1", VARIABLE: "1"},
                 )
         except OSError as error:
             _TURN.release()

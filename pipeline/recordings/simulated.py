@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from fantwin.pipeline.recordings.reading import TACHO_KEY
 from fantwin.pipeline.recordings.writing import RecordingWriter
@@ -24,13 +22,18 @@ SAMPLES_PER_MESSAGE = 100
 
 
 def record(
-    device: Device, path: Path, epoch_ns: int, duration_s: float, speed_unit: str, tachos: Sequence[Tacho]
+    device: Device,
+    path: Path,
+    epoch_ns: int,
+    speed_unit: str,
+    tachos: Sequence[Tacho],
+    progress: Callable[[float], None] = lambda _t_s: None,
 ) -> PlaybackCounts:
     """Write all samples of a device as Raw messages; equal arguments give equal bytes.
 
-    epoch_ns: time of t_s = 0; the time of receipt of a sample is that of its measurement. duration_s: for the progress
-    on stderr. speed_unit: unit to display speeds in; samples are in rad/s. tachos: how they are measured. An existing
-    recording is replaced.
+    epoch_ns: time of t_s = 0; the time of receipt of a sample is that of its measurement. speed_unit: unit to display
+    speeds in; samples are in rad/s. tachos: how they are measured. progress: is given the time of the newest sample, s.
+    An existing recording is replaced.
 
     Raises:
         RecordingError: it cannot be written.
@@ -44,16 +47,12 @@ def record(
     }
     if tuple(tachos) != INSTANTANEOUS:
         metadata[f"{TACHO_KEY}.{TRAY}"] = tachos_to_json(tachos)
-    with (
-        RecordingWriter(path, metadata, t_ns=epoch_ns, overwrite=True) as writer,
-        Progress(console=Console(stderr=True), transient=True) as progress,
-    ):
-        task = progress.add_task(f"simulating {duration_s:g} s", total=duration_s)
+    with RecordingWriter(path, metadata, t_ns=epoch_ns, overwrite=True) as writer:
         for sequence, block in enumerate(_blocks(device, played)):
             raw = _raw(device.fans, block, epoch_ns, sequence)
             writer.add_message(tray_key(SITE, TRAY, "raw"), raw, int(raw.host_receive_t_ns[-1]))
             played.samples_sent += len(block)
-            progress.update(task, completed=block[-1].t_s)
+            progress(block[-1].t_s)
     return played
 
 

@@ -4,22 +4,20 @@ import io
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
-from importlib import import_module
 from unittest.mock import patch
 
 import typer
 from typer.testing import CliRunner, Result
 
 from fantwin.pipeline.cli import main as command_line
-from fantwin.pipeline.cli.main import COMMANDS
+from fantwin.pipeline.cli.main import function_of
 from fantwin.pipeline.errors import UsageError, UserError
 
 
 def fantwin(name: str, *arguments: object, typed: str | None = None) -> Result:
     """Run a command; the result has its exit code, standard output and exception. typed: what it reads."""
-    module, _ = COMMANDS[name]
     app = typer.Typer(pretty_exceptions_enable=False)
-    app.command(name)(getattr(import_module(f"fantwin.pipeline.cli.{module}"), module.rpartition(".")[2]))
+    app.command(name)(function_of(name))
     return CliRunner().invoke(app, [str(argument) for argument in arguments], input=typed)
 
 

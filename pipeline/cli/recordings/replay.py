@@ -6,18 +6,15 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.live import Live
-from rich.text import Text
 
 from fantwin.pipeline.cli.options import JsonOption, SetOption
+from fantwin.pipeline.cli.progress import Reporter
 from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.dates import format_utc
@@ -40,7 +37,6 @@ _SHOWN_EVERY_S = 0.1
 LARGEST_RATE = 1e6
 LONGEST_S = 1e10
 """three centuries, which still fits in ns"""
-_Show: TypeAlias = Callable[[Progress], None]
 _VIEWING = "Viewing"
 _DECIDING = "Scoring again, without a bus"
 
@@ -153,10 +149,23 @@ def replay(
         replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
         stop = threading.Event()
         stop_on_signals(stop)
-        console = Console(stderr=True, highlight=False)
+        reporter, end_s = Reporter(has_lines=False), playback.end_s()
+        console = reporter.console
         if missing:
             console.print(missing, markup=False, soft_wrap=True)
-        with keys, _status_line(console, playback.end_s(), playback.seconds_at) as show:
+
+        shown_s = 0.0
+
+        def show(progress: Progress) -> None:
+            nonlocal shown_s
+            if not console.is_terminal or (time.monotonic() - shown_s < _SHOWN_EVERY_S and not progress.paused):
+                return
+            shown_s = time.monotonic()
+            at_s = playback.seconds_at(progress.t_ns)
+            ends_s = end_s if end_s is not None and not progress.round else 0.0
+            reporter.show("", int(at_s), math.ceil(ends_s), status_line(progress))
+
+        with keys, reporter:
             outcome = publish(
                 playback,
                 pace,
@@ -218,34 +227,12 @@ def _rate(text: str) -> float:
     return rate
 
 
-@contextmanager
-def _status_line(console: Console, end_s: float | None, seconds_at: Callable[[int], float]) -> Iterator[_Show]:
-    """Shows the progress in the last line of the terminal; without a terminal, nothing."""
-    if not console.is_terminal:
-        yield lambda _progress: None
-        return
-    with Live(console=console, auto_refresh=False, transient=True) as live:
-        shown_s = 0.0
-
-        def show(progress: Progress) -> None:
-            nonlocal shown_s
-            if time.monotonic() - shown_s >= _SHOWN_EVERY_S or progress.paused:
-                shown_s = time.monotonic()
-                live.update(
-                    Text(status_line(progress, seconds_at(progress.t_ns), end_s), no_wrap=True, overflow="ellipsis"),
-                    refresh=True,
-                )
-
-        yield show
-
-
-def status_line(progress: Progress, at_s: float, end_s: float | None) -> str:
-    """One line: recorded time, position in the recording, rate, messages sent."""
-    position = f"{at_s:.2f} s" + (f" of {end_s:.2f} s" if end_s is not None and not progress.round else "")
+def status_line(progress: Progress) -> str:
+    """One line: recorded time, rate, messages sent, keys."""
     rounds = f"  round {progress.round + 1}" if progress.round else ""
     rate = "as fast as possible" if math.isinf(progress.rate) else f"x {progress.rate:g}"
     state = "paused, " if progress.paused else ""
-    return f"{format_utc(progress.t_ns)}  {position}{rounds}  {state}{rate}  {progress.messages:,} sent  ({_KEYS_HELP})"
+    return f"{format_utc(progress.t_ns)}{rounds}  {state}{rate}  {progress.messages:,} sent  ({_KEYS_HELP})"
 
 
 def _summary(outcome: Outcome) -> str:

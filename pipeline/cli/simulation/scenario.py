@@ -60,7 +60,7 @@ class FileScenario(Section):
         description="speed columns[:unit], one for each fan; rpm, hz, deg/s, rad/s (default)"
     )
     channels: dict[str, tuple[str, ...]] = Field(
-        default_factory=dict,
+        default={},
         description=f"columns of {', '.join(column.name for column in AUXILIARY)}: one for all fans, or one for each",
     )
     from_s: float = Field(default=0.0, ge=0.0, description="start, since the first row")

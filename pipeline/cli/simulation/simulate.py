@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fantwin.pipeline.cli.options import JsonOption, SetOption
+from fantwin.pipeline.cli.progress import Reporter
 from fantwin.pipeline.cli.simulation.scenario import Scenario, read_scenario
 from fantwin.pipeline.cli.simulation.serving import serve_hwmon, serve_line
 from fantwin.pipeline.cli.simulation.simulated_hwmon import RATE_HZ, tachos_of
@@ -96,7 +97,12 @@ def simulate(
         if recording.exists():
             raise UserError(f"{recording}: exists; name another file with --recording, or delete it")
         epoch_ns = clock.time_ns() if wanted.epoch_ns is None else wanted.epoch_ns
-        played = record(device, recording, epoch_ns, _length_s(wanted), wanted.speed_unit, tachos)
+        length_s, doing = _length_s(wanted), "simulating, s"
+        with Reporter(quietly=doing) as reporter:
+            played = record(
+                *(device, recording, epoch_ns, wanted.speed_unit, tachos),
+                lambda t_s: reporter.show(doing, int(t_s), int(length_s)),
+            )
     else:
         save(truth, summary_of(PlaybackCounts(), complete=False))
         on_start = partial(save_start, truth, summary_of)

@@ -19,6 +19,7 @@ from fantwin.pipeline.cli.twins.versions_text import list_as_json, list_lines
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.learning.learning_process import VARIABLE
 from fantwin.pipeline.learning.versions import TwinVersions, learning_folder
 from fantwin.schemas.units import NS_PER_S
 
@@ -53,7 +54,6 @@ def twins(
     tray: Annotated[str | None, typer.Option(help="Which tray, where several learn their twins.")] = None,
     overrides: SetOption = None,
     json_output: JsonOption = False,
-    until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """List the versions of a learned twin, make the next one, put one in force, or mark a time span as faulty.
 
@@ -77,7 +77,7 @@ def twins(
         raise UsageError(
             f"give {' and '.join(takes) or 'nothing'} after {asked}: {' '.join(('fantwin twins', asked, *takes))}"
         )
-    if until_stdin_closes:
+    if VARIABLE in os.environ:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # it runs while no stage does
         threading.Thread(target=_end_with_parent, daemon=True).start()
     settings = load_config(config, overrides or (), stages=("learner",))

@@ -20,6 +20,7 @@ from fantwin.pipeline.cli.options import (
     HighOption,
     JsonOption,
     LowOption,
+    RoundsOption,
     SafeOption,
     SetOption,
 )
@@ -56,6 +57,7 @@ def commission(
     low: LowOption = None,
     high: HighOption = None,
     safe: SafeOption = None,
+    rounds: RoundsOption = 2,
     minutes: Annotated[
         float, typer.Option(min=0.1, max=10_000, help="Length of each recording of ordinary operation.")
     ] = 10.0,
@@ -78,9 +80,9 @@ def commission(
 
     Each tray that names no twin gets one; the others stay as they are. The steps are commands of
     docs/tutorial/own-fan.md; each is shown before it runs, except the `up` that records. The fans must be healthy. With
-    --sweep, the trays are swept one after another. Without
-    --sweep, no command is sent: the first recording lasts until the plant has moved the command of every fan enough,
-    and what is missing is shown. The calibration is from little data: calibrate again after a few days.
+    --sweep, the trays are swept one after another: --rounds times to train on, once more to validate. Without it, no
+    command is sent: the first recording lasts until the plant has moved the command of every fan enough, and what is
+    missing is shown. The calibration is from little data: calibrate again after a few days.
 
     A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends `commission`
     without further twins. Recordings stay, in folders `commissioned-N` of their own, which the limits of `[recorder]`
@@ -107,7 +109,7 @@ def commission(
         if each.twin is not None:
             say(f"{config}: tray {each.name} keeps its twin {each.twin}")
     with_sweep = _sweep_words(low, high, safe) if sweep else None
-    plan = Plan(with_sweep, 60.0 * minutes, 3600.0 * at_most_hours, false_alarms_per_day)
+    plan = Plan(with_sweep, rounds, 60.0 * minutes, 3600.0 * at_most_hours, false_alarms_per_day)
     commands = Commands(stop, say, to_standard_error=json_output)
     commissioning = Commissioning(settings, configured, commands, works, plan)
     _run(commissioning, works)

@@ -19,16 +19,14 @@ from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 SHOWN_EVERY_S = 60.0
 
 
-FIRST_ROUNDS = 2
-"""of the first sweep of each tray, on which it is trained"""
-
-
 @dataclass(frozen=True)
 class Plan:
     """How the fans of all trays are moved, and for how long they are recorded."""
 
     sweep: list[str] | None
     """the options of each sweep but for tray and rounds; None: the plant moves the fans"""
+    rounds: int
+    """of the first sweep of each tray"""
     operation_s: float
     """length of a recording of ordinary operation"""
     at_most_s: float
@@ -129,7 +127,7 @@ class Commissioning:
         """
         for work in self.left:
             with self._failing(work):
-                work.training = self._swept(work, options, FIRST_ROUNDS)
+                work.training = self._swept(work, options, self._plan.rounds)
                 _check_tachos(work)
                 work.validation = self._swept(work, options, 1)
         seen = {work.name: OrdinaryOperation(work.tray) for work in self.left}

@@ -23,6 +23,7 @@ from rich.table import Table
 
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.watch.demo_page import PICTURE, DemoPage
 from fantwin.pipeline.cli.watch.demo_report import Summary, summarise
 from fantwin.pipeline.cli.watch.demo_screen import DemoScreen
@@ -223,7 +224,7 @@ def _draw(out: Path, console: Console) -> None:
         return
     from fantwin.pipeline.outputs.rerun.band_plot import plot_recording  # noqa: PLC0415  an extra
 
-    with console.status("drawing bands.png"):
+    with working("drawing bands.png"):
         plot_recording(sorted(out.glob("recording*.mcap")), out / "bands.png", truth=out / "truth.json")
 
 

@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.config.models import nearest
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.selftest.scenarios import SCENARIOS, Scenario
@@ -53,7 +54,7 @@ def selftest(
         folder = out.resolve() if out else Path(temporary)
         if out and out.exists() and any(out.iterdir()):
             raise UserError(f"{out}: is not empty; name a new folder with -o")
-        with console.status(f"running {len(chosen)} scenarios"):
+        with working(f"running {len(chosen)} scenarios"):
             rows = run_scenarios(folder, chosen, lambda row: console.print(_line(row), markup=False))
     is_kept = all(row.kept is not False for row in rows)
     if json_output:

@@ -8,4 +8,4 @@ PAGE = Path(__file__).parents[3] / "docs" / "reference" / "configuration.md"
 
 
 def test_the_page_is_what_the_models_say() -> None:
-    assert PAGE.read_text(encoding="utf-8") == page(), "run `make configuration`"
+    assert PAGE.read_text(encoding="utf-8") == page(), "run `make reference`"

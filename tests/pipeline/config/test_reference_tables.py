@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[3]
 @pytest.mark.parametrize(("page", "made"), [("messages.md", with_topics), ("bounds.md", with_values)])
 def test_the_tables_are_those_of_the_code(page, made) -> None:
     text = (ROOT / PAGES / page).read_text(encoding="utf-8")
-    assert text == made(text), "run `make tables`"
+    assert text == made(text), "run `make reference`"
 
 
 def test_a_bound_gets_its_value_and_the_unit_of_its_name() -> None:
