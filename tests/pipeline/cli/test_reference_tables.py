@@ -1,15 +1,15 @@
-"""docs/reference: the table of topics and the values of bounds are those of the code."""
+"""docs/reference: topics, values of bounds and keys of a scenario are those of the code."""
 
 from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.config.reference_tables import PAGES, with_topics, with_values
+from fantwin.pipeline.cli.reference_tables import MADE, PAGES, with_topics, with_values
 
 ROOT = Path(__file__).parents[3]
 
 
-@pytest.mark.parametrize(("page", "made"), [("messages.md", with_topics), ("bounds.md", with_values)])
+@pytest.mark.parametrize(("page", "made"), MADE.items())
 def test_the_tables_are_those_of_the_code(page, made) -> None:
     text = (ROOT / PAGES / page).read_text(encoding="utf-8")
     assert text == made(text), "run `make reference`"

@@ -1,6 +1,6 @@
-"""The tables of docs/reference that are made of the code: the topics of messages.md, and the values of bounds.md.
+"""The tables of docs/reference that are made of the code: topics, keys of a scenario, and values of bounds.
 
-`make reference` writes both pages again. The words of bounds.md are its own; each row names a constant, whose value is
+`make reference` writes the pages again. The words of bounds.md are its own; each row names a constant, whose value is
 filled in here.
 """
 
@@ -10,6 +10,8 @@ import re
 from importlib import import_module
 from pathlib import Path
 
+from fantwin.pipeline.cli.simulation.scenario import ClockScenario, FileScenario, Scenario, SurroundingsScenario
+from fantwin.pipeline.config.reference_page import table
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.schemas.topics import KIB, MIB, TOPICS
 
@@ -17,6 +19,9 @@ PAGES = Path("docs", "reference")
 _BOUND = re.compile(r"^\| `([\w.]+)\.([A-Z_]+)` \|[^|]*\|", re.MULTILINE)
 _TOPICS = re.compile(r"^\| topic \|.*?\n\n", re.MULTILINE | re.DOTALL)
 _BESIDE_PIPELINE = ("client", "schemas", "scoring")
+_KEYS = re.compile(r"^<!-- (\w+) -->\n(?:\|.*\n)*", re.MULTILINE)
+_SCENARIO = {model.__name__: model for model in (Scenario, ClockScenario, SurroundingsScenario, FileScenario)}
+_TABLES_OF_SCENARIO = ("tacho", "clock", "surroundings", "file")
 _OTHER_WRITERS = {
     "health": "every stage",
     "consumed": "stages that make samples from samples",
@@ -38,6 +43,11 @@ def with_values(page: str) -> str:
         ModuleNotFoundError, AttributeError: there is no such constant.
     """
     return _BOUND.sub(lambda row: f"| `{row[1]}.{row[2]}` | {_value(row[1], row[2])} |", page)
+
+
+def with_keys(page: str) -> str:
+    """The page of the simulated tray, with the keys of a scenario below the comment that names their model."""
+    return _KEYS.sub(lambda found: f"<!-- {found[1]} -->\n{table(_SCENARIO[found[1]], but=_TABLES_OF_SCENARIO)}", page)
 
 
 def _topics() -> str:
@@ -75,6 +85,8 @@ def _bytes(size: int) -> str:
     return f"{size // MIB} MiB" if size % MIB == 0 else f"{size // KIB} KiB"
 
 
+MADE = {"messages.md": with_topics, "bounds.md": with_values, "simulated-tray.md": with_keys}
+
 if __name__ == "__main__":
-    for name, made in (("messages.md", with_topics), ("bounds.md", with_values)):
+    for name, made in MADE.items():
         (PAGES / name).write_text(made((PAGES / name).read_text(encoding="utf-8")), encoding="utf-8")
