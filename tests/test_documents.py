@@ -30,7 +30,7 @@ def anchors(page: Path) -> set[str]:
 def paragraphs(page: Path) -> Iterator[str]:
     """The paragraphs and the items of lists; tables, headings and code are none."""
     for block in re.split(r"\n\s*\n", prose(page)):
-        if not block.startswith(("    ", "|", "#", "![")):
+        if not block.startswith(("    ", "|", "#", "![", "<!--")):
             yield from re.split(r"\n(?=\s*(?:[-*]|\d+\.) )", block)
 
 
