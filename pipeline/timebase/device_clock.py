@@ -8,7 +8,7 @@ removal of clock skew from network delay measurements, INFOCOM 1999; by hull: Zh
 points are those of a sliding window, one (the least delayed sample) per bucket.
 
 Times never jump to a new line. They approach it slowly, so that the time between neighbouring samples stays that of
-the device clock. docs/explanation/time.md has the derivation and measurements.
+the device clock. docs/explanation/time.md has measurements.
 """
 
 from __future__ import annotations
