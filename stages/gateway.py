@@ -10,11 +10,13 @@ The server runs in a thread of its own: it reads what the core has collected, an
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
 from fantwin.pipeline.config.registry import RECORDER
 from fantwin.pipeline.errors import refusals
+from fantwin.pipeline.http_server import HttpServer, listen
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.outputs.web.live_feed import LiveFeed
 from fantwin.pipeline.recordings.clips.clip import clip_folder
@@ -135,35 +137,39 @@ class _Running(Server):
         desk: RequestDesk,
         clip_folders: Sequence[Path],
     ) -> None:
-        from fantwin.pipeline.outputs.web.access import Access  # noqa: PLC0415  slow to import
+        from fantwin.pipeline.certificates import read_certificate, server_context  # noqa: PLC0415  slow to import
+        from fantwin.pipeline.outputs.web.access import Access  # noqa: PLC0415
         from fantwin.pipeline.outputs.web.api import Api  # noqa: PLC0415
-        from fantwin.pipeline.outputs.web.app import application  # noqa: PLC0415
-        from fantwin.pipeline.outputs.web.server import WebServer, check_certificate, listen  # noqa: PLC0415
+        from fantwin.pipeline.outputs.web.app import MOST_CONNECTIONS, application  # noqa: PLC0415
         from fantwin.pipeline.site.users import Users  # noqa: PLC0415
 
         config: GatewayConfig = context.config
-        tls = None
+        tls = self._certificate = None
         if config.certificate and config.key:
-            tls = (context.resolve(config.certificate), context.resolve(config.key))
-            check_certificate(*tls)
+            certificate = context.resolve(config.certificate)
+            tls = server_context(certificate, context.resolve(config.key))
+            self._certificate = read_certificate(certificate)
         self._access = Access(config, Users(context.resolve(config.users)) if config.users else None)
-        listening = listen(config.host, config.port + context.shard_number - 1)
+        listening = listen(config.host, config.port + context.shard_number - 1, "gateway")
         site = configured(context, VIEWER)
         app = application(Api(model, self._access, feed, desk, viewer_urls(site) if site else {}, clip_folders), config)
-        self._server = WebServer(app, listening, tls, feed.end, frozenset({"127.0.0.1", "::1", *config.proxies}))
+        self._server = HttpServer(app, listening, tls, MOST_CONNECTIONS, feed.end)
 
     def stop(self) -> None:
         self._server.stop()
 
     def problem(self) -> str:
-        return "; ".join(filter(None, (self._server.problem, self._access.problem)))
+        ended = "" if self._server.is_running else "the web server has ended"
+        expired = self._certificate.time_problem(datetime.now(UTC)) if self._certificate else ""
+        wrong = "; ".join(filter(None, (ended, expired)))
+        return "; ".join(filter(None, (wrong and f"{wrong}; restart the gateway", self._access.problem)))
 
 
 def build(context: Context) -> BuiltStage:
     """Open the history and listen.
 
     Raises:
-        StageError: the port is taken, or a file cannot be read or written.
+        UserError: the port is taken, or a file cannot be read or written.
     """
     path = context.own_file(Path(HISTORY))
     store = AlarmStore(path)
@@ -178,18 +184,18 @@ def build(context: Context) -> BuiltStage:
 
 def check(context: Context) -> list[str]:
     """Problems with the gateway: its port is taken by another program, or a file cannot be read."""
-    from fantwin.pipeline.outputs.web.server import check_certificate, check_files, listen  # noqa: PLC0415  slow to import
+    from fantwin.pipeline.certificates import check_pair, require_valid  # noqa: PLC0415  slow to import
     from fantwin.pipeline.site.users import read_users  # noqa: PLC0415
 
     config: GatewayConfig = context.config
     attempts: list[Callable[[], object]] = []
     if config.certificate and config.key:
-        attempts.append(partial(check_certificate, context.resolve(config.certificate), context.resolve(config.key)))
-        attempts.append(partial(check_files, context.resolve(config.certificate), context.resolve(config.key)))
+        files = context.resolve(config.certificate), context.resolve(config.key)
+        attempts.append(lambda: require_valid(check_pair(*files)))
     if config.users:
         attempts.append(partial(read_users, context.resolve(config.users)))
     if not context.is_running and "port" in config.model_fields_set:
-        attempts.append(lambda: listen(config.host, config.port + context.shard_number - 1).close())
+        attempts.append(lambda: listen(config.host, config.port + context.shard_number - 1, "gateway").close())
     return refusals(*attempts)
 
 

@@ -277,7 +277,7 @@ def check(context: Context) -> list[str]:
     config: MqttConfig = context.config
     try:
         require("stage mqtt", "outputs", "paho")
-        client = new_client(config, context.folder, "stage mqtt", "mqtt")
+        client = new_client(config, context.folder, "mqtt")
     except UserError as error:
         return [str(error)]
     unknown = sorted(set(config.home_assistant_trays) - {tray.name for tray in context.trays})

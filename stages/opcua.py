@@ -8,8 +8,8 @@ The server runs in a thread of its own: it reads what the core has collected, an
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Mapping, Sequence, Set
-from functools import partial
 from pathlib import Path
 
 from fantwin.pipeline.errors import refusals
@@ -107,7 +107,7 @@ class OpcuaCore(SiteCore):
 
 class _Running(Server):
     def __init__(self, context: Context, model: SiteModel, book: ConditionBook, desk: RequestDesk) -> None:
-        from fantwin.pipeline.outputs.opcua.certificate import check_certificate, make_certificate  # noqa: PLC0415  an extra
+        from fantwin.pipeline.certificates import check_pair, make_self_signed, require_valid  # noqa: PLC0415  slow to import
         from fantwin.pipeline.outputs.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
         from fantwin.pipeline.outputs.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
         from fantwin.pipeline.site.users import Users  # noqa: PLC0415
@@ -116,13 +116,21 @@ class _Running(Server):
         if config.certificate and config.key:
             certificate, key = context.resolve(config.certificate), context.resolve(config.key)
         else:
-            names = (*config.names, "localhost", *([config.host] if config.is_loopback else []))
+            hosts = (socket.gethostname(), *config.names, "localhost", *([config.host] if config.is_loopback else []))
             certificate, key = context.own_file(CERTIFICATE), context.own_file(KEY)
-            make_certificate(certificate, key, application_uri(context.site), names)
-        check_certificate(certificate, key)
+            make_self_signed(certificate, key, "fantwin OPC UA server", application_uri(context.site), hosts)
+        shown = check_pair(certificate, key, needs_rsa=True)
+        require_valid(shown)
         users = Users(context.resolve(config.users)) if config.users else None
         self._server = OpcuaServer(
-            Listening(config.host, config.port + context.shard_number - 1, certificate, key, config.is_loopback),
+            Listening(
+                config.host,
+                config.port + context.shard_number - 1,
+                certificate,
+                key,
+                next(iter(shown.uris), application_uri(context.site)),
+                config.is_loopback,
+            ),
             model,
             book,
             desk,
@@ -165,17 +173,20 @@ def check(context: Context) -> list[str]:
     """Report a missing extra, a port that another program has taken, and files that cannot be read."""
     if problem := missing_extra("stage opcua", "outputs", "asyncua"):
         return [problem]
-    from fantwin.pipeline.outputs.opcua.certificate import check_certificate, check_port  # noqa: PLC0415  the extra may not be installed
+    from fantwin.pipeline.certificates import check_pair, require_valid  # noqa: PLC0415  slow to import
+    from fantwin.pipeline.http_server import listen  # noqa: PLC0415
     from fantwin.pipeline.site.users import read_users  # noqa: PLC0415
 
     config: OpcuaConfig = context.config
     attempts: list[Callable[[], object]] = []
     if config.certificate and config.key:
-        attempts.append(partial(check_certificate, context.resolve(config.certificate), context.resolve(config.key)))
+        files = context.resolve(config.certificate), context.resolve(config.key)
+        attempts.append(lambda: require_valid(check_pair(*files, needs_rsa=True)))
     if config.users:
-        attempts.append(partial(read_users, context.resolve(config.users)))
+        users = context.resolve(config.users)
+        attempts.append(lambda: read_users(users))
     if not context.is_running:
-        attempts.append(partial(check_port, config.host, config.port + context.shard_number - 1))
+        attempts.append(lambda: listen(config.host, config.port + context.shard_number - 1, "opcua").close())
     problems = refusals(*attempts)
     if config.trusted and not context.resolve(config.trusted).is_dir():
         problems.append(f"opcua.trusted = {str(config.trusted)!r}: there is no such folder")

@@ -28,7 +28,7 @@ from fantwin.pipeline.bus.settings import Settings
 from fantwin.pipeline.config.models import BusConfig
 
 if TYPE_CHECKING:
-    from fantwin.pipeline.bus.certificates import Credentials
+    from fantwin.pipeline.bus.credentials import Credentials
 
 ONE_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 """Of two peers that discover each other, the one with the greater id connects. By default both connect at once, and
@@ -48,7 +48,7 @@ def credentials_of(config: BusConfig, roles: Sequence[str]) -> Credentials | Non
     require_tls_with_security(config)
     if config.security is None:
         return None
-    from fantwin.pipeline.bus.certificates import checked_credentials  # noqa: PLC0415  takes 0.1 s, which most do without
+    from fantwin.pipeline.bus.credentials import checked_credentials  # noqa: PLC0415  takes 0.1 s, which most do without
 
     return checked_credentials(config.security, roles)
 

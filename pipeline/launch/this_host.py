@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 import json
-import socket
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import GATEWAY, STAGES
 from fantwin.pipeline.config.shards import Shard, process_list
 from fantwin.pipeline.extras import missing_extra
+from fantwin.pipeline.http_server import listening_socket
 
 _PORTS = 1000
 """number of ports that are tried, from the configured one on"""
@@ -121,13 +121,7 @@ def _are_free(host: str, ports: Sequence[int]) -> bool:
     with ExitStack() as opened:
         try:
             for port in ports:
-                family, kind, protocol, _, address = socket.getaddrinfo(
-                    host.strip("[]"), port, type=socket.SOCK_STREAM
-                )[0]
-                probe = opened.enter_context(socket.socket(family, kind, protocol))
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind(address)
-                probe.listen()
+                opened.enter_context(listening_socket(host, port))
         except OSError as error:
             return error.errno != errno.EADDRINUSE  # other reasons hold for every port, and the stage names them
     return True

@@ -97,7 +97,7 @@ from fantwin.pipeline.plugins import loaded
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS
 for row in SOURCE_KINDS.values():
     loaded(row.config), loaded(row.source)
-import fantwin.pipeline.outputs.web.app, fantwin.pipeline.outputs.web.server, fantwin.pipeline.site.users
+import fantwin.pipeline.outputs.web.app, fantwin.pipeline.http_server, fantwin.pipeline.site.users
 import fantwin.twin.build, fantwin.twin.comparison, fantwin.twin.report.assessment, fantwin.twin.export.onnx_twin
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)

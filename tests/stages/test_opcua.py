@@ -29,7 +29,7 @@ from asyncua.ua.ua_binary import (
 )
 from cryptography import x509
 
-from fantwin.pipeline.outputs.opcua.certificate import make_certificate
+from fantwin.pipeline.certificates import make_self_signed
 from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
 from fantwin.pipeline.outputs.opcua.sessions import LONGEST_LIFETIME_S
 from fantwin.pipeline.runtime.stage import Context
@@ -70,7 +70,7 @@ async def encrypted(running: RunningOpcua, folder: Path, user: str, password: st
     """A client that is logged in."""
     certificate, key = folder / "client.der", folder / "client.pem"
     client = Client(running.url, timeout=60)
-    make_certificate(certificate, key, client.application_uri, ("localhost",))
+    make_self_signed(certificate, key, "client", client.application_uri, ("localhost",))
     client.set_user(user)
     client.set_password(password)
     await client.set_security(SecurityPolicyBasic256Sha256, str(certificate), str(key))
@@ -247,7 +247,7 @@ def test_only_trusted_clients_connect_encrypted_and_history_certificate_and_even
 
 def test_the_certificate_that_it_makes_is_one_for_opc_ua_and_the_check_names_what_is_wrong(opcua, tmp_path):
     certificate, key = tmp_path / "c.der", tmp_path / "k.pem"
-    make_certificate(certificate, key, "urn:here:fantwin:hall", ("localhost", "127.0.0.1", "plant.example"))
+    make_self_signed(certificate, key, "server", "urn:here:fantwin:hall", ("localhost", "127.0.0.1", "plant.example"))
     found = x509.load_der_x509_certificate(certificate.read_bytes())
     names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert names.get_values_for_type(x509.UniformResourceIdentifier) == ["urn:here:fantwin:hall"]
@@ -256,4 +256,4 @@ def test_the_certificate_that_it_makes_is_one_for_opc_ua_and_the_check_names_wha
     assert usage.digital_signature and usage.data_encipherment
     config = OpcuaConfig(port=opcua.port, certificate=Path("no.der"), key=Path("no.pem"))
     problems = check(Context(SITE, (), config, tmp_path, tmp_path, 0))
-    assert [each.partition(" = ")[0] for each in problems] == ["opcua.certificate", "opcua.host"], "its port is taken"
+    assert [each.split()[0] for each in problems] == [f"{tmp_path / 'no.der'}:", "opcua.host"], "its port is taken"

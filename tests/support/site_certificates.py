@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from fantwin.pipeline.bus.authority import Authority, write_file, write_pair
+from fantwin.pipeline.certificates import Authority, write_file, write_pair
 from fantwin.pipeline.config.models import SecurityConfig
 
 HOSTS = ("localhost", "127.0.0.1")

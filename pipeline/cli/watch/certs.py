@@ -19,8 +19,17 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from fantwin.pipeline.bus.authority import LONGEST_ROLE, Authority, is_host, write_file, write_pair
-from fantwin.pipeline.bus.certificates import Certificate, in_words, of_role, read_certificate
+from fantwin.pipeline.bus.credentials import of_role, warning
+from fantwin.pipeline.certificates import (
+    LONGEST_NAME,
+    Authority,
+    Certificate,
+    in_words,
+    is_host,
+    read_certificate,
+    write_file,
+    write_pair,
+)
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import ROLE_PLACE, Config, SecurityConfig, nearest
@@ -148,8 +157,8 @@ def _with_trays(config: Config, roles: Sequence[str], trays: Sequence[str]) -> l
         if role not in known:
             of_all = [name for name in known if "." not in name]
             raise UsageError(f"no role called {role!r}{nearest(role, list(known) if '.' in role else of_all)}")
-        if len(role) > LONGEST_ROLE:
-            raise UsageError(f"role {role!r} has more than {LONGEST_ROLE} characters: give its tray a shorter name")
+        if len(role) > LONGEST_NAME:
+            raise UsageError(f"role {role!r} has more than {LONGEST_NAME} characters: give its tray a shorter name")
     return asked
 
 
@@ -261,8 +270,8 @@ def _show(request: _Request, *, json_output: bool) -> None:
             table.add_row(*row, *([" ".join(each.hosts)] if request.roles else []))
         Console().print(table)
         for each in found:
-            if warning := each.warning(now):
-                typer.echo(warning)
+            if problem := warning(each):
+                typer.echo(problem)
     if any(each.time_problem(now) for each in found):
         raise typer.Exit(1)
 
@@ -280,7 +289,7 @@ def _as_json(each: Certificate) -> dict[str, object]:
         "from": each.not_before.isoformat(),
         "until": each.not_after.isoformat(),
         "is_authority": each.is_authority,
-        "warning": each.warning(datetime.now(UTC)),
+        "warning": warning(each),
     }
 
 

@@ -19,7 +19,7 @@ import typer
 from rich.console import Console
 
 from fantwin.pipeline.bus.access_rules import SiteRoles
-from fantwin.pipeline.bus.certificates import of_role
+from fantwin.pipeline.bus.credentials import of_role
 from fantwin.pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
 from fantwin.pipeline.bus.errors import BusError, NoAnswerError
 from fantwin.pipeline.bus.opening import credentials_of

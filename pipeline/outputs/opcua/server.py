@@ -17,7 +17,6 @@ from pathlib import Path
 
 from asyncua import Server, ua
 from asyncua.common.connection import TransportLimits
-from cryptography import x509
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.opcua.address_space import build_address_space
@@ -48,12 +47,16 @@ _AT_ONCE = 200
 
 @dataclass(frozen=True)
 class Listening:
-    """Where the server listens, and how it shows who it is. is_open: whoever does not log in may read, unencrypted."""
+    """Where the server listens, and how it shows who it is.
+
+    uri: of the application, as its certificate names it. is_open: whoever does not log in may read, unencrypted.
+    """
 
     host: str
     port: int
     certificate: Path
     key: Path
+    uri: str
     is_open: bool
 
 
@@ -174,7 +177,7 @@ class OpcuaServer:
         listening = self._listening
         await server.load_certificate(listening.certificate)
         await server.load_private_key(listening.key)
-        await server.set_application_uri(uri_of(server.iserver.certificate) or application_uri(self._site))
+        await server.set_application_uri(listening.uri)
         server.set_server_name(f"fantwin {self._site}")
         server.application_type = ua.ApplicationType.Server
         server.product_uri = "urn:fantwin"
@@ -260,14 +263,3 @@ async def _publish(node: SiteNode) -> None:
 def application_uri(site: str) -> str:
     """Of a server whose certificate names none."""
     return f"urn:{socket.gethostname()}:fantwin:{site}"
-
-
-def uri_of(certificate: x509.Certificate | None) -> str:
-    """The application URI that a certificate names; empty: none."""
-    if certificate is None:
-        return ""
-    try:
-        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    except x509.ExtensionNotFound:
-        return ""
-    return next(iter(names.get_values_for_type(x509.UniformResourceIdentifier)), "")

@@ -13,10 +13,10 @@ import ipaddress
 from base64 import b64decode
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 from urllib.parse import urlsplit
 
-from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from fastapi import HTTPException, Request
 
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.outputs.web.sessions import LoginSessions, Session
@@ -72,9 +72,10 @@ class Access:
         return SECURE_COOKIE if self._config.certificate else COOKIE
 
     @property
-    def is_cookie_secure(self) -> bool:
-        """Whether browsers send it by https only."""
-        return self._config.certificate is not None
+    def cookie(self) -> dict[str, Any]:
+        """How the cookie is set and deleted: no script reads it, no other site sends it."""
+        is_secure = self._config.certificate is not None
+        return {"key": self.cookie_name, "httponly": True, "samesite": "strict", "secure": is_secure}
 
     def visitor(self, request: Request) -> Visitor:
         """Who sends a request."""
@@ -89,7 +90,7 @@ class Access:
             return Visitor(user.name, may_read=True, may_act=user.role == UserRole.OPERATOR, session=session)
         return Visitor("", may_read=self._is_free(request), may_act=False)
 
-    def reader(self, request: Request) -> Visitor:
+    async def reader(self, request: Request) -> Visitor:
         """Who sends a request that only reads.
 
         Raises:
@@ -100,7 +101,7 @@ class Access:
             raise HTTPException(401, "log in first")
         return visitor
 
-    def operator(self, request: Request) -> Visitor:
+    async def operator(self, request: Request) -> Visitor:
         """Who sends a request that changes something.
 
         Raises:
@@ -108,7 +109,7 @@ class Access:
         """
         name = ""
         try:
-            require_own_page(request)
+            await require_own_page(request)
             visitor = self.visitor(request)
             name = visitor.name
             if not name:
@@ -145,7 +146,7 @@ class Access:
         kind, _, encoded = request.headers.get("authorization", "").partition(" ")
         try:
             if self._users is None or kind.lower() != "basic":
-                self.reader(request)
+                await self.reader(request)
             else:
                 await self._verified(self._users, *_name_and_password(encoded), request)
         except HTTPException as error:
@@ -232,7 +233,7 @@ def plain_address(address: str) -> str:
     return str(getattr(found, "ipv4_mapped", None) or found)
 
 
-def require_own_page(request: Request) -> None:
+async def require_own_page(request: Request) -> None:
     """What changes something must come from a page of this server, or from a program that is no browser.
 
     Raises:

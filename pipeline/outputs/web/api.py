@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
-import re
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass, field
-from functools import partial, wraps
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ValidationError
-from starlette.concurrency import run_in_threadpool
-from starlette.exceptions import HTTPException
-from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import FileResponse, JSONResponse
+from sse_starlette import EventSourceResponse
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.outputs.web.access import Access, Visitor, address_of, require_own_page, require_token
-from fantwin.pipeline.outputs.web.forms import LoginForm
-from fantwin.pipeline.outputs.web.live_feed import LiveFeed, encoded
+from fantwin.pipeline.outputs.web import answers as typed
+from fantwin.pipeline.outputs.web.access import Access, address_of, require_own_page, require_token
+from fantwin.pipeline.outputs.web.answers import JSON, LoginForm
+from fantwin.pipeline.outputs.web.live_feed import LiveFeed, encoded, keep_alive
 from fantwin.pipeline.outputs.web.metrics import metrics_text
 from fantwin.pipeline.outputs.web.shared_answer import SharedAnswer
 from fantwin.pipeline.recordings.clips.clip import Clip, kept_clips
@@ -50,31 +47,35 @@ from fantwin.schemas.messages import Request as OperatorRequest
 from fantwin.schemas.units import NS_PER_S
 
 MOST_LISTED = 500
-LARGEST_BODY_BYTES, BODY_WITHIN_S = 16_384, 10.0
 CHECKED_EVERY_S = 5.0
 """so often it is looked whether a reader of live events may still read"""
+KEEP_ALIVE_S, NOT_READING_S = 10, 30.0
+"""A reader without events is sent a comment, so that a dead connection shows. One that takes nothing is cut off."""
 CLIP_TYPE = "application/octet-stream"
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 ALL_FANS = "all"
 
-Form = TypeVar("Form", bound=BaseModel)
-Handler = Callable[[Any, Request], Awaitable[Response]]
-
-
-def reads(handler: Handler) -> Handler:
-    """A handler of whoever may read."""
-
-    @wraps(handler)
-    async def checked(api: Api, request: Request) -> Response:
-        api.access.reader(request)
-        return await handler(api, request)
-
-    return checked
+Whole = Annotated[int, Query(ge=0, lt=10**15)]
+Of = Annotated[str, Query(description="name of a tray; empty: all")]
+_PROBLEMS = {
+    401: "nobody is logged in",
+    403: "the user may not do this",
+    404: "no such tray, fan or clip",
+    422: "a parameter or a field is wrong",
+    503: "a file cannot be read",
+    504: "no scorer has answered",
+}
+_RESPONSES: dict[int | str, dict[str, Any]] = {
+    code: {"model": typed.Problem, "description": why} for code, why in _PROBLEMS.items()
+}
+_EVENTS: dict[int | str, dict[str, Any]] = {200: {"content": {"text/event-stream": {}}, "description": "live events"}}
+_FILE: dict[int | str, dict[str, Any]] = {200: {"content": {CLIP_TYPE: {}}, "description": "an MCAP file"}}
+_REFUSED: dict[int | str, dict[str, Any]] = {409: {"model": typed.Refused, "description": "the scorer has refused it"}}
 
 
 @dataclass(frozen=True, eq=False)
 class Api:
-    """The handlers."""
+    """The handlers. Those that are no coroutines run in threads: live events go on meanwhile."""
 
     model: SiteModel
     access: Access
@@ -86,178 +87,165 @@ class Api:
     """of the alarm clips of recorders on this host"""
     _shared: dict[str, SharedAnswer] = field(default_factory=dict[str, SharedAnswer], init=False)
 
-    @reads
-    async def site(self, request: Request) -> Response:
-        """Trays, fans and what the classes of cells mean."""
-        return JSONResponse(site_json(self.model, self.viewer_urls))
+    def routes(self) -> APIRouter:
+        """Which path answers what, as which type, and to whom."""
+        router = APIRouter(responses=_RESPONSES)
+        get = partial(router.add_api_route, methods=["GET"], dependencies=[Depends(self.access.reader)])
+        get("/site", self.site, response_model=typed.Site)
+        get("/fans", self.fans, response_model=typed.Fans)
+        get("/fans/{tray}/{fan}", self.fan, response_model=typed.FanInFull)
+        get("/fans/{tray}/{fan}/curves", self.curves, response_model=typed.Curves)
+        get("/alarms", self.alarms, response_model=typed.Alarms)
+        get("/alarms/history", self.alarm_history, response_model=typed.History)
+        get("/alarm-rate", self.alarm_rate, response_model=typed.Rates)
+        get("/clips", self.clips, response_model=typed.Clips)
+        get("/clips/{name}", self.clip, response_class=FileResponse, responses=_FILE)
+        get("/stages", self.stages, response_model=typed.Stages)
+        get("/events", self.events, response_class=EventSourceResponse, responses=_EVENTS)
+        router.add_api_route("/me", self.me, response_model=typed.Me)
+        post = partial(router.add_api_route, methods=["POST"])
+        own = [Depends(require_own_page)]
+        post("/login", self.log_in, response_model=typed.Session, dependencies=own)
+        post("/logout", self.log_out, dependencies=own)
+        act = {"response_model": typed.ScorerAnswers, "responses": _REFUSED}
+        post("/fans/{tray}/{fan}/requests", self.act, dependencies=[Depends(self.access.operator)], **act)
+        return router
 
-    @reads
-    async def fans(self, request: Request) -> Response:
-        """All fans, the worst first; ?tray=NAME, ?state=GROUP and ?limit=N choose."""
-        tray, group = request.query_params.get("tray", ""), _group(request)
+    async def site(self) -> JSON:
+        """Trays, fans, and what the classes of cells mean."""
+        return site_json(self.model, self.viewer_urls)
+
+    def fans(self, tray: Of = "", state: FanGroup | None = None, limit: Whole = 10_000_000) -> JSON:
+        """All fans, the worst first."""
         if tray:
             self._tray(tray)
-        most = _number(request, "limit", 10_000_000)
         groups = self.model.groups()
         found = [
             (each, groups[each.fan])
             for each in self.model.every_fan()
-            if tray in ("", each.fan.tray) and group in (None, groups[each.fan])
+            if tray in ("", each.fan.tray) and state in (None, groups[each.fan])
         ]
-        return JSONResponse({"fans": [fan_json(each, of) for each, of in found[:most]]})
+        return {"fans": [fan_json(each, of) for each, of in found[:limit]]}
 
-    @reads
-    async def fan(self, request: Request) -> Response:
-        """One fan with its alarm and its twin."""
-        return JSONResponse(fan_in_full(self.model, self._fan(request)))
+    async def fan(self, tray: str, fan: int) -> JSON:
+        """One fan with its alarm, its twin and its wear."""
+        return fan_in_full(self.model, self._fan(tray, fan))
 
-    @reads
-    async def curves(self, request: Request) -> Response:
-        """The last hour of a fan, or its last ?seconds=N."""
-        fan = self._fan(request)
-        since_t_ns = self.model.newest_t_ns(fan.tray) - round(_number(request, "seconds", HISTORY_S) * NS_PER_S)
-        tray = self._tray(fan.tray)
-        return JSONResponse(curves_json(self.model.history(fan, since_t_ns), tray))
+    async def curves(self, tray: str, fan: int, seconds: Whole = int(HISTORY_S)) -> JSON:
+        """The last hour of a fan, or its last seconds."""
+        found = self._fan(tray, fan)
+        since_t_ns = self.model.newest_t_ns(tray) - seconds * NS_PER_S
+        return curves_json(self.model.history(found, since_t_ns), self._tray(tray))
 
-    @reads
-    async def alarms(self, request: Request) -> Response:
-        """The current alarms; ?all=1 also those that are over."""
-        everything = request.query_params.get("all", "") == "1"
-        name = "all alarms" if everything else "alarms"
-        return await self._answer(name, partial(alarms_json, self.model, everything=everything)).to(request)
+    async def alarms(self, request: Request, all: bool = False) -> Response:
+        """The current alarms, or also those that are over."""
+        name = "all alarms" if all else "alarms"
+        return await self._answer(name, partial(alarms_json, self.model, everything=all)).to(request)
 
-    @reads
-    async def alarm_history(self, request: Request) -> Response:
-        """The last transitions, newest first; ?tray=, ?fan=, ?limit=, and ?before=NUMBER for the next page. With them,
-        how far back the history reaches, and whether earlier alarms are still being read from recordings."""
+    def alarm_history(self, tray: Of = "", fan: int = -1, limit: Whole = 100, before: Whole | None = None) -> JSON:
+        """The last transitions, the newest first; `before`: the number of the last one, for the next page."""
         try:
-            found = self.model.past_alarms(
-                min(MOST_LISTED, _number(request, "limit", 100)),
-                tray=request.query_params.get("tray", ""),
-                fan=_number(request, "fan", -1),
-                before=_whole(request, "before"),
-            )
+            found = self.model.past_alarms(min(MOST_LISTED, limit), tray=tray, fan=fan, before=before)
             begins_t_ns = self.model.history_begins_t_ns()
             feedback = self.model.feedback_on([alarm for _, alarm in found])
         except UserError as error:
             raise HTTPException(503, "the history cannot be read: see the problem of the gateway") from error
-        return JSONResponse(
-            {
-                "transitions": [
-                    transition_json(number, alarm, said) for (number, alarm), said in zip(found, feedback, strict=True)
-                ],
-                "begins_t_ns": begins_t_ns,
-            }
-        )
+        rows = [transition_json(number, alarm, said) for (number, alarm), said in zip(found, feedback, strict=True)]
+        return {"transitions": rows, "begins_t_ns": begins_t_ns}
 
-    @reads
     async def alarm_rate(self, request: Request) -> Response:
-        """The rate of false alarms that really was beside the declared one, of each tray and of the site."""
+        """The observed rate of false alarms beside the declared one, of each tray and of the site."""
         try:
             return await self._answer("rate", partial(rates_json, self.model)).to(request)
         except UserError as error:
             raise HTTPException(503, "the rate cannot be read: see the problem of the gateway") from error
 
-    @reads
-    async def clips(self, request: Request) -> Response:
-        """The recordings around alarms that can be downloaded, the newest first; ?tray=NAME chooses."""
-        tray = request.query_params.get("tray", "")
-        found = await run_in_threadpool(self._kept_clips)
-        return JSONResponse({"clips": [clip_json(clip) for _, clip in found if tray in ("", clip.tray)]})
+    def clips(self, tray: Of = "") -> JSON:
+        """The recordings around alarms that can be downloaded, the newest first."""
+        return {"clips": [clip_json(clip) for _, clip in self._kept_clips() if tray in ("", clip.tray)]}
 
-    @reads
-    async def clip(self, request: Request) -> Response:
+    def clip(self, name: str) -> FileResponse:
         """Download an alarm clip, an MCAP file."""
-        found = await run_in_threadpool(self._kept_clips)
-        for folder, clip in found:
-            if clip.name == request.path_params["name"]:
+        for folder, clip in self._kept_clips():
+            if clip.name == name:
                 headers = {"Content-Encoding": "identity"}  # it is compressed already
                 return FileResponse(folder / clip.name, 200, headers, CLIP_TYPE, filename=clip.name)
         raise HTTPException(404, "no such clip")
 
-    @reads
-    async def stages(self, request: Request) -> Response:
+    async def stages(self) -> JSON:
         """The stages: state, rates, losses, latency."""
-        return JSONResponse({"stages": stages_json(self.model.stages())})
+        return {"stages": stages_json(self.model.stages())}
 
-    @reads
-    async def events(self, request: Request) -> Response:
-        """Live events (text/event-stream); ?fan=TRAY/NUMBER adds the samples of a fan."""
-        fan = None
-        if name := request.query_params.get("fan", ""):
-            fan = self._named(*name.rpartition("/")[::2])
+    async def events(self, request: Request, fan: Annotated[str, Query(description="TRAY/NUMBER")] = "") -> Response:
+        """Live events, with the samples of a fan if it is named."""
+        looked_at = None
+        if fan:
+            tray, _, number = fan.rpartition("/")
+            looked_at = self._fan(tray, int(number) if number.isdecimal() and len(number) < 6 else -1)
         first = encoded("fleet", fleet_json(self.model))
-        events = self._while_allowed(request, self.feed.events(first, fan))
-        return StreamingResponse(events, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
+        return EventSourceResponse(
+            self._while_allowed(request, self.feed.events(first, looked_at)),
+            ping=KEEP_ALIVE_S,
+            ping_message_factory=keep_alive,
+            send_timeout=NOT_READING_S,
+        )
 
     async def metrics(self, request: Request) -> Response:
-        """For Prometheus. Meanwhile live events go on."""
+        """For Prometheus."""
         await self.access.require_scraper(request)
-        text = await run_in_threadpool(metrics_text, self.model, self.feed.readers)
-        return Response(text, media_type=METRICS_TYPE)
+        return Response(await run_in_threadpool(metrics_text, self.model, self.feed.readers), media_type=METRICS_TYPE)
 
-    async def me(self, request: Request) -> Response:
-        """Who asks, and what he may do; the token that a page sends with what it changes."""
-        return JSONResponse(self._me(self.access.visitor(request)))
-
-    async def log_in(self, request: Request) -> Response:
-        """Begin a session."""
-        require_own_page(request)
-        form = await _form(request, LoginForm)
-        cookie, session = await self.access.log_in(form.name, form.password, request)
-        answer = JSONResponse({"name": session.user, "csrf_token": session.csrf_token})
-        answer.set_cookie(
-            self.access.cookie_name, cookie, httponly=True, samesite="strict", secure=self.access.is_cookie_secure
+    async def me(self, request: Request) -> typed.Me:
+        """Who asks, and what it may do; the token that a page sends with what it changes."""
+        visitor = self.access.visitor(request)
+        return typed.Me(
+            name=visitor.name,
+            may_read=visitor.may_read,
+            may_act=visitor.may_act,
+            has_login=self.access.has_login,
+            csrf_token=visitor.session.csrf_token if visitor.session else "",
         )
-        return answer
 
-    async def log_out(self, request: Request) -> Response:
+    async def log_in(self, form: LoginForm, request: Request, response: Response) -> typed.Session:
+        """Begin a session."""
+        cookie, session = await self.access.log_in(form.name, form.password, request)
+        response.set_cookie(value=cookie, **self.access.cookie)
+        return typed.Session(name=session.user, csrf_token=session.csrf_token)
+
+    async def log_out(self, request: Request, response: Response) -> dict[str, str]:
         """End the session."""
-        require_own_page(request)
         visitor = self.access.visitor(request)
         if visitor.session is not None:
             require_token(request, visitor.session)
             self.access.sessions.end(request.cookies[self.access.cookie_name])
             self.access.log.add("logout", user=visitor.name, **address_of(request))
-        answer = JSONResponse({})
-        answer.delete_cookie(
-            self.access.cookie_name, httponly=True, samesite="strict", secure=self.access.is_cookie_secure
-        )
-        return answer
+        response.delete_cookie(**self.access.cookie)
+        return {}
 
-    async def act(self, request: Request) -> Response:
+    async def act(self, tray: str, fan: int | Literal["all"], form: RequestForm, request: Request) -> Any:
         """Send an operator's request about a fan, or all fans of a tray, and answer what the scorer says."""
-        visitor = self.access.operator(request)
-        form = await _form(request, RequestForm)
-        name = request.path_params["tray"]
-        tray = self._tray(name)
-        is_all = request.path_params["fan"] == ALL_FANS
-        fan = -1 if is_all else self._fan(request).number
+        name = self.access.visitor(request).name
+        fans = range(self._tray(tray).fans) if fan == ALL_FANS else [self._fan(tray, fan).number]
         asked = OperatorRequest(
             t_ns=time.time_ns(),
             action=form.message_action,
-            fan=fan,
+            fan=-1 if fan == ALL_FANS else fan,
             duration_s=form.duration_s,
-            operator_name=visitor.name,
+            operator_name=name,
             comment=form.comment,
             onset_t_ns=form.onset_t_ns,
         )
-        where = f"{name} {'all' if is_all else fan}"
-        self.access.log.add("request", user=visitor.name, action=form.action, fan=where, **address_of(request))
+        self.access.log.add("request", user=name, action=form.action, fan=f"{tray} {fan}", **address_of(request))
         try:
-            answers = await self.desk.ask(name, asked, range(tray.fans) if is_all else [fan])
+            said = await self.desk.ask(tray, asked, fans)
         except TimeoutError as error:
-            raise HTTPException(504, str(error) or f"tray {name}: no scorer has answered") from error
-        refused = [each for each in answers if each.transition == Transition.REFUSED]
-        body = {
-            "answers": [
-                {"fan": each.fan, "transition": each.transition.name.lower(), "message": each.message}
-                for each in answers
-            ]
-        }
-        if len(refused) == len(answers):
-            return JSONResponse({"error": refused[0].message, **body}, 409)
-        return JSONResponse(body)
+            raise HTTPException(504, str(error) or f"tray {tray}: no scorer has answered") from error
+        answers = [
+            {"fan": each.fan, "transition": each.transition.name.lower(), "message": each.message} for each in said
+        ]
+        if all(each.transition == Transition.REFUSED for each in said):
+            return JSONResponse({"error": said[0].message, "answers": answers}, 409)
+        return {"answers": answers}
 
     async def _while_allowed(self, request: Request, events: AsyncIterator[bytes]) -> AsyncGenerator[bytes]:
         """The events, until the reader may not read any more. A page that is open keeps its session from being idle."""
@@ -270,15 +258,6 @@ class Api:
                         return
                 yield event
 
-    def _me(self, visitor: Visitor) -> dict[str, Any]:
-        return {
-            "name": visitor.name,
-            "may_read": visitor.may_read,
-            "may_act": visitor.may_act,
-            "has_login": self.access.has_login,
-            "csrf_token": visitor.session.csrf_token if visitor.session else "",
-        }
-
     def _answer(self, name: str, make: Callable[[], Any]) -> SharedAnswer:
         """The one for all who ask for this."""
         if name not in self._shared:
@@ -289,76 +268,14 @@ class Api:
         listed = [(folder, clip) for folder in self.clip_folders for clip in kept_clips(folder)]
         return [(folder, clip) for folder, clip in listed if self.model.tray(clip.tray)]
 
-    def _fan(self, request: Request) -> Fan:
-        return Fan(*self._named(request.path_params["tray"], request.path_params["fan"]))
-
-    def _named(self, tray: str, fan: str) -> tuple[str, int]:
+    def _fan(self, tray: str, fan: int) -> Fan:
         found = self._tray(tray)
-        if not (fan.isascii() and fan.isdigit() and len(fan) < 6 and int(fan) < found.fans):
+        if not 0 <= fan < found.fans:
             raise HTTPException(404, f"no such fan: {tray} has fans 0 to {found.fans - 1}")
-        return tray, int(fan)
+        return Fan(tray, fan)
 
     def _tray(self, name: str) -> TrayConfig:
         found = self.model.tray(name)
         if found is None:
             raise HTTPException(404, "no such tray")
         return found
-
-
-async def broken(api: Api, request: Request, error: Exception) -> Response:
-    """The answer to a request at which the gateway itself has failed; why, only the log says."""
-    why = f"{type(error).__name__}: {error}"
-    api.access.log.add("gateway failed", path=request.url.path, why=why, **address_of(request))
-    return JSONResponse({"error": "the gateway has failed; its log says why"}, 500)
-
-
-async def failed(_request: Request, error: Exception) -> Response:
-    """The answer to what cannot be done: {"error": why}."""
-    assert isinstance(error, HTTPException)
-    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
-
-
-async def _form(request: Request, kind: type[Form]) -> Form:
-    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-        raise HTTPException(415, "send application/json")
-    body = bytearray()
-    try:
-        async with asyncio.timeout(BODY_WITHIN_S):
-            async for piece in request.stream():
-                body += piece
-                if len(body) > LARGEST_BODY_BYTES:
-                    raise HTTPException(413, f"at most {LARGEST_BODY_BYTES} bytes are accepted")
-    except TimeoutError as error:
-        raise HTTPException(408, "the request took too long") from error
-    try:
-        return kind.model_validate_json(bytes(body))
-    except ValidationError as error:
-        found = json.loads(error.json(include_url=False, include_input=False))[0]
-        where = ".".join(map(str, found["loc"]))
-        raise HTTPException(422, f"{where}: {found['msg']}" if where else found["msg"]) from error
-
-
-def _group(request: Request) -> FanGroup | None:
-    """The group that is asked for; None: all."""
-    name = request.query_params.get("state", "")
-    if name and name not in list(FanGroup):
-        raise HTTPException(422, f"state must be one of {', '.join(FanGroup)}")
-    return FanGroup(name) if name else None
-
-
-def _number(request: Request, name: str, default: int) -> int:
-    number = _whole(request, name)
-    if number is None:
-        return default
-    if number < 0:
-        raise HTTPException(422, f"{name} must not be below 0")
-    return number
-
-
-def _whole(request: Request, name: str) -> int | None:
-    text = request.query_params.get(name, "")
-    if not text:
-        return None
-    if not re.fullmatch("-?[0-9]{1,15}", text):
-        raise HTTPException(422, f"{name} must be a whole number")
-    return int(text)

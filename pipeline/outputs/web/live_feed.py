@@ -14,10 +14,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from sse_starlette import ServerSentEvent
+
 MOST_WAITING = 64
 """events of one reader"""
-KEEP_ALIVE_S = 10.0
-"""a reader without events is sent a comment, so that a connection that is dead is noticed at both ends"""
 
 FanName = tuple[str, int]
 
@@ -84,12 +84,7 @@ class LiveFeed:
         with self._joined(fan) as reader:
             yield first
             while not self._ended:
-                try:
-                    event = await asyncio.wait_for(reader.waiting.get(), KEEP_ALIVE_S)
-                except TimeoutError:
-                    yield b": alive\n\n"
-                    continue
-                if events := reader.taken(event):
+                if events := reader.taken(await reader.waiting.get()):
                     yield events
                 if reader.has_missed and reader.waiting.empty():
                     reader.has_missed = False
@@ -120,4 +115,10 @@ class LiveFeed:
 
 def encoded(name: str, data: Any) -> bytes:
     """An event of a text/event-stream."""
-    return f"event: {name}\ndata: {json.dumps(data, separators=(',', ':'), allow_nan=False)}\n\n".encode()
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    return ServerSentEvent(text, event=name, sep="\n").encode()
+
+
+def keep_alive() -> ServerSentEvent:
+    """What a reader without events is sent."""
+    return ServerSentEvent(comment="alive", sep="\n")

@@ -7,13 +7,14 @@ taken and the answer is 429 with the time to wait: so a caller knows of each sam
 from __future__ import annotations
 
 import hmac
-import logging
-import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fantwin.pipeline.errors import UserError, refusals
+from fantwin.pipeline.http_server import HttpServer, listen
 from fantwin.pipeline.sources.http.config import HttpConfig
 from fantwin.pipeline.sources.json_samples import (
     LARGEST_BYTES,
@@ -24,7 +25,7 @@ from fantwin.pipeline.sources.json_samples import (
     parse_samples,
 )
 from fantwin.pipeline.sources.secret_file import read_secret
-from fantwin.pipeline.sources.source import LinkDown, LinkUp, ReadingBatch, Rejected, SourceContext, SourceEvent
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, Rejected, SourceContext, SourceEvent
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
 
@@ -32,14 +33,13 @@ if TYPE_CHECKING:
     from starlette.applications import Starlette
     from starlette.requests import Request
     from starlette.responses import Response
-    from uvicorn import Server
 
 MOST_WAITING = 2 * MOST_SAMPLES
 """samples that wait for acquisition"""
 RETRY_AFTER_S = 1
 RETRY_S = 2.0
 """time between attempts to listen"""
-MOST_CONNECTIONS = 32
+MOST_CONNECTIONS = 100
 STOP_LIMIT_S = 3.0
 MOST_REASONS = 20
 """refused samples that an answer names"""
@@ -62,9 +62,8 @@ class HttpSource:
         self._waiting: deque[SourceEvent] = deque()
         """events for acquisition"""
         self._waiting_samples = 0
-        self._accepted = self._refused = self._turned_away = self._over_limit = 0
+        self._accepted = self._refused = self._turned_away = 0
         self._stopping = False
-        self._server: Server | None = None
         self._threads: list[threading.Thread] = []
 
     @property
@@ -81,7 +80,7 @@ class HttpSource:
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
         """Listen, and deliver what comes, in threads of their own."""
         self._threads = [
-            threading.Thread(target=self._serve, name="http server", daemon=True),
+            threading.Thread(target=self._serve, name="http link", daemon=True),
             threading.Thread(target=self._deliver_all, args=(deliver,), name="http samples", daemon=True),
         ]
         for thread in self._threads:
@@ -91,8 +90,6 @@ class HttpSource:
         """Answer what is being asked, deliver what was accepted, then end."""
         with self._changed:
             self._stopping = True
-            if self._server is not None:
-                self._server.should_exit = True
             self._changed.notify_all()
         for thread in self._threads:
             thread.join(STOP_LIMIT_S)
@@ -102,16 +99,19 @@ class HttpSource:
         return self._config.why_no_commands
 
     def check(self) -> list[str]:
-        """Problems before the start: the port is not free."""
-        try:
-            self._listen().close()
-        except OSError as error:
-            return [self._cannot_listen(error)]
-        return []
+        """Problems before the start: the port is not free, or the certificate cannot be used."""
+        from fantwin.pipeline.certificates import check_pair, require_valid  # noqa: PLC0415  slow to import
+
+        attempts: list[Callable[[], object]] = [lambda: listen(self._config.host, self._config.port, "source").close()]
+        if files := self._files_of_tls():
+            attempts.append(lambda: require_valid(check_pair(*files)))
+        return refusals(*attempts)
 
     def app(self) -> Starlette:
         """Application that answers the requests."""
         from starlette.applications import Starlette  # noqa: PLC0415  slow to import
+        from starlette.middleware import Middleware  # noqa: PLC0415
+        from starlette.middleware.body_limit import RequestBodyLimitMiddleware  # noqa: PLC0415
         from starlette.routing import Route  # noqa: PLC0415
 
         path = f"/v1/trays/{self._context.tray}"
@@ -119,23 +119,22 @@ class HttpSource:
             routes=[
                 Route(path, self._get, methods=["GET"]),
                 Route(f"{path}/samples", self._post, methods=["POST"]),
-            ]
+            ],
+            middleware=[Middleware(RequestBodyLimitMiddleware, max_body_size=LARGEST_BYTES)],
         )
 
     async def _get(self, request: Request) -> Response:
-        return self._refusal(request) or _answer(200, {"tray": self._context.tray, **self._limits(), **self._counts()})
+        return self._unauthorized(request) or _answer(
+            200, {"tray": self._context.tray, **self._limits(), **self._counts()}
+        )
 
     async def _post(self, request: Request) -> Response:
-        refusal = self._refusal(request)
+        refusal = self._unauthorized(request)
         if refusal is not None:
             return refusal
-        body = bytearray()
-        async for part in request.stream():
-            body += part
-            if len(body) > LARGEST_BYTES:
-                return _answer(413, {"error": f"at most {LARGEST_BYTES} bytes are accepted at once"})
+        body = await request.body()
         try:
-            found = parse_samples(bytes(body))
+            found = parse_samples(body)
         except JsonSamplesError as error:
             return _answer(400, {"error": str(error)})
         return self._take(found, len(body))
@@ -171,22 +170,6 @@ class HttpSource:
             answer["speeds_beyond_speed_max"] = absurd
         return _answer(200 if accepted or not reasons else 422, answer)
 
-    def _refusal(self, request: Request) -> Response | None:
-        return self._too_many_connections() or self._unauthorized(request)
-
-    def _too_many_connections(self) -> Response | None:
-        if self._server is None or len(self._server.server_state.connections) < MOST_CONNECTIONS:
-            return None
-        error = f"{MOST_CONNECTIONS} connections are open"
-        with self._changed:
-            self._over_limit += 1
-            if self._waiting_samples < MOST_WAITING:  # acquisition counts it, too
-                rejected = Rejected("too_many_connections", error, harmless=True)
-                self._waiting.append(ReadingBatch(HOST_CLOCK.now_ns(), (rejected,)))
-                self._waiting_samples += 1
-                self._changed.notify_all()
-        return _answer(503, {"error": error, "accepted": 0}, {"Retry-After": str(RETRY_AFTER_S), "Connection": "close"})
-
     def _unauthorized(self, request: Request) -> Response | None:
         given = request.headers.get("authorization", "").encode()
         if not self._token or hmac.compare_digest(given, f"Bearer {self._token}".encode()):
@@ -211,7 +194,6 @@ class HttpSource:
                 "accepted": self._accepted,
                 "refused": self._refused,
                 "turned_away": self._turned_away,
-                "too_many_connections": self._over_limit,
                 "waiting": self._waiting_samples,
             }
 
@@ -227,63 +209,35 @@ class HttpSource:
                 self._waiting_samples -= not isinstance(event, LinkUp | LinkDown)
 
     def _serve(self) -> None:
-        """Listen until it is stopped; try again while the port is taken."""
+        """Listen until it is stopped; try again while it cannot."""
+        from fantwin.pipeline.certificates import server_context  # noqa: PLC0415  slow to import
+
+        files = self._files_of_tls()
         while True:
+            server = None
             try:
-                listening = self._listen()
-            except OSError as error:
-                self._add(LinkDown(self._cannot_listen(error)))
+                tls = server_context(*files) if files else None
+                listening = listen(self._config.host, self._config.port, "source")
+            except UserError as error:
+                self._add(LinkDown(str(error)))
             else:
-                with listening:
-                    self._serve_on(listening)
+                self._add(LinkUp())
+                server = HttpServer(self.app(), listening, tls, MOST_CONNECTIONS)
             with self._changed:
-                if self._changed.wait_for(lambda: self._stopping, RETRY_S):
-                    return
+                if self._changed.wait_for(lambda: self._stopping, None if server else RETRY_S):
+                    break
+        if server is not None:
+            server.stop()
 
-    def _serve_on(self, listening: socket.socket) -> None:
-        import uvicorn  # noqa: PLC0415  slow to import
-
-        from fantwin.pipeline.sources.http.protocol import LimitedProtocol  # noqa: PLC0415
-
-        logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
-        folder, certificate, key = self._context.folder, self._config.certificate, self._config.key
-        config = uvicorn.Config(
-            self.app(),
-            http=LimitedProtocol,
-            lifespan="off",
-            access_log=False,
-            log_config=None,
-            timeout_graceful_shutdown=1,
-            ssl_certfile=str(folder / certificate) if certificate else None,
-            ssl_keyfile=str(folder / key) if key else None,
-        )
-        try:
-            config.load()
-        except (OSError, ValueError) as error:  # a certificate that cannot be read
-            self._add(LinkDown(f"certificate and key cannot be used: {error}"))
-            return
-        server = uvicorn.Server(config)
-        with self._changed:
-            if self._stopping:
-                return
-            self._server = server
-        self._add(LinkUp())
-        server.run(sockets=[listening])
+    def _files_of_tls(self) -> tuple[Path, Path] | None:
+        """Certificate and key; None: without TLS."""
+        certificate, key, folder = self._config.certificate, self._config.key, self._context.folder
+        return (folder / certificate, folder / key) if certificate and key else None
 
     def _add(self, event: SourceEvent) -> None:
         with self._changed:
             self._waiting.append(event)
             self._changed.notify_all()
-
-    def _listen(self) -> socket.socket:
-        """A socket that accepts connections. Raises OSError."""
-        family = socket.AF_INET6 if ":" in self._config.host else socket.AF_INET
-        return socket.create_server((self._config.host, self._config.port), family=family)
-
-    def _cannot_listen(self, error: OSError) -> str:
-        return (
-            f"cannot listen on {self._config.host}:{self._config.port}: {error.strerror}; choose another host or port"
-        )
 
 
 def _answer(status: int, values: dict[str, Any], headers: dict[str, str] | None = None) -> Response:

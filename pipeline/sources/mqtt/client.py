@@ -7,7 +7,6 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.mqtt.settings import BrokerSettings
 from fantwin.pipeline.sources.secret_file import read_secret, secret_of_environment
 
@@ -26,13 +25,12 @@ def refusal(reason: object) -> str:
 
 
 def new_client(
-    settings: BrokerSettings, folder: Path, what: str, process: str, client_id: str = "", *, is_kept: bool = False
+    settings: BrokerSettings, folder: Path, process: str, client_id: str = "", *, is_kept: bool = False
 ) -> Client:
     """A client that is not connected yet.
 
-    folder: relative paths start here. what: who it is for, in errors. process: of that name, which needs the
-    environment. client_id: the broker ends an older connection of the same one. is_kept: the broker keeps what comes
-    while the client is away; needs client_id.
+    folder: relative paths start here. process: which needs the environment. client_id: the broker ends an older
+    connection of the same one. is_kept: the broker keeps what comes while the client is away; needs client_id.
 
     Raises:
         UserError: a password or certificate cannot be read.
@@ -50,25 +48,11 @@ def new_client(
             password = secret_of_environment(settings.password_env, process)
         client.username_pw_set(settings.username, password)
     if settings.tls:
-        ca, certificate, key = (
-            None if path is None else str(folder / path) for path in (settings.ca, settings.certificate, settings.key)
-        )
-        try:
-            client.tls_set(ca, certificate, key)
-        except (OSError, ssl.SSLError, ValueError) as error:
-            named = ", ".join(
-                f"{name} = {str(path)!r}"
-                for name, path in (("ca", settings.ca), ("certificate", settings.certificate), ("key", settings.key))
-                if path is not None
-            )
-            raise UserError(f"a certificate of {what} cannot be used: {named}: {error}") from error
+        from fantwin.pipeline.certificates import client_context  # noqa: PLC0415  slow to import
+
+        files = (path and folder / path for path in (settings.ca, settings.certificate, settings.key))
+        client.tls_set_context(client_context(*files))
     return client
-
-
-def _of_tls(error: ssl.SSLError) -> str:
-    if isinstance(error, ssl.SSLCertVerificationError):
-        return f"{error.verify_message}: check ca, and that host is a name in the certificate of the broker"
-    return "check port, and whether the broker has TLS there: if not, tls = false"
 
 
 def connection_problems(client: Client, settings: BrokerSettings, name: str) -> list[str]:
@@ -89,7 +73,9 @@ def connection_problems(client: Client, settings: BrokerSettings, name: str) -> 
     try:
         client.connect(settings.host, settings.port, keepalive=settings.keepalive_s)
     except ssl.SSLError as error:
-        return [f"{name}: no connection by TLS: {error.strerror or error}; {_of_tls(error)}"]
+        from fantwin.pipeline.certificates import tls_refusal  # noqa: PLC0415  slow to import
+
+        return [f"{name}: {tls_refusal(error, 'broker')}"]
     except OSError as error:
         return [f"{name}: cannot be reached: {error.strerror or error}; check host and port"]
     client.loop_start()

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.bus.authority import CLOCK_SKEW, Authority
-from fantwin.pipeline.bus.certificates import Credentials, checked_credentials, read_certificate
+from fantwin.pipeline.bus.credentials import Credentials, checked_credentials, warning
 from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.bus.opening import zenoh_config
 from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.certificates import CLOCK_SKEW, Authority, read_certificate
 from fantwin.pipeline.config.models import BusConfig
 from tests.support.site_certificates import DAY, SiteCertificates
 
@@ -43,44 +42,32 @@ def test_the_first_role_that_has_a_certificate_is_shown(site):
     assert checked(site, "scorer.tray1", "scorer").role == "scorer.tray1"
 
 
-def lose(name: str) -> Callable[[SiteCertificates], object]:
-    return lambda site: (site.folder / name).unlink()
+def lose_the_authority(site: SiteCertificates) -> None:
+    (site.folder / "ca.pem").unlink()
 
 
-def break_file(name: str) -> Callable[[SiteCertificates], object]:
-    return lambda site: (site.folder / name).write_text("nonsense")
+def lose_the_certificate(site: SiteCertificates) -> None:
+    (site.folder / "scorer.pem").unlink()
 
 
-def other_authority(site: SiteCertificates) -> None:
+def sign_by_another_authority(site: SiteCertificates) -> None:
     site.issue("scorer", authority=Authority.new("site", DAY))
 
 
-def other_key(site: SiteCertificates) -> None:
-    site.issue("viewer")
-    (site.folder / "viewer.key").replace(site.folder / "scorer.key")
-
-
-def readable(mode: int) -> Callable[[SiteCertificates], object]:
-    return lambda site: (site.folder / "scorer.key").chmod(mode)
+def let_it_expire(site: SiteCertificates) -> None:
+    site.issue("scorer", lifetime=-timedelta(minutes=1))
 
 
 @pytest.mark.parametrize(
     ("harm", "words"),
     [
-        (lose("ca.pem"), ["ca.pem", "No such file"]),
-        (lose("scorer.pem"), ["scorer.pem", "no such certificate", "certs issue"]),
-        (lose("scorer.key"), ["scorer.key", "No such file"]),
-        (break_file("ca.pem"), ["ca.pem", "no certificate"]),
-        (break_file("scorer.pem"), ["scorer.pem", "no certificate"]),
-        (break_file("scorer.key"), ["scorer.key", "no private key"]),
-        (readable(0o640), ["scorer.key", "others may read", "chmod 600"]),
-        (readable(0o604), ["scorer.key", "others may read", "chmod 600"]),
-        (other_key, ["scorer.key", "does not match", "scorer.pem"]),
-        (other_authority, ["scorer.pem", "not signed by", "ca.pem"]),
-        (lambda site: site.issue("scorer", lifetime=-timedelta(minutes=1)), ["scorer.pem", "expired on", "renew"]),
+        (lose_the_authority, ["ca.pem", "No such file"]),
+        (lose_the_certificate, ["scorer.pem", "no such certificate", "certs issue"]),
+        (sign_by_another_authority, ["scorer.pem", "not signed by", "ca.pem"]),
+        (let_it_expire, ["scorer.pem", "expired on", "certs renew scorer"]),
     ],
 )
-def test_what_cannot_be_used_is_one_line(site, harm, words):
+def test_what_cannot_be_used_is_one_line_that_says_what_to_do(site, harm, words):
     harm(site)
     with pytest.raises(BusError) as refused:
         checked(site)
@@ -107,7 +94,7 @@ def test_a_certificate_is_not_valid_before_its_time_and_warned_of_before_its_end
     assert "not valid before" in own.time_problem(own.not_before - timedelta(seconds=1))
     assert own.warning(made) == own.warning(own.not_after - 0.21 * (own.not_after - own.not_before)) == ""
     assert "expires in 24 hours" in own.warning(own.not_after - DAY)
-    assert "renew scorer" in own.warning(own.not_after - DAY)
+    assert warning(own) == ""
     assert "expired on" in own.warning(own.not_after)
 
 

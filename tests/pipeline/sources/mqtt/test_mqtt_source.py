@@ -225,9 +225,7 @@ def test_a_user_and_a_broker_that_proves_itself(tmp_path: Path, monkeypatch: pyt
         source_of(broker.port, tmp_path, **settings, password_file="password")
     with pytest.raises(UserError, match="the environment has no OTHER"):
         source_of(broker.port, tmp_path, **settings, password_env="OTHER")
-    with pytest.raises(
-        UserError, match=r"a certificate of source mqtt cannot be used: ca = 'none\.pem': .*No such file"
-    ):
+    with pytest.raises(UserError, match=r"none\.pem: No such file"):
         source_of(broker.port, tmp_path, topic="a", tls=True, ca="none.pem")
     broker.close()
 

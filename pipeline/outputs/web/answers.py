@@ -1,0 +1,297 @@
+"""What the API takes and answers, as types: `openapi.json` is made of them. Times `_t_ns` are ns since 1970."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from fantwin.pipeline.site.fan_groups import FanGroup
+
+
+class LoginForm(BaseModel):
+    """Name and password."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: Annotated[str, Field(min_length=1, max_length=64)]
+    password: Annotated[str, Field(min_length=1, max_length=128)]
+
+
+class Problem(BaseModel):
+    """Why a request was not done."""
+
+    error: str
+
+
+class Session(BaseModel):
+    """A session that has begun. csrf_token: goes with every change, as header `X-CSRF-Token`."""
+
+    name: str
+    csrf_token: str
+
+
+class Me(Session):
+    """The visitor and its rights. name: empty without a login. has_login: users can log in here."""
+
+    may_read: bool
+    may_act: bool
+    has_login: bool
+
+
+class Tray(BaseModel):
+    """A tray. viewer_url: of Rerun; empty without it."""
+
+    name: str
+    fans: int
+    speed_unit: str
+    viewer_url: str
+
+
+class Site(BaseModel):
+    """What does not change: the trays, and name, group and present state in words of each class of a cell."""
+
+    site: str
+    trays: list[Tray]
+    classes: list[str]
+    groups: list[FanGroup]
+    now: list[str]
+    level_at_limit: int
+
+
+class Fan(BaseModel):
+    """A fan in a list. score: relative to its limit; null: not judged."""
+
+    tray: str
+    fan: int
+    state: str
+    group: FanGroup
+    score: float | None
+    since_t_ns: int
+    in_alarm: bool
+
+
+class Fans(BaseModel):
+    """Fans, the worst first."""
+
+    fans: list[Fan]
+
+
+class Cause(BaseModel):
+    """A possible cause of an alarm."""
+
+    cause: str
+    probability: float
+
+
+class ExplainedCause(Cause):
+    """A cause with what speaks for it."""
+
+    evidence: str
+
+
+class Alarm(BaseModel):
+    """A current alarm. probability: of the likeliest cause. now: what its fan does now, in words."""
+
+    tray: str
+    fan: int
+    severity: str
+    active: bool
+    acknowledged: bool
+    confirmed: bool
+    latched: bool
+    shelved_until_t_ns: int
+    suppressed: bool
+    out_of_service: bool
+    stale: bool
+    retained: bool
+    presented: bool
+    onset_t_ns: int
+    t_ns: int
+    message: str
+    message_t_ns: int
+    causes: list[ExplainedCause]
+    acknowledged_by: str
+    feedback: str
+    feedback_by: str
+    feedback_reason: str
+    listed: bool
+    states: list[str]
+    cause: str
+    cause_with_share: str
+    probability: float | None
+    evidence: str
+    advice: str
+    other_causes: list[Cause]
+    now: str
+
+
+class Alarms(BaseModel):
+    """The current alarms."""
+
+    alarms: list[Alarm]
+
+
+class Wear(BaseModel):
+    """A slow change of a fan. change, error, limit: shares of its speed; null: not known."""
+
+    parameter: str
+    unit: str
+    change: float | None
+    error: float | None
+    beside: float | None
+    per_day: dict[str, float | None] | None
+    days: float | None
+    limit: float
+    reached_t_ns: dict[str, int | None] | None
+    unknown_reason: str | None
+    t_ns: int
+
+
+class Twin(BaseModel):
+    """The twin in force, and the parameters that it uses for the fan."""
+
+    name: str
+    kind: str
+    sha256: str
+    since_t_ns: int
+    parameters: dict[str, float]
+
+
+class FanInFull(Fan):
+    """A fan with its alarm, twin and wear."""
+
+    newest_t_ns: int
+    alarm: Alarm | None
+    twin: Twin | None
+    wear: list[Wear]
+
+
+class Curves(BaseModel):
+    """Samples of a fan as columns: speeds in the unit of the tray; null: not measured or not judged."""
+
+    speed_unit: str
+    t_s: list[float]
+    measured: list[float | None]
+    predicted: list[float | None]
+    half_width: list[float | None]
+    torque_balance_command: list[float | None]
+    score: list[float | None]
+    command: list[float | None]
+
+
+class Transition(BaseModel):
+    """A transition of an alarm. feedback: the last one on its alarm."""
+
+    number: int
+    t_ns: int
+    tray: str
+    fan: int
+    onset_t_ns: int
+    transition: str
+    severity: str
+    active: bool
+    message: str
+    operator_name: str
+    comment: str
+    feedback: str
+
+
+class History(BaseModel):
+    """Transitions, the newest first. begins_t_ns: how far back the history reaches."""
+
+    transitions: list[Transition]
+    begins_t_ns: int | None
+
+
+class Rate(BaseModel):
+    """The observed rate of false alarms per fan and day, beside the declared one; null where no fan was judged."""
+
+    since_t_ns: int
+    fan_hours: float
+    false_alarms: int
+    true_alarms: int
+    unmarked: int
+    false_alarms_per_day: float | None
+    interval_95: tuple[float, float] | None
+    with_unmarked_per_day: float | None
+    with_unmarked_interval_95: tuple[float, float] | None
+    declared_per_day: float | None
+    text: str
+
+
+class Rates(BaseModel):
+    """The rates of the trays, by name, and of the site."""
+
+    trays: dict[str, Rate]
+    site: Rate
+
+
+class ClippedAlarm(BaseModel):
+    """An alarm in a clip."""
+
+    fan: int
+    onset_t_ns: int
+    t_ns: int
+
+
+class Clip(BaseModel):
+    """A recording around alarms."""
+
+    name: str
+    tray: str
+    since_t_ns: int
+    until_t_ns: int
+    bytes: int
+    acknowledged: bool
+    problem: str
+    alarms: list[ClippedAlarm]
+
+
+class Clips(BaseModel):
+    """Clips, the newest first."""
+
+    clips: list[Clip]
+
+
+class Stage(BaseModel):
+    """A stage: its state in a word, rates, losses, latency."""
+
+    name: str
+    state: str
+    detail: str
+    in_hz: float
+    out_hz: float
+    lost: int
+    latency_p50_ms: float
+    latency_p99_ms: float
+    uptime_s: float
+    notes: list[str]
+
+
+class Stages(BaseModel):
+    """The stages, in the order of the data flow."""
+
+    stages: list[Stage]
+
+
+class ScorerAnswer(BaseModel):
+    """What the scorer says to a request about a fan."""
+
+    fan: int
+    transition: str
+    message: str
+
+
+class ScorerAnswers(BaseModel):
+    """An answer for each fan."""
+
+    answers: list[ScorerAnswer]
+
+
+class Refused(Problem, ScorerAnswers):
+    """The scorer has refused the request for every fan."""
+
+
+JSON = dict[str, Any]
+"""what `pipeline.site.shown` makes; FastAPI checks it against the type that a path declares"""
