@@ -21,7 +21,6 @@ from fantwin.pipeline.cli.twins.training_data import TrainingData, data_cards
 from fantwin.pipeline.errors import UsageError, UserError
 
 if TYPE_CHECKING:
-    from fantwin.pipeline.cli.twins.train import TrainingSettings
     from fantwin.twin.comparison import Candidate, Contender, Source
 
 Data: TypeAlias = tuple[TrainingData, TrainingData | None, TrainingData | None]
@@ -37,10 +36,12 @@ SOURCE_MEANING = {
 def train_side_by_side(
     chosen: Sequence[Candidate],
     read: Callable[[], Data],
-    settings: TrainingSettings,
     folder: Path,
     pool: RecordingsInParallel,
     *,
+    seed: int,
+    iterations: int | None,
+    command_unit: str,
     json_output: bool,
 ) -> None:
     """Train several models on the same recordings, print them side by side, and write the twins and comparison.json.
@@ -53,8 +54,6 @@ def train_side_by_side(
 
     if folder.suffix == ".onnx":
         raise UsageError(f"{folder}: several models are several twins: name a folder with -o")
-    if settings.networks is not None:
-        raise UsageError("--networks is for one model: models are compared with one network each")
     training_data, *others = read()
     make_folder(folder)
     validation_runs, test_runs = (part.runs if part else [] for part in others)
@@ -67,9 +66,9 @@ def train_side_by_side(
                 training_data.runs,
                 validation_runs,
                 test_runs,
-                seed=settings.seed,
-                max_iterations=settings.iterations,
-                command_unit=settings.command_unit,
+                seed=seed,
+                max_iterations=iterations,
+                command_unit=command_unit,
                 fan_numbers=training_data.fans,
                 data=data,
                 validation_data=validation_data,

@@ -139,7 +139,10 @@ def train(
         chosen = _chosen(model)
         if len(chosen) > 1:
             data = partial(_read, recordings, validate, test, part, pool)
-            train_side_by_side(chosen, data, given, output, pool, json_output=json_output)
+            if networks is not None:
+                raise UsageError("--networks is for one model: models are compared with one network each")
+            how = {"seed": seed, "iterations": iterations, "command_unit": command_unit}
+            train_side_by_side(chosen, data, output, pool, **how, json_output=json_output)
             return
         if test:
             raise UsageError("--test is for several models; `fantwin evaluate` judges one: fantwin evaluate TWIN.onnx")
