@@ -101,7 +101,7 @@ def test_a_pipeline_that_does_not_stop_is_one_line_and_is_killed(tmp_path, endpo
     overrides = [f"bus.endpoint='{endpoint}'", f"tray.0.port='{tmp_path / 'tray'}'"]
     config = load_config(DEMO_FOLDER / "demo.toml", overrides)
     with pytest.raises(UserError, match=r"did not stop within 0\.2 s.*up\.log"):
-        _run(config, overrides, tmp_path, 7, Console(file=io.StringIO()))
+        _run(config, overrides, tmp_path, Console(file=io.StringIO()))
     assert not is_running(int((tmp_path / "up").read_text()))
 
 
@@ -129,7 +129,7 @@ def test_the_reason_of_a_failure_is_in_the_terminal(tmp_path, endpoint, monkeypa
     overrides = [f"bus.endpoint='{endpoint}'", f"tray.0.port='{tmp_path / 'tray'}'"]
     config = load_config(DEMO_FOLDER / "demo.toml", overrides)
     with pytest.raises(UserError, match=f"^the pipeline did not run to its end: {reason}.*full log: .*up.log"):
-        _run(config, overrides, tmp_path, 7, Console(file=io.StringIO()))
+        _run(config, overrides, tmp_path, Console(file=io.StringIO()))
 
 
 @pytest.mark.parametrize("program", ["cat", "no-such-program"])

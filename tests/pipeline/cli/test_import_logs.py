@@ -163,8 +163,6 @@ def test_a_mistake_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
     bad.write_bytes(b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n")
     assert "no blackbox log that can be read" in error_of("import", bad, "--list")
     (tmp_path / "bag").mkdir()
-    assert "a folder, and no ROS 2 bag" in error_of("import", tmp_path / "bag", "--list")
     (tmp_path / "bag" / "metadata.yaml").write_text("none")
     assert "no ROS 2 bag that can be read" in error_of("import", tmp_path / "bag", "--list")
-    assert "cannot be read: No such file" in error_of("import", tmp_path / "none.ulg", "--list")
     assert list(tmp_path.glob("*.mcap")) == []

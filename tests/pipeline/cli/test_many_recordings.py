@@ -142,7 +142,6 @@ def test_the_error_of_another_process_is_that_of_one_and_of_several_the_first_ar
     bad = [folder / "none.mcap", folder / BAD]
     expected = f"{folder / 'none.mcap'}: cannot read the recording: No such file or directory"
     assert error_of("report", folder / "a.mcap", *bad, "--jobs", 2) == expected
-    assert error_of("report", *bad, "--jobs", 1, "--skip-bad") == expected, "where none is left, that is an error"
 
 
 def test_a_recording_of_which_nothing_can_be_scored_is_bad_and_leaves_no_output(folder: Path, tmp_path: Path) -> None:

@@ -157,7 +157,6 @@ def test_what_is_made_of_fans_as_they_change_and_how_it_is_listed_and_put_in_for
     said = fantwin("twins", "-c", config, *day).stdout
     assert "tray1-2 was learned from that time span and stays in force: no version can replace it; the next" in said
     assert "marked as faulty: 2027-01-14" in said
-    assert "no healthy history to learn from yet" in error_of("twins", "learn", "-c", config)
 
 
 def test_a_tray_that_has_learned_nothing_yet_says_what_makes_its_first_twin(tmp_path: Path) -> None:
