@@ -79,9 +79,10 @@ def commission(
     """Record healthy fans, train their twins, calibrate them, add them to the configuration, start `fantwin up`.
 
     Each tray that names no twin gets one; the others stay as they are. The steps are commands of
-    docs/tutorial/own-fan.md; each is shown before it runs, except the `up` that records. The fans must be healthy. With
-    --sweep, the trays are swept one after another: --rounds times to train on, once more to validate. Without it, no
-    command is sent: the first recording lasts until the plant has moved the command of every fan enough, and what is
+    docs/tutorial/own-fan.md; each is shown before it runs, except the `up` that records. The fans must be healthy.
+
+    With --sweep, the trays are swept one after another: --rounds times to train on, once more to validate. Without it,
+    no command is sent: the first recording lasts until the plant has moved the command of every fan enough, and what is
     missing is shown. The calibration is from little data: calibrate again after a few days.
 
     A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends `commission`
