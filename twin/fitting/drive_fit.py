@@ -22,16 +22,19 @@ from numpy.typing import NDArray
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.twin_card import DriveCard
 from fantwin.twin.errors import TwinError
+from fantwin.twin.fitting.damped_least_squares import Flags, minimise
 from fantwin.twin.fitting.free_run_fit import ERROR_ROUNDS
-from fantwin.twin.fitting.free_run_problem import HEAVIER, HUBER_DELTA
+from fantwin.twin.fitting.free_run_problem import INERTIA, FreeRunProblem, Point, Prior, Unknowns
 from fantwin.twin.fitting.identification import Identification
-from fantwin.twin.fitting.reading_errors import ReadingErrors, reading_errors, robust_scale
 from fantwin.twin.fitting.trajectories import MAX_SAMPLES, Trajectories, cut_into_trajectories, practical_samples
 from fantwin.twin.models.drive import DRIVE_PARAMETERS, Drive
-from fantwin.twin.models.integration import free_run, rk4_step_derivatives
-from fantwin.twin.models.physical import fitted_unknowns, parameters_by_unknowns, physical_parameters
-from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
-from fantwin.twin.models.recursion import linear_recursion
+from fantwin.twin.models.physical import (
+    PhysicalModel,
+    fitted_unknowns,
+    parameters_by_unknowns,
+    physical_parameters,
+)
+from fantwin.twin.models.physics import LAG
 from fantwin.twin.models.right_hand_side import FanEquation
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run
@@ -42,12 +45,10 @@ LEAST_GAIN = 0.07
 KICKS_S, RESTS_S = (0.3, 0.6, 1.2), (1.0, 2.0, 4.0)
 FIRST_ITERATIONS, MORE_ITERATIONS = 12, 5
 MOST_ITERATIONS = 2 * FIRST_ITERATIONS + (len(KICKS_S) + len(RESTS_S) + 2 * ERROR_ROUNDS) * MORE_ITERATIONS
-FIRST_DAMPING, DAMPING_DOWN, DAMPING_UP = 1e-3, 3.0, 4.0
 FIRST_PLATEAU, FIRST_KICK = 0.05, 0.5
 """shares of the range of commands above the lowest that turns the fans"""
 LOWEST, FRICTION, KICK = (LAG + index for index in range(len(DRIVE_PARAMETERS)))
 UNKNOWNS = LAG + len(DRIVE_PARAMETERS)
-INERTIA = PARAMETER_NAMES.index("J")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,48 +105,45 @@ def find_drive(
     def iteration_done() -> None:
         progress("drive of the fans", next(count), MOST_ITERATIONS, np.nan)
 
+    def behind(drive: Drive, runs: _Runs = learned) -> _Problem:
+        return _Problem(runs, drive, plain.top_speed_rad_s, highest)
+
     start = np.zeros((len(plain.parameters), UNKNOWNS))
     start[:, :LAG] = fitted_unknowns(plain.parameters, plain.top_speed_rad_s)[:, :LAG]
     without = np.arange(UNKNOWNS) < LAG
     without[FRICTION] = True
     drive = Drive(turning, KICKS_S[1], RESTS_S[1])
     never = replace(drive, rest_s=np.inf)
-    of_friction = _Problem(learned, never, plain.top_speed_rad_s, highest).fit(
-        start, without, FIRST_ITERATIONS, iteration_done
-    )
+    of_friction, _ = behind(never).fit(start, without, FIRST_ITERATIONS, iteration_done)
     start = of_friction.copy()
     # A plateau below all commands would have no effect, and so no derivative.
     start[:, LOWEST] = standstill.turning_command + FIRST_PLATEAU * (highest - standstill.turning_command)
     start[:, KICK] = turning + FIRST_KICK * (highest - turning)
     everything = np.ones(UNKNOWNS, np.bool_)
-    best = _Problem(learned, drive, plain.top_speed_rad_s, highest).fit(
-        start, everything, FIRST_ITERATIONS, iteration_done
-    )
-    loss = _Problem(learned, drive, plain.top_speed_rad_s, highest).mean_square(best)
+    best, loss = behind(drive).fit(start, everything, FIRST_ITERATIONS, iteration_done)
     for name, ladder in (("kick_s", KICKS_S), ("rest_s", RESTS_S)):
         for value in ladder:
             if value == getattr(drive, name):
                 continue
             other = replace(drive, **{name: value})
-            problem = _Problem(learned, other, plain.top_speed_rad_s, highest)
-            unknowns = problem.fit(best, everything, MORE_ITERATIONS, iteration_done)
-            if (of_other := problem.mean_square(unknowns)) < loss:
+            unknowns, of_other = behind(other).fit(best, everything, MORE_ITERATIONS, iteration_done)
+            if of_other < loss:
                 best, loss, drive = unknowns, of_other, other
     # Inertia and kick show while the speed changes, when readings say little of the rest.
     steady = everything.copy()
     steady[[INERTIA, KICK]] = False
 
-    def steadied(of: Drive, unknowns: Array, free: NDArray[np.bool_]) -> Array:
-        problem = _Problem(learned, of, plain.top_speed_rad_s, highest)
+    def steadied(drive: Drive, unknowns: Array, free: Flags) -> Array:
+        problem = behind(drive)
         for _ in range(ERROR_ROUNDS):
-            problem.learn_errors(unknowns)
-            unknowns = problem.fit(unknowns, free & steady, MORE_ITERATIONS, iteration_done)
+            problem.learn_errors(problem.point(unknowns))
+            unknowns, _ = problem.fit(unknowns, free & steady, MORE_ITERATIONS, iteration_done)
         return unknowns
 
     final, of_friction = steadied(drive, best, everything), steadied(never, of_friction, without)
-    with_drive = _Problem(judged, drive, plain.top_speed_rad_s, highest)
-    with_drive.learn_errors(final)
-    friction_alone = _Problem(judged, never, plain.top_speed_rad_s, highest, with_drive.errors)
+    with_drive, friction_alone = behind(drive, judged), behind(never, judged)
+    with_drive.learn_errors(with_drive.point(final))
+    friction_alone.errors = with_drive.errors
     if not with_drive.mean_square(final) < (1.0 - LEAST_GAIN) ** 2 * friction_alone.mean_square(of_friction):
         return None
     return FoundDrive(drive, final[:, LAG:])
@@ -174,125 +172,77 @@ class _Runs:
         return cut_into_trajectories(shares, self.samples).command
 
 
-class _Problem:
-    """The free run of fans behind one drive. Unknowns (fans, 6): ln J, two ln dampings, DRIVE_PARAMETERS."""
+class _Problem(FreeRunProblem):
+    """The free run of fans behind one drive. Physics unknowns (fans, 6): ln J, two ln dampings, DRIVE_PARAMETERS."""
 
-    def __init__(
-        self,
-        runs: _Runs,
-        drive: Drive,
-        top_speed_rad_s: Array,
-        highest_command: float,
-        errors: ReadingErrors | None = None,
-    ) -> None:
-        """errors: of the readings; None: not known."""
-        self._data, self._drive = runs.data, drive
-        self.errors = errors or ReadingErrors.unknown(self._data.command.shape)
-        self._share = runs.kick(drive)
-        self._top_speed_rad_s = top_speed_rad_s
-        self._fans = len(top_speed_rad_s)
+    def __init__(self, runs: _Runs, drive: Drive, top_speed_rad_s: Array, highest_command: float) -> None:
+        nothing = Prior(0.0, np.zeros(UNKNOWNS), np.zeros((len(top_speed_rad_s), UNKNOWNS)))
+        everything = np.ones(UNKNOWNS, np.bool_)
+        super().__init__(PhysicalModel(), runs.data, top_speed_rad_s, everything, nothing, estimate_initial_speed=False)
+        self._drive, self._share = drive, runs.kick(drive)
         self._highest_command = highest_command
-        self._initial = self._data.starting_speed_rad_s()
-        self._guess = self._data.interpolated_speed_rad_s()
+
+    def point(self, physics: Array) -> Point:
+        """The candidate with these unknowns."""
+        data = self.trajectories
+        unknowns = Unknowns(np.zeros(0), physics, data.starting_speed_rad_s())
+        return self.evaluate(unknowns, data.interpolated_speed_rad_s())
 
     def fit(
-        self, unknowns: Array, free: NDArray[np.bool_], iterations: int, iteration_done: Callable[[], None]
-    ) -> Array:
-        """The unknowns after so many steps, each fan for itself, that lower the pseudo-Huber loss of its residual."""
-        residual, speed = self._residual(unknowns)
-        scale = robust_scale(residual, self._data)
-        cost = self._cost(residual, scale)
-        damping = np.full(self._fans, FIRST_DAMPING)
-        held = np.flatnonzero(~free)
-        for _ in range(iterations):
-            squares, gradient = self._normal_equations(unknowns, speed, residual, scale)
-            squares[:, held, :] = squares[:, :, held] = gradient[:, held] = 0.0
-            diagonal = np.diagonal(squares, axis1=1, axis2=2)
-            ridge = damping[:, np.newaxis] * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True)
-            squares[:, np.arange(UNKNOWNS), np.arange(UNKNOWNS)] += np.where(diagonal > 0.0, ridge, 1.0)
-            trial = self._within_bounds(unknowns + np.linalg.solve(squares, gradient[..., np.newaxis])[..., 0])
-            of_trial, trial_speed = self._residual(trial)
-            trial_cost = self._cost(of_trial, scale)
-            better = trial_cost < cost
-            damping = np.where(better, damping / DAMPING_DOWN, damping * DAMPING_UP)
-            column = better[self._data.fan]
-            unknowns = np.where(better[:, np.newaxis], trial, unknowns)
-            residual, speed = np.where(column, of_trial, residual), np.where(column, trial_speed, speed)
-            cost = np.where(better, trial_cost, cost)
+        self, physics: Array, free: Flags, iterations: int, iteration_done: Callable[[], None]
+    ) -> tuple[Array, float]:
+        """The unknowns after at most so many steps of the free ones, and the mean square of their residual."""
+        self.free = free
+
+        def accepted(_iteration: int, _point: Point) -> bool:
             iteration_done()
-        return unknowns
+            return False
 
-    def learn_errors(self, unknowns: Array) -> None:
-        """Let readings have the errors that they have in the free run of these unknowns."""
-        heavier = unknowns.copy()
-        heavier[:, INERTIA] += HEAVIER
-        data, speed = self._data, self._speed(unknowns)
-        readings, of_heavier = data.measurement.of_speed(speed), data.measurement.of_speed(self._speed(heavier))
-        with np.errstate(over="ignore", invalid="ignore"):
-            errors, by_inertia = data.speed_rad_s - readings, of_heavier - readings
-        self.errors = reading_errors(errors, speed, by_inertia, data, self.errors)
+        start = self.rescaled(self.point(physics))
+        point, _, _ = minimise(self, start, iterations, tolerance=0.0, accepted=accepted)
+        return point.unknowns.physics, self._mean_square(point)
 
-    def mean_square(self, unknowns: Array) -> float:
+    def mean_square(self, physics: Array) -> float:
         """Mean square of the residual of all fans, (rad/s)^2."""
-        residual, _ = self._residual(unknowns)
-        return float(np.sum(residual**2) / np.count_nonzero(self._data.compared))
+        return self._mean_square(self.point(physics))
 
-    def _residual(self, unknowns: Array) -> tuple[Array, Array]:
-        """(n, batch) weighted readings less those expected, 0 where nothing is compared; and the free run's speeds."""
-        data, speed = self._data, self._speed(unknowns)
-        with np.errstate(over="ignore", invalid="ignore"):
-            error = data.speed_rad_s - data.measurement.of_speed(speed) - self.errors.expected_rad_s
-            return np.where(data.compared, self.errors.weight * error, 0.0), speed
+    def _mean_square(self, point: Point) -> float:
+        return float(np.sum(point.residual**2) / np.count_nonzero(self.trajectories.compared))
 
-    def _speed(self, unknowns: Array) -> Array:
-        """(n, batch) rad/s of the free run."""
-        equation, command = self._equation(unknowns)
-        speed, _ = free_run(equation, self._initial, command, self._data.step_s, self._guess)
-        return speed
-
-    def _equation(self, unknowns: Array) -> tuple[FanEquation, Array]:
-        fan = self._data.fan
-        parameters = self._parameters(unknowns)[fan]
+    def equation(self, unknowns: Unknowns, part: slice) -> tuple[FanEquation, Array]:
+        data = self.trajectories
+        fan = data.fan[part]
+        parameters = physical_parameters(_without_lag(unknowns.physics), self.top_speed_rad_s)[fan]
+        settings = unknowns.physics[fan, LAG:]
         return FanEquation(parameters, None), self._drive.effective(
-            self._data.command, self._share, unknowns[fan][:, LAG:]
+            data.command[:, part], self._share[:, part], settings
         )
 
-    def _parameters(self, unknowns: Array) -> Array:
-        return physical_parameters(_without_lag(unknowns), self._top_speed_rad_s)
+    def command_by_unknowns(self, unknowns: Unknowns, part: slice) -> Array:
+        data = self.trajectories
+        settings = unknowns.physics[data.fan[part], LAG:]
+        return self._drive.by_settings(data.command[:, part], self._share[:, part], settings)
 
-    def _cost(self, residual: Array, scale: Array) -> Array:
-        with np.errstate(over="ignore", invalid="ignore"):
-            loss = np.hypot(1.0, residual / (HUBER_DELTA * scale[self._data.fan])) - 1.0
-            cost = np.bincount(self._data.fan, loss.sum(axis=0), self._fans)
-        return np.where(np.isfinite(cost), cost, np.inf)
+    def parameters_by_unknowns(self, unknowns: Unknowns) -> Array:
+        chain = np.tile(np.eye(UNKNOWNS), (self.fans, 1, 1))
+        of_physics = parameters_by_unknowns(_without_lag(unknowns.physics), self.top_speed_rad_s)
+        chain[:, :LAG, :LAG] = of_physics[:, :LAG, :LAG]
+        return chain
 
-    def _normal_equations(self, unknowns: Array, speed: Array, residual: Array, scale: Array) -> tuple[Array, Array]:
-        """For each fan the weighted S^T S (fans, 6, 6) and S^T residual (fans, 6)."""
-        data, fan = self._data, self._data.fan
-        equation, command = self._equation(unknowns)
-        by_speed, by_command, by_physics = rk4_step_derivatives(equation, speed[:-1], command[:-1], data.step_s[:-1])
-        chain = parameters_by_unknowns(_without_lag(unknowns), self._top_speed_rad_s)[fan][:, :LAG, :LAG]
-        by_settings = self._drive.by_settings(data.command, self._share, unknowns[fan][:, LAG:])
-        forcing = np.zeros((*command.shape, UNKNOWNS))
-        forcing[1:, :, :LAG] = np.einsum("nbp,bpq->nbq", by_physics, chain)
-        forcing[1:, :, LAG:] = by_command[..., np.newaxis] * by_settings[:-1]
-        readings = data.measurement.of_speed(linear_recursion(by_speed, forcing))
-        sensitivity = (readings * self.errors.weight[..., np.newaxis]).transpose(1, 0, 2)
-        weight = np.where(data.compared, 1.0 / np.hypot(1.0, residual / (HUBER_DELTA * scale[fan])), 0.0)
-        weighted = sensitivity * weight.T[..., np.newaxis]
-        squares, gradient = np.zeros((self._fans, UNKNOWNS, UNKNOWNS)), np.zeros((self._fans, UNKNOWNS))
-        np.add.at(squares, fan, weighted.transpose(0, 2, 1) @ sensitivity)
-        np.add.at(gradient, fan, np.einsum("bnp,nb->bp", weighted, residual))
-        return squares, gradient
-
-    def _within_bounds(self, unknowns: Array) -> Array:
-        unknowns = unknowns.copy()
+    def within_bounds(self, physics: Array) -> Array:
         turning, highest = self._drive.turning_command, self._highest_command
-        unknowns[:, KICK] = unknowns[:, KICK].clip(0.0, 2.0 * highest)
-        unknowns[:, FRICTION] = unknowns[:, FRICTION].clip(0.0, highest)
-        unknowns[:, LOWEST] = unknowns[:, LOWEST].clip(turning, highest)
-        return unknowns
+        lowest = {KICK: 0.0, FRICTION: 0.0, LOWEST: turning}
+        for column, least in lowest.items():
+            most = 2.0 * highest if column == KICK else highest
+            physics[:, column] = physics[:, column].clip(least, most)
+        return physics
+
+    def at_bounds(self, physics: Array, downhill: Array) -> Flags:
+        return np.zeros(physics.shape, np.bool_)
+
+    def narrowed(self, point: Point, active: Flags) -> None:
+        return
 
 
-def _without_lag(unknowns: Array) -> Array:
-    return np.column_stack((unknowns[:, :LAG], np.zeros(len(unknowns))))
+def _without_lag(physics: Array) -> Array:
+    return np.column_stack((physics[:, :LAG], np.zeros(len(physics))))

@@ -11,27 +11,21 @@ to show of a free run is linear in it (twin.measurement), and so in its sensitiv
 The scale is a robust standard deviation of each fan's residual, so that outliers count linearly and fans with different
 noise count equally. Initial speeds are coupled with other unknowns only in their own trajectory, and physics only in
 their own fan: both are eliminated from the normal equations (Schur complements), so that a thousand trajectories and a
-hundred fans cost no more than their own integration. More, Numerical Analysis, LNM 630 (1978), for the damping by the
-diagonal.
-
-Without shared weights every fan is damped, accepted and stopped by itself, as if it were fitted alone,
-and what has converged is left out of further steps as soon as that pays.
+hundred fans cost no more than their own integration. The loop is that of twin.fitting.damped_least_squares; without
+shared weights every fan is a group of its own.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
+from fantwin.twin.fitting.damped_least_squares import minimise
 from fantwin.twin.fitting.free_run_problem import OF_STEADY_SPEEDS, Flags, FreeRunProblem, Point, Prior, Unknowns
-from fantwin.twin.fitting.reading_errors import counts, robust_scale
+from fantwin.twin.fitting.reading_errors import counts
 from fantwin.twin.fitting.trajectories import Trajectories
 from fantwin.twin.models.model import OdeModel
 from fantwin.twin.runs import Array
 
 SCALE_ROUNDS, ERROR_ROUNDS = 2, 4  # with a constant scale, or with what was learned of the errors of readings
-DAMPING_DOWN, DAMPING_UP = 3.0, 4.0
-FIRST_DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,58 +80,14 @@ def fit_free_run(
         if learns_errors:
             problem.learn_errors(point)
             point = problem.evaluate(point.unknowns, point.speed_rad_s)
-        problem.scale_rad_s = robust_scale(point.residual, trajectories)
-        point = problem.evaluate(point.unknowns, point.speed_rad_s)
-        point, iteration, stopped = _descend(problem, point, iteration, max_iterations, tolerance, accepted)
+        point, iteration, stopped = minimise(
+            problem,
+            problem.rescaled(point),
+            max_iterations,
+            tolerance=tolerance,
+            accepted=accepted,
+            iteration=iteration,
+        )
         if stopped:
             break
     return FreeRunFit(point, problem.rmse_rad_s(point), point.residual / problem.errors.weight, iteration)
-
-
-def _descend(
-    problem: FreeRunProblem,
-    point: Point,
-    iteration: int,
-    max_iterations: int,
-    tolerance: float,
-    accepted: Callable[[int, Point], bool],
-    damping: Array | None = None,
-) -> tuple[Point, int, bool]:
-    """Iterate to the next minimum with a constant scale. Also returns whether it was stopped. damping: (groups,)."""
-    groups = problem.groups
-    damping = np.full(groups, FIRST_DAMPING) if damping is None else damping
-    cost = problem.total(point)
-    active = np.isfinite(cost)
-    normal: tuple[Array, Array] | None = None
-    while iteration < max_iterations and np.any(active):
-        if normal is None and problem.pays_for_some(active):
-            part = problem.of_fans(active)
-
-            def whole(found: Point, others: Point = point, fans: Flags = active) -> Point:
-                return problem.with_point_of_some(others, found, fans)
-
-            found, iteration, stopped = _descend(
-                part,
-                problem.point_of_some(point, active),
-                iteration,
-                max_iterations,
-                tolerance,
-                lambda count, found: accepted(count, whole(found)),
-                damping[active],
-            )
-            return whole(found), iteration, stopped
-        iteration += 1
-        normal = problem.normal_equations(point) if normal is None else normal
-        trial = problem.evaluate(problem.step(point, *normal, damping), point.speed_rad_s)
-        trial_cost = problem.total(trial)
-        better = active & (trial_cost < cost)
-        gain = np.zeros(groups)
-        gain[better] = (cost[better] - trial_cost[better]) / cost[better]
-        damping = np.where(better, np.maximum(damping / DAMPING_DOWN, SMALLEST_DAMPING), damping * DAMPING_UP)
-        active &= ~(better & (gain < tolerance)) & (damping < LARGEST_DAMPING)
-        if not np.any(better):
-            continue
-        point, cost, normal = problem.merge(point, trial, better), np.where(better, trial_cost, cost), None
-        if accepted(iteration, point):
-            return point, iteration, True
-    return point, iteration, iteration >= max_iterations

@@ -1,12 +1,14 @@
 """The errors of a free run as a sum of losses, its normal equations and their damped steps: see free_run_fit."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fantwin.twin.fitting.reading_errors import ReadingErrors, counts, reading_errors
+from fantwin.twin.fitting.damped_least_squares import Flags, pseudo_huber, pseudo_huber_weight
+from fantwin.twin.fitting.reading_errors import ReadingErrors, counts, reading_errors, robust_scale
 from fantwin.twin.fitting.trajectories import Trajectories
 from fantwin.twin.models.integration import WIDE_BATCH, free_run, free_run_sensitivities
 from fantwin.twin.models.lag import effective_command, effective_command_by_lag
@@ -17,9 +19,6 @@ from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
 from fantwin.twin.models.right_hand_side import FanEquation
 from fantwin.twin.runs import Array
 
-Flags = NDArray[np.bool_]
-
-HUBER_DELTA = 3.0
 FAST_CHUNK_NUMBERS, MAX_CHUNK_NUMBERS = 500_000, 4_000_000
 FEWER = 0.75  # share of the fans: with fewer left to fit than that, the others are left out
 ALIGNED_COLUMNS = 16  # of fast chunks: whole registers, so that all columns of a chunk are summed alike
@@ -27,7 +26,7 @@ HELD = 1e12
 
 ALL_FREE = np.ones(len(PARAMETER_NAMES), dtype=bool)
 OF_STEADY_SPEEDS = np.array([name in ("alpha", "C_D") for name in PARAMETER_NAMES])
-OF_INERTIA = np.array([name == "J" for name in PARAMETER_NAMES])
+INERTIA = PARAMETER_NAMES.index("J")
 HEAVIER = 0.1  # of ln J: by what its errors in motion are found
 NONE_FREE = np.zeros(len(PARAMETER_NAMES), dtype=bool)
 
@@ -131,15 +130,21 @@ class FreeRunProblem:
         with np.errstate(over="ignore", invalid="ignore"):
             error = data.speed_rad_s - data.measurement.of_speed(speed) - self.errors.expected_rad_s
             residual = np.where(data.compared, self.errors.weight * error, 0.0)
-            loss = HUBER_DELTA**2 * (np.hypot(1.0, residual / (HUBER_DELTA * scale)) - 1.0)
-            cost = np.bincount(data.fan, loss.sum(axis=0), self.fans).astype(np.float64)
+            loss = pseudo_huber(residual, scale).sum(axis=0)
+            cost = np.bincount(data.fan, loss, self.fans).astype(np.float64)
         cost[~np.isfinite(cost)] = np.inf
         return Point(unknowns, speed, residual, cost)
+
+    def rescaled(self, point: Point) -> Point:
+        """The candidate with residuals in units of what they scatter by in its own free run."""
+        self.scale_rad_s = robust_scale(point.residual, self.trajectories)
+        return self.evaluate(point.unknowns, point.speed_rad_s)
 
     def learn_errors(self, point: Point) -> None:
         """Let readings have the errors that they have in the free run of this candidate."""
         data = self.trajectories
-        heavier = replace(point.unknowns, physics=point.unknowns.physics + HEAVIER * OF_INERTIA)
+        heavier = replace(point.unknowns, physics=point.unknowns.physics.copy())
+        heavier.physics[:, INERTIA] += HEAVIER
         readings = data.measurement.of_speed(point.speed_rad_s)
         of_heavier = data.measurement.of_speed(self.evaluate(heavier, point.speed_rad_s).speed_rad_s)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -175,7 +180,7 @@ class FreeRunProblem:
         """
         data = self.trajectories
         steps, batch = data.command.shape
-        size = self.weights + len(PARAMETER_NAMES) + 1
+        size = self.weights + point.unknowns.physics.shape[1] + 1
         squares, gradient = np.empty((batch, size, size)), np.empty((batch, size))
         width = _chunk_columns(steps * size)
         for first in range(0, batch, width):
@@ -191,39 +196,50 @@ class FreeRunProblem:
     def sample_weights(self, residual: Array, part: slice) -> Array:
         """(n, batch) the pseudo-Huber loss's weights: 1 for small residuals, 0 where nothing is compared."""
         data = self.trajectories
-        scaled = residual / self.scale_rad_s[data.fan[part]]
-        return np.where(data.compared[:, part], 1.0 / np.hypot(1.0, scaled / HUBER_DELTA), 0.0)
+        weight = pseudo_huber_weight(residual, self.scale_rad_s[data.fan[part]])
+        return np.where(data.compared[:, part], weight, 0.0)
 
     def sensitivities(self, point: Point, part: slice) -> Array:
         """(n, batch, M) derivatives of the free run's readings by weights, physics unknowns and initial speed, each
         times its weight.
         """
-        data = self.trajectories
-        fan, step_s = data.fan[part], data.step_s[:, part]
-        parameters = self.parameters(point.unknowns)[fan]
-        equation, command = self.equation(point.unknowns, part)
-        if np.any(parameters[:, LAG]):
-            before = data.command_before[part]
-            by_lag = effective_command_by_lag(data.command[:, part], step_s, parameters[:, LAG], before)
-        else:
-            by_lag = self._by_lag_of_zero[:, part]
-        raw = free_run_sensitivities(equation, point.speed_rad_s[:, part], command, step_s, by_lag)
+        data, unknowns = self.trajectories, point.unknowns
+        equation, command = self.equation(unknowns, part)
+        by_command = self.command_by_unknowns(unknowns, part)
+        raw = free_run_sensitivities(equation, point.speed_rad_s[:, part], command, data.step_s[:, part], by_command)
         if equation.parameters is None:
             unused = np.zeros((*command.shape, LAG))
             raw = np.concatenate((raw[..., : self.weights], unused, raw[..., -2:]), axis=-1)
         else:
-            chain = parameters_by_unknowns(point.unknowns.physics, self.top_speed_rad_s)[fan]
+            chain = self.parameters_by_unknowns(unknowns)[data.fan[part]]
             raw[..., self.weights : -1] = np.einsum("nbp,bpq->nbq", raw[..., self.weights : -1], chain)
         readings = data.measurement.of_speed(raw, part)
         if counts(data):
             readings *= self.errors.weight[:, part, np.newaxis]
         return readings
 
+    def command_by_unknowns(self, unknowns: Unknowns, part: slice) -> Array:
+        """(n, batch, K) derivatives of the command that acts by the last K physics unknowns: by the lag."""
+        data = self.trajectories
+        lag_s = unknowns.physics[data.fan[part], LAG]
+        if not np.any(lag_s):
+            return self._by_lag_of_zero[:, part, np.newaxis]
+        step_s, before = data.step_s[:, part], data.command_before[part]
+        return effective_command_by_lag(data.command[:, part], step_s, lag_s, before)[..., np.newaxis]
+
+    def parameters_by_unknowns(self, unknowns: Unknowns) -> Array:
+        """(fans, 4, 4) derivatives of the physical parameters by the physics unknowns."""
+        return parameters_by_unknowns(unknowns.physics, self.top_speed_rad_s)
+
     @cached_property
     def _by_lag_of_zero(self) -> Array:
         """(n, batch) effective_command_by_lag where there is no lag."""
         data = self.trajectories
         return effective_command_by_lag(data.command, data.step_s, np.zeros(len(data.fan)), data.command_before)
+
+    def trial(self, point: Point, squares: Array, gradient: Array, damping: Array) -> Point:
+        """See damped_least_squares."""
+        return self.evaluate(self.step(point, squares, gradient, damping), point.speed_rad_s)
 
     def step(self, point: Point, squares: Array, gradient: Array, damping: Array) -> Unknowns:
         """The damped Gauss-Newton step: initial speeds eliminated first, then each fan's physics, then the weights."""
@@ -264,9 +280,22 @@ class FreeRunProblem:
         physics_move = np.where(self.free, alone - share @ move, 0.0)
         whole = np.concatenate((np.broadcast_to(move, (self.fans, self.weights)), physics_move), axis=1)
         initial_move = gradient[:, -1] / by_initial - np.sum(coupling * whole[fan_of], axis=1)
-        new_physics = unknowns.physics + physics_move
-        new_physics[:, LAG] = np.maximum(new_physics[:, LAG], 0.0)
-        return Unknowns(unknowns.weights + move, new_physics, unknowns.initial_speed_rad_s + initial_move)
+        return Unknowns(
+            unknowns.weights + move,
+            self.within_bounds(unknowns.physics + physics_move),
+            unknowns.initial_speed_rad_s + initial_move,
+        )
+
+    def within_bounds(self, physics: Array) -> Array:
+        """The nearest physics unknowns that are possible: no lag is negative."""
+        physics[:, LAG] = np.maximum(physics[:, LAG], 0.0)
+        return physics
+
+    def at_bounds(self, physics: Array, downhill: Array) -> Flags:
+        """(fans, 4) which physics unknowns would leave their bounds: a lag of zero that would decrease further."""
+        held = np.zeros(physics.shape, np.bool_)
+        held[:, LAG] = (physics[:, LAG] <= 0.0) & (downhill[:, LAG] <= 0.0)
+        return held
 
     def _network(self, weights: Array) -> TanhNetwork:
         network = self.model.network
@@ -277,14 +306,13 @@ class FreeRunProblem:
         self, unknowns: Unknowns, reduced: Array, downhill: Array, diagonal: Array, damping: Array
     ) -> Array:
         """(fans, 4, 4) the damped curvature of the physics unknowns; a very large one for those that are fixed."""
-        held = np.broadcast_to(~self.free, diagonal.shape).copy()
-        # A lag of zero that would decrease further stays at zero.
-        held[:, LAG] |= (unknowns.physics[:, LAG] <= 0.0) & (downhill[:, LAG] <= 0.0)
+        held = ~self.free | self.at_bounds(unknowns.physics, downhill)
         largest = diagonal.max(axis=1, keepdims=True) + 1.0
         # An unknown without any effect still needs a pivot: the floor keeps the system solvable and the step zero.
         ridge = damping[:, None] * diagonal + self.prior.physics + 1e-12 * largest + np.where(held, HELD * largest, 0.0)
         pivot = reduced.copy()
-        pivot[:, np.arange(len(PARAMETER_NAMES)), np.arange(len(PARAMETER_NAMES))] += ridge
+        every = np.arange(ridge.shape[1])
+        pivot[:, every, every] += ridge
         return pivot
 
     def merge(self, old: Point, new: Point, take_new: Flags) -> Point:
@@ -305,6 +333,12 @@ class FreeRunProblem:
             residual=np.where(column, new.residual, old.residual),
             cost=np.where(fan, new.cost, old.cost),
         )
+
+    def narrowed(self, point: Point, active: Flags) -> tuple["FreeRunProblem", Point, Callable[[Point], Point]] | None:
+        """See damped_least_squares."""
+        if not self.pays_for_some(active):
+            return None
+        return self.of_fans(active), self.point_of_some(point, active), lambda found: self._whole(point, found, active)
 
     def pays_for_some(self, fans: Flags) -> bool:
         """Whether it pays to go on with these fans (fans,) alone. Their results are the same, for without shared
@@ -338,7 +372,7 @@ class FreeRunProblem:
         )
         return Point(unknowns, point.speed_rad_s[:, columns], point.residual[:, columns], point.cost[fans])
 
-    def with_point_of_some(self, point: Point, found: Point, fans: Flags) -> Point:
+    def _whole(self, point: Point, found: Point, fans: Flags) -> Point:
         """The candidate with that of some fans in their places."""
         columns = fans[self.trajectories.fan]
         unknowns = replace(

@@ -9,11 +9,12 @@ squares); missing speeds do not count.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from fantwin.twin.fitting.free_run_problem import HUBER_DELTA
+from fantwin.twin.fitting.damped_least_squares import Flags, minimise, pseudo_huber, pseudo_huber_weight
 from fantwin.twin.fitting.reading_errors import NORMAL_90_PERCENT
 from fantwin.twin.models.narx import INPUTS, ORDER, UNITS, Narx, regressor_rows
 from fantwin.twin.models.network import Scaling
@@ -22,10 +23,18 @@ from fantwin.twin.models.recursion import dtbtrs
 from fantwin.twin.runs import Array, Run, starting_speed_rad_s
 
 TOLERANCE = 1e-3
-FIRST_DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e9
 
 IterationDone = Callable[[float], None]
 """Called after every iteration with the free-run rmse in rad/s over the samples that count."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Weights theta (1151,), the speeds in rad/s of their free run of each stretch, and its cost."""
+
+    theta: Array
+    speeds: Sequence[Array]
+    cost: float
 
 
 class OutputErrorFit:
@@ -34,12 +43,15 @@ class OutputErrorFit:
     prior_mean, prior_weight: (1151,) the mean of the prior of each weight, and its relative strength.
     """
 
+    groups = 1
+
     def __init__(self, stretches: Sequence[Run], scaling: Scaling, prior_mean: Array, prior_weight: Array) -> None:
         self.stretches = stretches
         self.scaling = scaling
         self.prior_mean = prior_mean
         self.prior_weight = prior_weight
         self.measured = [np.isfinite(stretch.speed_rad_s[:, 0]) for stretch in stretches]
+        self.precision, self.scale_rad_s = prior_weight, 1.0
 
     def minimise(
         self, theta: Array, prior_precision: float, max_iterations: int, iteration_done: IterationDone
@@ -48,33 +60,55 @@ class OutputErrorFit:
 
         prior_precision: inverse variance of a weight of prior_weight one, residuals having variance one.
         """
-        precision = prior_precision * self.prior_weight
+
+        def accepted(_iteration: int, point: Candidate) -> bool:
+            iteration_done(float(np.sqrt(np.mean(self._residual(point.speeds) ** 2))))
+            return False
+
+        self.precision = prior_precision * self.prior_weight
+        self.scale_rad_s = self._robust_scale(self._free_run(theta))
+        point, _, _ = minimise(self, self._candidate(theta), max_iterations, tolerance=TOLERANCE, accepted=accepted)
+        return point.theta
+
+    def total(self, point: Candidate) -> Array:
+        """See damped_least_squares."""
+        return np.array([point.cost])
+
+    def normal_equations(self, point: Candidate) -> tuple[Array, Array]:
+        """J^T W J (1151, 1151) and J^T W r (1151,) of the residuals in units of scale_rad_s, without the prior."""
+        size = len(point.theta)
+        squares, downhill = np.zeros((size, size)), np.zeros(size)
+        for stretch, speed, measured in zip(self.stretches, point.speeds, self.measured, strict=True):
+            by_theta = free_run_sensitivities(Narx(point.theta, self.scaling), speed, stretch.command[:, 0])
+            residual = (stretch.speed_rad_s[measured, 0] - speed[measured]) / self.scale_rad_s
+            root_weight = np.sqrt(pseudo_huber_weight(residual, 1.0))
+            by_theta = by_theta[:, measured] * (root_weight / self.scale_rad_s)
+            squares += by_theta @ by_theta.T
+            downhill += by_theta @ (root_weight * residual)
+        return squares, downhill
+
+    def trial(self, point: Candidate, squares: Array, gradient: Array, damping: Array) -> Candidate:
+        """See damped_least_squares. Without a step where sensitivities are not finite, or the matrix not definite."""
+        damped = squares + np.diag(damping[0] * np.diag(squares) + self.precision)
+        try:
+            factor = cho_factor(damped, lower=True)
+        except (np.linalg.LinAlgError, ValueError):
+            return point
+        downhill = gradient - self.precision * (point.theta - self.prior_mean)
+        return self._candidate(point.theta + cho_solve(factor, downhill, check_finite=False))
+
+    def merge(self, _old: Candidate, new: Candidate, _take_new: Flags) -> Candidate:
+        """See damped_least_squares."""
+        return new
+
+    def narrowed(self, _point: Candidate, _active: Flags) -> None:
+        """See damped_least_squares."""
+        return
+
+    def _candidate(self, theta: Array) -> Candidate:
         speeds = self._free_run(theta)
-        scale_rad_s = self._robust_scale(speeds)
-        cost, damping = self._cost(theta, speeds, scale_rad_s, precision), FIRST_DAMPING
-        for _ in range(max_iterations):
-            squares, downhill = self._normal_equations(theta, speeds, scale_rad_s)
-            downhill -= precision * (theta - self.prior_mean)
-            diagonal, previous = np.diag(squares).copy(), cost
-            while damping < LARGEST_DAMPING:
-                try:
-                    factor = cho_factor(squares + np.diag(damping * diagonal + precision), lower=True)
-                except (np.linalg.LinAlgError, ValueError):
-                    # Sensitivities are not finite, or the matrix is not definite: only a more damped step is possible.
-                    damping *= 4.0
-                    continue
-                trial = theta + cho_solve(factor, downhill, check_finite=False)
-                trial_speeds = self._free_run(trial)
-                trial_cost = self._cost(trial, trial_speeds, scale_rad_s, precision)
-                if trial_cost < cost:
-                    theta, speeds, cost = trial, trial_speeds, trial_cost
-                    damping = max(damping / 5.0, SMALLEST_DAMPING)
-                    break
-                damping *= 4.0
-            iteration_done(float(np.sqrt(np.mean(self._residual(speeds) ** 2))))
-            if previous - cost < TOLERANCE * previous:
-                break
-        return theta
+        loss = float(np.sum(pseudo_huber(self._residual(speeds), self.scale_rad_s)))
+        return Candidate(theta, speeds, loss + 0.5 * float(self.precision @ (theta - self.prior_mean) ** 2))
 
     def _free_run(self, theta: Array) -> list[Array]:
         """(n,) speeds in rad/s of each stretch."""
@@ -98,23 +132,6 @@ class OutputErrorFit:
         """Standard deviation of a normal residual with the same 90th percentile: a tenth may be outliers."""
         robust_std = float(np.quantile(np.abs(self._residual(speeds)), 0.9)) / NORMAL_90_PERCENT
         return max(robust_std, 1e-6 * self.scaling.speed_scale_rad_s)
-
-    def _cost(self, theta: Array, speeds: Sequence[Array], scale_rad_s: float, precision: Array) -> float:
-        relative = self._residual(speeds) / (HUBER_DELTA * scale_rad_s)
-        loss = HUBER_DELTA**2 * float(np.sum(np.sqrt(1.0 + relative**2) - 1.0))
-        return loss + 0.5 * float(precision @ (theta - self.prior_mean) ** 2)
-
-    def _normal_equations(self, theta: Array, speeds: Sequence[Array], scale_rad_s: float) -> tuple[Array, Array]:
-        """J^T W J (1151, 1151) and J^T W r (1151,) of the residuals in units of scale_rad_s."""
-        squares, downhill = np.zeros((len(theta), len(theta))), np.zeros(len(theta))
-        for stretch, speed, measured in zip(self.stretches, speeds, self.measured, strict=True):
-            by_theta = free_run_sensitivities(Narx(theta, self.scaling), speed, stretch.command[:, 0])
-            residual = (stretch.speed_rad_s[measured, 0] - speed[measured]) / scale_rad_s
-            root_weight = (1.0 + (residual / HUBER_DELTA) ** 2) ** -0.25
-            by_theta = by_theta[:, measured] * (root_weight / scale_rad_s)
-            squares += by_theta @ by_theta.T
-            downhill += by_theta @ (root_weight * residual)
-        return squares, downhill
 
 
 def free_run_sensitivities(model: Narx, speed_rad_s: Array, command: Array) -> Array:

@@ -192,18 +192,19 @@ def rk4_step_derivatives(
 
 
 def free_run_sensitivities(
-    rhs: Linearised, speed_rad_s: Array, command: Array, step_s: Array, command_by_lag: Array
+    rhs: Linearised, speed_rad_s: Array, command: Array, step_s: Array, command_by: Array
 ) -> Array:
-    """(n, batch, P + 2) derivatives of a free run by theta, by the lag and, last, by its own initial speed.
+    """(n, batch, P + K + 1) derivatives of a free run by theta, by K unknowns of its command and, last, by its own
+    initial speed.
 
-    speed_rad_s: (n, batch), the free run itself. command, step_s: (n, batch). command_by_lag: (n, batch), that of the
-    command by lag_s.
+    speed_rad_s: (n, batch), the free run itself. command, step_s: (n, batch). command_by: (n, batch, K), derivatives of
+    the command by its unknowns.
     """
     by_speed, by_command, by_theta = rk4_step_derivatives(rhs, speed_rad_s[:-1], command[:-1], step_s[:-1])
     steps, batch, parameters = by_theta.shape
-    forcing = np.empty((steps + 1, batch, parameters + 2))
+    forcing = np.empty((steps + 1, batch, parameters + command_by.shape[-1] + 1))
     forcing[0], forcing[1:, :, -1] = 0.0, 0.0
     forcing[0, :, -1] = 1.0
-    forcing[1:, :, :-2] = by_theta
-    forcing[1:, :, -2] = by_command * command_by_lag[:-1]
+    forcing[1:, :, :parameters] = by_theta
+    forcing[1:, :, parameters:-1] = by_command[..., np.newaxis] * command_by[:-1]
     return linear_recursion(by_speed, forcing)

@@ -104,7 +104,9 @@ def test_sensitivities_agree_with_finite_differences_over_irregular_steps() -> N
     point = np.array([*PARAMETERS[0, :3], 0.015, 30.0])
     acting, _ = effective_command(command, step_s, point[3:4], before)
     by_lag = effective_command_by_lag(command, step_s, point[3:4], before)
-    exact = free_run_sensitivities(right_hand_side(point[None, :4]), run(point), acting, step_s, by_lag)
+    exact = free_run_sensitivities(
+        right_hand_side(point[None, :4]), run(point), acting, step_s, by_lag[..., np.newaxis]
+    )
     for index, size in enumerate(point):
         move = np.zeros(len(point))
         move[index] = 1e-5 * size
