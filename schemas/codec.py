@@ -132,8 +132,10 @@ class _Layout:
     proto: type[ProtoMessage]
     record: _Record
     columns: tuple[_PackedColumn, ...]
+    parts: dict[str, bytes]
+    """the keys of the fields with nested messages that hold columns, by name"""
     by_number: dict[int, _PackedColumn]
-    """the columns by the numbers of their fields"""
+    """the columns that the message itself holds, by the numbers of their fields"""
     required: frozenset[str]
     """names of the columns that are not optional"""
     time: str | None
@@ -143,8 +145,12 @@ class _Layout:
 @cache
 def _layout(message_type: type[Message]) -> _Layout:
     proto = proto_type(message_type)
-    numbers = {f.name: f.number for f in proto.DESCRIPTOR.fields}
     declared = columns(message_type)
+    of_parts = {
+        column.part: proto.DESCRIPTOR.fields_by_name[column.part] for column in declared.values() if column.part
+    }
+    holders = {"": proto.DESCRIPTOR, **{name: field.message_type for name, field in of_parts.items()}}
+    numbers = {name: holders[column.part].fields_by_name[name].number for name, column in declared.items()}
     packed = tuple(
         _PackedColumn(
             name,
@@ -161,7 +167,8 @@ def _layout(message_type: type[Message]) -> _Layout:
         proto=proto,
         record=_record(message_type),
         columns=packed,
-        by_number={numbers[column.name]: column for column in packed},
+        parts={name: _varint(field.number << 3 | LENGTH_DELIMITED) for name, field in of_parts.items()},
+        by_number={numbers[column.name]: column for column in packed if not column.declared.part},
         required=frozenset(column.name for column in packed if column.nothing is None),
         time=time if time in declared else None,
     )
@@ -193,6 +200,7 @@ def encode(message: Message) -> bytes:
     proto = layout.proto()
     layout.record.write(message, proto)
     parts = [proto.SerializeToString()]
+    nested: dict[str, list[bytes]] = {name: [] for name in layout.parts}
     samples, fans = _sample_count(layout, message), getattr(message, "fans", -1)
     with np.errstate(over="ignore"):  # beyond the range of float32 is infinite
         arrays = [np.asarray(getattr(message, column.name), dtype=column.dtype) for column in layout.columns]
@@ -207,7 +215,11 @@ def encode(message: Message) -> bytes:
             _check_limits(layout, column, values)
         elif not data.isascii():  # the quickest way to see that no byte is above 127
             raise _out_of_limits(layout, column)
-        parts += (column.key, _varint(len(data)), data)
+        into = nested[column.declared.part] if column.declared.part else parts
+        into += (column.key, _varint(len(data)), data)
+    for name, of_part in nested.items():
+        if data := b"".join(of_part):
+            parts += (layout.parts[name], _varint(len(data)), data)
     return b"".join(parts)
 
 
@@ -228,7 +240,7 @@ def decode(message_type: type[AnyMessage], data: bytes) -> AnyMessage:
     fans = values.get("fans", -1)  # -1: a message without
     samples = len(getattr(proto, layout.time)) if layout.time else -1
     for column in layout.columns:
-        field = getattr(proto, column.name)
+        field = _field(proto, column)
         if column.nothing is not None and not field:
             values[column.name] = column.nothing
             continue
@@ -243,6 +255,11 @@ def decode(message_type: type[AnyMessage], data: bytes) -> AnyMessage:
     message = message_type(**values)
     _check_period(layout, message)
     return message
+
+
+def _field(proto: Any, column: _PackedColumn) -> Any:
+    part = column.declared.part
+    return getattr(getattr(proto, part) if part else proto, column.name)
 
 
 def decode_header(message_type: type[Message], data: bytes) -> Any:
@@ -270,15 +287,18 @@ def decode_columns(message_type: type[AnyMessage], data: bytes, names: Collectio
         CodecError: the bytes are not such a message.
     """
     layout = _layout(message_type)
+    own = {column.name for column in layout.by_number.values()}
     try:
-        proto, arrays = _views(layout, data, {*names, layout.time} - {None})
+        proto, arrays = _views(layout, data, {*names, layout.time} & own)
     except (_PackedOtherwiseError, WireError):
         return decode(message_type, data)
     values = layout.record.read(proto)
     fans, samples = values.get("fans", -1), len(arrays[layout.time]) if layout.time else -1
     for column in layout.columns:
         array = arrays.get(column.name)
-        if array is None:
+        if column.declared.part and column.name in names:
+            array = _array(layout, column, _field(proto, column))
+        if array is None or (column.declared.part and not array.size):
             continue
         if column.declared.shape == "samples x fans" and array.size == samples * fans:
             array = array.reshape(samples, fans)

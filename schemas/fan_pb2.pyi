@@ -206,8 +206,18 @@ class InputPosition(_message.Message):
     from_timer: bool
     def __init__(self, topic: _Optional[str] = ..., producer: _Optional[str] = ..., sequence: _Optional[int] = ..., consumed_count: _Optional[int] = ..., contiguous_from: _Optional[int] = ..., from_timer: _Optional[bool] = ...) -> None: ...
 
+class Measured(_message.Message):
+    __slots__ = ("supply_voltage_v", "current_a", "temperature_c")
+    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
+    current_a: _containers.RepeatedScalarFieldContainer[float]
+    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
+
 class Raw(_message.Message):
-    __slots__ = ("header", "fans", "host_receive_t_ns", "device_clock_us", "device_sequence", "command", "speed_rad_s", "supply_voltage_v", "current_a", "temperature_c", "tachos")
+    __slots__ = ("header", "fans", "host_receive_t_ns", "device_clock_us", "device_sequence", "command", "speed_rad_s", "measured", "tachos")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     HOST_RECEIVE_T_NS_FIELD_NUMBER: _ClassVar[int]
@@ -215,9 +225,7 @@ class Raw(_message.Message):
     DEVICE_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     COMMAND_FIELD_NUMBER: _ClassVar[int]
     SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
-    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
-    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_FIELD_NUMBER: _ClassVar[int]
     TACHOS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
@@ -226,11 +234,9 @@ class Raw(_message.Message):
     device_sequence: _containers.RepeatedScalarFieldContainer[int]
     command: _containers.RepeatedScalarFieldContainer[float]
     speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
-    current_a: _containers.RepeatedScalarFieldContainer[float]
-    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    measured: Measured
     tachos: _containers.RepeatedCompositeFieldContainer[StatedTacho]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., host_receive_t_ns: _Optional[_Iterable[int]] = ..., device_clock_us: _Optional[_Iterable[int]] = ..., device_sequence: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ..., tachos: _Optional[_Iterable[_Union[StatedTacho, _Mapping]]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., host_receive_t_ns: _Optional[_Iterable[int]] = ..., device_clock_us: _Optional[_Iterable[int]] = ..., device_sequence: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., measured: _Optional[_Union[Measured, _Mapping]] = ..., tachos: _Optional[_Iterable[_Union[StatedTacho, _Mapping]]] = ...) -> None: ...
 
 class StatedTacho(_message.Message):
     __slots__ = ("kind", "pulses", "window_s", "update_s", "delay_s", "step_rad_s")
@@ -249,7 +255,7 @@ class StatedTacho(_message.Message):
     def __init__(self, kind: _Optional[_Union[TachoKind, str]] = ..., pulses: _Optional[int] = ..., window_s: _Optional[float] = ..., update_s: _Optional[float] = ..., delay_s: _Optional[float] = ..., step_rad_s: _Optional[float] = ...) -> None: ...
 
 class PushedSamples(_message.Message):
-    __slots__ = ("header", "fans", "t_ns", "first_number", "newest_t_ns", "command", "speed_rad_s", "supply_voltage_v", "current_a", "temperature_c")
+    __slots__ = ("header", "fans", "t_ns", "first_number", "newest_t_ns", "command", "speed_rad_s", "measured")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     T_NS_FIELD_NUMBER: _ClassVar[int]
@@ -257,9 +263,7 @@ class PushedSamples(_message.Message):
     NEWEST_T_NS_FIELD_NUMBER: _ClassVar[int]
     COMMAND_FIELD_NUMBER: _ClassVar[int]
     SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
-    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
-    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     t_ns: _containers.RepeatedScalarFieldContainer[int]
@@ -267,13 +271,11 @@ class PushedSamples(_message.Message):
     newest_t_ns: int
     command: _containers.RepeatedScalarFieldContainer[float]
     speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
-    current_a: _containers.RepeatedScalarFieldContainer[float]
-    temperature_c: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., first_number: _Optional[int] = ..., newest_t_ns: _Optional[int] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
+    measured: Measured
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., first_number: _Optional[int] = ..., newest_t_ns: _Optional[int] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., measured: _Optional[_Union[Measured, _Mapping]] = ...) -> None: ...
 
 class Grid(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing", "supply_voltage_v", "current_a", "temperature_c", "reading_repeated")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing", "measured", "reading_repeated")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -283,9 +285,7 @@ class Grid(_message.Message):
     VALID_FIELD_NUMBER: _ClassVar[int]
     INVALID_REASON_FIELD_NUMBER: _ClassVar[int]
     READING_MISSING_FIELD_NUMBER: _ClassVar[int]
-    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
-    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
-    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_FIELD_NUMBER: _ClassVar[int]
     READING_REPEATED_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
@@ -296,14 +296,12 @@ class Grid(_message.Message):
     valid: _containers.RepeatedScalarFieldContainer[bool]
     invalid_reason: _containers.RepeatedScalarFieldContainer[InvalidReason]
     reading_missing: _containers.RepeatedScalarFieldContainer[bool]
-    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
-    current_a: _containers.RepeatedScalarFieldContainer[float]
-    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    measured: Measured
     reading_repeated: _containers.RepeatedScalarFieldContainer[bool]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ..., reading_repeated: _Optional[_Iterable[bool]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., measured: _Optional[_Union[Measured, _Mapping]] = ..., reading_repeated: _Optional[_Iterable[bool]] = ...) -> None: ...
 
 class Prediction(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command", "reading_range_rad_s", "averaged_command", "reading_missing", "air_density_ratio", "supply_voltage_v", "current_a", "temperature_c", "reading_repeated")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command", "reading_range_rad_s", "averaged_command", "reading_missing", "air_density_ratio", "measured", "reading_repeated")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -321,9 +319,7 @@ class Prediction(_message.Message):
     AVERAGED_COMMAND_FIELD_NUMBER: _ClassVar[int]
     READING_MISSING_FIELD_NUMBER: _ClassVar[int]
     AIR_DENSITY_RATIO_FIELD_NUMBER: _ClassVar[int]
-    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
-    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
-    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_FIELD_NUMBER: _ClassVar[int]
     READING_REPEATED_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
@@ -342,14 +338,12 @@ class Prediction(_message.Message):
     averaged_command: _containers.RepeatedScalarFieldContainer[float]
     reading_missing: _containers.RepeatedScalarFieldContainer[bool]
     air_density_ratio: _containers.RepeatedScalarFieldContainer[float]
-    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
-    current_a: _containers.RepeatedScalarFieldContainer[float]
-    temperature_c: _containers.RepeatedScalarFieldContainer[float]
+    measured: Measured
     reading_repeated: _containers.RepeatedScalarFieldContainer[bool]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., air_density_ratio: _Optional[_Iterable[float]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ..., reading_repeated: _Optional[_Iterable[bool]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ..., air_density_ratio: _Optional[_Iterable[float]] = ..., measured: _Optional[_Union[Measured, _Mapping]] = ..., reading_repeated: _Optional[_Iterable[bool]] = ...) -> None: ...
 
 class Score(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "state", "valid", "invalid_reason", "torque_balance_command", "expected_residual_rad_s", "expected_balance_command", "score", "statistic", "supply_voltage_v", "current_a", "temperature_c")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "state", "valid", "invalid_reason", "torque_balance_command", "expected_residual_rad_s", "expected_balance_command", "score", "statistic", "measured")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -366,9 +360,7 @@ class Score(_message.Message):
     EXPECTED_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
     SCORE_FIELD_NUMBER: _ClassVar[int]
     STATISTIC_FIELD_NUMBER: _ClassVar[int]
-    SUPPLY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
-    CURRENT_A_FIELD_NUMBER: _ClassVar[int]
-    TEMPERATURE_C_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     period_ns: int
@@ -385,10 +377,8 @@ class Score(_message.Message):
     expected_balance_command: _containers.RepeatedScalarFieldContainer[float]
     score: _containers.RepeatedScalarFieldContainer[float]
     statistic: _containers.RepeatedScalarFieldContainer[Statistic]
-    supply_voltage_v: _containers.RepeatedScalarFieldContainer[float]
-    current_a: _containers.RepeatedScalarFieldContainer[float]
-    temperature_c: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., expected_residual_rad_s: _Optional[_Iterable[float]] = ..., expected_balance_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., supply_voltage_v: _Optional[_Iterable[float]] = ..., current_a: _Optional[_Iterable[float]] = ..., temperature_c: _Optional[_Iterable[float]] = ...) -> None: ...
+    measured: Measured
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., expected_residual_rad_s: _Optional[_Iterable[float]] = ..., expected_balance_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., measured: _Optional[_Union[Measured, _Mapping]] = ...) -> None: ...
 
 class Diagnosis(_message.Message):
     __slots__ = ("cause", "probability", "parameter", "change", "unit", "evidence")

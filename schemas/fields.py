@@ -65,6 +65,7 @@ class Column:
         enum: what the values mean; None for quantities.
         optional: whether the array may be empty although the message has samples, because a recording lacks it.
         limits: the smallest and the largest value accepted; None for any.
+        part: the field of the protobuf message whose nested message has it; empty: the message itself has it.
     """
 
     shape: Shape
@@ -72,6 +73,7 @@ class Column:
     enum: type[OpenEnum] | None = None
     optional: bool = False
     limits: tuple[int, int] | None = None
+    part: str = ""
 
     @property
     def by_fan(self) -> bool:
@@ -126,8 +128,9 @@ def derived_columns(message_type: type) -> dict[str, Column]:
 
 @cache
 def columns(message_type: type) -> dict[str, Column]:
-    """The columns of a message type by name, in its order."""
-    return {f.name: f.metadata["column"] for f in fields(message_type) if "column" in f.metadata}
+    """The columns of a message type by name, in its order; those of a nested message come last."""
+    declared = {f.name: f.metadata["column"] for f in fields(message_type) if "column" in f.metadata}
+    return dict(sorted(declared.items(), key=lambda item: bool(item[1].part)))
 
 
 @cache

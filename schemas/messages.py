@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fantwin.schemas.channels import Measured
 from fantwin.schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Statistic, TachoKind, Transition
 from fantwin.schemas.fields import Array, column, derived, time_column
 from fantwin.schemas.formats import SNAPSHOT
@@ -50,7 +51,7 @@ class StatedTacho:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Raw:
+class Raw(Measured):
     """Samples as the device sent them. A column that the device does not have is empty.
 
     tachos: what the speeds are, one for all fans or one for each; empty where the source does not state it.
@@ -63,14 +64,11 @@ class Raw:
     device_sequence: Array = column("samples", np.uint32, optional=True)
     command: Array = column("samples x fans", np.float64)
     speed_rad_s: Array = column("samples x fans", np.float64)
-    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
-    current_a: Array = column("samples x fans", np.float32, optional=True)
-    temperature_c: Array = column("samples x fans", np.float32, optional=True)
     tachos: tuple[StatedTacho, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PushedSamples:
+class PushedSamples(Measured):
     """Samples of one tray that a client pushes, not yet checked.
 
     Attributes:
@@ -87,13 +85,10 @@ class PushedSamples:
     newest_t_ns: int = 0
     command: Array = column("samples x fans", np.float64)
     speed_rad_s: Array = column("samples x fans", np.float64)
-    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
-    current_a: Array = column("samples x fans", np.float32, optional=True)
-    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Grid:
+class Grid(Measured):
     """Samples on a uniform time grid: command held, speed interpolated."""
 
     header: Header = Header()
@@ -106,15 +101,12 @@ class Grid:
     invalid_reason: Array = column("samples x fans", InvalidReason)
     reading_missing: Array = column("samples x fans", np.bool_, optional=True)
     """whether the newest raw sample at that time has no reading, though the speed may be known from those around it"""
-    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
-    current_a: Array = column("samples x fans", np.float32, optional=True)
-    temperature_c: Array = column("samples x fans", np.float32, optional=True)
     reading_repeated: Array = column("samples x fans", np.bool_, optional=True)
     """whether a tacho that holds its reading shows that of the grid sample before, as no raw sample has come since"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Prediction:
+class Prediction(Measured):
     """The free run of the healthy twin beside the measurement."""
 
     header: Header = Header()
@@ -136,15 +128,12 @@ class Prediction:
     """as in Grid"""
     air_density_ratio: Array = column("samples x fans", np.float64, optional=True)
     """of a twin that needs the temperature: relative to its reference. Its balance is that of speeds times this"""
-    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
-    current_a: Array = column("samples x fans", np.float32, optional=True)
-    temperature_c: Array = column("samples x fans", np.float32, optional=True)
     reading_repeated: Array = column("samples x fans", np.bool_, optional=True)
     """as in Grid"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Score:
+class Score(Measured):
     """Scored samples, with everything a viewer needs to draw them.
 
     No alarm is decided by these numbers, so they travel with seven digits.
@@ -167,9 +156,6 @@ class Score:
     expected_balance_command: Array = column("samples x fans", np.float32)
     score: Array = column("samples x fans", np.float32)
     statistic: Array = column("samples x fans", Statistic)
-    supply_voltage_v: Array = column("samples x fans", np.float32, optional=True)
-    current_a: Array = column("samples x fans", np.float32, optional=True)
-    temperature_c: Array = column("samples x fans", np.float32, optional=True)
 
     @derived(np.float32)
     def residual_rad_s(self) -> Array:

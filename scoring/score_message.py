@@ -7,7 +7,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from fantwin.schemas.auxiliary import auxiliary_columns
+from fantwin.schemas.channels import measured_columns
 from fantwin.schemas.enums import FanState, InvalidReason, Statistic
 from fantwin.schemas.messages import Array, Prediction, Score
 from fantwin.scoring.samples import BALANCE_COUNTS, among
@@ -86,7 +86,7 @@ def score_of(item: Prediction, of: ScoreColumns, unseen_rad_s: Array | float = 0
         expected_balance_command=of.expected_balance_command,
         score=np.where(valid, of.score, np.nan),
         statistic=of.statistic,
-        **auxiliary_columns(item),
+        **measured_columns(item),
     )
 
 
@@ -110,5 +110,5 @@ def unscored(item: Prediction) -> Score:
         expected_balance_command=unknown,
         score=unknown,
         statistic=np.zeros(unknown.shape, np.uint8),
-        **auxiliary_columns(item),
+        **measured_columns(item),
     )

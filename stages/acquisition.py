@@ -40,7 +40,7 @@ from fantwin.pipeline.sources.source import (
     SourceContext,
 )
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK, HostClock
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.health import AcceptedSamples
 from fantwin.schemas.messages import Command, PushedSamples, Raw, StatedTacho
 from fantwin.schemas.tacho import Tacho
@@ -162,7 +162,7 @@ class AcquisitionCore(Core):
 
     def notes(self) -> list[str]:
         """Notes on what the source measures beside command and speed, and on refused or lost input and commands."""
-        also = ", ".join(column.title for column in AUXILIARY if column in self._plausibility.auxiliary)
+        also = ", ".join(column.title for column in CHANNELS if column in self._plausibility.measured)
         found = [f"the source also measures {also}"] if also else []
         found += [
             f"refused input: {kind} {self._counts[kind]}, the first of them: {detail}"

@@ -24,6 +24,7 @@ from fantwin.client.times import Time, times_ns
 from fantwin.pipeline.acquisition.tray_acquisition import TrayAcquisition
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.sources.source import limits_of_float32
+from fantwin.schemas.channels import BY_NAME as CHANNELS_BY_NAME
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import AcceptedSamples, Health
@@ -91,10 +92,7 @@ class Tray:
         t: Time | Sequence[Time] | NDArray[Any],
         command: Values,
         speed: Values,
-        *,
-        supply_voltage_v: Values | None = None,
-        current_a: Values | None = None,
-        temperature_c: Values | None = None,
+        **measured: Values,
     ) -> None:
         """Publish one sample of all fans, or several.
 
@@ -102,7 +100,8 @@ class Tray:
         one sample or of n. It need not be the clock of the site (docs/explanation/time.md), but it must go on.
         command, speed: one value for each fan, in the tray's command unit and in `speed_unit`; of n samples (n, fans).
         The command is the one applied from `t` on. A speed of NaN was not measured.
-        supply_voltage_v, current_a, temperature_c: likewise, where they are measured; one number is for all fans.
+        measured: likewise, what else is measured, by the name of its channel (docs/reference/messages.md), such as
+        supply_voltage_v; one number is for all fans.
 
         It returns at once. While acquisition works but is behind, it waits for room, at most 5 s.
 
@@ -114,13 +113,13 @@ class Tray:
         times = times_ns(t)
         commands, speeds = self._by_fan(command, len(times), "command"), self._by_fan(speed, len(times), "speed")
         self._check_commands(commands)
-        given = {"supply_voltage_v": supply_voltage_v, "current_a": current_a, "temperature_c": temperature_c}
+        if unknown := measured.keys() - CHANNELS_BY_NAME:
+            raise TypeError(f"no channel {min(unknown)}; known: {', '.join(CHANNELS_BY_NAME)}")
         others = {
             name: np.full((len(times), self.fans), values, np.float32)
             if np.ndim(values) == 0
             else self._by_fan(values, len(times), name).astype(np.float32)
-            for name, values in given.items()
-            if values is not None
+            for name, values in measured.items()
         }
         with self._changed:
             self._check_thread()

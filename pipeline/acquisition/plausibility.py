@@ -9,7 +9,7 @@ from dataclasses import replace
 from fantwin.pipeline.acquisition.device_sequence import DeviceSequence
 from fantwin.pipeline.acquisition.input_quality import InputQuality
 from fantwin.pipeline.sources.source import Reading, ReadingLimits, Rejected
-from fantwin.schemas.auxiliary import AUXILIARY, AuxiliaryColumn
+from fantwin.schemas.channels import BY_NAME, Channel
 
 LONGEST_DETAIL = 120
 """characters of the fault of a refused input, which may quote it; each health contains it"""
@@ -32,8 +32,8 @@ class Plausibility:
         self._counts = counts
         self._quality = quality
         self._sequence = sequence
-        self.auxiliary: list[AuxiliaryColumn] = []
-        """the columns beside command and speed that the source has given"""
+        self.measured: list[Channel] = []
+        """the channels that the source has given"""
         self.first_refused: dict[str, str] = {}
         """fault of the first refused input, by kind"""
 
@@ -90,25 +90,24 @@ class Plausibility:
 
         A source that gives a column in some samples only, such as a temperature once a second, has it in all.
         """
-        if not (self.auxiliary or reading.supply_voltage_v or reading.current_a or reading.temperature_c):
+        if not (self.measured or reading.measured):
             return reading
         unknown = (math.nan,) * self.limits.fans
-        changed: dict[str, tuple[float, ...]] = {}
-        for column in AUXILIARY:
-            values: tuple[float, ...] = getattr(reading, column.name)
+        measured = dict.fromkeys((each.name for each in self.measured), unknown)
+        for name, values in reading.measured.items():
             if not values:
-                if column in self.auxiliary:
-                    changed[column.name] = unknown
                 continue
-            if column not in self.auxiliary:
-                self.auxiliary.append(column)
-            absurd = sum(not (column.is_plausible(value) or math.isnan(value)) for value in values)
-            if len(values) != self.limits.fans:
-                absurd, values = len(values), unknown
+            each = BY_NAME[name]
+            if each not in self.measured:
+                self.measured.append(each)
+            if len(values) == self.limits.fans:
+                measured[name] = tuple(value if each.is_plausible(value) else math.nan for value in values)
+                absurd = sum(not (each.is_plausible(value) or math.isnan(value)) for value in values)
+            else:
+                measured[name], absurd = unknown, len(values)
             if absurd:
-                self._counts[f"absurd_{column.name.rpartition('_')[0]}"] += absurd
-                changed[column.name] = tuple(value if column.is_plausible(value) else math.nan for value in values)
-        return replace(reading, **changed) if changed else reading
+                self._counts[f"absurd_{each.key}"] += absurd
+        return replace(reading, measured=measured)
 
 
 def _shortened(detail: str) -> str:

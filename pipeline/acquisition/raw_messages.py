@@ -11,7 +11,7 @@ import numpy as np
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.sources.source import Reading
 from fantwin.pipeline.timebase.device_clock import UINT32
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array, Raw, StatedTacho
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
@@ -30,17 +30,15 @@ class ReceivedReading:
         return (
             reading.clock_us is not None,
             reading.sequence is not None,
-            bool(reading.supply_voltage_v),
-            bool(reading.current_a),
-            bool(reading.temperature_c),
+            *(each.name in reading.measured for each in CHANNELS),
         )
 
 
 def raw_message(block: Sequence[ReceivedReading], tray: TrayConfig, tachos: tuple[StatedTacho, ...] = ()) -> Raw:
     """Make one message of samples that agree in their columns. tachos: what their source states to measure."""
     readings = [received.reading for received in block]
-    auxiliary: dict[str, Any] = {
-        column.name: _float32([getattr(r, column.name) for r in readings]) for column in AUXILIARY
+    measured: dict[str, Any] = {
+        name: np.array([reading.measured[name] for reading in readings], np.float32) for name in readings[0].measured
     }
     return Raw(
         fans=tray.fans,
@@ -50,15 +48,10 @@ def raw_message(block: Sequence[ReceivedReading], tray: TrayConfig, tachos: tupl
         command=np.array([r.command for r in readings], np.float64),
         speed_rad_s=np.array([r.speed for r in readings], np.float64) * RAD_S_PER_UNIT[tray.speed_unit],
         tachos=tachos,
-        **auxiliary,
+        **measured,
     )
 
 
 def _uint32(values: Iterable[int | None]) -> Array:
     """A column of numbers that wrap at 2^32; empty if the samples have none."""
     return np.array([value % UINT32 for value in values if value is not None], np.uint32)
-
-
-def _float32(rows: list[tuple[float, ...]]) -> Array:
-    """A column, (samples, fans); empty if the samples have none."""
-    return np.array(rows if rows[0] else (), np.float32)

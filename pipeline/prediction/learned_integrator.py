@@ -16,8 +16,8 @@ import numpy as np
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.prediction.twin_file import TwinFile, learned_twin
 from fantwin.pipeline.runtime.stage import Core, StageError
-from fantwin.schemas.auxiliary import auxiliary_columns
 from fantwin.schemas.blocks import cut, select
+from fantwin.schemas.channels import measured_columns
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Grid, Message, NewTwin, Prediction
 
@@ -134,5 +134,5 @@ def _without_twin(grid: Grid) -> Prediction:
         torque_balance_sigma_command=sigma,
         reading_missing=grid.reading_missing,
         reading_repeated=grid.reading_repeated,
-        **auxiliary_columns(grid),
+        **measured_columns(grid),
     )

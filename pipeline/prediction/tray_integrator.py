@@ -16,7 +16,7 @@ from fantwin.pipeline.prediction.free_run import FreeRun, FreeRunInputs
 from fantwin.pipeline.prediction.starting_fans import StartingFans
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import StageConfig
-from fantwin.schemas.auxiliary import auxiliary_columns
+from fantwin.schemas.channels import measured_columns
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Grid, Prediction
 from fantwin.schemas.side_by_side import present_columns
@@ -363,7 +363,7 @@ class TrayIntegrator:
             reading_missing=grid.reading_missing,
             reading_repeated=grid.reading_repeated,
             air_density_ratio=ratios.density if ratios is not None and self._needs_temperature else nothing,
-            **auxiliary_columns(grid),
+            **measured_columns(grid),
         )
 
 

@@ -18,7 +18,7 @@ from fantwin.pipeline.recordings.left_out import left_out_hint
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from fantwin.pipeline.sources.tables.measured_table import hold_last
 from fantwin.pipeline.timebase.device_clock import DeviceClock
-from fantwin.schemas.auxiliary import AUXILIARY, auxiliary_columns
+from fantwin.schemas.channels import CHANNELS, measured_columns
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
 from fantwin.schemas.units import NS_PER_S
@@ -40,7 +40,7 @@ class RecordedRun:
     speed_rad_s: Array
     """(n, fans), NaN where the tacho gave no reading"""
     auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
-    """(n, fans) each, NaN where not known: what the source measures beside, by name (schemas.auxiliary)"""
+    """(n, fans) each, NaN where not known: what the source measures beside, by name (schemas.channels)"""
 
 
 @dataclass(frozen=True)
@@ -109,13 +109,13 @@ def merged(messages: Sequence[Raw]) -> list[Raw]:
     """The same samples in as few messages as possible; the many arrays of small ones take more memory than samples."""
     groups = groupby(
         messages,
-        key=lambda raw: (raw.fans, len(raw.device_clock_us) > 0, raw.tachos, [*auxiliary_columns(raw)]),
+        key=lambda raw: (raw.fans, len(raw.device_clock_us) > 0, raw.tachos, [*measured_columns(raw)]),
     )
     return [_one(list(group)) for _, group in groups]
 
 
 def _one(messages: Sequence[Raw]) -> Raw:
-    names = ("host_receive_t_ns", "device_clock_us", "command", "speed_rad_s", *auxiliary_columns(messages[0]))
+    names = ("host_receive_t_ns", "device_clock_us", "command", "speed_rad_s", *measured_columns(messages[0]))
     columns = {name: np.concatenate([getattr(raw, name) for raw in messages]) for name in names}
     return Raw(header=messages[0].header, fans=messages[0].fans, tachos=messages[0].tachos, **columns)
 
@@ -183,7 +183,7 @@ def segments_of(path: Path, messages: Sequence[Raw]) -> list[Columns]:
 
 def _auxiliary(messages: Sequence[Raw]) -> dict[str, Array]:
     """The columns that any of the messages has, NaN in those that do not have it."""
-    present = {name for message in messages for name in auxiliary_columns(message)}
+    present = {name for message in messages for name in measured_columns(message)}
     return {
         column.name: np.concatenate(
             [
@@ -191,7 +191,7 @@ def _auxiliary(messages: Sequence[Raw]) -> dict[str, Array]:
                 for message in messages
             ]
         )
-        for column in AUXILIARY
+        for column in CHANNELS
         if column.name in present
     }
 

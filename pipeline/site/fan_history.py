@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fantwin.pipeline.config.models import TrayConfig
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array, Score
 from fantwin.schemas.units import NS_PER_S
 
@@ -23,7 +24,7 @@ CURVES = (
     "score",
     "command",
 )
-"""of a fan, in the order of the last axis; NaN where nothing was measured or judged"""
+"""of a fan, in the order of the last axis, before its channels; NaN where nothing was measured or judged"""
 COLUMNS = (
     "command",
     "measured_speed_rad_s",
@@ -34,21 +35,29 @@ COLUMNS = (
     "state",
     "valid",
     "invalid_reason",
+    *(each.name for each in CHANNELS),
 )
 """of a score, from which the curves and the state of a fan are made"""
 
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """A stretch of one fan: t_ns (n,) int64 and values (n, len(CURVES)) float32."""
+    """A stretch of one fan: t_ns (n,) int64 and values (n, len(CURVES) + len(channels)) float32."""
 
     t_ns: Array
     values: Array
+    channels: tuple[str, ...] = ()
 
 
 def curves_of(score: Score, fan: int, rows: slice = slice(None)) -> Curves:
     """Those of a score with `COLUMNS`."""
-    return Curves(score.t_ns[rows], values_of(score, rows)[:, fan])
+    channels = channels_of(score)
+    return Curves(score.t_ns[rows], values_of(score, channels, rows)[:, fan], channels)
+
+
+def channels_of(score: Score) -> tuple[str, ...]:
+    """The channels that a score has."""
+    return tuple(each.name for each in CHANNELS if len(getattr(score, each.name)))
 
 
 class FanHistory:
@@ -61,7 +70,9 @@ class FanHistory:
     def add(self, score: Score) -> None:
         """Keep the last sample of a score with `COLUMNS`, if the one before is a step older. Time that goes back, as in
         a replay that begins again, empties the ring."""
-        self._rings[score.header.tray].add(int(score.t_ns[-1]), values_of(score, slice(-1, None))[0])
+        ring = self._rings[score.header.tray]
+        ring.have(channels_of(score))
+        ring.add(int(score.t_ns[-1]), values_of(score, ring.channels, slice(-1, None))[0])
 
     def of(self, tray: str, fan: int, since_t_ns: int) -> Curves:
         """What is kept of a fan, oldest first."""
@@ -76,6 +87,14 @@ class _Ring:
         self._values = np.full((self._points, fans, len(CURVES)), np.nan, np.float32)
         self._count = 0
         """all that were added"""
+        self.channels: tuple[str, ...] = ()
+
+    def have(self, channels: tuple[str, ...]) -> None:
+        """Room for channels that are measured for the first time."""
+        new = tuple(name for name in channels if name not in self.channels)
+        if new:
+            room = np.full((*self._values.shape[:2], len(new)), np.nan, np.float32)
+            self._values, self.channels = np.concatenate((self._values, room), axis=-1), (*self.channels, *new)
 
     def add(self, t_ns: int, values: Array) -> None:
         newest_t_ns = int(self._t_ns[(self._count - 1) % self._points]) if self._count else None
@@ -88,12 +107,13 @@ class _Ring:
     def of(self, fan: int, since_t_ns: int) -> Curves:
         order = np.arange(max(0, self._count - self._points), self._count) % self._points
         order = order[self._t_ns[order] >= since_t_ns]
-        return Curves(self._t_ns[order], self._values[order, fan])
+        return Curves(self._t_ns[order], self._values[order, fan], self.channels)
 
 
-def values_of(score: Score, rows: slice = slice(None)) -> Array:
-    """The curves of all fans in a score with `COLUMNS`, (n, fans, len(CURVES)) float32."""
+def values_of(score: Score, channels: Sequence[str], rows: slice = slice(None)) -> Array:
+    """The curves of all fans in a score with `COLUMNS`, (n, fans, len(CURVES) + len(channels)) float32."""
     valid = score.valid[rows]
+    unknown = np.full(valid.shape, np.nan)
 
     def judged(values: Array) -> Array:
         return np.where(valid, values[rows], np.nan)
@@ -102,8 +122,9 @@ def values_of(score: Score, rows: slice = slice(None)) -> Array:
         score.measured_speed_rad_s[rows],
         judged(score.predicted_speed_rad_s),
         judged(np.sqrt(score.band_variance)),
-        judged(score.torque_balance_command) if len(score.torque_balance_command) else np.full(valid.shape, np.nan),
-        judged(score.score) if len(score.score) else np.full(valid.shape, np.nan),
+        judged(score.torque_balance_command) if len(score.torque_balance_command) else unknown,
+        judged(score.score) if len(score.score) else unknown,
         score.command[rows],
+        *(values[rows] if len(values := getattr(score, name)) else unknown for name in channels),
     )
     return np.stack(columns, axis=-1).astype(np.float32)

@@ -16,6 +16,7 @@ from fantwin.pipeline.site.fan_history import Curves
 from fantwin.pipeline.site.fleet import Fan, FanNow
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.site_state import StageState
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.enums import Feedback
 from fantwin.schemas.messages import Alarm, Array, ModelCard
 from fantwin.schemas.twin_card import CardError, TwinCard
@@ -57,6 +58,7 @@ def site_json(model: SiteModel, viewer_urls: Mapping[str, str]) -> dict[str, Any
         "classes": [each.name for each in SHOWN_CLASSES],
         "groups": [str(each.group) for each in SHOWN_CLASSES],
         "now": [each.now for each in SHOWN_CLASSES],
+        "channels": [{"name": each.name, "title": each.title, "unit": each.unit} for each in CHANNELS],
         "level_at_limit": 100,
     }
 
@@ -128,7 +130,7 @@ def curves_json(curves: Curves, tray: TrayConfig) -> dict[str, Any]:
     values = curves.values.astype(np.float64)
     values[:, :_SPEEDS] /= RAD_S_PER_UNIT[tray.speed_unit]
     names = ("measured", "predicted", "half_width", "torque_balance_command", "score", "command")
-    columns = {name: _or_null(values[:, number]) for number, name in enumerate(names)}
+    columns = {name: _or_null(values[:, number]) for number, name in enumerate((*names, *curves.channels))}
     return {"speed_unit": tray.speed_unit, "t_s": (curves.t_ns / 1e9).round(3).tolist(), **columns}
 
 

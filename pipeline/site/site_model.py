@@ -19,7 +19,7 @@ from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.site.alarm_rates import AlarmRates
 from fantwin.pipeline.site.alarm_store import AlarmStore
 from fantwin.pipeline.site.fan_groups import SHOWN_CLASSES, FanGroup, classes_of, counts_of
-from fantwin.pipeline.site.fan_history import COLUMNS, Curves, FanHistory, values_of
+from fantwin.pipeline.site.fan_history import COLUMNS, Curves, FanHistory, channels_of, values_of
 from fantwin.pipeline.site.fleet import Fan, FanNow, Fleet, last_sample
 from fantwin.pipeline.site.judged_time import LEARNED, JudgedTime
 from fantwin.pipeline.site.site_state import StageState, stage_states
@@ -50,7 +50,7 @@ class FleetNow:
 
 @dataclass(frozen=True, eq=False)
 class TrayNow:
-    """The newest sample of a tray: values (fans, len(CURVES)) and whether each fan is judged (fans,).
+    """The newest sample of a tray: values (fans, len(CURVES) + len(channels)), and whether each fan is judged (fans,).
 
     is_heard: False: it has sent none for long, and this is an old one.
     """
@@ -61,6 +61,7 @@ class TrayNow:
     is_judged: Array
     invalid_reason: Array
     is_heard: bool
+    channels: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -242,10 +243,11 @@ class SiteModel:
             TrayNow(
                 tray,
                 int(score.t_ns[-1]),
-                values_of(score)[-1],
+                values_of(score, channels_of(score))[-1],
                 score.valid[-1] | np.isin(score.invalid_reason[-1], JUDGED_AT_REST),
                 score.invalid_reason[-1],
                 is_heard,
+                channels_of(score),
             )
             for tray, score, is_heard in newest
         ]

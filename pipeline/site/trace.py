@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.enums import FanState, InvalidReason
 from fantwin.schemas.fields import LARGEST_ENUM_VALUE
 from fantwin.schemas.messages import Array, Score
@@ -35,7 +35,7 @@ TRACE_COLUMNS = (
     "score",
 )
 """the columns of a score that a trace is made of, its times apart"""
-MEASURED_COLUMNS = (*TRACE_COLUMNS, *(column.name for column in AUXILIARY))
+MEASURED_COLUMNS = (*TRACE_COLUMNS, *(column.name for column in CHANNELS))
 """the same with those that a source may measure beside command and speed"""
 
 
@@ -96,7 +96,7 @@ def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit, fans: Se
     def column(name: str) -> Array:
         return np.concatenate([getattr(score, name)[:, chosen] for score in scores])
 
-    present = [each.name for each in AUXILIARY if any(len(getattr(score, each.name)) for score in scores)]
+    present = [each.name for each in CHANNELS if any(len(getattr(score, each.name)) for score in scores)]
     valid = column("valid")
     state = column("state")
     return Trace(

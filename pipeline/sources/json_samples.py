@@ -12,7 +12,7 @@ from typing import Any
 from fantwin.pipeline.sources.source import Reading, ReadingBatch, Rejected
 from fantwin.pipeline.timebase.device_clock import NS_PER_US, UINT32
 from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS
 from fantwin.schemas.units import NS_PER_S
 
@@ -20,7 +20,7 @@ LARGEST_BYTES = 1 << 20
 """size of one text"""
 MOST_SAMPLES = 4096
 """samples in one text"""
-_OTHERS = tuple(column.name for column in AUXILIARY)
+_OTHERS = tuple(column.name for column in CHANNELS)
 _OF_FAN = ("command", "speed", *_OTHERS)
 _OF_SAMPLE = ("t", "sequence", "fans", *_OF_FAN)
 _UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -105,7 +105,10 @@ def _timed_reading(sample: Mapping[str, Any]) -> TimedReading:
             raise ValueError(f"{name!r} is missing")
     t_ns = _time_ns(sample["t"]) if sample.get("t") is not None else None
     clock_us = None if t_ns is None else (t_ns + NS_PER_US // 2) // NS_PER_US % UINT32
-    return TimedReading(Reading(**columns, clock_us=clock_us, sequence=_sequence(sample.get("sequence"))), t_ns)
+    reading = Reading(
+        columns.pop("command"), columns.pop("speed"), clock_us, _sequence(sample.get("sequence")), measured=columns
+    )
+    return TimedReading(reading, t_ns)
 
 
 def _by_column(sample: Mapping[str, Any]) -> dict[str, list[Any]]:

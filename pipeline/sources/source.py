@@ -16,6 +16,7 @@ from typing import ClassVar, Protocol, TypeAlias
 
 from pydantic import BaseModel
 
+from fantwin.schemas.channels import FanValues
 from fantwin.schemas.tacho import Tacho
 
 MOST_FANS = 1024
@@ -130,11 +131,8 @@ class Reading:
     """device clock at the time of measurement, modulo 2^32"""
     sequence: int | None = None
     """number of the sample, modulo 2^32"""
-    supply_voltage_v: tuple[float, ...] = ()
-    """this and the following: one value per fan, NaN where it is not known; empty if the source does not measure it"""
-    current_a: tuple[float, ...] = ()
-    temperature_c: tuple[float, ...] = ()
-    """temperature of the air"""
+    measured: FanValues = field(default_factory=dict[str, tuple[float, ...]])
+    """by channel that the source measures: one value per fan, NaN where it is not known"""
 
 
 @dataclass(frozen=True, slots=True)

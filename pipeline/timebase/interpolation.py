@@ -6,15 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array
 
 NEVER_NS = -(1 << 62)
+_IS_LINEAR = np.array([each.interpolation == "linear" for each in CHANNELS])[:, np.newaxis]
 
 
 class Samples(NamedTuple):
     """Raw samples by strictly rising time. t_ns: (n,). command, speed_rad_s: (n, fans).
 
-    auxiliary: (n, columns, fans), the columns of `AUXILIARY`, NaN where a value is not known; (n, 0, fans) if the
+    auxiliary: (n, columns, fans), the columns of `CHANNELS`, NaN where a value is not known; (n, 0, fans) if the
     source measures nothing beside command and speed.
     """
 
@@ -62,12 +64,12 @@ def interpolate_samples(t_ns: Array, at: Array, samples: Samples, is_held: Array
 def interpolate_auxiliary(t_ns: Array, at: Array, samples: Samples) -> Array:
     """(n, columns, fans) values at t_ns (n,): linear between two samples that have one, else that of the one before.
 
-    at: (n,), index of the last sample at or before each time.
+    A channel that is held has the latter everywhere. at: (n,), index of the last sample at or before each time.
     """
     here_t_ns, here = samples.t_ns.take(at), samples.auxiliary.take(at, axis=0)
     after = samples.auxiliary.take(at + 1, axis=0, mode="clip")
     span_ns = samples.t_ns.take(at + 1, mode="clip") - here_t_ns
-    share = ((t_ns - here_t_ns) / np.maximum(span_ns, 1))[:, np.newaxis, np.newaxis]
+    share = ((t_ns - here_t_ns) / np.maximum(span_ns, 1))[:, np.newaxis, np.newaxis] * _IS_LINEAR
     between = here + share * (after - here)
     return np.where(np.isfinite(between), between, here)
 

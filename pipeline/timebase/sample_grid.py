@@ -25,8 +25,8 @@ from fantwin.pipeline.timebase.interpolation import (
 from fantwin.pipeline.timebase.line_guard import LineGuard
 from fantwin.pipeline.timebase.line_rate import GridTiming
 from fantwin.pipeline.timebase.stage_clock import is_of_replay
-from fantwin.schemas.auxiliary import AUXILIARY, auxiliary_columns
 from fantwin.schemas.blocks import cut, join
+from fantwin.schemas.channels import CHANNELS, measured_columns
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Grid, Raw
 from fantwin.schemas.side_by_side import present_columns
@@ -168,9 +168,9 @@ class SampleGrid:
 
     def _auxiliary_of(self, item: Raw) -> Array:
         """The columns of a message beside command and speed, as Samples has them."""
-        given = auxiliary_columns(item)
-        self._auxiliary |= {column.name: place for place, column in enumerate(AUXILIARY) if column.name in given}
-        values = np.full((len(item.command), len(AUXILIARY) if self._auxiliary else 0, self._fans), np.nan)
+        given = measured_columns(item)
+        self._auxiliary |= {column.name: place for place, column in enumerate(CHANNELS) if column.name in given}
+        values = np.full((len(item.command), len(CHANNELS) if self._auxiliary else 0, self._fans), np.nan)
         for name, column in given.items():
             values[:, self._auxiliary[name]] = column
         return values
@@ -309,7 +309,7 @@ class SampleGrid:
         reason = np.where(t_ns - self._held.t_ns[0] <= self._watermark_ns, GAP, STALE)
         self._count_gap(len(t_ns))
         command, nothing = np.broadcast_to(self._held.command[0], shape), np.zeros(shape, np.bool_)
-        auxiliary = np.full((len(t_ns), len(AUXILIARY), self._fans), np.nan)
+        auxiliary = np.full((len(t_ns), len(CHANNELS), self._fans), np.nan)
         self._append(t_ns, command, np.full(shape, np.nan), reason[:, np.newaxis], nothing, nothing[:, 0], auxiliary)
 
     def _count_gap(self, samples: int) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from cobs import cobs
 
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.wire.frames import (
     DEVICE_COUNTERS,
     VERSION,
@@ -41,12 +41,12 @@ def _float32_bytes(values: Sequence[float]) -> bytes:
 def encode_binary(frame: Frame) -> bytes:
     """The bytes of a valid frame, with delimiters on both sides."""
     if isinstance(frame, Sample):
-        present = [column for column in frame.auxiliary if column]
-        rows = zip(frame.command, frame.speed, *present, strict=True)
+        present = {bit: values for bit, each in enumerate(CHANNELS) if (values := frame.measured.get(each.name))}
+        rows = zip(frame.command, frame.speed, *present.values(), strict=True)
         head = _HEAD.pack(VERSION, _SAMPLE_WITH_COLUMNS if present else _SAMPLE)
         payload = head + _CLOCK_SEQUENCE.pack(frame.clock_us, frame.sequence) + bytes([len(frame.command)])
         if present:
-            payload += bytes([sum(1 << bit for bit, column in enumerate(frame.auxiliary) if column)])
+            payload += bytes([sum(1 << bit for bit in present)])
         payload += _float32_bytes([value for row in rows for value in row])
     elif isinstance(frame, DeviceCounters):
         payload = _HEAD.pack(VERSION, _DEVICE_COUNTERS) + _UPTIME_COUNT.pack(frame.uptime_s, len(frame.counts))
@@ -146,8 +146,8 @@ def _frame(frame_type: int, payload: bytes) -> Frame:
     clock_us, sequence = _CLOCK_SEQUENCE.unpack_from(payload, _HEAD.size)
     if frame_type == _SAMPLE:
         return Sample(clock_us, sequence, values[0::2], values[1::2])
-    if layout.columns >> len(AUXILIARY):
+    if layout.columns >> len(CHANNELS):
         raise FrameError(FaultKind.WRONG_TYPE, f"unknown columns, bits {layout.columns:#x}")
-    present = [column.name for bit, column in enumerate(AUXILIARY) if layout.columns >> bit & 1]
+    present = [column.name for bit, column in enumerate(CHANNELS) if layout.columns >> bit & 1]
     columns = {name: values[2 + place :: layout.per_fan] for place, name in enumerate(present)}
-    return Sample(clock_us, sequence, values[0 :: layout.per_fan], values[1 :: layout.per_fan], **columns)
+    return Sample(clock_us, sequence, values[0 :: layout.per_fan], values[1 :: layout.per_fan], columns)

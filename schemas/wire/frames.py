@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import TypeAlias
 
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import FanValues
 
 VERSION = 1
 MAX_FANS = 64
@@ -26,21 +26,14 @@ class Sample:
         clock_us, sequence: wrap at 2^32; None if a text device has none.
         command: one value per fan, in the tray's command unit.
         speed: one value per fan, in the tray's speed unit; NaN without a tacho reading.
-        supply_voltage_v, current_a, temperature_c: one value per fan, NaN if unknown; empty if not measured.
+        measured: by name of channel, one value per fan, NaN if unknown; without those that are not measured.
     """
 
     clock_us: int | None
     sequence: int | None
     command: tuple[float, ...]
     speed: tuple[float, ...]
-    supply_voltage_v: tuple[float, ...] = ()
-    current_a: tuple[float, ...] = ()
-    temperature_c: tuple[float, ...] = ()
-
-    @property
-    def auxiliary(self) -> list[tuple[float, ...]]:
-        """The columns beside command and speed, in the order of `AUXILIARY`."""
-        return [getattr(self, column.name) for column in AUXILIARY]
+    measured: FanValues = field(default_factory=dict[str, tuple[float, ...]])
 
 
 @dataclass(frozen=True, slots=True)

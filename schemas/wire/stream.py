@@ -45,7 +45,7 @@ def encode(protocol: Protocol, frame: Frame) -> bytes:
     if not 1 <= fans <= MAX_FANS:
         raise ValueError(f"{fans} fans; a frame carries 1 to {MAX_FANS}")
     if isinstance(frame, Sample):
-        if any(len(column) not in (0, fans) for column in frame.auxiliary):
+        if any(len(column) not in (0, fans) for column in frame.measured.values()):
             raise ValueError(f"a column beside command and speed does not have {fans} values, one for each fan")
         for name, count in (("clock_us", frame.clock_us), ("sequence", frame.sequence)):
             if count is None and protocol == "binary":

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.wire.frames import UINT32, CommandFrame, FaultKind, Frame, FrameError, Sample, SetPointFrame
 
 LETTER = re.compile(rb"[SCP]")  # begins a line and occurs nowhere else, so that a reader can find the next line
@@ -36,8 +36,8 @@ def encode_text(frame: Sample | CommandFrame | SetPointFrame) -> bytes:
         pairs = [_text_number(v) for pair in zip(frame.command, frame.speed, strict=True) for v in pair]
         groups = [
             field
-            for column, values in zip(AUXILIARY, frame.auxiliary, strict=True)
-            if values
+            for column in CHANNELS
+            if (values := frame.measured.get(column.name))
             for field in (column.letter, *_text_group(values))
         ]
         return (" ".join(["S", *head, *pairs, *groups]) + "\n").encode()
@@ -68,7 +68,7 @@ def _numbers(fields: Sequence[bytes]) -> tuple[float, ...]:
         return tuple(np.array([_number(field) for field in fields], np.float32).tolist())
 
 
-_COLUMN_OF_LETTER = {column.letter.encode(): column.name for column in AUXILIARY}
+_COLUMN_OF_LETTER = {column.letter.encode(): column.name for column in CHANNELS}
 
 
 def _split_groups(fields: list[bytes]) -> tuple[list[bytes], dict[str, tuple[float, ...]]]:
@@ -105,7 +105,7 @@ def decode_text(line: bytes, fans: int) -> Frame:
             raise FrameError(FaultKind.TRUNCATED, f"{len(fields)} fields; S needs clock, sequence and two per fan")
         clock_us, sequence = (None if field == _NONE else _integer(field) for field in fields[:2])
         values = _numbers(fields[2:])
-        return Sample(clock_us, sequence, values[0::2], values[1::2], **columns)
+        return Sample(clock_us, sequence, values[0::2], values[1::2], columns)
     if len(fields) != 2:
         raise FrameError(FaultKind.TRUNCATED, f"{len(fields)} fields; {line[:1].decode()} needs fan and value")
     fan, (value,) = _integer(fields[0]), _numbers(fields[1:])

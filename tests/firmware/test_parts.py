@@ -12,6 +12,7 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fantwin.schemas.channels import SUPPLY_VOLTAGE
 from fantwin.schemas.wire import DEVICE_COUNTERS, CommandFrame, Decoder, DeviceCounters, Sample, SetPointFrame, encode
 from tests.support.firmware_build import parts_library
 from tests.support.firmware_parts import (
@@ -107,7 +108,7 @@ def test_the_host_reads_the_sample_that_was_written(
     assert isinstance(read, Sample)
     assert (read.clock_us, read.sequence, read.command) == (clock, sequence, command)
     assert read.speed == pytest.approx(speed, abs=0, nan_ok=True)
-    assert read.supply_voltage_v == pytest.approx((supply,) * FANS, abs=0, nan_ok=True)
+    assert read.measured[SUPPLY_VOLTAGE] == pytest.approx((supply,) * FANS, abs=0, nan_ok=True)
 
 
 @given(

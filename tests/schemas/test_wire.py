@@ -16,7 +16,7 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.wire import (
     DEVICE_COUNTERS,
     MAX_FRAME_BYTES,
@@ -162,7 +162,7 @@ def test_after_a_reset_half_a_frame_is_forgotten(protocol: Protocol) -> None:
 
 
 SAMPLE_PAYLOAD = cobs.decode(SAMPLE_BINARY.strip(b"\0"))[:-4]
-WITH_COLUMN = cobs.decode(encode("binary", replace(SAMPLE, current_a=(1.5, 2.5))).strip(b"\0"))[:-4]
+WITH_COLUMN = cobs.decode(encode("binary", replace(SAMPLE, measured={"current_a": (1.5, 2.5)})).strip(b"\0"))[:-4]
 COUNTERS_PAYLOAD = cobs.decode(encode("binary", DeviceCounters(5, (1, 2, 3))).strip(b"\0"))[:-4]
 NAN, INFINITY = struct.pack("<f", math.nan), struct.pack("<f", math.inf)
 BINARY_FAULTS = {
@@ -277,7 +277,7 @@ def test_a_person_can_type_commands() -> None:
         ("text", Sample(2**32, 1, (0.5,), (1.0,)), "does not fit 32 bits"),
         ("binary", Sample(1, -1, (0.5,), (1.0,)), "does not fit 32 bits"),
         ("text", Sample(1, 1, (0.5,), (1.0, 2.0)), "zip"),
-        ("text", replace(SAMPLE, current_a=(1.0,)), "does not have 2 values"),
+        ("text", replace(SAMPLE, measured={"current_a": (1.0,)}), "does not have 2 values"),
         ("binary", CommandFrame(()), "0 fans"),
         ("binary", SetPointFrame((0.0,) * 65), "65 fans"),
     ],
@@ -292,7 +292,9 @@ def samples_with_columns(draw: st.DrawFn) -> Sample:
     sample = draw(samples())
     values = st.lists(READING, min_size=len(sample.command), max_size=len(sample.command)).map(tuple)
     same_for_all = READING.map(lambda value: (value,) * len(sample.command))
-    return replace(sample, **{column.name: draw(st.just(()) | values | same_for_all) for column in AUXILIARY})
+    chosen = draw(st.sets(st.sampled_from(CHANNELS)))
+    measured = {each.name: draw(values | same_for_all) for each in CHANNELS if each in chosen}
+    return replace(sample, measured=measured)
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -306,7 +308,7 @@ def test_columns_beside_command_and_speed_come_back_exactly(protocol: Protocol, 
 def test_the_longest_frame_of_64_fans_with_all_columns_fits(protocol: Protocol) -> None:
     longest = float(np.float32(-1.1754944e-38))
     each = tuple(longest * (1 + fan % 2) for fan in range(64))  # differ, or one value is sent for all
-    sample = Sample(2**32 - 1, 2**32 - 1, each, each, each, each, each)
+    sample = Sample(2**32 - 1, 2**32 - 1, each, each, {channel.name: each for channel in CHANNELS})
     data = encode(protocol, sample)
     assert len(data) <= MAX_FRAME_BYTES
     assert Decoder(protocol, 64).feed(data) == [sample]
@@ -327,9 +329,7 @@ def test_groups_of_a_text_line_have_one_value_for_all_fans_or_one_for_each(
     line: bytes, expected: dict[str, tuple[float, ...]]
 ) -> None:
     (found,) = joined("text").feed(line)
-    assert same(
-        found, replace(Sample(1, 2, (0.5, 1.0), (100.0, 0.0)), **{k: tuple(map(float, v)) for k, v in expected.items()})
-    )
+    assert same(found, Sample(1, 2, (0.5, 1.0), (100.0, 0.0), {k: tuple(map(float, v)) for k, v in expected.items()}))
 
 
 def test_the_worked_examples_of_the_reference_are_what_is_on_the_line():
@@ -338,7 +338,7 @@ def test_the_worked_examples_of_the_reference_are_what_is_on_the_line():
     sample = Sample(1_000_000, 42, (0.5,), (100.0,))
     frames: list[Frame] = [
         sample,
-        replace(sample, supply_voltage_v=(12.0,), temperature_c=(25.0,)),
+        replace(sample, measured={"supply_voltage_v": (12.0,), "temperature_c": (25.0,)}),
         DeviceCounters(60, (7, 0, 2, 0, 0, 0, 0, 0, 1, 0, 0, 0)),
         CommandFrame((0.75, math.nan)),
     ]

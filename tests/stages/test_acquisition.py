@@ -360,7 +360,7 @@ def test_row_13_a_host_clock_that_is_set_is_reported_once_and_silence_still_coun
 
 
 def with_columns(number: int, **columns: tuple[float, ...]) -> Sample:
-    return replace(sample(number), **columns)
+    return replace(sample(number), measured=columns)
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fantwin.schemas.channels import SUPPLY_VOLTAGE
 from fantwin.simulation.excitation import Excitation
 from tests.support.fan_board import FANS, FanBoard
 from tests.support.fantwin_command import fantwin
@@ -40,7 +41,7 @@ def run_board(
         writer.writerow(COLUMNS)
         for sample in board.samples[1:]:
             assert sample.clock_us is not None
-            values = (*sample.command, *sample.speed, sample.supply_voltage_v[0])
+            values = (*sample.command, *sample.speed, sample.measured[SUPPLY_VOLTAGE][0])
             writer.writerow([sample.clock_us / 1e6, *map(repr, values)])
 
 

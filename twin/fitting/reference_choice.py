@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fantwin.schemas.auxiliary import TITLES
+from fantwin.schemas.channels import BY_NAME
 from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.twin.fitting.identification import Identification, identify
 from fantwin.twin.progress import Progress, unreported, within
@@ -44,12 +44,13 @@ def identify_at_reference(
         if not _varies(runs, conditions, name):
             continue
         fewer = replace(conditions, **{name: None})
-        without = identify(at_reference(runs, fewer), progress=within(f"without {TITLES[name]}", progress))
+        without = identify(at_reference(runs, fewer), progress=within(f"without {BY_NAME[name].title}", progress))
         with_rad_s, without_rad_s = (_rmse_rad_s(each) for each in (identification, without))
         if without_rad_s < (1.0 - LEAST_GAIN) * with_rad_s:
             conditions, identification = fewer, without
             notes.append(
-                f"{TITLES[name]}: not used, because the fans do not follow it: the error of the physical free run is "
+                f"{BY_NAME[name].title}: not used, because the fans do not follow it: "
+                f"the error of the physical free run is "
                 f"{without_rad_s:.3g} rad/s without it and {with_rad_s:.3g} rad/s with it"
             )
     return AtReference(conditions if conditions and conditions.needed else None, identification, tuple(notes))
@@ -59,7 +60,7 @@ def behind_a_drive(found: AtReference) -> tuple[str, ...]:
     """The notes of a twin of fans that control their own speed: why it uses none of the quantities."""
     if found.conditions is None:
         return found.notes
-    unused = " and ".join(TITLES[name] for name in found.conditions.needed)
+    unused = " and ".join(BY_NAME[name].title for name in found.conditions.needed)
     return (*found.notes, f"{unused}: not used, because these fans control their own speed")
 
 

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from fantwin.schemas.auxiliary import AUXILIARY, AuxiliaryColumn, axis_range
+from fantwin.schemas.channels import CHANNELS, Channel, axis_range
 from fantwin.schemas.model_uncertainty import ModelUncertainty
 from fantwin.twin.report.content import Content, FanContent
 from fantwin.twin.report.steady_states import StaticCurve
@@ -54,7 +54,7 @@ LINE = {"lw": 0.5, "color": MEASURED, "solid_joinstyle": "round"}
 def over_time(content: Content, fan: FanContent, *, narrow: bool) -> str:
     """Measured speed on free run and band, the error in its band, the command, and the other measured columns."""
     width_in, height_in = NARROW_IN if narrow else WIDE_IN
-    beside = [column for column in AUXILIARY if np.isfinite(fan.auxiliary.get(column.name, np.nan)).any()]
+    beside = [column for column in CHANNELS if np.isfinite(fan.auxiliary.get(column.name, np.nan)).any()]
     with _figure((width_in, height_in + BESIDE_IN * len(beside))) as figure:
         shares = [2.4, 1.5, 0.8] + [0.8] * len(beside)
         panels: list[Axes] = figure.subplots(len(shares), 1, sharex=True, height_ratios=shares).tolist()
@@ -246,7 +246,7 @@ def _draw_over_time(content: Content, fan: FanContent, panels: tuple[Axes, Axes,
     command.set_xlim(line.t_s[0], line.t_s[-1])
 
 
-def _draw_beside(content: Content, axes: Axes, column: AuxiliaryColumn, values: Array, columns: int) -> None:
+def _draw_beside(content: Content, axes: Axes, column: Channel, values: Array, columns: int) -> None:
     """Draw a column beside command and speed, on an axis on which noise looks small."""
     line = content.timeline
     kept = kept_samples(line.t_s, (values,), columns)

@@ -23,7 +23,7 @@ from fantwin.pipeline.sources.logs.formats import LogFormat, log_format, open_lo
 from fantwin.pipeline.sources.logs.samples_of_log import read_samples
 from fantwin.pipeline.sources.tables.measured_table import Table, read_table
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan, tachos_to_json
@@ -71,7 +71,7 @@ def import_table(
         list[str] | None,
         typer.Option(
             metavar="NAME=COLUMN",
-            help=f"Column of {', '.join(column.name for column in AUXILIARY)}: one for all fans, or one per fan. "
+            help=f"Column of {', '.join(column.name for column in CHANNELS)}: one for all fans, or one per fan. "
             "Repeatable.",
         ),
     ] = None,
@@ -173,7 +173,7 @@ def _range(values: Array) -> dict[str, float | None]:
 
 def _channels(given: Sequence[str]) -> dict[str, list[str]]:
     """The columns of each channel beside command and speed."""
-    known = [column.name for column in AUXILIARY]
+    known = [column.name for column in CHANNELS]
     columns: dict[str, list[str]] = {}
     for text in given:
         name, equals, column = text.partition("=")

@@ -17,7 +17,7 @@ from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.simulated.table import TableDevice
 from fantwin.pipeline.sources.tables.measured_table import read_table
 from fantwin.schemas import wire
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos
 from fantwin.schemas.units import SpeedUnit
 
@@ -61,7 +61,7 @@ class FileScenario(Section):
     )
     channels: dict[str, tuple[str, ...]] = Field(
         default={},
-        description=f"columns of {', '.join(column.name for column in AUXILIARY)}: one for all fans, or one for each",
+        description=f"columns of {', '.join(column.name for column in CHANNELS)}: one for all fans, or one for each",
     )
     from_s: float = Field(default=0.0, ge=0.0, description="start, since the first row")
     to_s: float | None = Field(default=None, description="end, since the first row; without it, the last row")
@@ -106,7 +106,7 @@ class Scenario(Section):
         """
         if (file := self.file) is None:
             return None
-        names = [column.name for column in AUXILIARY]
+        names = [column.name for column in CHANNELS]
         if unknown := [name for name in file.channels if name not in names]:
             raise UsageError(f"file.channels.{unknown[0]}: known are {', '.join(names)}")
         channels = {name: list(columns) for name, columns in file.channels.items()}

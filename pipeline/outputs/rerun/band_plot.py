@@ -26,7 +26,7 @@ from fantwin.pipeline.recordings.dates import format_utc, has_date
 from fantwin.pipeline.recordings.left_out import left_out_hint
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.site.trace import Trace, state_changes, trace_of
-from fantwin.schemas.auxiliary import AUXILIARY, AuxiliaryColumn, axis_range
+from fantwin.schemas.channels import CHANNELS, Channel, axis_range
 from fantwin.schemas.messages import Array, Score
 from fantwin.schemas.units import NS_PER_S, SpeedUnit
 
@@ -163,7 +163,7 @@ def _chosen_fans(trace: Trace, fans: Sequence[int] | None) -> list[int]:
 
 def _figure(trace: Trace, fans: Sequence[int], faults: Sequence[Fault]) -> Figure:
     lanes_in = LANE_HEIGHT_IN * (2 if faults else 1)
-    beside = [each for each in AUXILIARY if _is_measured(trace, each, fans)]
+    beside = [each for each in CHANNELS if _is_measured(trace, each, fans)]
     heights_in = [PANEL_HEIGHT_IN, *[BESIDE_HEIGHT_IN] * len(beside), lanes_in]
     block_in = sum(heights_in)
     height = HEADER_IN + FOOT_IN + len(fans) * (block_in + BETWEEN_IN) - BETWEEN_IN
@@ -197,7 +197,7 @@ def _figure(trace: Trace, fans: Sequence[int], faults: Sequence[Fault]) -> Figur
     return figure
 
 
-def _is_measured(trace: Trace, column: AuxiliaryColumn, fans: Sequence[int]) -> bool:
+def _is_measured(trace: Trace, column: Channel, fans: Sequence[int]) -> bool:
     values = trace.auxiliary.get(column.name)
     return values is not None and bool(np.isfinite(values[:, fans]).any())
 
@@ -247,7 +247,7 @@ def _draw_panel(axes: Axes, trace: Trace, fan: int, faults: Sequence[Fault]) -> 
     axes.set_title(_title(trace, fan, faults), loc="left", size=10.5)
 
 
-def _draw_beside(axes: Axes, trace: Trace, fan: int, column: AuxiliaryColumn) -> None:
+def _draw_beside(axes: Axes, trace: Trace, fan: int, column: Channel) -> None:
     """Draw a column that was measured beside command and speed of the fan."""
     gaps, values = _gaps(trace.t_ns), trace.auxiliary[column.name][:, fan]
     t_s = _seconds(trace, trace.t_ns)

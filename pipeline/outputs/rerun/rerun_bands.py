@@ -34,7 +34,7 @@ from fantwin.pipeline.outputs.rerun.rerun_styles import (
 )
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.trace import NO_SAMPLES, Trace
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import SpeedUnit
 
@@ -72,7 +72,7 @@ class RerunBands:
         times = np.array([t_ns])
         speed = fan_path(self._root(fan), fan.number, "speed")
         self._send_measurements(speed, times, np.full((1, 4), np.nan), np.zeros((1, 4)))
-        for column in AUXILIARY:
+        for column in CHANNELS:
             self._send_where(self._auxiliary_path(fan, column.name), times, np.array([np.nan]))
         for kind, series in ((BALANCE, 2), (SCORE, 3)):
             self._send_rows(place_beside(self._places[fan], kind), times, np.full((1, series), np.nan))

@@ -35,7 +35,7 @@ from fantwin.pipeline.outputs.rerun.rerun_paths import (
 )
 from fantwin.pipeline.outputs.rerun.rerun_styles import LINE_WIDTH, RED, STATE_COLORS, log_state_styles
 from fantwin.pipeline.site.trace import state_names
-from fantwin.schemas.auxiliary import AuxiliaryColumn
+from fantwin.schemas.channels import Channel
 
 WORST, COUNTS = "fleet/worst", "fleet/counts"
 COUNT_COLORS = {"in alarm": RED, "suspect": STATE_COLORS["suspect"]}
@@ -77,7 +77,7 @@ def count_path(name: str) -> str:
 
 
 def fleet_blueprint(
-    plots: FleetPlots, window_s: float, auxiliary: Sequence[AuxiliaryColumn] = (), *, for_picture: bool = False
+    plots: FleetPlots, window_s: float, auxiliary: Sequence[Channel] = (), *, for_picture: bool = False
 ) -> rrb.Blueprint:
     """The layout `all` of a fleet. auxiliary: the columns beside command and speed that are drawn."""
     tabs = [_overview_tab(window_s)]
@@ -86,7 +86,7 @@ def fleet_blueprint(
 
 
 def fleet_alarms_blueprint(
-    plots: FleetPlots, window_s: float, auxiliary: Sequence[AuxiliaryColumn] = (), *, for_picture: bool = False
+    plots: FleetPlots, window_s: float, auxiliary: Sequence[Channel] = (), *, for_picture: bool = False
 ) -> rrb.Blueprint:
     """The layout `alarms` of a fleet: its plots, which the fans in alarm get."""
     lists = rrb.Horizontal(alarms_view(), log_view([FLEET_LOG], "alarm log"), name="alarms")
@@ -113,7 +113,7 @@ def _overview_tab(window_s: float) -> rrb.Container:
     )
 
 
-def _plots_tab(plots: FleetPlots, auxiliary: Sequence[AuxiliaryColumn]) -> rrb.Container:
+def _plots_tab(plots: FleetPlots, auxiliary: Sequence[Channel]) -> rrb.Container:
     """The tab with the plots."""
     starts = range(1, plots.count + 1, PLOTS_ON_A_PAGE)
     pages = [
@@ -122,7 +122,7 @@ def _plots_tab(plots: FleetPlots, auxiliary: Sequence[AuxiliaryColumn]) -> rrb.C
     return rrb.Tabs(*pages, active_tab=0, name="plots") if len(pages) > 1 else pages[0]
 
 
-def _plots_page(plots: FleetPlots, places: Sequence[int], auxiliary: Sequence[AuxiliaryColumn]) -> rrb.Container:
+def _plots_page(plots: FleetPlots, places: Sequence[int], auxiliary: Sequence[Channel]) -> rrb.Container:
     lanes = rrb.StateTimelineView(
         origin=f"/{SHOWN}/state",
         contents=[f"/{place_lane(place)}" for place in places],

@@ -47,7 +47,7 @@ from fantwin.pipeline.outputs.rerun.rerun_styles import (
     speed_style,
 )
 from fantwin.pipeline.site.trace import state_names
-from fantwin.schemas.auxiliary import AuxiliaryColumn
+from fantwin.schemas.channels import Channel
 from fantwin.schemas.units import SpeedUnit
 
 LayoutName = Literal["all", "alarms", "wear"]
@@ -74,7 +74,7 @@ class TrayLayout:
     speed_unit: SpeedUnit
     all_fans: int
     places: Mapping[int, Sequence[int]] = field(default_factory=dict[int, Sequence[int]])
-    auxiliary: Sequence[AuxiliaryColumn] = ()
+    auxiliary: Sequence[Channel] = ()
     alarmed: Sequence[int] = ()
 
     def roots(self, fan: int) -> list[str]:
@@ -196,7 +196,7 @@ def _names(plots: Iterable[FanPlot]) -> str:
     return ", ".join(f"{tray.name}/{fan}" for tray, fan in plots)
 
 
-def page_tab(name: str, plots: Sequence[FanPlot], auxiliary: Sequence[AuxiliaryColumn] = ()) -> rrb.Container:
+def page_tab(name: str, plots: Sequence[FanPlot], auxiliary: Sequence[Channel] = ()) -> rrb.Container:
     """Up to `FANS_ON_A_PAGE` fans, each with speed above torque balance and score; their lanes, the alarms, the log."""
     columns = columns_of(len(plots))
     lanes = rrb.StateTimelineView(
@@ -219,7 +219,7 @@ def page_tab(name: str, plots: Sequence[FanPlot], auxiliary: Sequence[AuxiliaryC
     )
 
 
-def _auxiliary_view(plots: Sequence[FanPlot], column: AuxiliaryColumn) -> rrb.TimeSeriesView:
+def _auxiliary_view(plots: Sequence[FanPlot], column: Channel) -> rrb.TimeSeriesView:
     """What is measured of some fans beside command and speed: one line for each."""
     contents = [path for tray, fan in plots for path in _beside(tray, fan, column.name)]
     return rrb.TimeSeriesView(

@@ -33,7 +33,7 @@ from fantwin.pipeline.outputs.rerun.rerun_layout import LayoutName, TrayLayout, 
 from fantwin.pipeline.outputs.rerun.rerun_paths import DAYS, TIMELINE, WEAR, place_in
 from fantwin.pipeline.outputs.rerun.rerun_sink import APPLICATION, LOOPBACK, rerun_program
 from fantwin.pipeline.outputs.rerun.site_layout import SiteLayout
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S, SpeedUnit
 
@@ -188,7 +188,7 @@ def _read(rrd: Path) -> _Rrd:
         raise PictureError(f"{rrd}: holds no speeds drawn by the viewer stage")
     all_times = np.concatenate(times)
     for name, layout in trays.items():
-        beside = [column for column in AUXILIARY if (name, column.name) in auxiliary]
+        beside = [column for column in CHANNELS if (name, column.name) in auxiliary]
         in_alarm = [fan for tray, fan in alarmed if tray == name]
         trays[name] = replace(layout, auxiliary=beside, alarmed=in_alarm)
     first_ns, last_ns = int(all_times.min()), int(all_times.max())

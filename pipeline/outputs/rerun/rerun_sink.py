@@ -31,7 +31,7 @@ from fantwin.pipeline.runtime.stage import StageError
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.loopback import LOOPBACK, check_free
 from fantwin.pipeline.site.trace import Trace
-from fantwin.schemas.auxiliary import AUXILIARY
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import SpeedUnit
 
@@ -142,7 +142,7 @@ class RerunSink:
         the layout `alarms` to a fan that goes into alarm for the first time."""
         before, drawn = self._layout, self._layout.auxiliary_of(trace.tray)
         if not trace.auxiliary.keys() <= {column.name for column in drawn}:
-            shown = [column for column in AUXILIARY if column in drawn or column.name in trace.auxiliary]
+            shown = [column for column in CHANNELS if column in drawn or column.name in trace.auxiliary]
             self._layout = self._layout.with_auxiliary(trace.tray, shown)
         if self._layout_name == "alarms":
             in_alarm = [trace.fan_numbers[column] for column in np.flatnonzero(trace.in_alarm.any(axis=0)).tolist()]

@@ -16,7 +16,7 @@ from fantwin.pipeline.outputs.rerun.rerun_layout import (
     trays_blueprint,
     wear_blueprint,
 )
-from fantwin.schemas.auxiliary import AuxiliaryColumn
+from fantwin.schemas.channels import Channel
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class SiteLayout:
     trays: tuple[TrayLayout, ...]
     window_s: float
     plots: FleetPlots | None = None
-    auxiliary: tuple[AuxiliaryColumn, ...] = ()
+    auxiliary: tuple[Channel, ...] = ()
 
     def blueprint(self, name: LayoutName = "all", *, for_picture: bool = False) -> rrb.Blueprint:
         """One of the layouts."""
@@ -46,11 +46,11 @@ class SiteLayout:
             return fleet_blueprint(self.plots, self.window_s, self.auxiliary, for_picture=for_picture)
         return fleet_alarms_blueprint(self.plots, self.window_s, self.auxiliary, for_picture=for_picture)
 
-    def auxiliary_of(self, tray: str) -> Sequence[AuxiliaryColumn]:
+    def auxiliary_of(self, tray: str) -> Sequence[Channel]:
         """The columns beside command and speed that are drawn of a tray."""
         return next((each.auxiliary for each in self.trays if each.name == tray), self.auxiliary)
 
-    def with_auxiliary(self, tray: str, columns: Sequence[AuxiliaryColumn]) -> SiteLayout:
+    def with_auxiliary(self, tray: str, columns: Sequence[Channel]) -> SiteLayout:
         """The layouts with these columns drawn of a tray."""
         if not self.trays:
             return replace(self, auxiliary=tuple(columns))

@@ -24,6 +24,7 @@ from prometheus_client.utils import floatToGoString
 from fantwin.pipeline.site.fan_history import CURVES
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.site_state import AT_WORK, StageState, Word
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.health import LatencyBucket
 from fantwin.schemas.units import RAD_S_PER_UNIT
@@ -139,10 +140,15 @@ def _of_fans(model: SiteModel) -> Iterator[str]:
         ("fantwin_fan_speed_rpm", "Measured speed.", "measured_speed_rad_s", _PER_RPM, 2),
         ("fantwin_fan_predicted_speed_rpm", "Speed of the healthy twin.", "predicted_speed_rad_s", _PER_RPM, 2),
         ("fantwin_fan_score_ratio", "Score relative to its limit.", "score", 1.0, 4),
+        *((f"fantwin_fan_{each.name}", f"Measured {each.label}.", each.name, 1.0, 4) for each in CHANNELS),
     ):
-        yield _head(name, about)
-        for tray in heard:
-            values = (tray.values[:, CURVES.index(curve)].astype(np.float64) / per_unit).round(digits).tolist()
+        known = {tray.tray: (*CURVES, *tray.channels) for tray in heard}
+        having = [tray for tray in heard if curve in known[tray.tray]]
+        if having or curve in CURVES:
+            yield _head(name, about)
+        for tray in having:
+            column = tray.values[:, known[tray.tray].index(curve)]
+            values = (column.astype(np.float64) / per_unit).round(digits).tolist()
             yield from (
                 f"{name}{label} {floatToGoString(value)}\n"
                 for label, value in zip(labels[tray.tray], values, strict=True)

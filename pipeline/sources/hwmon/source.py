@@ -21,6 +21,7 @@ from fantwin.pipeline.sources.hwmon.modes import FoundModes, FoundPwm
 from fantwin.pipeline.sources.hwmon.tree import ChipFolder, chip_folders, device_words
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
+from fantwin.schemas.channels import CURRENT, SUPPLY_VOLTAGE, TEMPERATURE
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
 MANUAL = 1
@@ -100,12 +101,17 @@ class HwmonDevice:
         return Reading(
             command=tuple(float(pwm[number]) for number in self._pwms),
             speed=speed,
-            supply_voltage_v=tuple(
-                _value(chip, f"in{number}_input", 1e-3 * self._config.voltage_scale) for number in self._voltages
-            ),
-            current_a=tuple(_value(chip, f"curr{number}_input", 1e-3) for number in self._currents),
-            temperature_c=tuple(_temperature_c(chip, number) for number in self._temperatures),
+            measured={name: values for name, values in self._measured(chip).items() if values},
         )
+
+    def _measured(self, chip: ChipFolder) -> dict[str, tuple[float, ...]]:
+        """By name of channel; empty where it has no file."""
+        scale = 1e-3 * self._config.voltage_scale
+        return {
+            SUPPLY_VOLTAGE: tuple(_value(chip, f"in{number}_input", scale) for number in self._voltages),
+            CURRENT: tuple(_value(chip, f"curr{number}_input", 1e-3) for number in self._currents),
+            TEMPERATURE: tuple(_temperature_c(chip, number) for number in self._temperatures),
+        }
 
     def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
         """Set pwm values, after `pwmN_enable` is manual."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field, create_model, model_validator
 
 from fantwin.pipeline.sources.polling import PolledConfig
+from fantwin.schemas.channels import CHANNELS, Channel
 from fantwin.schemas.tacho import LONGEST_WINDOW_S, Tacho
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
@@ -32,7 +33,14 @@ class Register(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         return self
 
 
-class ModbusFan(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
+_Channels = create_model(
+    "_Channels",
+    __doc__="A register for each channel.",
+    **{each.key: (Register | None, Field(default=None, description=each.label)) for each in CHANNELS},
+)
+
+
+class ModbusFan(_Channels, frozen=True, extra="forbid", allow_inf_nan=False):
     """The registers of one fan."""
 
     unit: int = Field(default=1, ge=0, le=255, description="unit id of the fan's device")
@@ -41,9 +49,10 @@ class ModbusFan(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     write: Register | None = Field(
         default=None, description="where commands are written; without it, this fan takes none"
     )
-    supply_voltage: Register | None = Field(default=None, description="supply voltage, V")
-    current: Register | None = Field(default=None, description="current, A")
-    temperature: Register | None = Field(default=None, description="temperature of the air, °C")
+
+    def channel(self, channel: Channel) -> Register | None:
+        """Where a channel is; None: the device does not measure it."""
+        return getattr(self, channel.key)
 
 
 class ModbusConfig(PolledConfig, frozen=True):

@@ -20,6 +20,7 @@ from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.modbus.config import ModbusConfig, ModbusFan, Register
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.source import Reading, SourceContext
+from fantwin.schemas.channels import CHANNELS, Channel
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
 if TYPE_CHECKING:
@@ -108,9 +109,9 @@ class ModbusDevice:
         return Reading(
             command=command,
             speed=tuple(_value(words, fan.unit, fan.speed) * self._unit_per_rpm for fan in fans),
-            supply_voltage_v=_column(words, fans, "supply_voltage"),
-            current_a=_column(words, fans, "current"),
-            temperature_c=_column(words, fans, "temperature"),
+            measured={
+                each.name: _column(words, fans, each) for each in CHANNELS if any(fan.channel(each) for fan in fans)
+            },
         )
 
     def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
@@ -202,7 +203,7 @@ class ModbusDevice:
 
 
 def _registers(fan: ModbusFan) -> Iterator[Register]:
-    for register in (fan.speed, fan.command, fan.supply_voltage, fan.current, fan.temperature):
+    for register in (fan.speed, fan.command, *map(fan.channel, CHANNELS)):
         if register is not None:
             yield register
 
@@ -254,11 +255,9 @@ def _packed(register: Register, number: float) -> list[int]:
     return words[::-1] if register.word_order == "little" else words
 
 
-def _column(words: dict[_Place, int], fans: tuple[ModbusFan, ...], name: str) -> tuple[float, ...]:
-    """A value for each fan, NaN for a fan without this register; empty if none has it."""
-    registers = [getattr(fan, name) for fan in fans]
-    if not any(registers):
-        return ()
+def _column(words: dict[_Place, int], fans: tuple[ModbusFan, ...], channel: Channel) -> tuple[float, ...]:
+    """A value for each fan, NaN for a fan without a register of this channel."""
+    registers = [fan.channel(channel) for fan in fans]
     return tuple(
         math.nan if register is None else _value(words, fan.unit, register)
         for fan, register in zip(fans, registers, strict=True)

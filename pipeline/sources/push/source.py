@@ -17,7 +17,7 @@ from fantwin.pipeline.sources.push.config import PushConfig
 from fantwin.pipeline.sources.source import LinkUp, Reading, ReadingBatch, Rejected, SourceContext, SourceEvent
 from fantwin.pipeline.timebase.device_clock import NS_PER_US, UINT32
 from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
-from fantwin.schemas.auxiliary import auxiliary_columns
+from fantwin.schemas.channels import measured_columns
 from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, PushedSamples
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
@@ -105,14 +105,14 @@ class PushSource:
         command = message.command.tolist()
         speed = (message.speed_rad_s / self._rad_s_per_unit).tolist()
         clock_us = ((message.t_ns + NS_PER_US // 2) // NS_PER_US % UINT32).tolist()
-        others = {name: values.tolist() for name, values in auxiliary_columns(message).items()}
+        others = {name: values.tolist() for name, values in measured_columns(message).items()}
         return [
             Reading(
                 tuple(command[row]),
                 tuple(speed[row]),
                 clock_us[row],
                 (message.first_number + row) % UINT32,
-                **{name: tuple(values[row]) for name, values in others.items()},
+                {name: tuple(values[row]) for name, values in others.items()},
             )
             for row in range(len(clock_us))
         ]

@@ -17,6 +17,7 @@ from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.redfish.config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
+from fantwin.schemas.channels import TEMPERATURE
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
 if TYPE_CHECKING:
@@ -98,9 +99,9 @@ class RedfishDevice:
                 is_sample=True,
                 setting="source.command",
             )
-        temperature_c = (self._temperature_c(),) * len(fans) if self._config.temperature else ()
+        measured = {TEMPERATURE: (self._temperature_c(),) * len(fans)} if self._config.temperature else {}
         speed = tuple(_rpm(fan) * self._unit_per_rpm for fan in fans)
-        return Reading(command=command, speed=speed, temperature_c=temperature_c)
+        return Reading(command=command, speed=speed, measured=measured)
 
     def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
         """Redfish has no standard command."""

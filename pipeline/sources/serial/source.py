@@ -111,15 +111,7 @@ class SerialSource:
 
     def _reading_of(self, found: wire.Frame | wire.Fault) -> Reading | Rejected:
         if isinstance(found, wire.Sample):
-            return Reading(
-                found.command,
-                found.speed,
-                found.clock_us,
-                found.sequence,
-                found.supply_voltage_v,
-                found.current_a,
-                found.temperature_c,
-            )
+            return Reading(found.command, found.speed, found.clock_us, found.sequence, found.measured)
         assert isinstance(found, wire.Fault), "commands and set-points are not for the decoder of a host"
         return Rejected(
             found.kind.value,

@@ -61,7 +61,7 @@ class DeviceSample(Protocol):
     @property
     def lost(self) -> bool: ...  # noqa: D102
     @property
-    def auxiliary(self) -> Mapping[str, NDArray[np.float64]]: ...  # noqa: D102  by the names of schemas.auxiliary
+    def auxiliary(self) -> Mapping[str, NDArray[np.float64]]: ...  # noqa: D102  by the names of schemas.channels
 
 
 class Device(Protocol):
@@ -278,7 +278,7 @@ def _frame(sample: DeviceSample, rad_s_per_unit: float) -> wire.Sample:
     speed = sample.speed_rad_s / rad_s_per_unit
     auxiliary = {name: tuple(values.tolist()) for name, values in sample.auxiliary.items()}
     command = tuple(sample.command.tolist())
-    return wire.Sample(sample.clock_us, sample.sequence, command, tuple(speed.tolist()), **auxiliary)
+    return wire.Sample(sample.clock_us, sample.sequence, command, tuple(speed.tolist()), auxiliary)
 
 
 def _counters_frame(uptime_s: float, counters: Counter[str]) -> bytes:

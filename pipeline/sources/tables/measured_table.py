@@ -74,7 +74,7 @@ class Table:
     assumed: str = ""
     """units that were assumed, and how to give them, in one line; empty if all were given"""
     auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
-    """other measured columns, (n, fans) each, NaN where missing, by name in schemas.auxiliary"""
+    """other measured columns, (n, fans) each, NaN where missing, by name in schemas.channels"""
 
     @property
     def fans(self) -> int:
@@ -130,7 +130,7 @@ def read_table(
     Without a unit, numbers are seconds and anything else is a date. None: no such column, samples are `period` apart,
     for example `10ms`. command: one column per fan, or one for all. speed: `COLUMN` or `COLUMN:UNIT`, one per fan,
     unit rad/s (the default), rpm, hz (revolutions a second) or deg/s. auxiliary: one column for all fans, or one per
-    fan, by the name of what it is (schemas.auxiliary), in its unit.
+    fan, by the name of what it is (schemas.channels), in its unit.
 
     Raises:
         UserError: the file, a column or a unit cannot be used.

@@ -14,6 +14,7 @@ from fantwin.pipeline.sources.hwmon.config import HwmonConfig
 from fantwin.pipeline.sources.hwmon.source import HwmonDevice, HwmonSource
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
+from fantwin.schemas.channels import CURRENT, SUPPLY_VOLTAGE, TEMPERATURE
 from fantwin.schemas.tacho import Tacho
 from tests.support.hwmon_trees import add_chip, board
 
@@ -47,8 +48,10 @@ def test_speeds_commands_and_what_is_asked_for_are_read_in_units_of_the_tray(roo
     made = connected(root, fans=[2, 1], temperatures=[2, 3], voltages=[0], voltage_scale=12)
     found = reading(made)
     assert found.speed == (1200.0, 900.0) and found.command == (140.0, 120.0)
-    assert found.temperature_c[0] == 31.5 and math.isnan(found.temperature_c[1]), "a sensor that is not connected"
-    assert found.supply_voltage_v == pytest.approx((12.096, 12.096)) and found.current_a == ()
+    assert found.measured[TEMPERATURE][0] == 31.5 and math.isnan(found.measured[TEMPERATURE][1]), (
+        "a sensor that is not connected"
+    )
+    assert found.measured[SUPPLY_VOLTAGE] == pytest.approx((12.096, 12.096)) and CURRENT not in found.measured
     in_rad_s = device(root, unit="rad/s")
     in_rad_s.connect()
     assert reading(in_rad_s).speed[1] == pytest.approx(1200 * math.pi / 30)

@@ -19,6 +19,7 @@ from fantwin.pipeline.sources.json_samples import (
 )
 from fantwin.pipeline.sources.source import Reading, Rejected
 from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
+from fantwin.schemas.channels import CURRENT, SUPPLY_VOLTAGE, TEMPERATURE
 
 
 def one(text: str) -> TimedReading | Rejected:
@@ -51,7 +52,8 @@ def test_what_else_is_measured_time_and_number_are_optional() -> None:
     reading = found.reading
     assert (reading.command, reading.speed, reading.sequence) == ((1.0,), (2.0,), 1)
     assert (found.t_ns, reading.clock_us) == (None, None)
-    assert reading.supply_voltage_v == (12.1,) and math.isnan(reading.temperature_c[0]) and reading.current_a == ()
+    assert reading.measured[SUPPLY_VOLTAGE] == (12.1,) and math.isnan(reading.measured[TEMPERATURE][0])
+    assert CURRENT not in reading.measured
 
 
 @pytest.mark.parametrize(

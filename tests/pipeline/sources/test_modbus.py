@@ -15,6 +15,7 @@ from fantwin.pipeline.sources.modbus.config import ModbusConfig
 from fantwin.pipeline.sources.modbus.source import ModbusDevice
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.source import SourceContext
+from fantwin.schemas import channels as of
 from fantwin.schemas.tacho import Tacho
 from fantwin.simulation.tray import SimulatedTray, TraySettings
 from tests.support.modbus_server import (
@@ -64,8 +65,8 @@ def test_registers_of_all_types_are_read_by_one_request_and_a_command_moves_the_
         made = device(port)
         assert [(each.first.address, each.count) for each in made._requests] == [(SPEED, 7)]
         first = made.read()
-        assert first.current_a == (1.5,) and first.supply_voltage_v == pytest.approx((540.25,))
-        assert first.temperature_c == pytest.approx((24.5,))
+        assert first.measured[of.CURRENT] == (1.5,) and first.measured[of.SUPPLY_VOLTAGE] == pytest.approx((540.25,))
+        assert first.measured[of.TEMPERATURE] == pytest.approx((24.5,))
         made.write((0.9,), ())
         time.sleep(0.8)
         second = made.read()
@@ -105,7 +106,7 @@ def test_frames_of_modbus_rtu_go_over_a_serial_line_both_ways() -> None:
         made = ModbusDevice(*over_serial(line))
         made.connect()
         first = made.read()
-        assert (first.current_a, first.supply_voltage_v) == ((1.5,), pytest.approx((540.25,)))
+        assert (first.measured[of.CURRENT], first.measured[of.SUPPLY_VOLTAGE]) == ((1.5,), pytest.approx((540.25,)))
         made.write((0.9,), ())
         time.sleep(0.8)
         second = made.read()
@@ -151,7 +152,7 @@ def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_
         received = len(line.transferred["host"])
         slow.is_silent = False
         eventually(lambda: len(line.transferred["host"]) == received + 19, "the answer comes, too late")
-        assert made.read().supply_voltage_v == pytest.approx((540.25,))
+        assert made.read().measured[of.SUPPLY_VOLTAGE] == pytest.approx((540.25,))
         made.disconnect()
 
 

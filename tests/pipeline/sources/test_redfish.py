@@ -16,6 +16,7 @@ from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.redfish.config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
 from fantwin.pipeline.sources.redfish.source import RedfishDevice
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
+from fantwin.schemas.channels import TEMPERATURE
 from fantwin.schemas.tacho import Tacho
 from tests.support.redfish_server import Controller, redfish_server
 
@@ -49,7 +50,7 @@ def test_the_newer_schema_gives_speed_and_percent() -> None:
     controller = Controller(is_new=True)
     with redfish_server(controller) as url:
         made = connected(url, temperature="Intake")
-        assert reading(made) == Reading((40.0, 42.0), (4000.0, 4200.0), temperature_c=(22.0, 22.0))
+        assert reading(made) == Reading((40.0, 42.0), (4000.0, 4200.0), measured={TEMPERATURE: (22.0, 22.0)})
         controller.rpm[1], controller.percent[1] = 0, 100
         assert reading(made).speed == (4000.0, 0.0)
         chosen = connected(url, 1, fans=["FAN2"], chassis="1U")
@@ -62,13 +63,13 @@ def test_the_older_schema_gives_speeds_and_the_command_of_the_vendor() -> None:
     controller = Controller(is_new=False)
     with redfish_server(controller) as url:
         made = connected(url, command="/Oem/Vendor/PWM", temperature="Inlet Temp")
-        assert reading(made) == Reading((40.0, 42.0), (4000.0, 4200.0), temperature_c=(23.5, 23.5))
+        assert reading(made) == Reading((40.0, 42.0), (4000.0, 4200.0), measured={TEMPERATURE: (23.5, 23.5)})
         unknown = connected(url)
         refused = unknown.read()
         assert isinstance(refused, Rejected) and refused.kind == "unknown_command" and refused.is_sample
         assert "no fan has a number at /SpeedPercent/Reading" in refused.detail
         unread = connected(url, 1, fans=["FAN1"], command="/Oem/Vendor/PWM", temperature="Exhaust")
-        assert math.isnan(reading(unread).temperature_c[0])
+        assert math.isnan(reading(unread).measured[TEMPERATURE][0])
 
 
 def test_what_does_not_fit_the_controller_is_one_line() -> None:

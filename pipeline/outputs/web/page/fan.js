@@ -23,6 +23,7 @@ export class FanView {
   constructor(site, index, tray, fan, alarm, viewerUrl) {
     Object.assign(this, { site, index, tray, fan, viewerUrl, window_s: 600, plots: [], class: -1 });
     this.path = `/fans/${encodeURIComponent(tray)}/${fan}`;
+    this.names = [...COLUMNS];
     this.columns = Object.fromEntries(COLUMNS.map((name) => [name, []]));
     this.state = element("span");
     this.score = element("span");
@@ -60,7 +61,8 @@ export class FanView {
       return;
     }
     const live = this.columns;
-    this.columns = Object.fromEntries(COLUMNS.map((name) => [name, past[name]]));
+    this.names = [...COLUMNS, ...this.channelsOf(past)];
+    this.columns = Object.fromEntries(this.names.map((name) => [name, past[name] ?? past.t_s.map(() => null)]));
     this.draw();
     this.add(live);
   }
@@ -95,17 +97,26 @@ export class FanView {
     this.known = true;
   }
 
+  // What is measured beside command and speed, of samples.
+  channelsOf(samples) {
+    return this.site.channels.map((each) => each.name).filter((name) => samples[name]);
+  }
+
   // Samples that have just come.
   add(samples) {
+    const added = this.channelsOf(samples).filter((name) => !this.columns[name]);
+    added.forEach((name) => { this.names.push(name); this.columns[name] = this.columns.t_s.map(() => null); });
+    if (added.length && this.plots.length) this.draw();
+    samples = Object.fromEntries(this.names.map((name) => [name, samples[name] ?? samples.t_s.map(() => null)]));
     const mine = this.columns, newest = mine.t_s.at(-1) ?? -Infinity;
     const first = samples.t_s.findIndex((t_s) => t_s > newest);
-    if (samples.t_s.length && samples.t_s.at(-1) < newest - 10) COLUMNS.forEach((name) => { mine[name] = samples[name]; });
+    if (samples.t_s.length && samples.t_s.at(-1) < newest - 10) this.names.forEach((name) => { mine[name] = samples[name]; });
     else if (first >= 0) {
-      if (newest > 0 && samples.t_s[first] - newest > HOLE_S) COLUMNS.forEach((name) => mine[name].push(name === "t_s" ? newest + HOLE_S / 2 : null));
-      COLUMNS.forEach((name) => mine[name].push(...samples[name].slice(first)));
+      if (newest > 0 && samples.t_s[first] - newest > HOLE_S) this.names.forEach((name) => mine[name].push(name === "t_s" ? newest + HOLE_S / 2 : null));
+      this.names.forEach((name) => mine[name].push(...samples[name].slice(first)));
     } else return;
     const old = mine.t_s.findIndex((t_s) => t_s > mine.t_s.at(-1) - KEPT_S);
-    if (old > 2000) COLUMNS.forEach((name) => mine[name].splice(0, old));
+    if (old > 2000) this.names.forEach((name) => mine[name].splice(0, old));
     this.refresh();
   }
 
@@ -120,6 +131,8 @@ export class FanView {
     this.balancePlot = add("Torque balance: command in excess of what a healthy fan needs", "command", [{ label: "torque balance", color: "measured" }]);
     this.scorePlot = add("Score: an alarm is raised at 1", "of the limit", [{ label: "score", color: "measured" },
       { label: "limit", color: "limit", dash: [2, 4] }], [0, 1.2]);
+    this.channelPlots = this.site.channels.filter((each) => this.names.includes(each.name)).map((each) =>
+      [each.name, add(each.title[0].toUpperCase() + each.title.slice(1), each.unit, [{ label: each.title, color: "measured" }])]);
     this.refresh();
   }
 
@@ -133,6 +146,7 @@ export class FanView {
       this.commandPlot.set(shown.t_s, [shown.command]);
       this.balancePlot.set(shown.t_s, [shown.torque_balance_command]);
       this.scorePlot.set(shown.t_s, [shown.score, shown.t_s.map(() => 1)]);
+      this.channelPlots.forEach(([name, plot]) => plot.set(shown.t_s, [shown[name]]));
     });
   }
 
@@ -147,7 +161,7 @@ export class FanView {
       indexes.push(i);
       next_s = t_s[i] + step_s;
     }
-    return Object.fromEntries(COLUMNS.map((name) => [name, indexes.map((i) => all[name][i])]));
+    return Object.fromEntries(this.names.map((name) => [name, indexes.map((i) => all[name][i])]));
   }
 
   show(window_s, button) {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fantwin.schemas.auxiliary import axis_range
+from fantwin.schemas.channels import axis_range
 
 
 @pytest.mark.parametrize(
