@@ -32,8 +32,8 @@ from fantwin.twin.fitting.reference_choice import behind_a_drive, identify_at_re
 from fantwin.twin.fitting.standstill import find_standstill
 from fantwin.twin.fitting.training import MOST_NETWORKS, Physics
 from fantwin.twin.kinds import BOTH_INPUTS, ModelKind, find_kind
+from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.model import Model
-from fantwin.twin.models.network_ode import NetworkOde
 from fantwin.twin.models.physics import PARAMETER_NAMES
 from fantwin.twin.networks import ForEachNetwork, one_after_another
 from fantwin.twin.progress import Progress, unreported, within

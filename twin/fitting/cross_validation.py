@@ -16,7 +16,7 @@ from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals
 from fantwin.twin.fitting.identification import identify
 from fantwin.twin.fitting.training import GRID_PRIOR_STD, Physics, train_network
-from fantwin.twin.models.model import NetworkOde
+from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.progress import Progress, unreported, within
 from fantwin.twin.runs import Array, Run
 

@@ -16,8 +16,8 @@ import numpy as np
 from fantwin.twin.fitting.filtering import filtered_regression
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.measurement import with_measured_command
+from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.lag import effective_command
-from fantwin.twin.models.model import NetworkOde
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.models.physics import LAG
 from fantwin.twin.runs import Array, Run

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fantwin.twin.models.model import NetworkOde
+from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.models.physics import LAG
 from fantwin.twin.runs import Array

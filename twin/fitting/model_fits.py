@@ -13,7 +13,8 @@ from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.initial_weights import initial_weights
 from fantwin.twin.fitting.narx_training import train_narx
 from fantwin.twin.fitting.training import GRID_PRIOR_STD, Physics, data_scaling, train_network
-from fantwin.twin.models.model import Model, NetworkOde, OdeModel
+from fantwin.twin.models.fan_ode import NetworkOde
+from fantwin.twin.models.model import Model, OdeModel
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.networks import ForEachNetwork, one_after_another

@@ -14,8 +14,8 @@ from fantwin.twin.evaluation.accuracy import evaluation_pieces
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS
 from fantwin.twin.fitting.trajectories import cut_into_trajectories, stretch_samples
+from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.lag import effective_command
-from fantwin.twin.models.model import NetworkOde
 from fantwin.twin.models.physics import LAG
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run

@@ -35,8 +35,8 @@ from fantwin.twin.fitting.mean_model import mean_model
 from fantwin.twin.fitting.reading_errors import counts, robust_scale
 from fantwin.twin.fitting.thinning import thinning_factor, windows_of
 from fantwin.twin.fitting.trajectories import MAX_SAMPLES, cut_into_trajectories, practical_samples, stretch_samples
+from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.integration import WIDE_BATCH
-from fantwin.twin.models.model import NetworkOde
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
 from fantwin.twin.models.physics import LAG, PARAMETER_NAMES

@@ -6,7 +6,7 @@ weights on [w, tau] or 31 on [w]; with J, alpha and C_D 44 or 34 parameters.
 
 from typing import ClassVar
 
-from fantwin.twin.models.network_ode import NetworkOde
+from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.physics import PARAMETER_NAMES
 
 UNITS = 10

@@ -76,18 +76,3 @@ class OdeModel(Model, Protocol):
     def equation(self, parameters: Array) -> FanEquation:
         """The right-hand side for a batch of fans with the physical parameters (batch, 4)."""
         ...
-
-
-class NetworkOde(OdeModel, Protocol):
-    """A model w' = f(w, command) with a network. has_physics: whether it is a fan without its network, too."""
-
-    has_physics: ClassVar[bool]
-
-    @property
-    def network(self) -> TanhNetwork:
-        """Its network."""
-        ...
-
-    def with_network(self, network: TanhNetwork) -> Self:
-        """The same model with another network."""
-        ...

@@ -5,7 +5,7 @@ All fans share the network; of a fan's own parameters only the lag of its comman
 
 from typing import ClassVar
 
-from fantwin.twin.models.network_ode import NetworkOde
+from fantwin.twin.models.fan_ode import NetworkOde
 
 UNITS = 20
 

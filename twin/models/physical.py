@@ -5,35 +5,22 @@ d torque / d speed is alpha + 2 C_D |w|. That it is positive at both ends makes 
 speed, which is all that physics demands: C_D may come out negative where friction or a dead zone bends the curve.
 """
 
-from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
 
-from fantwin.schemas.twin_card import NetworkCard, StateLayout
-from fantwin.twin.models.drive import DRIVE_LAYOUT, Drive
-from fantwin.twin.models.ode_graph import ode_graph
-from fantwin.twin.models.onnx_nodes import Nodes
+from fantwin.schemas.twin_card import NetworkCard
+from fantwin.twin.models.fan_ode import FanOde
 from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
-from fantwin.twin.models.right_hand_side import ODE_LAYOUT, FanEquation, advance
 from fantwin.twin.runs import Array
 
 
-@dataclass(frozen=True)
-class PhysicalModel:
-    """Physics alone. Shapes as in model.TwinModel."""
-
-    state_layout: StateLayout = ODE_LAYOUT
-    drive: Drive | None = None
+class PhysicalModel(FanOde):
+    """Physics alone."""
 
     kind: ClassVar[str] = "physical"
-    fixed_rate: ClassVar[bool] = False
+    has_physics: ClassVar[bool] = True
     used_parameters: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
-
-    @property
-    def network(self) -> None:
-        """There is none."""
-        return None
 
     @property
     def network_card(self) -> NetworkCard:
@@ -48,22 +35,6 @@ class PhysicalModel:
     def with_theta(self, theta: Array) -> Self:
         """The same model: it has no weights."""
         return self
-
-    def with_drive(self, drive: Drive) -> Self:
-        """The same model behind a drive; its parameters are then (fans, 7)."""
-        return replace(self, drive=drive, state_layout=DRIVE_LAYOUT)
-
-    def equation(self, parameters: Array) -> FanEquation:
-        """w' of a batch of fans with the physical parameters (batch, 4)."""
-        return FanEquation(parameters, None)
-
-    def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
-        """Free run from state; see model.TwinModel."""
-        return advance(self.equation(parameters), state, command, step_s, parameters, self.drive)
-
-    def graph(self) -> Nodes:
-        """See model.Model."""
-        return ode_graph(None, has_physics=True, drive=self.drive)
 
 
 def physical_parameters(unknowns: Array, top_speed_rad_s: Array) -> Array:

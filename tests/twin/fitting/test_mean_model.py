@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fantwin.twin.fitting.mean_model import mean_model
+from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.hybrid import Hybrid
-from fantwin.twin.models.model import NetworkOde
 from fantwin.twin.models.network import Scaling, TanhNetwork
 from fantwin.twin.models.neural_ode import NeuralOde
 from fantwin.twin.models.physics import LAG

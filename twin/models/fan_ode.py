@@ -1,0 +1,67 @@
+"""Models that are continuous in time: what the physical model, the hybrid and the neural ODE share."""
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
+
+from fantwin.schemas.twin_card import NetworkCard, StateLayout
+from fantwin.twin.models.drive import DRIVE_LAYOUT, Drive
+from fantwin.twin.models.network import TanhNetwork
+from fantwin.twin.models.ode_graph import ode_graph
+from fantwin.twin.models.onnx_nodes import Nodes
+from fantwin.twin.models.right_hand_side import ODE_LAYOUT, FanEquation, advance
+from fantwin.twin.runs import Array
+
+
+@dataclass(frozen=True, eq=False)
+class FanOde:
+    """Physics of each fan, a network for all, or both. Shapes as in model.TwinModel."""
+
+    network: TanhNetwork | None = None
+    state_layout: StateLayout = field(default=ODE_LAYOUT, kw_only=True)
+    drive: Drive | None = field(default=None, kw_only=True)
+
+    kind: ClassVar[str]
+    has_physics: ClassVar[bool]
+    used_parameters: ClassVar[tuple[str, ...]]
+    fixed_rate: ClassVar[bool] = False
+
+    def with_drive(self, drive: Drive) -> Self:
+        """The same model behind a drive; its parameters are then (fans, 7)."""
+        return replace(self, drive=drive, state_layout=DRIVE_LAYOUT)
+
+    def equation(self, parameters: Array) -> FanEquation:
+        """w' of a batch of fans with the physical parameters (batch, 4), which enter only if the model has physics."""
+        return FanEquation(parameters if self.has_physics else None, self.network)
+
+    def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
+        """Free run from state; see model.TwinModel."""
+        return advance(self.equation(parameters), state, command, step_s, parameters, self.drive)
+
+    def graph(self) -> Nodes:
+        """See model.Model."""
+        return ode_graph(self.network, has_physics=self.has_physics, drive=self.drive)
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkOde(FanOde):
+    """One network for all fans, beside the physics of each fan or alone."""
+
+    network: TanhNetwork = field()
+
+    @property
+    def theta(self) -> Array:
+        """(P,) the weights of the network."""
+        return self.network.theta
+
+    @property
+    def network_card(self) -> NetworkCard:
+        """The size of the network."""
+        return self.network.card
+
+    def with_theta(self, theta: Array) -> Self:
+        """The same model with other weights."""
+        return self.with_network(self.network.with_theta(theta))
+
+    def with_network(self, network: TanhNetwork) -> Self:
+        """The same model with another network."""
+        return replace(self, network=network)
