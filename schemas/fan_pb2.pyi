@@ -575,7 +575,7 @@ class Counter(_message.Message):
     def __init__(self, name: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
 
 class Input(_message.Message):
-    __slots__ = ("key", "producer", "received", "missing", "duplicated", "next_sequence", "missing_at_start", "refused", "unsaved")
+    __slots__ = ("key", "producer", "received", "missing", "duplicated", "next_sequence", "missing_at_start", "unsaved")
     KEY_FIELD_NUMBER: _ClassVar[int]
     PRODUCER_FIELD_NUMBER: _ClassVar[int]
     RECEIVED_FIELD_NUMBER: _ClassVar[int]
@@ -583,7 +583,6 @@ class Input(_message.Message):
     DUPLICATED_FIELD_NUMBER: _ClassVar[int]
     NEXT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MISSING_AT_START_FIELD_NUMBER: _ClassVar[int]
-    REFUSED_FIELD_NUMBER: _ClassVar[int]
     UNSAVED_FIELD_NUMBER: _ClassVar[int]
     key: str
     producer: str
@@ -592,9 +591,8 @@ class Input(_message.Message):
     duplicated: int
     next_sequence: int
     missing_at_start: int
-    refused: int
     unsaved: int
-    def __init__(self, key: _Optional[str] = ..., producer: _Optional[str] = ..., received: _Optional[int] = ..., missing: _Optional[int] = ..., duplicated: _Optional[int] = ..., next_sequence: _Optional[int] = ..., missing_at_start: _Optional[int] = ..., refused: _Optional[int] = ..., unsaved: _Optional[int] = ...) -> None: ...
+    def __init__(self, key: _Optional[str] = ..., producer: _Optional[str] = ..., received: _Optional[int] = ..., missing: _Optional[int] = ..., duplicated: _Optional[int] = ..., next_sequence: _Optional[int] = ..., missing_at_start: _Optional[int] = ..., unsaved: _Optional[int] = ...) -> None: ...
 
 class Output(_message.Message):
     __slots__ = ("key", "published", "has_more")

@@ -23,7 +23,6 @@ class Input:
     Attributes:
         missing: gaps in the sequence, never filled.
         missing_at_start: those of them before the first message that was received.
-        refused: those of the received ones that were ignored, because another process owns the stage of their producer.
         unsaved: the last of the received ones, so many, that are lost if the stage is killed now.
     """
 
@@ -34,7 +33,6 @@ class Input:
     duplicated: int
     next_sequence: int
     missing_at_start: int = 0
-    refused: int = 0
     unsaved: int = 0
 
 

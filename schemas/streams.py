@@ -37,8 +37,6 @@ class StreamState:
     duplicated: int = 0
     missing_at_start: int = 0
     """those of the missing ones before the first that was received"""
-    refused: int = 0
-    """those of the received ones that were ignored as of a second process"""
     unsaved: int = 0
     """the last of the received ones, so many, that are lost if the consumer is killed now"""
 
@@ -87,7 +85,6 @@ class StreamState:
             duplicated=self.duplicated,
             next_sequence=self.next_sequence or 0,
             missing_at_start=self.missing_at_start,
-            refused=self.refused,
             unsaved=unsaved,
         )
 
@@ -106,7 +103,6 @@ def input_streams(health: Health) -> dict[StreamId, StreamState]:
             missing=line.missing,
             duplicated=line.duplicated,
             missing_at_start=line.missing_at_start,
-            refused=line.refused,
             unsaved=line.unsaved,
         )
         for line in health.inputs

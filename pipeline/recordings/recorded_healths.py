@@ -58,6 +58,6 @@ class RecordedHealths:
 
 def _said(health: Health) -> object:
     """The content whose change is worth recording. Figures in the text of a problem may change each second."""
-    lost = sum(line.missing + line.refused for line in health.inputs)
+    lost = sum(line.missing for line in health.inputs)
     awaited = tuple(line.key for line in health.waiting_for)
     return health.status, without_figures(health.problem), health.lost, lost, awaited, health.is_last

@@ -216,17 +216,13 @@ class Receiver:
 
     def _take_newest(self, item: Newest) -> None:
         now_ns = HOST_CLOCK.now_ns()
-        believed = [each for each in self._decoded(item.answer.messages, now_ns) if self._counts_on_its_key(each)]
+        found = self._decoded(item.answer.messages, now_ns)
+        believed = [each for each in found if not self._sessions.is_stranger(each.key, each.header.producer)]
         newest = self._newest.finish(item, believed)
         if newest is not None:
             self._health.add_input(newest.key, now_ns, now_ns)
             self._due.add([newest])
         self._newest.ask()
-
-    def _counts_on_its_key(self, envelope: Envelope) -> bool:
-        producer = envelope.header.producer
-        is_ignored = self._sessions.is_ignored(producer, envelope.header.tray)
-        return not (is_ignored or self._sessions.is_stranger(envelope.key, producer))
 
     def _take_health(self, envelope: Envelope, health: Health) -> None:
         said, health = health, self._believed_outputs.of(health)

@@ -25,14 +25,14 @@ from fantwin.pipeline.runtime.building import abort, build_and_join
 from fantwin.pipeline.runtime.due_messages import DueMessages
 from fantwin.pipeline.runtime.ending import Ending, Step
 from fantwin.pipeline.runtime.health import HealthBuilder
-from fantwin.pipeline.runtime.inbox import INBOX_SIZE, FromBus, FromSource, Inbox, Item
+from fantwin.pipeline.runtime.inbox import INBOX_SIZE, FromBus, FromSource, Inbox, Item, Liveness
 from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers
 from fantwin.pipeline.runtime.notifier import Notifier
 from fantwin.pipeline.runtime.outputs import Outputs
 from fantwin.pipeline.runtime.receiving import Receiver
-from fantwin.pipeline.runtime.sessions import Session, Sessions
+from fantwin.pipeline.runtime.sessions import Session, Sessions, trays_in_words
 from fantwin.pipeline.runtime.sources import Sources
-from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
+from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage, StageError
 from fantwin.pipeline.runtime.steps import Steps
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.pipeline.timebase.stage_clock import StageClock
@@ -145,7 +145,6 @@ class Runner:
             stage,
             self._parts,
             receiver=self._receiver,
-            sessions=self._sessions,
             kept=self._kept,
             outputs=self._outputs,
             health=self._health,
@@ -177,7 +176,8 @@ class Runner:
         else:
             ending.begin()
             if work.error is not None:
-                ending.fail(work.error, f"crashed: {type(work.error).__name__}: {work.error}")
+                is_ours = isinstance(work.error, UserError)
+                ending.fail(work.error, f"{'' if is_ours else f'crashed: {type(work.error).__name__}: '}{work.error}")
         self._inbox.close()
         ending.finish("stopping the source", self._sources.stop(), SOURCES_STOPPED)
         failed = self._steps.active
@@ -350,6 +350,17 @@ class Runner:
             self._kept.answer(item)
         else:
             self._receiver.take(item)
+            if isinstance(item, Liveness):
+                self._end_if_replaced()
+
+    def _end_if_replaced(self) -> None:
+        other = self._sessions.successor_of(self._session)
+        if other is not None and other.may_live(self._session.host):
+            shared = [tray for tray in self._session.trays or other.trays if other.has(tray)]
+            raise StageError(
+                f"{self._session.name} ends: {other.name}, {other.process}, has {trays_in_words(shared)} and started "
+                "later; stop one of them, or give it other trays"
+            )
 
     def _step_once(self) -> None:
         """Process the next message, or as many as can be at once."""
@@ -400,7 +411,6 @@ class Runner:
             problems=[
                 self._ending.problem,
                 self._bus.certificate_warning(),
-                self._sessions.problem(),
                 self._bus.forgeries.problem(),
                 self._tracker.problem(),
                 *(core.problem() for core in cores),

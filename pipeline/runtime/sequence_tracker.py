@@ -148,11 +148,6 @@ class SequenceTracker:
         waiting = [stream.waiting for stream in self._streams if stream.waiting]
         return sum(len(each.held) + (each.shown_by is not None) for each in waiting)
 
-    def refuse_second(self, envelope: Envelope) -> None:
-        """An accepted message is ignored: another process owns the stage of its producer."""
-        if stream := self._streams.get(envelope.key, envelope.header.producer):
-            stream.refused += 1
-
     def inputs(self, unsaved: Iterable[Envelope] = ()) -> tuple[Input, ...]:
         """The counts for health. Forgotten producers of a key are summed up under an empty name. unsaved: the messages
         that are lost if the stage is killed now."""

@@ -1,11 +1,9 @@
-"""One owner of each tray in each stage: which process has it, and whose messages count where two have it.
+"""One owner of each tray in each stage: which process has it.
 
 Each session of a stage shows a liveliness token, which says its trays, from before its first message until it ends,
 however it ends. A stage is refused at its start if the token of another process already shows one of its trays. Where
-two were started at once, or a network has healed, all see both tokens: of each tray that both have, the session that
-started later is the owner, and what the other publishes for that tray is ignored until one of them ends. Ownership
-depends only on the tokens that exist now, so a clock that was once wrong has no effect later. Nobody has to be asked,
-and the one that is ignored goes on working: it takes over at once when the owner ends.
+two were started at once, or a network has healed, all see both tokens, and the one that started earlier ends. Until
+then the later one is the owner.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from __future__ import annotations
 import os
 import re
 import socket
-from collections.abc import Collection, Iterable, Iterator, Set
+from collections.abc import Collection, Iterable, Set
 from dataclasses import dataclass
 
 from fantwin.pipeline.config.shards import Shard
@@ -113,7 +111,7 @@ def this_host() -> str:
 
 
 class Sessions:
-    """The sessions on the bus, and which of them are ignored, for which trays."""
+    """The sessions on the bus, and which of them owns which trays."""
 
     def __init__(self) -> None:
         self._alive: dict[str, Session] = {}
@@ -121,8 +119,6 @@ class Sessions:
         """those that are alive"""
         self._owners: dict[str, _Owners] = {}
         """by stage"""
-        self._problems: dict[str, str] = {}
-        """by stage, where trays have two owners"""
         self._written: dict[str, set[str]] = {}
         """by producer of a session: the keys on which it publishes"""
         self._ended: dict[str, Session] = {}
@@ -147,9 +143,7 @@ class Sessions:
                 self._ended[session.producer] = session
                 if len(self._ended) > MOST_SESSIONS:
                     del self._ended[next(iter(self._ended))]
-        of_stage = _Owners(each for each in self._alive.values() if each.stage == session.stage)
-        self._owners[session.stage] = of_stage
-        self._problems[session.stage] = "; ".join(of_stage.conflicts())
+        self._owners[session.stage] = _Owners(each for each in self._alive.values() if each.stage == session.stage)
 
     def add_health(self, health: Health, read_keys: Set[str]) -> None:
         """A stage has said what it publishes; `read_keys`: the keys that matter here."""
@@ -185,11 +179,10 @@ class Sessions:
             return False
         return any(key in keys for keys in self._written.values())
 
-    def is_ignored(self, producer: str, tray: str) -> bool:
-        """Whether this producer is a session that has a tray of which another one is the owner."""
-        session = self._by_producer.get(producer)
-        owner = self._owners[session.stage].of(tray) if session else None
-        return owner is not None and owner is not session
+    def successor_of(self, session: Session) -> Session | None:
+        """The first session that started later than this one, and has one of its trays in the same stage."""
+        later = self._owners[session.stage].after(session) if session.stage in self._owners else ()
+        return next((each for each in later if each.shares_a_tray_with(session)), None)
 
     def named(self, stage: str, instance: str) -> Session | None:
         """The session of this stage and instance, the one that started last; None: there is none."""
@@ -204,16 +197,12 @@ class Sessions:
         """The session of a stage that owns a tray; None: there is none."""
         return self._owners[stage].of(tray) if stage in self._owners else None
 
-    def problem(self) -> str:
-        """The trays with two owners; empty if there is none."""
-        return "; ".join(filter(None, self._problems.values()))
-
 
 class _Owners:
     """Which of the sessions of one stage is the owner of each tray: the one that started last of those that have it."""
 
     def __init__(self, sessions: Iterable[Session]) -> None:
-        self._sessions = sorted(sessions, key=lambda each: (each.started_t_ns, each.producer))
+        self._sessions = sorted(sessions, key=_start)
         self._by_name = {each.instance: each for each in self._sessions}
         self._of_tray: dict[str, Session] = {}
         self._of_others: Session | None = None
@@ -232,30 +221,13 @@ class _Owners:
         """The session of this name that started last."""
         return self._by_name.get(instance)
 
-    def conflicts(self) -> Iterator[str]:
-        """A line for each two sessions of which one is ignored for the benefit of the other."""
-        by_producer = {each.producer: each for each in self._sessions}
-        for each in self._sessions:
-            lost: dict[str, list[str]] = {}
-            for tray in each.trays or self._of_tray:
-                if (owner := self.of(tray)) is not None and owner is not each:
-                    lost.setdefault(owner.producer, []).append(tray)
-            if not each.trays and self._of_others is not None and self._of_others is not each:
-                lost = {self._of_others.producer: []}
-            yield from (_conflict(each, by_producer[owner], trays) for owner, trays in lost.items())
+    def after(self, session: Session) -> list[Session]:
+        """The sessions that started later."""
+        return [each for each in self._sessions if _start(each) > _start(session)]
 
 
-def _conflict(ignored: Session, owner: Session, trays: Collection[str]) -> str:
-    """trays: those that both have; none: all."""
-    if ignored.instance == owner.instance:
-        return (
-            f"{ignored.name} runs twice: {ignored.process} is ignored, because {owner.process} started later; "
-            "stop one of them"
-        )
-    return (
-        f"two owners of {trays_in_words(trays)} in {ignored.stage}: {ignored.name}, {ignored.process}, is ignored, "
-        f"because {owner.name}, {owner.process}, started later; stop one of them, or give it other trays"
-    )
+def _start(session: Session) -> tuple[int, str]:
+    return session.started_t_ns, session.producer
 
 
 def trays_in_words(trays: Collection[str]) -> str:

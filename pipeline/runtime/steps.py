@@ -12,7 +12,6 @@ from fantwin.pipeline.runtime.joint_step import step_together
 from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers
 from fantwin.pipeline.runtime.outputs import Outputs
 from fantwin.pipeline.runtime.receiving import Receiver
-from fantwin.pipeline.runtime.sessions import Sessions
 from fantwin.pipeline.runtime.stage import BuiltStage, Stage
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.pipeline.timebase.stage_clock import StageClock, is_of_replay
@@ -39,7 +38,6 @@ class Steps:
         parts: Mapping[str, BuiltStage],
         *,
         receiver: Receiver,
-        sessions: Sessions,
         kept: KeptForOthers,
         outputs: Outputs,
         health: HealthBuilder,
@@ -50,7 +48,7 @@ class Steps:
         self._parts = parts
         self._joint = stage.joint() if stage.joint else None
         self._has_source = any(part.source for part in parts.values())
-        self._receiver, self._sessions, self._kept = receiver, sessions, kept
+        self._receiver, self._kept = receiver, kept
         self._outputs, self._health, self._clock = outputs, health, clock
         self.counts: Counter[str] = Counter()
         self.active: frozenset[str] = frozenset()
@@ -94,11 +92,6 @@ class Steps:
             return None
         if self._has_source and is_of_replay(header.producer):  # a recorded command must not drive today's fan
             self.counts["refused_of_replay"] += count
-            return None
-        if first.topic != "health" and self._sessions.is_ignored(header.producer, header.tray):
-            self.counts["refused_of_second"] += count
-            for envelope in envelopes:
-                self._receiver.tracker.refuse_second(envelope)
             return None
         for envelope in envelopes:
             self._kept.add(envelope)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from fantwin.pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
 from fantwin.pipeline.site.loss_accounting import Launched
 from fantwin.schemas.health import Health
-from fantwin.schemas.topics import topic_of, tray_of
+from fantwin.schemas.topics import topic_of
 
 _WATCHED_TOPICS = {"alarm", "score", "snapshot"}
 
@@ -91,9 +91,8 @@ class KnownSessions:
         return self._sessions.owner(stage, tray)
 
     def counts(self, key: str, producer: str) -> bool:
-        """Whether a message on this key of a tray is one of the site: its producer is the session that owns the tray in
-        its stage, or no session publishes there."""
-        return not self.is_stranger(key, producer) and not self._sessions.is_ignored(producer, tray_of(key))
+        """Whether a message on this key is one of the site: its producer is a session, or none publishes there."""
+        return not self.is_stranger(key, producer)
 
     def is_stranger(self, key: str, producer: str) -> bool:
         """Whether a session publishes on this key, and this producer is none and never was."""

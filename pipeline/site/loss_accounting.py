@@ -193,7 +193,7 @@ def _absent(states: Iterable[StreamState], *, is_due_from_0: bool) -> tuple[int,
     absent, due = 0, 0 if is_due_from_0 else min(state.first_sequence for state in had)
     for state in had:
         begin, end = state.first_sequence + state.missing_at_start, (state.next_sequence or 0) - state.unsaved
-        lacking = state.missing - state.missing_at_start + (state.refused if is_due_from_0 else 0)
+        lacking = state.missing - state.missing_at_start
         absent += max(0, begin - due)
         due = max(due, begin)
         absent += min(lacking, max(0, end - due))

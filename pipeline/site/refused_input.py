@@ -13,7 +13,6 @@ from fantwin.pipeline.site.loss_accounting import Launched, label
 from fantwin.schemas.health import Health
 
 WORDS = {
-    "refused_of_second": "message{s} from a second process of a stage",
     "refused_of_replay": "command{s} of a replay",
     "refused_clocks": "clock message{s} from others than the replay",
     "refused_of_other_key": "message{s} of another tray or process than the key names",

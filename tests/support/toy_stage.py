@@ -87,8 +87,11 @@ def raw(t_ns: int) -> Raw:
 class Bench:
     """A stage running in a thread, and a second session on the bus that feeds it and listens."""
 
-    def __init__(self, stage: Stage, config, tray: str | None = None) -> None:
-        """tray: as on the command line, one or several."""
+    def __init__(
+        self, stage: Stage, config, tray: str | None = None, expects: type[Exception] = ZeroDivisionError
+    ) -> None:
+        """tray: as on the command line, one or several. expects: with what the stage may crash."""
+        self._expects = expects
         self.stop = threading.Event()
         self.heard: queue.Queue[tuple[str, Message]] = queue.Queue()
         self.bus = Bus(config.bus)
@@ -100,7 +103,7 @@ class Bench:
         }
         self.runner = Runner(stage, config, chosen_shard(stage.name, config, tray), self.stop)
         self.last: list[Health] = []
-        self.crashes: list[ZeroDivisionError] = []
+        self.crashes: list[Exception] = []
         self.thread = threading.Thread(target=self._run)
         self.thread.start()
         self.health_with(lambda health: health.status == StageStatus.OK)
@@ -108,7 +111,7 @@ class Bench:
     def _run(self) -> None:
         try:
             self.last.append(self.runner.run())
-        except ZeroDivisionError as crash:
+        except self._expects as crash:
             self.crashes.append(crash)
 
     def _hear(self, kind: type[Message]) -> Callable[[str, bytes], None]:

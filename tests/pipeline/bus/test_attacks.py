@@ -351,5 +351,5 @@ def test_rows_15_to_17_what_a_health_claims_a_token_names_and_a_header_says_beyo
         site.flush("acquisition.a")
         health = stage.health_with(lambda health: counter(health, "refused_of_other_key") == 30, "all are counted")
         assert [line.producer for line in health.inputs] == [sender.producer]
-        assert (counter(health, "refused_producers"), counter(health, "refused_of_second"), health.lost) == (0, 0, 0)
+        assert (counter(health, "refused_producers"), counter(health, "refused_forged"), health.lost) == (0, 0, 0)
     assert grids.messages == []

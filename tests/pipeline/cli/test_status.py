@@ -167,11 +167,11 @@ def test_row_18_the_loss_of_a_stage_that_was_restarted_while_it_is_watched_does_
     assert (row.split()[2:4], row.split()[-1]) == (["3", "min"], "9")
 
 
-def test_row_07_what_was_refused_of_a_second_process_is_said_and_is_no_loss(site):
+def test_row_10_what_was_refused_in_the_name_of_another_is_said_and_is_no_loss(site):
     watcher = SiteWatcher(site.outside, SITE)
-    refusals = (Counter(name="refused_of_second", value=12),)
+    refusals = (Counter(name="refused_forged", value=12),)
     view(site, watcher, replace(HEALTH, inputs=(), counters=refusals, lost=0))
-    assert "scorer: refused: 12 messages from a second process of a stage\n" in shown(watcher, site.judged())
+    assert "scorer: refused: 12 messages in the name of another session\n" in shown(watcher, site.judged())
     assert watcher.losses() == {"scorer": 0}
 
 

@@ -1,4 +1,4 @@
-"""One owner of each stage: a second is refused at its start, and ignored where both run."""
+"""One owner of each stage: a second is refused at its start, and where two run, the earlier one ends."""
 
 from __future__ import annotations
 
@@ -14,23 +14,15 @@ from fantwin.pipeline.config.shards import Shard
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
 from fantwin.pipeline.runtime.stage import BuiltStage, StageError
-from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
-from fantwin.schemas.codec import encode, type_name
-from fantwin.schemas.enums import Severity
-from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Grid, Raw
-from fantwin.schemas.topics import BY_NAME, alive_key, sessions_key, tray_key
-from tests.support.running_chain import eventually
-from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, raw, toy
+from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.messages import Grid
+from fantwin.schemas.topics import alive_key, sessions_key
+from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, toy
 
 FIRST = Session("acquisition", TRAY_A, 100, "acquisition-a-1111", "board", 4711, (TRAY_A,))
 SECOND = Session("acquisition", TRAY_A, 200, "acquisition-a-2222", "rack", 4712, (TRAY_A,))
 SHARD_A = Shard(TRAY_A, (TRAY_A,), ("--trays", TRAY_A))
-ONE_LINE = (
-    "acquisition/a runs twice: process 4711 on board is ignored, because process 4712 on rack started later; "
-    "stop one of them"
-)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +37,7 @@ def test_row_07_a_token_that_names_the_producer_of_another_process_is_none(stage
     assert Session.of_key(forged.key("s")) is None
     for session in (forged, replace(forged, started_t_ns=2, producer=f"{stage}-{instance}-2")):
         sessions.update(session.key("s"), alive=True)
-    assert not sessions.is_ignored(FIRST.producer, TRAY_A)
+    assert sessions.successor_of(FIRST) is None
     sessions.update(forged.key("s"), alive=False)
     assert sessions.is_alive(FIRST.producer)
 
@@ -61,15 +53,13 @@ def test_row_07_a_token_of_the_same_producer_does_not_take_the_place_of_one_that
 
 @pytest.mark.parametrize("order", [(FIRST, SECOND), (SECOND, FIRST)])
 def test_row_07_of_two_sessions_the_later_owns_the_stage_until_it_ends(order):
-    sessions = Sessions()
-    for session in order:
-        sessions.update(session.key("s"), alive=True)
-    assert sessions.is_ignored(FIRST.producer, TRAY_A)
-    assert not sessions.is_ignored(SECOND.producer, TRAY_A)
-    assert sessions.problem() == ONE_LINE
+    sessions = known(*order)
+    assert sessions.successor_of(FIRST) == SECOND
+    assert sessions.successor_of(SECOND) is None
+    assert sessions.owner("acquisition", TRAY_A) == SECOND
     sessions.update(SECOND.key("s"), alive=False)
-    assert not sessions.is_ignored(FIRST.producer, TRAY_A)
-    assert not sessions.problem()
+    assert sessions.successor_of(FIRST) is None
+    assert sessions.owner("acquisition", TRAY_A) == FIRST
 
 
 def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict_and_the_remembered_ones_are_bounded():
@@ -79,7 +69,7 @@ def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict_and_the_r
     for session in (FIRST, of_b, scorer):
         sessions.update(session.key("s"), alive=True)
         assert sessions.named(session.stage, session.instance) == session
-    assert not sessions.problem()
+        assert sessions.successor_of(session) is None
     for number in range(MOST_SESSIONS + 5):
         sessions._alive[f"key {number}"] = FIRST
     sessions.update(SECOND.key("s"), alive=True)
@@ -104,30 +94,16 @@ def test_row_07_a_session_and_its_trays_are_read_from_the_key_of_its_token():
     assert Session.of_key(FIRST.key("s").replace("4711", "x")) is None
 
 
-def test_row_07_only_the_trays_that_two_sessions_have_change_their_owner():
-    one, other = shard("1-of-2", 1, "a", "c"), shard("c+d", 2, "c", "d")
-    sessions = known(other, one, shard("2-of-2", 1, "b"))
-    assert [sessions.is_ignored(one.producer, tray) for tray in "ac"] == [False, True]
-    assert not any(sessions.is_ignored(other.producer, tray) for tray in "cd")
+def test_row_07_only_sessions_with_a_common_tray_have_successors():
+    one, other, third = shard("1-of-2", 1, "a", "c"), shard("c+d", 2, "c", "d"), shard("2-of-2", 1, "b")
+    sessions = known(other, one, third)
+    assert [sessions.successor_of(each) for each in (one, other, third)] == [other, None, None]
     assert sessions.owner("scorer", "c") == other
     assert sessions.owner("scorer", "x") is None
-    assert sessions.problem() == (
-        "two owners of tray c in scorer: scorer/1-of-2, process 1 on board, is ignored, because scorer/c+d, "
-        "process 2 on board, started later; stop one of them, or give it other trays"
-    )
-    sessions.update(other.key("s"), alive=False)
-    assert not sessions.is_ignored(one.producer, "c"), "it takes over at once"
-    assert not sessions.problem()
-
-
-@pytest.mark.parametrize(("whole_started", "is_whole_ignored"), [(1, True), (9, False)])
-def test_row_07_a_session_of_all_trays_and_one_of_some(whole_started, is_whole_ignored):
-    whole, some = shard("all", whole_started), shard("a+b", 5, "a", "b")
-    sessions = known(whole, some)
-    for tray, is_shared in (("a", True), ("b", True), ("c", False)):
-        assert sessions.is_ignored(whole.producer, tray) == (is_whole_ignored and is_shared)
-        assert sessions.is_ignored(some.producer, tray) == (not is_whole_ignored or not is_shared)
-    assert "two owners of trays a, b in scorer" in sessions.problem()
+    whole = shard("all", 9)
+    sessions.update(whole.key("s"), alive=True)
+    assert sessions.successor_of(third) == whole, "a session of all trays has those of each other one"
+    assert [sessions.owner("scorer", tray) for tray in "acx"] == [whole] * 3
 
 
 def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(config, monkeypatch):
@@ -193,57 +169,19 @@ def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobod
         Runner(toy(), config, None, stop).run()
 
 
-def test_row_07_where_two_run_the_samples_of_one_are_ignored_and_both_are_named(config):
-    bench = Bench(toy(), config)
+def test_row_07_where_two_were_started_at_once_the_earlier_ends_and_names_the_other(config):
+    bench = Bench(toy(), config, expects=StageError)
     with Bus(config.bus) as other:
-        for bus, session in ((bench.bus, FIRST), (other, SECOND)):
-            bus.declare_alive(session.key("s"))
-        bench.health_with(lambda health: health.problem == ONE_LINE)
-        key = tray_key("s", TRAY_A, "raw")
-        publishers = {s: bench.bus.publisher(key, BY_NAME["raw"], type_name(Raw), s.producer) for s in (FIRST, SECOND)}
-
-        def feed(session: Session, t_ns: int) -> None:
-            header = Header(session.producer, publishers[session].published, TRAY_A)
-            publishers[session].put(encode(replace(raw(t_ns), header=header)))
-
-        feed(FIRST, 1)
-        feed(SECOND, 2)
-        assert bench.next(Grid).t_ns.tolist() == [2]
-        refused = bench.health_with(lambda health: any(c.name == "refused_of_second" for c in health.counters))
-    bench.health_with(lambda health: not health.problem)
-    feed(FIRST, 3)
-    assert bench.next(Grid).t_ns.tolist() == [3], "the other has ended"
-    bench.end()
-    assert {c.name: c.value for c in refused.counters}["refused_of_second"] == 1
-    assert {line.producer: line.refused for line in refused.inputs} == {FIRST.producer: 1, SECOND.producer: 0}
-
-
-def test_row_07_alarms_of_a_second_scorer_are_not_shown(config):
-    first, second = (
-        replace(s, stage="scorer", instance="all", producer=f"scorer-all-{s.started_t_ns}", trays=())
-        for s in (FIRST, SECOND)
-    )
-    with Bus(config.bus) as site, Bus(config.bus) as ours:
-        watcher = SiteWatcher(ours, "s")
-        for session in (first, second):
-            site.declare_alive(session.key("s"))
-        key = tray_key("s", TRAY_A, "alarm")
-        eventually(lambda: not watcher.counts(key, first.producer), "both are known")
-        for session, fan in ((first, 1), (second, 2)):
-            alarm = Alarm(
-                header=Header(session.producer, 0, TRAY_A),
-                fan=fan,
-                active=True,
-                severity=Severity.ALARM,
-                t_ns=1,
-                onset_t_ns=1,
-                residual_rad_s=0,
-                residual_std_rad_s=0,
-                message="",
-            )
-            site.publisher(key, BY_NAME["alarm"], type_name(Alarm), session.producer).put(encode(alarm))
-        eventually(watcher.alarms, "an alarm is shown")
-        assert [alarm.fan for alarm in watcher.alarms()] == [2]
+        token = Session("resampler", "a+x", 2**62, "resampler-a+x-1", "rack", 4712, (TRAY_A, "x"))
+        other.declare_alive(token.key("s"))
+        ending = bench.health_with(lambda health: health.is_last)
+    bench.thread.join(20)
+    bench.bus.close()
+    (error,) = bench.crashes
+    said = "resampler ends: resampler/a+x, process 4712 on rack, has trays a, x and started later"
+    assert str(error).startswith(said)
+    assert ending.problem.startswith(said)
+    assert ending.status == StageStatus.DEGRADED
 
 
 def test_row_07_a_snapshot_that_another_process_uses_is_refused_in_one_line(tmp_path: Path):

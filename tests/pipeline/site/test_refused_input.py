@@ -20,10 +20,10 @@ def health(name: str = "acquisition/bench", process_id: int = 7, /, **counters: 
     return made_messages.health(stage, instance, status=status, process_id=process_id, counters=counts)
 
 
-def test_row_07_what_sessions_have_refused_is_added_up():
-    sessions = [health("recorder/all", refused_of_second=5, refused_clocks=0)] * 2
-    assert refused([*sessions, health(samples=3)]) == {"recorder": {"refused_of_second": 10}}
-    assert refused_lines(refused(sessions)) == ["recorder: refused: 10 messages from a second process of a stage"]
+def test_row_10_what_sessions_have_refused_is_added_up():
+    sessions = [health("recorder/all", refused_forged=5, refused_clocks=0)] * 2
+    assert refused([*sessions, health(samples=3)]) == {"recorder": {"refused_forged": 10}}
+    assert refused_lines(refused(sessions)) == ["recorder: refused: 10 messages in the name of another session"]
 
 
 def test_noise_on_a_line_is_listed_with_its_kinds():
