@@ -13,7 +13,6 @@ from typing import Any
 
 import zenoh
 
-from fantwin.pipeline.bus.kept_messages import kept_key
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, recovery_key
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import Role, roles_of
@@ -81,7 +80,7 @@ def rights_of(role: Role, site: str) -> Rights:
         tokens.append(sweep_key(site, "*"))
     keeps = [key for topic in role.keeps for key in _keys(site, topic, ())]
     kept = [key for topic in role.keeps for key in _keys(site, topic, role.trays)]
-    asks = [kept_key(key, ALL_PRODUCERS) for topic in role.writes for key in _keys(site, topic, role.trays)]
+    asks = [key for topic in role.writes for key in _keys(site, topic, role.trays)]
     answers = [recovery_key(key, ALL_PRODUCERS) for key in writes]
     who_is_there = (alive_key(site, "*", "*"), sessions_key(site), sweep_key(site, "*"))
     return Rights(
@@ -93,8 +92,8 @@ def rights_of(role: Role, site: str) -> Rights:
                 *asks,
                 rights_key(site, role.name),
             ),
-            "declare_queryable": (*answers, *(kept_key(key, ALL_PRODUCERS) for key in keeps)),
-            "reply": (*answers, *(kept_key(key, ALL_PRODUCERS) for key in kept)),
+            "declare_queryable": (*answers, *keeps),
+            "reply": (*answers, *kept),
             "liveliness_token": tuple(tokens),
             "liveliness_query": who_is_there,
             "declare_liveliness_subscriber": who_is_there,

@@ -19,7 +19,7 @@ from fantwin.pipeline.bus.access_rules import SiteRoles
 from fantwin.pipeline.bus.endpoint import endpoint_problem, somebody_listens
 from fantwin.pipeline.bus.errors import BusError, NoAnswerError
 from fantwin.pipeline.bus.identity import Forgeries, new_session_id, sender_of
-from fantwin.pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept, kept_key
+from fantwin.pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
 from fantwin.pipeline.bus.meeting import Meeting
 from fantwin.pipeline.bus.opening import (
     MEETING_LIMIT_S,
@@ -224,13 +224,13 @@ class Bus:
         request.cancel()
         return answer.messages
 
-    def answer_for_kept(self, key_expression: str, kept_by: str, on_query: Callable[[KeptQuery], object]) -> None:
+    def answer_for_kept(self, key_expression: str, on_query: Callable[[KeptQuery], object]) -> None:
         """Call `on_query` when somebody asks for the last message on a key that is kept here."""
-        self._claims.append(("declare_queryable", kept_key(key_expression, kept_by)))
-        self._declared.append(answer_for_kept(self._session, key_expression, kept_by, on_query))
+        self._claims.append(("declare_queryable", key_expression))
+        self._declared.append(answer_for_kept(self._session, key_expression, on_query))
 
     def ask_for_kept(self, key: str, timeout_s: float) -> tuple[list[bytes], bool]:
-        """The messages that others keep for one key, and whether all of them have answered in time. Waits for it."""
+        """What each keeper of a key has, empty if nothing, and whether all have answered in time. Waits for it."""
         return ask_for_kept(self._session, key, timeout_s)
 
     def require_rights(self, stop: threading.Event | None = None, *, of_role: bool = False) -> None:

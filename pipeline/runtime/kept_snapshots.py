@@ -10,16 +10,14 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from fantwin.pipeline.bus.errors import NoAnswerError
 from fantwin.pipeline.bus.kept_messages import KeptQuery
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.runtime.second_owner import GOSSIP_S
-from fantwin.pipeline.runtime.sessions import Session
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import ScorerSnapshot
-from fantwin.schemas.topics import sessions_key, topic_of, tray_key
+from fantwin.schemas.topics import tray_key
 
 SNAPSHOT = "snapshot"
 KEEPER_LIMIT_S = 60.0
@@ -37,19 +35,20 @@ class KeptForOthers:
         bus: Bus,
         site: str,
         topics: Iterable[str],
-        producer: str,
+        trays: Iterable[str],
         before: Mapping[str, bytes],
         on_query: Callable[[KeptQuery], object],
     ) -> None:
-        """topics: those that are kept; producer: of this process; before: messages from before its start, by key.
+        """topics, trays: those of which messages are kept. before: messages from before its start, by key.
 
         on_query: called from a thread of the bus. `answer` must be called after what had arrived before the query has
         been added: whoever asks has seen the end of a process, whose last message may still be on the way.
         """
         self._topics = frozenset(topics)
+        self._keys = {tray_key(site, tray, topic) for tray in trays for topic in self._topics}
         self._last = dict(before)
         for topic in self._topics:
-            bus.answer_for_kept(tray_key(site, "*", topic), producer, on_query)
+            bus.answer_for_kept(tray_key(site, "*", topic), on_query)
 
     def add(self, envelope: Envelope) -> None:
         """Keep a message if it is of such a topic."""
@@ -58,8 +57,10 @@ class KeptForOthers:
 
     def answer(self, query: KeptQuery) -> None:
         """Give the last message to whoever asks for it."""
-        is_kept = topic_of(query.key).name in self._topics
-        query.answer(self._last.get(query.key) if is_kept else None)
+        if query.key in self._keys:
+            query.answer(self._last.get(query.key, b""))
+        else:
+            query.decline()
 
 
 class KeptSnapshots:
@@ -99,31 +100,18 @@ class KeptSnapshots:
             self._wait_for_predecessor()
             self._began_s = time.monotonic()
         is_patient = is_patient and self._is_one_expected
-        bus = self._bus()
+        bus, key = self._bus(), tray_key(self._site, tray, SNAPSHOT)
         limit_s = self._keeper_limit_s if is_patient else GOSSIP_S if bus.came_second else 0.0
-        is_kept = self._wait_for_keeper(bus, tray, self._began_s + limit_s)
-        payloads, have_answered = bus.ask_for_kept(tray_key(self._site, tray, SNAPSHOT), self._answer_limit_s)
-        why = f"no recorder of this tray was there within {limit_s:g} s" if is_patient and not is_kept else ""
+        while True:
+            payloads, have_answered = bus.ask_for_kept(key, self._answer_limit_s)
+            is_over = time.monotonic() >= self._began_s + limit_s
+            if payloads or is_over or not have_answered or self._stop.wait(_POLL_S):
+                break
+        why = f"no recorder of this tray was there within {limit_s:g} s" if is_patient and not payloads else ""
         if not have_answered:
             why = f"a recorder did not answer within {self._answer_limit_s:g} s"
             self._answer_limit_s = min(self._answer_limit_s, IMPATIENT_S)
         return [snapshot for snapshot in map(_decoded, payloads) if snapshot is not None], why
-
-    def _wait_for_keeper(self, bus: Bus, tray: str, until_s: float) -> bool:
-        """Whether a stage that keeps the snapshots of a tray is there in time."""
-        while not (is_there := self._has_keeper(bus, tray)) and time.monotonic() < until_s:
-            if self._stop.wait(_POLL_S):
-                break
-        return is_there
-
-    def _has_keeper(self, bus: Bus, tray: str) -> bool:
-        """Whether such a stage is there. False also without an answer of the bus: then it cannot be asked either."""
-        keepers = filter(keeps_snapshots, STAGES)
-        try:
-            tokens = [token for stage in keepers for token in bus.alive(sessions_key(self._site, stage))]
-        except NoAnswerError:
-            return False
-        return any(each is not None and each.has(tray) for each in map(Session.of_key, tokens))
 
 
 def keeps_snapshots(stage: str) -> bool:
@@ -133,6 +121,6 @@ def keeps_snapshots(stage: str) -> bool:
 
 def _decoded(payload: bytes) -> ScorerSnapshot | None:
     try:
-        return decode(ScorerSnapshot, payload)
+        return decode(ScorerSnapshot, payload) if payload else None
     except CodecError:
         return None

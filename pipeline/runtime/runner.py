@@ -99,7 +99,7 @@ class Runner:
         )
         before = {key: payload for parts in self._parts.values() for key, payload in parts.kept.items()}
         self._kept = KeptForOthers(
-            self._bus, config.site, STAGES[stage.name].keeps, self.producer, before, self._inbox.put
+            self._bus, config.site, STAGES[stage.name].keeps, shard.trays, before, self._inbox.put
         )
         self._has_source = any(parts.source for parts in self._parts.values())
         takes_messages = not (stage.wants_envelopes or stage.undecoded)

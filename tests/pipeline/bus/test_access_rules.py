@@ -12,7 +12,6 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from fantwin.pipeline.bus.kept_messages import kept_key
 from fantwin.pipeline.bus.recovery import recovery_key
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.runtime.stage import load_stage
@@ -145,7 +144,7 @@ def test_who_may_answer_for_what_was_missed_and_who_may_ask(site):
             for tray in TRAYS:
                 for key in (
                     recovery_key(tray_key(SITE, tray, topic), role),
-                    kept_key(tray_key(SITE, tray, topic), role),
+                    tray_key(SITE, tray, topic),
                 ):
 
                     def answer(query: zenoh.Query, key: str = key, role: str = role) -> None:
@@ -164,11 +163,11 @@ def test_who_may_answer_for_what_was_missed_and_who_may_ask(site):
                 if topic == "snapshot" and stage_and_trays(role)[0] == "recorder" and tray in stage_and_trays(role)[1]
             }
             assert answers(site, "router", recovery_key(key, "*")) == writers, key
-            assert answers(site, "router", kept_key(key, "*")) == keepers, key
+            assert answers(site, "router", key) == keepers, key
             for role in (each for each in roles(site) if tray == "a" or "." in each):  # the others are for both trays
                 expected = writers if may_read(role, topic, tray) else set()
                 assert answers(site, role, recovery_key(key, "*")) - {role} == expected - {role}, (role, key)
-    kept = kept_key(tray_key(SITE, "a", "snapshot"), "*")
+    kept = tray_key(SITE, "a", "snapshot")
     assert answers(site, "scorer", kept) - {"scorer"} == {"recorder", "recorder.a"}
     assert answers(site, "resampler", kept) - {"resampler"} == set()
     for each in answering:

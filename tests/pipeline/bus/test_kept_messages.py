@@ -18,7 +18,7 @@ LOST_S, RATE_HZ = 30, 100
 def test_row_16_what_is_sent_while_a_link_is_lost_for_30_s_is_kept(endpoint):
     """Samples of 8 fans at 100 Hz; a consumer that begins, as after a hang, asks for those of 40 s."""
     key, topic = tray_key("s", "a", "raw"), BY_NAME["raw"]
-    config = BusConfig(endpoint=endpoint)
+    config = BusConfig(endpoint=endpoint, recovery_timeout_s=60)
     with Bus(config) as bus, Bus(config) as asker:
         publisher = bus.publisher(key, topic, "", "p")
         for _ in range(LOST_S * RATE_HZ + CATCH_UP_MESSAGES):
@@ -34,7 +34,7 @@ def test_a_site_or_tray_may_have_a_name_of_which_other_keys_are_made(endpoint):
         for key in (tray_key("s", "recover", "snapshot"), tray_key("kept", "recover", "snapshot")):
             bus.publisher(key, topic, "", "p").put(b"one")
             asked: list[str] = []
-            with answer_for_kept(bus._session, key, "recorder", lambda query, asked=asked: answer(query, asked)):
+            with answer_for_kept(bus._session, key, lambda query, asked=asked: answer(query, asked)):
                 found = eventually(lambda key=key: ask_for_kept(asker._session, key, 1.0)[0], "what is kept is found")
             assert (found, set(asked)) == ([b"one"], {key})
             assert eventually(lambda key=key: asker.recover(key, "p"), "they have met") == [(key, b"one")]

@@ -7,12 +7,10 @@ from collections.abc import Callable, Iterator, Mapping
 
 import pytest
 
-from fantwin.pipeline.bus.errors import NoAnswerError
 from fantwin.pipeline.bus.kept_messages import KeptQuery
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
 from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers, KeptSnapshots
-from fantwin.pipeline.runtime.sessions import Session
 from fantwin.schemas.codec import encode
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
@@ -22,7 +20,8 @@ from tests.support.running_chain import eventually
 from tests.support.written_recordings import alarm
 
 LONG_S = 60.0
-RECORDER = Session("recorder", "1-of-2", 1, "recorder-1-of-2-1", "board", 1, ("a", "b"))
+TRAYS = ("a", "b")
+"""those that the recorder has"""
 
 
 def snapshot(tray: str, t_ns: int) -> Envelope:
@@ -57,13 +56,13 @@ def asking(
     )
 
 
-def keeping(bus: Bus, before: Mapping[str, bytes], producer: str = RECORDER.producer) -> KeptForOthers:
+def keeping(bus: Bus, before: Mapping[str, bytes]) -> KeptForOthers:
     """What a recorder keeps that answers at once."""
 
     def answer(query: KeptQuery) -> None:
         kept.answer(query)
 
-    kept = KeptForOthers(bus, "s", ("snapshot",), producer, before, answer)
+    kept = KeptForOthers(bus, "s", ("snapshot",), TRAYS, before, answer)
     return kept
 
 
@@ -78,7 +77,6 @@ def times(kept: KeptSnapshots, tray: str, *, is_patient: bool = True) -> list[in
 def test_the_last_snapshot_of_a_tray_is_given_to_whoever_asks_for_that_tray(buses):
     recorder, scorer = buses
     kept = keeping(recorder, by_key(snapshot("b", 1), snapshot("a", 1)))
-    recorder.declare_alive(RECORDER.key("s"))
     for t_ns in (5, 7):
         kept.add(snapshot("a", t_ns))
     kept.add(Envelope.of(tray_key("s", "a", "alarm"), alarm(0), 9))
@@ -90,10 +88,10 @@ def test_the_last_snapshot_of_a_tray_is_given_to_whoever_asks_for_that_tray(buse
 
 def test_each_stage_that_keeps_one_answers_and_what_cannot_be_read_is_left_out(buses):
     one, scorer = buses
-    for number, payload in enumerate((encode(snapshot("a", 3).message), b"\xff\xff")):
-        keeping(one, {tray_key("s", "a", "snapshot"): payload}, f"recorder-{number}")
-    one.declare_alive(RECORDER.key("s"))
-    assert times(asking(scorer), "a") == [3]
+    for payload in (encode(snapshot("a", 3).message), b"\xff\xff"):
+        keeping(one, {tray_key("s", "a", "snapshot"): payload})
+    found = asking(scorer)
+    assert eventually(lambda: times(found, "a"), "both have answered") == [3]
 
 
 def test_nobody_waits_for_a_recorder_that_the_configuration_does_not_have_or_where_the_own_file_is_recent(buses):
@@ -102,38 +100,12 @@ def test_nobody_waits_for_a_recorder_that_the_configuration_does_not_have_or_whe
     assert asking(scorer).of("a", is_patient=False) == ([], "")
 
 
-def test_a_recorder_of_other_trays_is_not_the_one_that_is_waited_for(buses):
+def test_a_recorder_that_has_nothing_of_a_tray_is_not_waited_for_and_one_of_other_trays_is_none(buses):
     recorder, scorer = buses
     keeping(recorder, {})
-    recorder.declare_alive(RECORDER.key("s"))
+    assert asking(scorer).of("a", is_patient=True) == ([], "")
     found = asking(scorer, keeper_limit_s=0.3)
-    looked: list[str] = []
-    alive = scorer.alive
-
-    def look(key: str) -> set[str]:
-        looked.append(key)
-        return alive(key)
-
-    eventually(lambda: scorer.alive(RECORDER.key("s")), "the recorder is known")
-    scorer.alive = look
-    assert found.of("a", is_patient=True) == ([], "")
-    assert len(looked) == 1, "the recorder of this tray is there"
     assert found.of("c", is_patient=True) == ([], "no recorder of this tray was there within 0.3 s")
-    assert len(looked) > 2, "no recorder has this tray: it may still start"
-
-
-def test_row_18_where_nobody_says_who_is_there_no_recorder_is_waited_for_longer(buses):
-    recorder, scorer = buses
-    keeping(recorder, by_key(snapshot("a", 4)))
-
-    def unknown(_key: str) -> set[str]:
-        raise NoAnswerError("who is on the bus is not known")
-
-    found = asking(scorer, keeper_limit_s=0.3)
-    scorer.alive = unknown
-    kept, why = found.of("a", is_patient=True)
-    assert [each.t_ns for each in kept] == [4], "it is asked all the same"
-    assert why == "no recorder of this tray was there within 0.3 s"
 
 
 def test_a_recorder_that_starts_meanwhile_is_waited_for(buses):
@@ -142,7 +114,6 @@ def test_a_recorder_that_starts_meanwhile_is_waited_for(buses):
     thread = threading.Thread(target=lambda: given.extend(times(asking(scorer), "a")))
     thread.start()
     keeping(recorder, by_key(snapshot("a", 4)))
-    recorder.declare_alive(RECORDER.key("s"))
     thread.join(LONG_S)
     assert given == [4]
 
@@ -150,15 +121,13 @@ def test_a_recorder_that_starts_meanwhile_is_waited_for(buses):
 def test_whoever_takes_over_asks_when_the_one_before_has_published_its_last_snapshot(buses):
     recorder, scorer = buses
     kept = keeping(recorder, by_key(snapshot("a", 1)))
-    recorder.declare_alive(RECORDER.key("s"))
     assert times(asking(scorer, wait_for_predecessor=lambda: kept.add(snapshot("a", 2))), "a") == [2]
 
 
 def test_a_recorder_that_hangs_is_not_waited_for_twice_and_is_told_of(buses):
     recorder, scorer = buses
     queries: list[KeptQuery] = []
-    KeptForOthers(recorder, "s", ("snapshot",), RECORDER.producer, {}, queries.append)
-    recorder.declare_alive(RECORDER.key("s"))
+    KeptForOthers(recorder, "s", ("snapshot",), TRAYS, {}, queries.append)
     found = asking(scorer, answer_limit_s=0.6)
     assert found.of("a", is_patient=True) == ([], "a recorder did not answer within 0.6 s")
     assert found.of("b", is_patient=True) == ([], "a recorder did not answer within 0.5 s")
