@@ -224,7 +224,9 @@ def test_messages_that_acquisition_missed_are_fetched_by_it(
         tray.check()
         dropped: list[object] = []
         with monkeypatch.context() as lossy:
-            lossy.setattr(tray._publisher, "_publisher", SimpleNamespace(put=dropped.append))
+            lossy.setattr(
+                tray._publisher, "_publisher", SimpleNamespace(put=lambda payload, **_: dropped.append(payload))
+            )
             for number in range(1, 5):
                 tray.publish(T_S + number, [0.5, 0.5], [1.0, 1.0])
             eventually(lambda: dropped and not tray._outbox.waiting, "they are sent in vain")

@@ -65,7 +65,7 @@ class AlarmOnRequestScorer(Core):
         severity, judged = np.full(FANS, int(Severity.ALARM)), np.ones(FANS, np.bool_)
         events = self.conditions.update(Decided(now_ns, judged, active, severity, self._raised_t_ns, 0))
         alarms = [self._alarm(each.fan, each.transition, each.alarm_state, "too slow") for each in events]
-        return [one_sample(FANS, *self.not_judged), *alarms]
+        return [replace(one_sample(FANS, *self.not_judged), t_ns=np.array([now_ns])), *alarms]
 
     def step(self, item: Any) -> Sequence[Message]:
         if self.deaf or not isinstance(item, Request):

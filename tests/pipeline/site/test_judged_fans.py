@@ -101,6 +101,16 @@ def test_row_01_without_scores_the_first_stage_that_does_not_work_is_the_reason(
     assert listener.lines(after[1]) == ["a: no fan is judged: no score arrives"]
 
 
+def test_row_11_scores_that_are_late_judge_nobody_however_many_come(listener):
+    """A flood of requests once held up a scorer for a minute, while its scores of before still came."""
+    listener.score("a")
+    listener.score("b")
+    behind = state("scorer/a", Word.LATE, "it is 19 s behind")
+    assert listener.lines(state("scorer", Word.OK)) == []
+    assert listener.lines(behind) == ["a: no fan is judged: scorer/a: it is 19 s behind"]
+    assert listener.lines(state("viewer", Word.LATE, "it is 19 s behind")) == [], "it is not on the way"
+
+
 @pytest.mark.parametrize("payload", [b"\xff", b"", encode(one_sample(FANS + 1))])
 def test_bytes_that_are_no_score_of_the_tray_judge_nothing(listener, payload):
     listener.judged.add("a", payload)
