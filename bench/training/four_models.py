@@ -1,4 +1,4 @@
-"""Figures of the models that `fantwin train` of several models sets side by side (twin.comparison), over runs held out."""
+"""Figures of the models that `fantwin train` sets side by side (twin.comparison), over runs held out."""
 
 from __future__ import annotations
 
