@@ -24,7 +24,7 @@ from fantwin.pipeline.recordings.clips.worker import ClipWorker
 from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.disk_room import DiskRoom
 from fantwin.pipeline.recordings.held_messages import HeldMessages
-from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.interference import Interference
 from fantwin.pipeline.recordings.metadata import recording_metadata
 from fantwin.pipeline.recordings.open_part import OpenPart, PartsFolder
@@ -44,7 +44,7 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Message
 from fantwin.schemas.streams import StreamId
-from fantwin.schemas.topics import TOPICS, tray_key
+from fantwin.schemas.topics import HEALTH, TOPICS, tray_key
 from fantwin.schemas.units import NS_PER_S
 
 HELD_BYTES = 16 << 20
@@ -128,14 +128,13 @@ class Recorder(Core):
 
     def step(self, item: Envelope) -> Sequence[Message]:
         """Record one message."""
-        header = item.message.header
         self._now_ns = max(self._now_ns, item.received_t_ns)
         if item.topic == "twin":
             self._cards[item.key] = item
-        elif header.sequence < self._before.get((item.key, header.producer), 0):  # recorded before the restart
-            self._ledger.add_duplicated(item.key, header.producer)
+        elif self._before and self._was_recorded(item):
+            self._ledger.add_duplicated(item.key, item.header.producer)
             return ()
-        if isinstance(item.message, Health):
+        if item.topic == HEALTH and isinstance(item.message, Health):
             self._count_duplicated(item.message)
             if not self._healths.is_due(item, item.message):
                 return ()
@@ -223,6 +222,10 @@ class Recorder(Core):
         others = self._interference.problem(self._now_ns), self._room.problem, of_clips
         return self._problem or "; ".join(filter(None, others))
 
+    def _was_recorded(self, item: Envelope) -> bool:
+        """Whether a recorder before this one has recorded the message."""
+        return item.header.sequence < self._before.get((item.key, item.header.producer), 0)
+
     def _index(self) -> PartIndex | None:
         return self._part.index() if self._part else None
 
@@ -233,8 +236,10 @@ class Recorder(Core):
         if self._unflushed_ns is None:
             self._unflushed_ns = min(envelope.received_t_ns, self._now_ns)
         self._unflushed_bytes += len(envelope.payload)
-        part = self._part
-        self._attempt(lambda: part.add(envelope))
+        try:
+            self._part.add(envelope)
+        except RecordingError as error:
+            self._pause(str(error))
 
     def _attempt(self, action: Callable[[], None]) -> None:
         """Do something that the disk may refuse, and pause if it does."""

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fantwin.pipeline.learning.versions import TimeSpan, overlap
+from fantwin.pipeline.recordings.rare_messages import last_message_ns
 from fantwin.pipeline.recordings.reading import RecordingError, read_recording
-from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX, CORRUPT_DATA_ERRORS, indexed_reader
+from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX
 from fantwin.pipeline.recordings.repair import repair_in_place
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.messages import Raw
@@ -238,15 +239,7 @@ def _span(path: Path) -> TimeSpan:
     first = next(raws_of(path), None)
     if first is None:
         return 0, 0
-    return int(first.host_receive_t_ns[0]), _indexed_end_t_ns(path) or max(map(last_t_ns, raws_of(path)))
-
-
-def _indexed_end_t_ns(path: Path) -> int:
-    """The newest receipt by the index of a recording, that of its last samples; 0 if it has no index."""
-    with path.open("rb") as file, suppress(*CORRUPT_DATA_ERRORS):
-        summary = indexed_reader(file).get_summary()
-        return summary.statistics.message_end_time if summary and summary.statistics else 0
-    return 0
+    return int(first.host_receive_t_ns[0]), last_message_ns(path) or max(map(last_t_ns, raws_of(path)))
 
 
 def _seconds(span: TimeSpan) -> float:

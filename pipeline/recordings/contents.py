@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.opcode import Opcode
-from mcap.records import ChunkIndex
-from mcap.summary import Summary
-
 from fantwin.pipeline.recordings.disk import is_being_written
+from fantwin.pipeline.recordings.indexed import IndexedRecording, PartIndex
 from fantwin.pipeline.recordings.reading import METADATA_NAME
-from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, MESSAGE, chunk_at, indexed_reader, records_in
+from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
 from fantwin.pipeline.recordings.scan import Scan, scan
 from fantwin.pipeline.recordings.sequence_ledger import (
@@ -26,13 +23,15 @@ from fantwin.pipeline.recordings.sequence_ledger import (
     counts_from_metadata,
     next_sequences,
     recovered_from_metadata,
+    sum_by_key,
 )
-from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.codec import CodecError
 from fantwin.schemas.health import Health
-from fantwin.schemas.messages import Message, ModelCard
+from fantwin.schemas.messages import ModelCard
 from fantwin.schemas.streams import StreamId
-from fantwin.schemas.topics import topic_of
+from fantwin.schemas.topics import HEALTH, topic_of
 
+TWIN = "twin"
 TRUNCATED = "it is truncated, as after a crash"
 NOT_A_RECORD = "bytes that belong to no intact record"
 NO_INDEX = "it has no index"
@@ -127,6 +126,7 @@ def damage_of(found: Scan) -> tuple[str, ...]:
         (found.damaged_chunks, f"damaged chunks: {found.damaged_chunks}"),
         (found.damaged_records, f"damaged records: {found.damaged_records}"),
         (found.damaged_attachments, f"damaged attachments: {found.damaged_attachments}"),
+        (found.lacking and not found.is_damaged, f"messages that its ledger counts and that are gone: {found.lacking}"),
         (found.nameless, f"messages of channels without a name: {found.nameless}"),
         (found.counts.undecodable, f"messages that do not have the type of their channel: {found.counts.undecodable}"),
     )
@@ -171,8 +171,8 @@ def _by_scan(found: Scan) -> Contents:
         streams=found.streams,
         others={topic: counts.messages for topic, counts in found.counts.others.items()},
         before=found.before,
-        first_ns=found.index.first_ns,
-        last_ns=found.index.last_ns if found.messages else None,
+        first_ns=found.first_ns,
+        last_ns=found.last_ns,
         messages=found.messages,
         sessions=tuple(found.counts.sessions.values()),
         cards=found.counts.cards,
@@ -192,93 +192,41 @@ def _by_index(path: Path, file: BinaryIO) -> Contents | None:
         return None
     statistics, ledger = summary.statistics, records[LEDGER_NAME]
     streams = counts_from_metadata(ledger)
-    cards = [_last_card(file, summary, number) for number in _channels(summary, ModelCard)]
+    held = {channel.topic: statistics.channel_message_counts.get(id, 0) for id, channel in summary.channels.items()}
+    if any(counts.messages > held.get(key, 0) for key, counts in sum_by_key(streams.items()).items()):
+        return None  # somebody has removed messages: reading all of it tells which
+    sessions: dict[str, Health] = {}
+    cards: dict[str, ModelCard] = {}
+    indexed = IndexedRecording(PartIndex(path, summary.channels, summary.chunk_indexes), (HEALTH, TWIN))
+    for envelope in indexed:
+        with suppress(CodecError):
+            message = envelope.message
+            if isinstance(message, Health):
+                sessions.pop(message.header.producer, None)
+                sessions[message.header.producer] = message
+            elif isinstance(message, ModelCard):
+                cards[envelope.key] = message
     return Contents(
         path=path,
         size_bytes=path.stat().st_size,
         metadata=records.get(METADATA_NAME, {}),
         attachments=tuple(index.name for index in summary.attachment_indexes),
         streams=streams,
-        others={
-            channel.topic: statistics.channel_message_counts.get(number, 0)
-            for number, channel in summary.channels.items()
-            if _message_type(channel.topic) is None
-        },
+        others={topic: count for topic, count in held.items() if not _is_ours(topic)},
         before=before_from_metadata(records.get(BEFORE_NAME, {})),
         first_ns=statistics.message_start_time if statistics.message_count else None,
         last_ns=statistics.message_end_time if statistics.message_count else None,
         messages=statistics.message_count,
-        sessions=_sessions(file, summary, streams),
-        cards={key: card for key, card in cards if card is not None},
+        sessions=tuple(sessions.values()),
+        cards=cards,
         has_ended=ENDED in ledger,
         recovered=recovered_from_metadata(ledger),
     )
 
 
-def _channels(summary: Summary, kind: type[Message]) -> list[int]:
-    """The channels of this kind of message that have one in a chunk."""
-    return [
-        number
-        for number, channel in summary.channels.items()
-        if _message_type(channel.topic) is kind
-        and any(number in chunk.message_index_offsets for chunk in summary.chunk_indexes)
-    ]
-
-
-def _last_card(file: BinaryIO, summary: Summary, number: int) -> tuple[str, ModelCard | None]:
-    """The key of a channel and its last card; None if that cannot be decoded."""
-    chunk = next(chunk for chunk in reversed(summary.chunk_indexes) if number in chunk.message_index_offsets)
-    *_, (_, payload) = _messages_in(file, chunk, {number})
+def _is_ours(topic: str) -> bool:
     try:
-        return summary.channels[number].topic, decode(ModelCard, payload)
-    except CodecError:
-        return summary.channels[number].topic, None
-
-
-def _sessions(file: BinaryIO, summary: Summary, streams: Mapping[StreamId, StreamCounts]) -> tuple[Health, ...]:
-    """The last health of each session, in the order of the file. The ledger says when each was received, and so which
-    chunk has it; only where the host's clock was set back others are read as well."""
-    numbers = set(_channels(summary, Health))
-    keys = {summary.channels[number].topic for number in numbers}
-    wanted = {
-        (producer, counts.last_sequence): counts.last_ns
-        for (key, producer), counts in streams.items()
-        if key in keys and counts.last_sequence is not None and counts.last_ns is not None
-    }
-    found: dict[tuple[int, int], Health] = {}
-
-    def look_in(chunk: ChunkIndex, these: Collection[tuple[str, int]]) -> None:
-        sequences = {sequence & 0xFFFFFFFF for _, sequence in these}
-        for place, (sequence, payload) in enumerate(_messages_in(file, chunk, numbers)):
-            if sequence in sequences:
-                with suppress(CodecError):
-                    health = decode(Health, payload)
-                    if wanted.pop((health.header.producer, health.header.sequence), None) is not None:
-                        found[chunk.chunk_start_offset, place] = health
-
-    chunks = [chunk for chunk in summary.chunk_indexes if not numbers.isdisjoint(chunk.message_index_offsets)]
-    for chunk in chunks:
-        within = range(chunk.message_start_time, chunk.message_end_time + 1)
-        if these := [name for name, last_ns in wanted.items() if last_ns in within]:
-            look_in(chunk, these)
-    for chunk in reversed(chunks):
-        if wanted:
-            look_in(chunk, list(wanted))
-    return tuple(found[place] for place in sorted(found))
-
-
-def _messages_in(file: BinaryIO, chunk: ChunkIndex, numbers: Collection[int]) -> Iterator[tuple[int, bytes]]:
-    """MCAP's sequence number and the payload of each message of these channels in a chunk."""
-    data = chunk_at(file, chunk.chunk_start_offset, chunk.chunk_length)
-    for _, opcode, start, end in records_in(data):
-        if opcode == Opcode.MESSAGE:
-            channel, sequence, *_ = MESSAGE.unpack_from(data, start)
-            if channel in numbers:
-                yield sequence, data[start + MESSAGE.size : end]
-
-
-def _message_type(topic: str) -> type[Message] | None:
-    try:
-        return topic_of(topic).message
+        topic_of(topic)
     except KeyError:
-        return None
+        return False
+    return True

@@ -8,7 +8,6 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
 
 from fantwin.pipeline.recordings.records import RecordingError
 
@@ -51,14 +50,21 @@ class AtomicAppendFile:
     def write(self, data: bytes) -> None:
         """Append. OSError if the system refuses; the file is then unchanged."""
         rest = memoryview(data)
-        self._is_synced = False
         try:
             while rest:
+                self._is_synced = False
                 rest = rest[os.write(self._descriptor, rest) :]
         except OSError:
             self.cut(self.size)
             raise
         self.size += len(data)
+
+    def tell(self) -> int:
+        """Where the next write goes."""
+        return self.size
+
+    def flush(self) -> None:
+        """Nothing: every write goes to the system at once."""
 
     def cut(self, size: int) -> None:
         """Shorten it to `size` bytes; the next write goes there."""
@@ -71,11 +77,6 @@ class AtomicAppendFile:
         if not self._is_synced:
             os.fdatasync(self._descriptor)
             self._is_synced = True
-
-    def reader(self) -> BinaryIO:
-        """What it holds now, wherever it is. Nothing may be written any more: reading moves the place of writing."""
-        os.lseek(self._descriptor, 0, os.SEEK_SET)
-        return os.fdopen(os.dup(self._descriptor), "rb")
 
     def is_at(self, path: Path) -> bool:
         """Whether `path` is still this file: not deleted, moved or replaced. OSError if the system cannot say."""

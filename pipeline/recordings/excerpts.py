@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.records import ChunkIndex
-from mcap.summary import Summary
 
-from fantwin.pipeline.recordings.reading import Reading, RecordingError, read_recording
-from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, chunk_at, indexed_reader
+from fantwin.pipeline.recordings.indexed import IndexedRecording
+from fantwin.pipeline.recordings.reading import RecordingError, read_recording
+from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS
 from fantwin.pipeline.recordings.runs import RecordedTray, no_samples, read_runs, recorded_tray, segments_of
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
@@ -111,11 +111,10 @@ def _spaced(t_s: Array, every_s: float, before_s: float = -math.inf) -> Array:
 class _RawChunks:
     """The chunks of a recording with raw samples of one tray, in the order of the file."""
 
-    def __init__(self, path: Path, summary: Summary, channels: dict[int, tuple[str, str]], reading: Reading) -> None:
-        """channels: of raw samples. reading: knows them, and counts what cannot be read."""
-        self._path, self._channels, self._reading = path, channels, reading
-        with_raw = (chunk for chunk in summary.chunk_indexes if channels.keys() & chunk.message_index_offsets.keys())
-        self._chunks = sorted(with_raw, key=lambda chunk: chunk.chunk_start_offset)
+    def __init__(self, indexed: IndexedRecording) -> None:
+        """indexed: of raw samples."""
+        self._path, self._indexed = indexed.file, indexed
+        self._chunks = indexed.chunks
         self._first_t_ns = np.array([chunk.message_start_time for chunk in self._chunks], np.int64)
         self._last_t_ns = np.array([chunk.message_end_time for chunk in self._chunks], np.int64)
 
@@ -126,24 +125,14 @@ class _RawChunks:
         Raises:
             RecordingError: the file cannot be opened or is not a recording.
         """
-        reading = read_recording(path, topics=("raw",))
-        channels: dict[int, tuple[str, str]] = {}
-        try:
-            with path.open("rb") as file:
-                summary = indexed_reader(file).get_summary()
-        except (OSError, LookupError, *CORRUPT_DATA_ERRORS):
-            return None
-        for channel in summary.channels.values() if summary else ():
-            reading.add_channel(channel, channels)
-        if summary is None or len(channels) != 1:
-            return None
-        chunks = cls(path, summary, channels, reading)
-        return chunks if chunks._chunks else None
+        read_recording(path)
+        indexed = IndexedRecording.of(path, ("raw",))
+        return cls(indexed) if indexed and len(indexed.channels) == 1 and indexed.chunks else None
 
     @property
     def damage(self) -> str:
         """What could not be read so far, in one line; empty if all could."""
-        return self._reading.damage
+        return self._indexed.reading.damage
 
     def start(self) -> tuple[int, str] | None:
         """Time of the first sample, ns, and the name of the tray; None where these cannot be found in one chunk."""
@@ -178,24 +167,19 @@ class _RawChunks:
         return [raw for envelope in self._envelopes(chunks) if (raw := self._raw(envelope))]
 
     def _envelopes(self, chunks: Sequence[ChunkIndex]) -> Iterator[Envelope]:
-        try:
-            with self._path.open("rb") as file:
-                for chunk in chunks:
-                    try:
-                        data = chunk_at(file, chunk.chunk_start_offset, chunk.chunk_length)
-                        envelopes = self._reading.envelopes_in(data, self._channels)
-                    except CORRUPT_DATA_ERRORS:
-                        self._reading.damaged_chunks += 1
-                    else:
-                        yield from envelopes
-        except OSError as error:
-            raise RecordingError(f"{self._path}: cannot read the recording: {error.strerror}") from error
+        for chunk in chunks:
+            try:
+                yield from self._indexed.envelopes(chunk)
+            except CORRUPT_DATA_ERRORS:
+                self._indexed.reading.damaged_chunks += 1
+            except OSError as error:
+                raise RecordingError(f"{self._path}: cannot read the recording: {error.strerror}") from error
 
     def _raw(self, envelope: Envelope) -> Raw | None:
         try:
             raw = envelope.message
         except CodecError:
-            self._reading.undecodable += 1
+            self._indexed.reading.undecodable += 1
             return None
         assert isinstance(raw, Raw)
         return raw if len(raw.host_receive_t_ns) else None

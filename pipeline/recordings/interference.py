@@ -16,7 +16,7 @@ class Interference:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        """files that were restored, and messages lost with their file or not in it"""
+        """files that were restored, and messages lost with their file"""
         self._restored_reported = 0
         self._news = ""
         self._news_ns = 0
@@ -44,13 +44,6 @@ class Interference:
             self._news = (
                 f"{part.path}: another program deleted or cut the file while it was written; messages lost with it: "
                 f"{part.lost}; keep other programs away from it"
-            )
-        if part.absent:
-            self.counts["lost_absent"] += part.absent
-            self._news_ns = now_ns
-            self._news = (
-                f"{part.path}: messages that were written and are not in the finished file: {part.absent}; check the "
-                "disk, and keep other programs away from it"
             )
 
     def clock_set_back(self, now_ns: int) -> None:

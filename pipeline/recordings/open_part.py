@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
 from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart
 from fantwin.schemas.envelope import Envelope
@@ -21,7 +21,6 @@ class OpenPart(Protocol):
     written: Counter[str]
     restored: int
     lost: int
-    absent: int
 
     @property
     def pending(self) -> Sequence[Envelope]: ...  # noqa: D102

@@ -128,11 +128,12 @@ class RecordingParts:
     def last_messages(self, topic: str) -> dict[str, bytes]:
         """The last message of a topic on each key in the last parts of this recording, as bytes."""
         found: dict[str, bytes] = {}
-        with suppress(OSError, RecordingError):
+        with suppress(OSError):
             files = sorted(part_files(self.path), reverse=True)
             ours = (path for _, path in files if path.suffix == self.path.suffix and self._is_ours(path))
             for path in islice(ours, PARTS_SEARCHED):
-                found = last_messages(path, topic) | found
+                with suppress(RecordingError):
+                    found = last_messages(path, topic) | found
         return found
 
     def free_bytes(self) -> int:

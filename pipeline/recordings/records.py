@@ -10,7 +10,7 @@ import os
 import re
 import struct
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
@@ -25,7 +25,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import McapReader, SeekingReader
-from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Header, McapRecord, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
@@ -319,12 +319,18 @@ def whole_number(text: str) -> int | None:
     return int(text) if re.fullmatch(r"[0-9]{1,19}", text) else None
 
 
-def chunk_at(file: BinaryIO, offset: int, length: int) -> bytes:
-    """`chunk_data` of the chunk that an index places there; `length` is that of the whole record."""
-    if not RECORD.size <= length <= LARGEST_RECORD_BYTES:
-        raise ValueError(f"an index with a chunk of {length} bytes")
-    file.seek(offset + RECORD.size)
-    return chunk_data(parse(Chunk, file.read(length - RECORD.size)))
+def chunk_at(file: BinaryIO, chunk: ChunkIndex) -> bytes:
+    """`chunk_data` of the chunk that an index places there. Raises one of CORRUPT_DATA_ERRORS."""
+    file.seek(chunk.chunk_start_offset)
+    opcode, length = RECORD.unpack(file.read(RECORD.size))
+    if opcode != Opcode.CHUNK or length > LARGEST_RECORD_BYTES:
+        raise ValueError("an index with a chunk where none is")
+    return chunk_data(parse(Chunk, file.read(length)))
+
+
+def may_hold(chunk: ChunkIndex, channels: Collection[int]) -> bool:
+    """Whether a chunk can have messages of these channels: an index need not say which it has."""
+    return not chunk.message_index_offsets or not chunk.message_index_offsets.keys().isdisjoint(channels)
 
 
 def records_in(data: bytes) -> Iterator[tuple[int, int, int, int]]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
@@ -22,7 +21,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.contents import NOT_A_RECORD, losses_outside_counts
 from fantwin.pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused
-from fantwin.pipeline.recordings.index import SHORT_ENDING, write_ending
+from fantwin.pipeline.recordings.ending import write_ending
 from fantwin.pipeline.recordings.records import (
     ACTIVE_SUFFIX,
     MESSAGE,
@@ -87,16 +86,10 @@ def repair_in_place(active: Path) -> Recovery | None:
         if found is None or not (found.messages or found.is_damaged):
             active.unlink()
             return None
-        if found.is_damaged or not (found.is_intact or found.is_laid_out_as_written):
+        if found.is_damaged:
             return _recover(active, None)
         if not found.is_intact:
-            file.cut(found.data_end)
-            try:
-                write_ending(file, found.index, _ledger_of(found), before=found.missing_indexes)
-            except OSError:
-                with suppress(OSError):
-                    file.write(SHORT_ENDING)
-                    file.sync()
+            write_ending(file, found, _ledger_of(found))
         name = _finished_name(active)
         active.rename(name)
         sync_folder(name.parent)

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import struct
+from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from zlib import crc32
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Header, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Header,
+    Metadata,
+    MetadataIndex,
+    Schema,
+)
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-from fantwin.pipeline.recordings.index import Index, message_indexes
 from fantwin.pipeline.recordings.message_counts import MessageCounts
 from fantwin.pipeline.recordings.reading import METADATA_NAME, left_out_of
 from fantwin.pipeline.recordings.records import (
@@ -47,8 +58,13 @@ class Scan:
     path: Path
     reader: RecordReader
     profile: str = ""
-    index: Index = field(default_factory=Index)
-    """of what is intact"""
+    index: Summary = field(default_factory=Summary)
+    """of what is intact, without statistics"""
+    written: Counter[int] = field(default_factory=Counter[int])
+    """intact messages by channel"""
+    first_ns: int | None = None
+    """first and last time of receipt; None without a message"""
+    last_ns: int | None = None
     counts: MessageCounts = field(default_factory=MessageCounts)
     recorded: dict[StreamId, StreamCounts] | None = None
     """the ledger in the file; None if it was never finished"""
@@ -74,11 +90,7 @@ class Scan:
     damaged_offsets: set[int] = field(default_factory=set)
     """positions of the damaged chunks, attachments and other records"""
     data_end: int = len(MCAP0_MAGIC)
-    """offset after the last intact chunk or other record of the data"""
-    missing_indexes: bytes = b""
-    """the message indexes of that chunk, which must follow at `data_end`"""
-    is_laid_out_as_written: bool = True
-    """every record is where our own writer puts it: the data can stay where it is when the file is repaired"""
+    """offset after the last intact record of the data"""
 
     @property
     def is_damaged(self) -> bool:
@@ -89,12 +101,20 @@ class Scan:
     @property
     def is_intact(self) -> bool:
         """There is nothing to repair."""
-        return self.reader.is_complete and self.has_index and not self.is_damaged
+        return self.reader.is_complete and self.has_index and not self.is_damaged and not self.lacking
+
+    @property
+    def lacking(self) -> int:
+        """Messages that the ledger in the file counts and that are not in it: damaged, or removed afterwards."""
+        found, recorded = self.counts.ledger.counts, self.recorded or {}
+        return sum(
+            max(0, counts.messages - found.get(stream, StreamCounts()).messages) for stream, counts in recorded.items()
+        )
 
     @property
     def messages(self) -> int:
         """Number of messages, on channels of any origin."""
-        return self.index.messages.total()
+        return self.written.total()
 
     @property
     def streams(self) -> dict[StreamId, StreamCounts]:
@@ -102,7 +122,7 @@ class Scan:
         found = self.counts.ledger.counts
         if self.recorded is None:
             return found
-        return correct_for_damage(self.recorded, found) if self.is_damaged else self.recorded
+        return correct_for_damage(self.recorded, found) if self.is_damaged or self.lacking else self.recorded
 
 
 def scan(path: Path) -> Scan:
@@ -131,6 +151,7 @@ def _read_to_footer(found: Scan) -> Record | None:
             footer = record
         else:
             scanner.add(record)
+    scanner.end_chunk()
     return footer
 
 
@@ -141,6 +162,8 @@ class _Scanner:
         self._found = found
         self._summary: Summary | None = None
         self._nameless: set[int] = set()
+        self._channels: Collection[int] = ()
+        """of the last chunk"""
 
     def add(self, record: Record) -> None:
         found = self._found
@@ -154,14 +177,10 @@ class _Scanner:
             found.damaged_records += record.opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT)
 
     def _add(self, record: Record) -> None:
-        found, length = self._found, record.end - record.offset
-        if record.opcode == Opcode.MESSAGE_INDEX:
-            return
-        expected_offset = found.data_end + len(found.missing_indexes)
-        indexes = b""
+        found, index, length = self._found, self._found.index, record.end - record.offset
         match record.parsed:
             case Chunk() as chunk:
-                indexes = self._add_chunk(record, chunk)
+                self._add_chunk(record, chunk)
             case Metadata(name=name, metadata=metadata) if name == LEDGER_NAME:
                 found.recorded = counts_from_metadata(metadata)
                 found.has_ended = ENDED in metadata
@@ -170,23 +189,31 @@ class _Scanner:
                 return
             case Metadata() as metadata:
                 self._add_metadata(metadata)
-                found.index.add_metadata(metadata, record.offset, length)
-            case Attachment() as attachment:
-                found.attachments.append(attachment.name)
-                found.index.add_attachment(attachment, record.offset, length)
+                index.metadata_indexes.append(MetadataIndex(record.offset, length, metadata.name))
+            case Attachment() as a:
+                found.attachments.append(a.name)
+                index.attachment_indexes.append(
+                    AttachmentIndex(record.offset, length, a.log_time, a.create_time, len(a.data), a.name, a.media_type)
+                )
             case Schema() | Channel() as description:
                 self._describe(description)
             case Header(profile=profile) if record.offset == len(MCAP0_MAGIC):
                 found.profile = profile
             case None if record.opcode == Opcode.MESSAGE:
                 self._add_unchunked(record)
+            case None if record.opcode == Opcode.MESSAGE_INDEX and index.chunk_indexes:
+                chunk_index = index.chunk_indexes[-1]
+                (channel,) = struct.unpack_from("<H", record.content)
+                chunk_index.message_index_offsets[channel] = record.offset
+                chunk_index.message_index_length += length
+            case None if record.opcode == Opcode.MESSAGE_INDEX:
+                pass
             case None if record.opcode == Opcode.DATA_END and len(record.content) == 4:
                 found.is_ended = True
                 return
             case _:
                 raise ValueError(f"a record of kind {record.opcode} in the data section, or a damaged one")
-        found.is_laid_out_as_written &= record.offset == expected_offset
-        found.data_end, found.missing_indexes = record.end, indexes
+        found.data_end = record.end
 
     def _add_metadata(self, metadata: Metadata) -> None:
         found = self._found
@@ -203,41 +230,51 @@ class _Scanner:
         if not self._found.counts.knows(channel):
             raise ValueError("a message without a channel")
         self._found.counts.add(channel, sequence, received_t_ns, record.content, MESSAGE.size, len(record.content))
-        self._found.index.add_unchunked_message(channel, received_t_ns)
+        self._found.written[channel] += 1
+        self._add_times(received_t_ns, received_t_ns)
 
-    def _add_chunk(self, record: Record, chunk: Chunk) -> bytes:
-        """Returns the message indexes that belong after the chunk."""
+    def _add_chunk(self, record: Record, chunk: Chunk) -> None:
         found, data = self._found, chunk_data(chunk)
-        entries: dict[int, list[int]] = {}
-        for offset, opcode, start, end in records_in(data):
+        self.end_chunk()
+        written: Counter[int] = Counter()
+        for _, opcode, start, end in records_in(data):
             if opcode == Opcode.MESSAGE:
                 channel, sequence, received_t_ns, _ = MESSAGE.unpack_from(data, start)
-                flat = entries.get(channel)
-                if flat is None:
-                    flat = entries[channel] = []
-                    if not found.counts.knows(channel):
-                        self._describe_from_summary(channel)
-                flat += (received_t_ns, offset)
+                if channel not in written and not found.counts.knows(channel):
+                    self._describe_from_summary(channel)
+                written[channel] += 1
                 found.counts.add(channel, sequence, received_t_ns, data, start + MESSAGE.size, end)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._describe(parse(Schema if opcode == Opcode.SCHEMA else Channel, data[start:end]))
-        found.nameless += sum(len(entries[channel]) // 2 for channel in entries.keys() & self._nameless)
-        indexes, offsets = message_indexes(entries, record.end)
-        found.index.add_chunk(
+        found.nameless += sum(written[channel] for channel in written.keys() & self._nameless)
+        found.written.update(written)
+        self._channels = written.keys()
+        if written:
+            self._add_times(chunk.message_start_time, chunk.message_end_time)
+        found.index.chunk_indexes.append(
             ChunkIndex(
                 message_start_time=chunk.message_start_time,
                 message_end_time=chunk.message_end_time,
                 chunk_start_offset=record.offset,
                 chunk_length=record.end - record.offset,
-                message_index_offsets=offsets,
-                message_index_length=len(indexes),
+                message_index_offsets={},
+                message_index_length=0,
                 compression=chunk.compression,
                 compressed_size=len(chunk.data),
                 uncompressed_size=chunk.uncompressed_size,
-            ),
-            {channel: len(flat) // 2 for channel, flat in entries.items()},
+            )
         )
-        return indexes
+
+    def end_chunk(self) -> None:
+        """Forget the message indexes of the last chunk if some are missing: a reader then looks for each channel."""
+        for last in self._found.index.chunk_indexes[-1:]:
+            if last.message_index_offsets.keys() != self._channels:
+                last.message_index_offsets, last.message_index_length = {}, 0
+
+    def _add_times(self, first_ns: int, last_ns: int) -> None:
+        found = self._found
+        found.first_ns = first_ns if found.first_ns is None else min(found.first_ns, first_ns)
+        found.last_ns = last_ns if found.last_ns is None else max(found.last_ns, last_ns)
 
     def _describe(self, description: Schema | Channel) -> None:
         if isinstance(description, Schema):

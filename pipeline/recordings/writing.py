@@ -7,6 +7,7 @@ after the last. While a file is written it is called NAME.mcap.active. See docs/
 from __future__ import annotations
 
 import mimetypes
+import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -14,29 +15,28 @@ from functools import cache
 from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, NoReturn, Self
+from typing import IO, NamedTuple, NoReturn, Self, cast
 
-from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema
+from mcap.records import Channel, ChunkIndex
 from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import MCAP0_MAGIC
+from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from fantwin.pipeline.files import sync_folder
-from fantwin.pipeline.recordings.chunk import FillingChunk
 from fantwin.pipeline.recordings.disk import AtomicAppendFile, Disk, refused
-from fantwin.pipeline.recordings.index import SHORT_ENDING, Index, PartIndex, write_ending
+from fantwin.pipeline.recordings.ending import write_short_ending
+from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.records import (
-    CORRUPT_DATA_ERRORS,
     FORMAT_KEY,
     MADE_BY_KEY,
+    MESSAGE,
     METADATA_NAME,
+    RECORD,
     RecordingError,
     active_path,
-    indexed_reader,
-    record_bytes,
     this_program,
 )
-from fantwin.pipeline.recordings.sequence_ledger import BEFORE_NAME, SequenceLedger, ledger_metadata
+from fantwin.pipeline.recordings.sequence_ledger import BEFORE_NAME, LEDGER_NAME, SequenceLedger, ledger_metadata
 from fantwin.schemas.codec import proto_type, type_name
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.formats import RECORDING
@@ -48,6 +48,7 @@ CHUNK_BYTES = 256 * 1024
 """A crash loses what is not in a finished chunk; a reader holds one chunk in memory."""
 UNSYNCED_BYTES = 4 << 20
 """About the most that is kept in memory until it is flushed to the disk."""
+_MESSAGE_BYTES = RECORD.size + MESSAGE.size
 
 
 class RecordingWriter:
@@ -92,10 +93,6 @@ class RecordingWriter:
         """how often another program had deleted, moved or replaced the file, and its content was written again"""
         self.lost = 0
         """messages that were flushed and are lost with the file, because it could not be restored"""
-        self.absent = 0
-        """messages that were added and are not in the finished file, by its own count"""
-        self._added: Counter[str] = Counter()
-        """messages by key"""
         self._filling: list[Envelope] = []
         """the messages of the chunk that is not written yet"""
         self._unsynced: list[_WrittenChunk] = []
@@ -103,9 +100,10 @@ class RecordingWriter:
         self._unsynced_bytes = 0
         self._overwrite = overwrite
         self._ended = False
-        self._index = Index()
+        self._chunks: list[ChunkIndex] = []
+        self._schemas: dict[str, int] = {}
         self._channels: dict[str, tuple[int, str]] = {}
-        self._chunk = FillingChunk()
+        self._chunk_bytes = 0
         self._active = active_path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -118,13 +116,15 @@ class RecordingWriter:
         except OSError as error:
             raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
         try:
-            self._file.write(MCAP0_MAGIC + record_bytes(Header(profile="", library="fantwin")))
+            # a chunk ends by `flush` alone: what a refused write has cost is then known
+            self._writer = Writer(cast(IO[bytes], self._file), chunk_size=sys.maxsize)
+            self._writer.start(profile="", library="fantwin")
             about = {MADE_BY_KEY: this_program(), **metadata, FORMAT_KEY: str(RECORDING.written)}
-            self._write_metadata(METADATA_NAME, about)
+            self._writer.add_metadata(METADATA_NAME, about)
             if self.ledger.next:
-                self._write_metadata(BEFORE_NAME, self.ledger.before_as_metadata())
+                self._writer.add_metadata(BEFORE_NAME, self.ledger.before_as_metadata())
             for name, content in (attachments or {}).items():
-                self._write_attachment(Attachment(t_ns, t_ns, name, _media_type(name), content))
+                self._writer.add_attachment(t_ns, t_ns, name, _media_type(name), content)
             sync_folder(path.parent)
             self._synced_size = self._file.size
         except OSError as error:
@@ -144,22 +144,27 @@ class RecordingWriter:
 
     def index(self) -> PartIndex:
         """What is flushed to the disk, and where."""
-        return PartIndex(self._active, dict(self._index.channels), list(self._index.chunks))
+        channels = {id: Channel(id, key, MessageEncoding.Protobuf, {}, 0) for key, (id, _) in self._channels.items()}
+        return PartIndex(self._active, channels, list(self._chunks))
 
     def add(self, envelope: Envelope) -> None:
-        """Add a message.
+        """Add a message. MCAP has no times before 1970 (the message itself keeps them) and a 32 bit sequence.
 
         Raises:
             RecordingError: the disk refuses; `pending` then has the messages that are not in the file.
         """
-        key = envelope.key
+        key, payload = envelope.key, envelope.payload
         channel, _ = self._channels.get(key) or self._register_channel(key, topic_of(key).message)
-        self._chunk.add(
-            channel, envelope.header.sequence, envelope.received_t_ns, envelope.newest_t_ns, envelope.payload
+        self._writer.add_message(
+            channel,
+            max(0, envelope.received_t_ns),
+            payload,
+            max(0, envelope.newest_t_ns),
+            envelope.header.sequence & 0xFFFFFFFF,
         )
-        self._filling.append(envelope)  # counted as recorded only if it is in the chunk
-        self._added[key] += 1
-        if self._chunk.size > CHUNK_BYTES:
+        self._filling.append(envelope)
+        self._chunk_bytes += len(payload) + _MESSAGE_BYTES
+        if self._chunk_bytes > CHUNK_BYTES:
             self._finish_chunk()
             if self._unsynced_bytes > UNSYNCED_BYTES:
                 self._sync()
@@ -207,12 +212,12 @@ class RecordingWriter:
         if has_ended:
             self.ledger.finish()
         try:
-            write_ending(self._file, self._index, ledger_metadata(self.ledger.counts, has_ended=has_ended))
+            self._writer.add_metadata(LEDGER_NAME, ledger_metadata(self.ledger.counts, has_ended=has_ended))
+            self._writer.finish()
+            self._file.sync()
         except OSError as error:
+            self._take_back()
             raise self._end_early(error) from error
-        for key, lacking in (self._added - self._counted_in_file()).items():
-            self.absent += lacking
-            self.written[self._channels[key][1]] -= lacking
         self._rename()
 
     def discard(self) -> None:
@@ -233,49 +238,31 @@ class RecordingWriter:
         else:
             self.discard()
 
-    def _counted_in_file(self) -> Counter[str]:
-        """The messages of each key by the statistics that are in the file; none if these cannot be read."""
-        with self._file.reader() as file, suppress(OSError, *CORRUPT_DATA_ERRORS):
-            summary = indexed_reader(file).get_summary()
-            if summary and summary.statistics:
-                counts = summary.statistics.channel_message_counts
-                return Counter({channel.topic: counts.get(id, 0) for id, channel in summary.channels.items()})
-        return Counter()
-
     def _register_channel(self, key: str, message_type: type[Message]) -> tuple[int, str]:
         name = type_name(message_type)
-        known = next((schema for schema in self._index.schemas.values() if schema.name == name), None)
-        schema = known or Schema(
-            id=len(self._index.schemas) + 1, name=name, encoding=SchemaEncoding.Protobuf, data=_schema(message_type)
-        )
-        channel = Channel(
-            id=len(self._channels) + 1,
-            topic=key,
-            message_encoding=MessageEncoding.Protobuf,
-            metadata={},
-            schema_id=schema.id,
-        )
-        self._index.schemas[schema.id] = schema
-        self._index.channels[channel.id] = channel
-        self._chunk.append(record_bytes(channel) if known else record_bytes(schema, channel))
-        self._channels[key] = (channel.id, topic_of(key).name)
+        if name not in self._schemas:
+            data = _schema(message_type)
+            self._schemas[name] = self._writer.register_schema(name, SchemaEncoding.Protobuf, data)
+            self._chunk_bytes += len(data)
+        channel = self._writer.register_channel(key, MessageEncoding.Protobuf, self._schemas[name])
+        self._channels[key] = (channel, topic_of(key).name)
         return self._channels[key]
 
     def _finish_chunk(self) -> None:
         if not self._filling:
             return
         self.stay_in_place()  # before writing: a write to a file that was cut would hide that
-        offset = self._file.size
-        record, index = self._chunk.finish(offset)
+        start = self._file.size
         try:
-            self._file.write(record)
+            self._writer.flush()
         except OSError as error:
+            with suppress(OSError):
+                self._file.cut(start)
             self._sync()  # the chunks before it are still saved
             raise self._end_early(error) from error
-        counts = {channel: len(flat) // 2 for channel, flat in self._chunk.entries.items()}
-        self._unsynced.append(_WrittenChunk(index, counts, self._filling))
-        self._unsynced_bytes += self._chunk.size
-        self._chunk, self._filling = FillingChunk(), []
+        self._unsynced.append(_WrittenChunk(start, self._filling))
+        self._unsynced_bytes += self._chunk_bytes
+        self._filling, self._chunk_bytes = [], 0
 
     def _sync(self) -> None:
         """Flush what is written to the disk; it counts as recorded from then on."""
@@ -290,15 +277,20 @@ class RecordingWriter:
         self._unsynced, self._unsynced_bytes, self._synced_size = [], 0, self._file.size
 
     def _count(self, chunk: _WrittenChunk) -> None:
-        self._index.add_chunk(chunk.chunk_index, chunk.counts)
+        times = [max(0, envelope.received_t_ns) for envelope in chunk.messages]
+        channels: set[int] = set()
         for envelope in chunk.messages:
-            header, (_, topic) = envelope.header, self._channels[envelope.key]
+            header, (channel, topic) = envelope.header, self._channels[envelope.key]
+            channels.add(channel)
             self.ledger.add(envelope.key, header.producer, header.sequence, envelope.received_t_ns)
             self.written[topic] += 1
             if topic == HEALTH:
                 message = envelope.message
                 assert isinstance(message, Health)
                 self.ledger.add_health(message)
+        self._chunks.append(
+            ChunkIndex(0, chunk.offset, "zstd", 0, max(times), 0, dict.fromkeys(channels, 0), min(times), 0)
+        )
 
     def _take_back(self) -> None:
         """Remove what may not be on the disk from the file; it is pending again."""
@@ -331,24 +323,9 @@ class RecordingWriter:
             f"{self._active}: {why}; messages lost with it: {self.lost}; keep other programs away from it"
         )
 
-    def _write_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        metadata = Metadata(name=name, metadata=dict(values))
-        record = record_bytes(metadata)
-        self._index.add_metadata(metadata, self._file.size, len(record))
-        self._file.write(record)
-
-    def _write_attachment(self, attachment: Attachment) -> None:
-        record = record_bytes(attachment)
-        self._index.add_attachment(attachment, self._file.size, len(record))
-        self._file.write(record)
-
     def _end_early(self, error: OSError) -> RecordingError:
-        """End the file after what is on the disk, with an index if there is room. Returns the error to raise."""
-        try:
-            write_ending(self._file, self._index, ledger_metadata(self.ledger.counts))
-        except OSError:
-            with suppress(OSError):  # without it the file is still readable, by readers that accept a truncated file
-                self._file.write(SHORT_ENDING)
+        """End the file after what is on the disk, without an index. Returns the error to raise."""
+        write_short_ending(self._file, ledger_metadata(self.ledger.counts))
         self._rename()
         return refused(
             f"{self.path}: cannot be written any more", error, "it ends here and is readable: make room on the disk"
@@ -372,9 +349,7 @@ class RecordingWriter:
 class _WrittenChunk(NamedTuple):
     """A chunk, to be counted once it is on the disk."""
 
-    chunk_index: ChunkIndex
-    counts: dict[int, int]
-    """messages by channel"""
+    offset: int
     messages: list[Envelope]
 
 

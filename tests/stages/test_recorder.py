@@ -23,7 +23,7 @@ from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import ConfigError, TrayConfig
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.disk import DiskError
-from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from fantwin.pipeline.recordings.scan import scan
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
@@ -85,7 +85,7 @@ class Part:
         self.written: Counter[str] = Counter()
         self.pending: list[Envelope] = []
         self.content: list[Envelope] = []
-        self.flushes = self.restored = self.lost = self.absent = 0
+        self.flushes = self.restored = self.lost = 0
         self.closed = ""
         self.size = disk.attached_bytes
 

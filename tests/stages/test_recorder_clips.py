@@ -12,8 +12,8 @@ import pytest
 from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips, tracker_of
 from fantwin.pipeline.recordings.clips.clip import Clip, clips_in, kept_clips, list_path
 from fantwin.pipeline.recordings.clips.tracker import ClipTracker, CutResult
-from fantwin.pipeline.recordings.clips.worker import ClipMaker, ClipWorker
-from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.clips.worker import ClipWorker
+from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError, read_recording
 from fantwin.pipeline.recordings.writing import RecordingWriter
@@ -34,7 +34,7 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recording_of(tmp_path_factory.mktemp("chain"), 1, 400)
 
 
-class Maker(ClipMaker):
+class Maker(ClipWorker):
     """A stand-in for the disk of the clips."""
 
     def __init__(self) -> None:

@@ -7,13 +7,10 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from fantwin.pipeline.recordings.chunk import FillingChunk
 from fantwin.pipeline.recordings.contents import contents_of
-from fantwin.pipeline.recordings.index import Index
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.stages.recorder import STAGE, Recorder
 from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, envelope, raw
@@ -119,25 +116,3 @@ def test_row_03_what_cannot_be_restored_is_lost_and_counted(tmp_path, monkeypatc
     assert (contents.streams[STREAM].messages, contents.streams[STREAM].missing) == (40, 20)
     assert "messages lost with it: 20" in contents.metadata["paused_because"]
     assert contents.metadata["lost_in_pause"] == "20"
-
-
-def test_row_05_what_is_not_in_the_finished_file_is_lost(tmp_path, monkeypatch):
-    add = FillingChunk.add
-
-    def lose_number_13(chunk: FillingChunk, channel: int, sequence: int, *others: Any) -> None:
-        if sequence != 13:
-            add(chunk, channel, sequence, *others)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(FillingChunk, "add", lose_number_13)
-        run = Run(tmp_path)
-        run.seconds(3)
-        run.core.close()
-    assert run.recorded() == [sequence for sequence in range(30) if sequence != 13]
-    assert run.core.counters() == {"recorded_raw": 29, "lost_unwritten": 0, "lost_absent": 1, "parts": 1}
-    assert "recording.mcap: messages that were written and are not in the finished file: 1;" in run.core.problem()
-    monkeypatch.setattr(Index, "ending", lambda _index, _offset: b"\xff" * 100)
-    run = Run(tmp_path / "other")
-    run.seconds(3)
-    run.core.close()
-    assert run.core.counters()["lost_absent"] == 30, "its end cannot be read again"

@@ -142,12 +142,12 @@ class Kills:
             due = {key: ledger.next[key, producer] for key, producer in ledger.counts if producer == PRODUCER}
             recorders = [health for health in found.counts.sessions.values() if health.stage == "recorder"]
             has_caught_up = bool(recorders) and recorders[-1].status == StageStatus.OK
-            if has_caught_up and found.index.first_ns is not None:
-                self._killed.append(_Killed(found.index.first_ns, at_ns, due, found.index.last_ns))
+            if has_caught_up and found.first_ns is not None:
+                self._killed.append(_Killed(found.first_ns, at_ns, due, found.last_ns or 0))
 
     def _records(self) -> bool:
         """Whether a message of the feed that was sent since the recorder started is in its file."""
-        return any(found.index.first_ns and found.index.last_ns > self._started_ns for found in self._active())
+        return any(found.last_ns and found.last_ns > self._started_ns for found in self._active())
 
     def _has_all(self) -> bool:
         """Whether the running recorder has recorded everything, or counted it as missing."""

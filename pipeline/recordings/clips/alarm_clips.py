@@ -9,8 +9,8 @@ from pathlib import Path
 from fantwin.pipeline.recordings.clips.clip import NOT_A_LIST, Clip, clips_in, list_path
 from fantwin.pipeline.recordings.clips.cutting import LEAD_NS
 from fantwin.pipeline.recordings.clips.tracker import LONGEST_NS, RETRY_NS, ClipTracker
-from fantwin.pipeline.recordings.clips.worker import ClipMaker
-from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.clips.worker import ClipWorker
+from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.rare_messages import last_message_ns, rare_messages
 from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.schemas.envelope import Envelope
@@ -33,7 +33,7 @@ CLOSE_S = 3.0
 class AlarmClips:
     """Follows the alarms, has clips cut when they are due, and says what may be deleted."""
 
-    def __init__(self, tracker: ClipTracker, maker: ClipMaker) -> None:
+    def __init__(self, tracker: ClipTracker, maker: ClipWorker) -> None:
         self._tracker, self._maker = tracker, maker
         self._saved, self._saved_ns = tracker.version, 0
         self._undeletable = ""

@@ -22,9 +22,9 @@ from fantwin.pipeline.recordings.clips.clip import CLIP_KEY, CLIP_SNAPSHOT_KEY, 
 from fantwin.pipeline.recordings.clips.part_chunks import PartChunks, parts_backwards
 from fantwin.pipeline.recordings.clips.tracker import SET_BACK_NS, CutResult
 from fantwin.pipeline.recordings.disk import DiskError, is_being_written, refused
-from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.reading import TACHO_KEY, RecordingMetadata
-from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, active_path
+from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, active_path, may_hold
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.envelope import Envelope
@@ -133,7 +133,7 @@ class _Parts:
         for part in self.go_back_to(t_ns, PARTS_SEARCHED):
             numbers = part.channels_of(key)
             for chunk in reversed(part.chunks):
-                if chunk.message_start_time > t_ns or numbers.isdisjoint(chunk.message_index_offsets):
+                if chunk.message_start_time > t_ns or not may_hold(chunk, numbers):
                     continue
                 with suppress(OSError, *CORRUPT_DATA_ERRORS):
                     found = [each for each in part.envelopes(chunk) if each.key == key and each.received_t_ns <= t_ns]

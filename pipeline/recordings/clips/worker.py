@@ -7,14 +7,13 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Protocol
 
 from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.recordings.clips.clip import Clip, clip_folder, clips_as_text, list_path
 from fantwin.pipeline.recordings.clips.cutting import cut_clips, remove_unfinished
 from fantwin.pipeline.recordings.clips.tracker import CutResult
 from fantwin.pipeline.recordings.disk import DiskError, refused
-from fantwin.pipeline.recordings.index import PartIndex
+from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.records import RecordingError
 
 AT_ONCE = 16
@@ -25,35 +24,7 @@ REST_S = 0.002
 """after each chunk, for the thread that records"""
 
 
-class ClipMaker(Protocol):
-    """What `AlarmClips` needs of the disk; tests stand in for it."""
-
-    def save(self, clips: Sequence[Clip]) -> None:
-        """Write the list of clips."""
-        ...
-
-    def cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
-        """Cut clips; `results` says what came of it. open_part: of the part that is being written."""
-        ...
-
-    def results(self) -> list[CutResult]:
-        """What came of clips since the last call."""
-        ...
-
-    def delete(self, clip: Clip) -> None:
-        """Delete the file of a clip. Raises RecordingError if that is not possible."""
-        ...
-
-    def problem(self) -> str:
-        """Why the list cannot be written; empty if it can."""
-        ...
-
-    def end(self, timeout_s: float) -> None:
-        """Finish what was asked for, as far as there is time, and stop."""
-        ...
-
-
-class ClipWorker(ClipMaker):
+class ClipWorker:
     """Cuts the clips of one recording."""
 
     def __init__(self, recording: Path, min_free_bytes: int, free_bytes: Callable[[], int]) -> None:
@@ -72,7 +43,7 @@ class ClipWorker(ClipMaker):
         remove_unfinished(self._folder)
 
     def save(self, clips: Sequence[Clip]) -> None:
-        """See ClipMaker. Of lists that wait, only the newest is written. After `end` it is written at once: a clip that
+        """Write the list of clips; of lists that wait, only the newest. After `end` it is written at once: a clip that
         takes longer than there was time for may still be cut."""
         self._to_save = tuple(clips)
         if self._has_ended:
@@ -81,20 +52,21 @@ class ClipWorker(ClipMaker):
             self._put(self._save)
 
     def cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
-        """See ClipMaker."""
+        """Cut clips; `results` says what came of it. open_part: of the part that is being written."""
         for first in range(0, len(clips), AT_ONCE):
             some = tuple(clips[first : first + AT_ONCE])
             self._put(lambda some=some: self._cut(some, open_part))
 
     def results(self) -> list[CutResult]:
-        """See ClipMaker."""
+        """What came of clips since the last call."""
         found: list[CutResult] = []
         while not self._results.empty():
             found.append(self._results.get())
         return found
 
     def delete(self, clip: Clip) -> None:
-        """See ClipMaker. At once: what waits behind clips that are being cut makes no room, and more is deleted."""
+        """Delete the file of a clip, at once: what waits behind clips that are being cut makes no room, and more is
+        deleted. Raises RecordingError if that is not possible."""
         path = self._folder / clip.name
         try:
             path.unlink(missing_ok=True)
@@ -103,11 +75,11 @@ class ClipWorker(ClipMaker):
             raise refused(f"{path}: cannot be deleted", error, advice) from error
 
     def problem(self) -> str:
-        """See ClipMaker."""
+        """Why the list cannot be written; empty if it can."""
         return self._problem
 
     def end(self, timeout_s: float) -> None:
-        """See ClipMaker."""
+        """Finish what was asked for, as far as there is time, and stop."""
         self._has_ended = True
         if self._thread is not None:
             self._jobs.put(None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Collection, Generator, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import fields, replace
 from itertools import islice
 from pathlib import Path
@@ -13,8 +12,8 @@ from typing import Any
 
 from fantwin.pipeline.recordings.grouping import describe, recordings_of
 from fantwin.pipeline.recordings.order import Seen, in_order
+from fantwin.pipeline.recordings.rare_messages import last_message_ns
 from fantwin.pipeline.recordings.reading import RecordingError, read_recording
-from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
 from fantwin.pipeline.replay.live.recorded_versions import NEW_TWIN, TWIN, ComingVersions, read_versions
 from fantwin.pipeline.replay.live.sample_times import sample_times
 from fantwin.schemas.envelope import Envelope
@@ -62,7 +61,7 @@ class RecordingPlayback:
 
     def end_s(self) -> float | None:
         """The end of the stretch in seconds since the first message; None where no file has an index."""
-        recorded = max(map(_last_received_t_ns, self.files))
+        recorded = max(map(last_message_ns, self.files))
         if not recorded:
             return None
         return self.seconds_at(min(recorded, self._end_ns) if self._end_ns is not None else recorded)
@@ -164,12 +163,3 @@ def _later(t_ns: Any, by_ns: int) -> Any:
     """A time, or an array of times, shifted. Values that stand for `never` or `until it clears` are not."""
     is_none = isinstance(t_ns, int) and not 0 < t_ns < 2**63 - 1
     return t_ns if is_none else t_ns + by_ns
-
-
-def _last_received_t_ns(file: Path) -> int:
-    """Receipt of the last message according to the file's index; 0 where it has none."""
-    with suppress(OSError, *CORRUPT_DATA_ERRORS), file.open("rb") as opened:
-        summary = indexed_reader(opened).get_summary()
-        if summary and summary.statistics:
-            return summary.statistics.message_end_time
-    return 0

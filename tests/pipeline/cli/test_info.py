@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from fantwin.pipeline.recordings import contents
@@ -190,6 +191,33 @@ def three_parts(folder: Path, *firsts: int) -> list[Path]:
         part(place, range(first, first + 10), ledger).finish()
         ledger = ledger.for_next_part()
     return [folder / name for name in ("r.mcap", "r-2.mcap", "r-3.mcap")]
+
+
+def test_messages_that_were_removed_afterwards_are_missing_and_recover_corrects_the_ledger(tmp_path):
+    path, altered = write(tmp_path / "r.mcap", 50), tmp_path / "altered.mcap"
+    with path.open("rb") as source, altered.open("wb") as file:
+        reader, writer = make_reader(source), Writer(file)
+        writer.start()
+        metadata = {each.name: each.metadata for each in reader.iter_metadata()}
+        writer.add_metadata("fantwin", metadata.pop("fantwin"))
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema
+            if channel.id not in channels:
+                of_schema = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, of_schema)
+            if not (channel.topic == RAW_KEY and 20 <= message.sequence < 30):
+                number = channels[channel.id]
+                writer.add_message(number, message.log_time, message.data, message.publish_time, message.sequence)
+        writer.flush()
+        writer.add_metadata("fantwin.ledger", metadata["fantwin.ledger"])
+        writer.finish()
+    for name in ("altered.mcap", "repaired.mcap"):
+        of_raw = shown(tmp_path / name, exit_code=3)["topics"][RAW_KEY]
+        assert (of_raw["messages"], of_raw["missing"]) == (40, 10)
+        if name == "altered.mcap":
+            assert "that its ledger counts and that are gone: 10" in fantwin("info", altered).stdout
+            assert fantwin("info", "--repair", altered, "-o", tmp_path / "repaired.mcap").exit_code == 3
 
 
 def test_parts_are_added_up_and_checked_for_continuity(tmp_path):

@@ -72,16 +72,6 @@ def test_an_intact_file_is_not_changed_and_one_that_lacks_only_its_index_has_los
     assert len(read_by_others(whole)) == 41
 
 
-def test_a_damaged_chunk_is_reported(whole):
-    content = bytearray(whole.read_bytes())
-    content[chunk_ends(whole)[3][0] - 5] ^= 0xFF
-    whole.write_bytes(content)
-    done = fantwin("info", "--repair", whole)
-    assert done.exit_code == 3
-    assert "damaged chunks: 1" in done.stdout
-    assert f"{RAW_KEY}: 5 messages of acquisition-1 missing in between" in done.stdout
-
-
 @pytest.mark.parametrize("number", [0, 2])
 def test_info_reports_the_losses_of_a_repaired_file(tmp_path, number):
     """Whichever chunk is damaged: the ledger of the file still has its messages."""

@@ -5,13 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from mcap.opcode import Opcode
-from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 
-import fantwin.pipeline.recordings.rare_messages as rare
-from fantwin.pipeline.recordings.index import SHORT_ENDING
+from fantwin.pipeline.recordings import indexed
 from fantwin.pipeline.recordings.rare_messages import last_messages, rare_messages
-from fantwin.pipeline.recordings.records import RecordReader
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.codec import decode
 from fantwin.schemas.header import Header
@@ -52,39 +49,15 @@ def test_they_are_found_by_the_index_without_reading_the_rest(recording, monkeyp
     assert rare_messages(recording, "grid") == []
 
 
-def test_in_a_truncated_file_they_are_found_as_far_as_it_can_be_read(recording):
-    content = recording.read_bytes()
-    recording.write_bytes(content[: len(content) // 4 * 3])
-    assert found(recording) == CARDS[:2]
-
-
-def test_in_a_file_without_an_index_they_are_found(recording):
-    (end,) = (record.offset for record in RecordReader(recording) if record.opcode == Opcode.DATA_END)
-    recording.write_bytes(recording.read_bytes()[:end] + SHORT_ENDING)
-    assert found(recording) == CARDS
-
-
-def test_beside_a_damaged_chunk_they_are_found(recording):
-    with recording.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary
-    t_ns = CARDS[1][2]
-    (damaged,) = (c for c in summary.chunk_indexes if c.message_start_time <= t_ns <= c.message_end_time)
-    content = bytearray(recording.read_bytes())
-    content[damaged.chunk_start_offset + 100] ^= 0xFF
-    recording.write_bytes(content)
-    assert found(recording) == [CARDS[0], CARDS[2]]
-
-
 def test_the_last_one_of_each_key_is_found_from_the_end(recording, monkeypatch):
     read: list[int] = []
 
-    def chunk_at(file, offset: int, length: int) -> bytes:
-        read.append(offset)
-        return whole(file, offset, length)
+    def chunk_at(file, chunk: ChunkIndex) -> bytes:
+        read.append(chunk.chunk_start_offset)
+        return whole(file, chunk)
 
-    whole = rare.chunk_at
-    monkeypatch.setattr(rare, "chunk_at", chunk_at)
+    whole = indexed.chunk_at
+    monkeypatch.setattr(indexed, "chunk_at", chunk_at)
     (payload,) = last_messages(recording, "twin").values()
     assert decode(ModelCard, payload).header.sequence == AT[-1]
     assert len(read) == 1
