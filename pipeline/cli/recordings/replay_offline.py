@@ -180,7 +180,8 @@ def _print_verified(found: dict[str, Any], console: Console) -> None:
         not_made = f"{found['samples_not_made']} were not replayed, " if has_scores else ""
         console.print(
             f"[bold red]DIFFERS:[/bold red] {different} of {different + equal} {what} differ, {not_made}"
-            f"{found['alarms_different']} alarms differ; the first differences:"
+            f"{found['inputs_different']} of the grid and of predictions differ, {found['alarms_different']} alarms "
+            "differ; the first differences:"
         )
         for line in found["differences"]:
             console.print(f"  {line}", markup=False)

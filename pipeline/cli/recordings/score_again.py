@@ -105,6 +105,7 @@ def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray]) -> dict[st
             "equal": all(one.is_equal for one in compared),
             "samples_equal": sum(one.equal for one in compared),
             "samples_different": sum(one.different for one in compared),
+            "inputs_different": sum(one.inputs_different for one in compared),
             "samples_not_made": sum(one.not_made for one in compared),
             "samples_not_recorded": sum(one.not_recorded for one in compared),
             "alarms_equal": sum(one.alarms_equal for one in compared),

@@ -31,6 +31,10 @@ class Comparison:
     """recorded, and not replayed"""
     not_recorded: int = 0
     """replayed, and not in the recording: in flight when it ended, or lost"""
+    holes: int = 0
+    """those between recorded ones: they were lost, or removed"""
+    inputs_different: int = 0
+    """samples of `grid` and `prediction` that were replayed differently"""
     alarms_equal: int = 0
     alarms_different: int = 0
     alarms_not_recorded: int = 0
@@ -55,7 +59,13 @@ class Comparison:
     @property
     def is_equal(self) -> bool:
         """Whether nothing differs."""
-        return not (self.different or self.not_made or self.alarms_different or self.snapshots_different)
+        return not (
+            self.different
+            or self.inputs_different
+            or self.not_made
+            or self.alarms_different
+            or self.snapshots_different
+        )
 
     @property
     def has_content(self) -> bool:

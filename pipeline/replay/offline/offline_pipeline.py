@@ -84,10 +84,10 @@ class OfflinePipeline:
         return 2 * BY_NAME["raw"].history * self._raw.samples_in_message
 
     def limit_of(self, producer: str) -> Limit | None:
-        """Up to where the outputs of a session of the last stage can be reproduced; exact for what has been run."""
+        """Up to where the outputs of a session of a stage can be reproduced; exact for what has been run."""
         limits: dict[str, Limit | None] = {}
         for sessions in self._plan.sessions.values():
-            limits = {session.producer: limit_through(session, limits) for session in sessions}
+            limits |= {session.producer: limit_through(session, limits) for session in sessions}
         return limits.get(producer)
 
     def run(self) -> Iterator[ReplayedMessage]:
@@ -195,8 +195,9 @@ class OfflinePipeline:
     def _samples(self, session: Session, streams: Mapping[str, SampleStream[Any]]) -> Iterator[Any]:
         for span in session.spans:
             for block in streams[span.producer].of(span):
-                self._observe(block)
-                yield replace(block, header=Header(span.producer, 0, block.header.tray))
+                of_session = replace(block, header=Header(span.producer, 0, block.header.tray))
+                self._observe(of_session)
+                yield of_session
 
     def _with_twins(self, session: Session, inputs: Mapping[str, SampleStream[Any]]) -> Iterator[Any]:
         """The samples of a session, and before its first sample each learned twin."""

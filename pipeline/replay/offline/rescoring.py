@@ -20,7 +20,7 @@ from fantwin.pipeline.replay.offline.verify import TrayVerifier
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Message, Score, ScorerSnapshot
+from fantwin.schemas.messages import Alarm, Grid, Message, Prediction, Score, ScorerSnapshot
 from fantwin.schemas.streams import LOSS_PREFIX
 from fantwin.schemas.units import NS_PER_S
 
@@ -127,7 +127,15 @@ def _rescore_tray(
     plan_used = plan or undisturbed_plan(replay_input.stages, replay_input.learned_twins(tray))
     rescored = RescoredTray(tray, plan_used, recorded_alarms=recorded_alarms)
     output = TrayOutput(writer, replay_input.config.site, tray) if writer else None
-    pipeline = replay_input.pipeline(tray, rescored.plan, output.add if output else _ignore)
+    verifier: TrayVerifier | None = None
+
+    def observe(message: Message) -> None:
+        if output:
+            output.add(message)
+        if verifier and isinstance(message, Grid | Prediction) and not plan_used.uses_recorded_inputs:
+            verifier.add_input(message)
+
+    pipeline = replay_input.pipeline(tray, rescored.plan, observe)
     verifier = (
         TrayVerifier(
             tray,
@@ -161,7 +169,3 @@ def _rescore_tray(
     elif verify:
         rescored.comparison = Comparison(tray, reasons=[f"{tray}: {no_plan_reason}"])
     return rescored
-
-
-def _ignore(_message: Message) -> None:
-    pass

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import cache
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -23,7 +25,9 @@ from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.fast_decode import decode_header, decode_together
 from fantwin.schemas.fields import columns
-from fantwin.schemas.messages import Alarm, Array, Score, ScorerSnapshot
+from fantwin.schemas.messages import Alarm, Array, Grid, Message, Prediction, Score, ScorerSnapshot
+
+Samples = TypeVar("Samples", bound=Grid | Prediction | Score)
 
 SCORE, SNAPSHOT = "score", "snapshot"
 AT_A_LIMIT = (
@@ -31,12 +35,7 @@ AT_A_LIMIT = (
     "differently, or the way of deciding has changed"
 )
 _BLOCK_MESSAGES = 512
-_SAMPLE_COLUMNS = {
-    name: column.dtype
-    for name, column in columns(Score).items()
-    if column.by_sample and not column.optional and name != "t_ns"
-}
-"""optional ones are only passed on from the source"""
+_INPUTS = {Grid: "grid", Prediction: "prediction"}
 
 
 class TrayVerifier:
@@ -61,8 +60,10 @@ class TrayVerifier:
         self._limit_of = limit_of
         self._lacking_evidence = lacking_evidence
         self._producer: str | None = None
-        self._recorded: RecordedSession | None = None
+        self._recorded: RecordedSession[Score] | None = None
         self._visited: set[str] = set()
+        self._inputs: dict[str, RecordedSession[Grid | Prediction]] = {}
+        """by producer"""
         self._found = Comparison(tray, has_scores=SCORE not in left_out)
         self._snapshots = SnapshotVerifier(lambda: read(SNAPSHOT), limit_of, self._found)
 
@@ -72,6 +73,13 @@ class TrayVerifier:
             self._add_score(producer, message)
         elif isinstance(message, ScorerSnapshot) and not (message.restored or self._found.has_scores):
             self._snapshots.add(producer, message)
+
+    def add_input(self, block: Grid | Prediction) -> None:
+        """Compare the next samples that a stage made for the next one, of the recorded session that they name."""
+        producer = block.header.producer
+        if producer not in self._inputs:
+            self._inputs[producer] = RecordedSession(self._read(_INPUTS[type(block)]), producer, type(block))
+        compare_inputs(block, self._inputs[producer], self._found, self._limit_of(producer))
 
     def _add_score(self, producer: str, score: Score) -> None:
         if self._recorded is None or producer != self._producer:
@@ -95,6 +103,8 @@ class TrayVerifier:
             compare_alarms(replayed, known, session.last_t_ns, self._found, limit, lacks_evidence=lacks_evidence)
             if limit is not None and limit.t_ns < session.last_t_ns and not self._found.has_scores:
                 self._found.add_limit(limit)
+        if holes := self._found.holes:
+            self._found.add_reason(f"{self._found.tray}: the recording lacks {holes} scored samples between others")
         return self._found
 
     def _finish_scores(self, sessions: Sequence[Session]) -> None:
@@ -104,10 +114,10 @@ class TrayVerifier:
                 self._recorded = self._begin_session(session.producer)
                 self._end_session()
 
-    def _begin_session(self, producer: str) -> RecordedSession:
+    def _begin_session(self, producer: str) -> RecordedSession[Score]:
         self._producer = producer
         self._visited.add(producer)
-        return RecordedSession(self._read(SCORE), producer)
+        return RecordedSession(self._read(SCORE), producer, Score)
 
     def _end_session(self) -> None:
         if self._recorded and self._producer is not None:
@@ -117,19 +127,27 @@ class TrayVerifier:
         self._recorded = None
 
 
-class RecordedSession:
-    """The recorded scores of one session of the scorer, in order, each once."""
+class RecordedSession(Generic[Samples]):
+    """The recorded samples of one session of a stage, in order, each once."""
 
-    def __init__(self, envelopes: Iterable[Envelope], producer: str) -> None:
-        self._blocks = _scores(envelopes, producer)
-        self._rest: Score | None = next(self._blocks, None)
+    def __init__(self, envelopes: Iterable[Envelope], producer: str, kind: type[Samples]) -> None:
+        self._blocks = _blocks(envelopes, producer, kind)
+        self._rest: Samples | None = next(self._blocks, None)
+        self.has_begun = False
+        """whether samples have been taken"""
 
-    def until(self, t_ns: int | None) -> Iterator[Score]:
+    @property
+    def has_more(self) -> bool:
+        """Whether samples are left."""
+        return self._rest is not None
+
+    def until(self, t_ns: int | None) -> Iterator[Samples]:
         """The next samples up to and including a time; None: all that are left."""
         while self._rest is not None:
             block = self._rest
             last = len(block.t_ns) if t_ns is None else int(np.searchsorted(block.t_ns, t_ns, side="right"))
             if last:
+                self.has_begun = True
                 yield cut(block, 0, last)
             if last < len(block.t_ns):
                 self._rest = cut(block, last, len(block.t_ns))
@@ -137,22 +155,41 @@ class RecordedSession:
             self._rest = next(self._blocks, None)
 
 
+def compare_inputs(
+    made: Samples, recorded: RecordedSession[Samples], found: Comparison, limit: Limit | None = None
+) -> None:
+    """Compare a block of another stage than the scorer with what is recorded of it, up to its last sample."""
+    topic = _INPUTS[type(made)]
+    for block in recorded.until(int(made.t_ns[-1])):
+        at = np.searchsorted(made.t_ns, block.t_ns)
+        is_made = (at < len(made.t_ns)) & (made.t_ns[np.minimum(at, len(made.t_ns) - 1)] == block.t_ns)
+        if block.fans == made.fans and is_made.any():
+            one, other = (
+                {f"{topic}.{name}": values for name, values in _columns(message, rows).items()}
+                for message, rows in ((made, at[is_made]), (block, is_made))
+            )
+            within = _within(block.t_ns[is_made], limit)
+            different = _compare_samples(block.t_ns[is_made], one, other, within, found)
+            found.inputs_different += int((different & within).sum())
+
+
 def compare_scores(
     made: Score,
-    recorded: RecordedSession,
+    recorded: RecordedSession[Score],
     found: Comparison,
     limit: Limit | None = None,
     *,
     lacks_evidence: bool = False,
 ) -> None:
     """Compare a block of scores with the recorded ones up to its last sample. lacks_evidence: see Session."""
-    taken = 0
+    is_taken = np.zeros(len(made.t_ns), np.bool_)
+    had_begun = recorded.has_begun
     for block in recorded.until(int(made.t_ns[-1])):
         at = np.searchsorted(made.t_ns, block.t_ns)
         is_made = (at < len(made.t_ns)) & (made.t_ns[np.minimum(at, len(made.t_ns) - 1)] == block.t_ns)
         count_not_made(block.t_ns[~is_made], found, limit)
         rows = at[is_made]
-        taken += len(rows)
+        is_taken[rows] = True
         within = _within(block.t_ns[is_made], limit)
         in_part = np.zeros(len(rows), np.bool_)
         if block.fans != made.fans:
@@ -173,11 +210,27 @@ def compare_scores(
             found.add_reason(f"{found.tray}: {LACKS_EVIDENCE}")
         found.different += int((different & within).sum())
         found.equal += int((~different & ~in_part).sum())
-    found.not_recorded += len(made.t_ns) - taken
+    found.not_recorded += int((~is_taken).sum())
+    taken = np.flatnonzero(is_taken)
+    between = slice(
+        0 if had_begun else int(taken[0]) if len(taken) else len(is_taken),
+        len(is_taken) if recorded.has_more else int(taken[-1]) if len(taken) else 0,
+    )
+    found.holes += int((~is_taken & _within(made.t_ns, limit))[between].sum())
 
 
-def _columns(score: Score, rows: Array) -> dict[str, Array]:
-    return {name: getattr(score, name)[rows].astype(dtype) for name, dtype in _SAMPLE_COLUMNS.items()}
+@cache
+def _dtypes(kind: type[Message]) -> dict[str, np.dtype[Any]]:
+    """The columns that are compared; optional ones are only passed on from the source."""
+    return {
+        name: column.dtype
+        for name, column in columns(kind).items()
+        if column.by_sample and not column.optional and name != "t_ns"
+    }
+
+
+def _columns(message: Message, rows: Array) -> dict[str, Array]:
+    return {name: getattr(message, name)[rows].astype(dtype) for name, dtype in _dtypes(type(message)).items()}
 
 
 def _compare_samples(
@@ -299,7 +352,7 @@ def _compare_in_time(
         found.add_reason(f"{found.tray}: {LACKS_EVIDENCE}")
 
 
-def _scores(envelopes: Iterable[Envelope], producer: str) -> Iterator[Score]:
+def _blocks(envelopes: Iterable[Envelope], producer: str, kind: type[Samples]) -> Iterator[Samples]:
     waiting: list[bytes] = []
     next_sequence = 0
     for envelope in envelopes:
@@ -308,9 +361,9 @@ def _scores(envelopes: Iterable[Envelope], producer: str) -> Iterator[Score]:
             next_sequence = header.sequence + 1
             waiting.append(envelope.payload)
             if len(waiting) == _BLOCK_MESSAGES:
-                yield from decode_together(Score, waiting)
+                yield from decode_together(kind, waiting)
                 waiting = []
-    yield from decode_together(Score, waiting)
+    yield from decode_together(kind, waiting)
 
 
 def first_difference(alarm: Alarm, other: Alarm, note: Callable[[Apart], None]) -> str:

@@ -79,6 +79,33 @@ def test_a_difference_is_exit_code_1_and_named(tmp_path):
     assert "DIFFERS" in result.stdout and "expected_residual_rad_s" in result.stdout
 
 
+@pytest.mark.parametrize(("topic", "column"), [("grid", "speed_rad_s"), ("prediction", "predicted_speed_rad_s")])
+def test_one_altered_number_of_what_was_judged_is_a_difference(tmp_path, topic, column):
+    altered: list[str] = []
+
+    def two_more(entry):
+        if entry.topic == topic and entry.message.header.sequence == 20 and not altered:
+            altered.append(entry.key)
+            values = getattr(entry.message, column)
+            values.setflags(write=True)
+            values[0, 0] += 2.0
+        return entry.message
+
+    result = replay("--verify", changed(GOLDEN, tmp_path / "altered.mcap", two_more))
+    assert result.exit_code == 1
+    assert "1 of the grid and of predictions differ" in result.stdout and f"{topic}.{column}" in result.stdout
+
+
+def test_scores_that_are_missing_between_others_are_exit_code_3(tmp_path):
+    def removed(entry):
+        is_one = entry.topic == "score" and 20 <= entry.message.header.sequence < 30
+        return None if is_one else entry.message
+
+    result = replay("--verify", changed(GOLDEN, tmp_path / "removed.mcap", removed))
+    assert result.exit_code == 3
+    assert "scored samples between others" in result.stdout
+
+
 @pytest.mark.parametrize("words", [("--twin",), ("--set", "scorer.alarm_share=1"), ("--start", "2")])
 def test_verifying_with_other_settings_is_refused_exit_code_2(tmp_path, words):
     if words == ("--twin",):

@@ -72,7 +72,7 @@ def compared(made: Score, recorded: Score) -> Comparison:
     found = Comparison("tray1")
     message = replace(recorded, header=Header("scorer-1", 0, "tray1"))
     envelope = Envelope.of("fantwin/site/tray1/score", message, 0)
-    compare_scores(made, RecordedSession([envelope], "scorer-1"), found)
+    compare_scores(made, RecordedSession([envelope], "scorer-1", Score), found)
     return found
 
 
